@@ -1,0 +1,29 @@
+"""ddrecon: density volumes from pictures of smoke and clouds, by differential diffusion.
+
+`load_scene(path) -> Scene`, `render(scene, view=None) -> Tensor [views, 3, h, w]`, `optimize(scene, ...) -> Result` and
+`VolumeRenderer`, the renderer as a layer. Names are imported when first used, so that `import ddrecon` costs nothing.
+"""
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+_HOMES = {
+    "load_scene": "ddrecon.scene.build",
+    "render": "ddrecon.renderer",
+    "VolumeRenderer": "ddrecon.layer",
+    "optimize": "ddrecon.reconstruct.loop",
+    "Result": "ddrecon.reconstruct.loop",
+    "Scene": "ddrecon.world",
+    "DdreconError": "ddrecon.errors",
+    "SceneError": "ddrecon.errors",
+    "FormatError": "ddrecon.errors",
+    "SolveError": "ddrecon.errors",
+}
+__all__ = ["__version__", *_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'ddrecon' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

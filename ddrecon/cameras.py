@@ -1,0 +1,81 @@
+"""Cameras: which world ray belongs to which pixel.
+
+Row 0 of an image is its top; +x of the image is to the right of someone looking from origin to target with `up` up. World
+vectors here are (x, y, z); `rays` hands them on in array order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import array_order
+
+
+@dataclass(eq=False)
+class Camera:
+    """A camera: `pose` is the camera-to-world matrix `[3, 4]` with OpenGL axes (right, up, backward, origin), rigid.
+
+    `size`: (height, width) in pixels. `is_perspective` chooses between perspective, whose horizontal field of view is
+    `2 atan(half_width)`, and orthographic, whose image is `2 half_width` world units wide.
+    """
+
+    pose: Tensor
+    size: tuple[int, int]
+    half_width: float
+    is_perspective: bool = True
+
+    def resized(self, factor: int) -> Camera:
+        """The same camera with `factor` times fewer pixels along each side (at least one)."""
+        height, width = (max(1, side // factor) for side in self.size)
+        return Camera(self.pose, (height, width), self.half_width, self.is_perspective)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """View rays in array order: `origin` [R, 3] in u and `direction` [R, 3] of unit length, away from the camera.
+
+    `eye` [3] is the point all rays of a perspective camera pass through, None for parallel rays.
+    """
+
+    origin: Tensor
+    direction: Tensor
+    eye: Tensor | None
+
+
+def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
+    """Camera-to-world matrix `[3, 4]` of a camera at `origin` looking at `target`; all three are `[3]` (x, y, z).
+
+    Raises ValueError when origin and target coincide or `up` is parallel to the view direction.
+    """
+    forward = target - origin
+    right = torch.linalg.cross(forward, up)
+    if not bool(forward.norm() > 0) or not bool(right.norm() > 1e-6 * forward.norm() * up.norm()):
+        raise ValueError("origin, target and up do not span a view: move target away from origin, turn up away from the view direction")
+    forward, right = forward / forward.norm(), right / right.norm()
+    return torch.stack([right, torch.linalg.cross(right, forward), -forward, origin], dim=1)
+
+
+def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
+    """Centers (row, column), in pixels, of `samples` equal parts of a pixel laid out as squarely as `samples` divides."""
+    rows = max(n for n in range(1, math.isqrt(samples) + 1) if samples % n == 0)
+    columns = samples // rows
+    return [((i + 0.5) / rows, (j + 0.5) / columns) for i in range(rows) for j in range(columns)]
+
+
+def rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Rays:
+    """The rays through every pixel, row by row, at `offset` (row, column) within the pixel: R = height * width."""
+    height, width = camera.size
+    pose = camera.pose
+    row = (torch.arange(height, dtype=pose.dtype, device=pose.device) + offset[0] - height / 2) * (-2 / width)
+    column = (torch.arange(width, dtype=pose.dtype, device=pose.device) + offset[1] - width / 2) * (2 / width)
+    y, x = torch.meshgrid(row * camera.half_width, column * camera.half_width, indexing="ij")
+    right, up, backward, origin = pose.unbind(1)
+    plane = x.reshape(-1, 1) * right + y.reshape(-1, 1) * up
+    if camera.is_perspective:
+        direction = torch.nn.functional.normalize(plane - backward, dim=-1)
+        return Rays(array_order(origin.expand_as(direction)), array_order(direction), array_order(origin))
+    return Rays(array_order(origin + plane), array_order((-backward).expand_as(plane)), None)

@@ -1,0 +1,97 @@
+"""Derivatives of a diffusion solve: the tangent (THEORY E8) and the adjoint (E9) of the discrete system, both by hand.
+
+With A u = S and A symmetric, differentiating gives A du = dS - dA u for a tangent; for a cotangent u_bar one solve A lambda = u_bar
+serves all parameters: S_bar = lambda and A_bar = -lambda u^T, of which only the entries A depends on are needed.
+A nested forward-mode call inside a custom function's own jvp fails in torch, hence no help from autograd here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
+from ddrecon.diffusion.solvers.scaled import Solution
+
+Solver = Callable[[Operator, Tensor, Tensor | None, float], Solution]
+
+
+@dataclass(frozen=True)
+class SolveRecord:
+    """One solve: `kind` is forward, adjoint or tangent; iterations used, relative residual reached, seconds taken."""
+
+    kind: str
+    iterations: int
+    residual: float
+    seconds: float
+
+
+@dataclass
+class SolveMemory:
+    """What solves remember between renders: the last solution of each kind, to start from, and a record of every solve.
+
+    With `is_warm` False every solve starts from zero.
+    """
+
+    is_warm: bool = True
+    last: dict[str, Tensor] = field(default_factory=dict)
+    records: list[SolveRecord] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Solve:
+    """How to solve: the solver, its tolerance, and the memory that its solves share."""
+
+    solver: Solver
+    tolerance: float
+    memory: SolveMemory
+
+    def __call__(self, kind: str, operator: Operator, source: Tensor) -> Tensor:
+        """u with `operator` u = `source` [C, z, y, x]."""
+        start = perf_counter()
+        guess = self.memory.last.get(kind) if self.memory.is_warm and kind != "tangent" else None
+        solution = self.solver(operator, source, guess, self.tolerance)
+        self.memory.records.append(SolveRecord(kind, solution.iterations, solution.residual, perf_counter() - start))
+        if self.memory.is_warm:
+            self.memory.last[kind] = solution.value
+        return solution.value
+
+
+class _Solve(torch.autograd.Function):
+    @staticmethod
+    def forward(solve: Solve, source: Tensor, loss: Tensor, c_z: Tensor, c_y: Tensor, c_x: Tensor) -> Tensor:
+        return solve("forward", Operator((c_z, c_y, c_x), loss), source).clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.solve, _, *coefficients = inputs
+        ctx.save_for_backward(output, *coefficients)
+        ctx.save_for_forward(output, *coefficients)
+
+    @staticmethod
+    def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
+        u, loss, *conductances = ctx.saved_tensors
+        adjoint = ctx.solve("adjoint", Operator(tuple(conductances), loss), u_bar)
+        conductance_bars = [-difference(adjoint, axis) * difference(u, axis) for axis in AXES]
+        return None, adjoint.clone(), -adjoint * u, *conductance_bars
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, d_source: Tensor | None, d_loss: Tensor | None, *d_conductances: Tensor | None) -> Tensor:
+        u, loss, *conductances = ctx.saved_tensors
+        right = torch.zeros_like(u) if d_source is None else d_source.clone()
+        if d_loss is not None:
+            right -= d_loss * u
+        for axis, d_conductance in zip(AXES, d_conductances, strict=True):
+            if d_conductance is not None:
+                right -= accumulate(d_conductance * difference(u, axis), axis)
+        return ctx.solve("tangent", Operator(tuple(conductances), loss), right).clone()
+
+
+def solve_diffusion(solve: Solve, operator: Operator, source: Tensor) -> Tensor:
+    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes with respect to `source` and the operator."""
+    return _Solve.apply(solve, source, operator.loss, *operator.conductances)

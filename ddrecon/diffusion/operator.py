@@ -1,0 +1,130 @@
+"""The conservative diffusion operator A = G^T c G + loss (THEORY E7) on cell-centered arrays `[C, z, y, x]`.
+
+G is the difference of neighboring cells across each interior face, c the conductance of that face; `loss` is what a cell gives up
+to absorption and through the faces of the box. Every flux that leaves a cell enters its neighbor, so energy is kept to rounding.
+Neighbors are combined by slicing: conv3d with fixed difference kernels gives the same result about 70 times slower on a CPU
+(`benchmarks/stencil.py` measures both).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+
+AXES = (1, 2, 3)
+"""Array axes of z, y, x in a `[C, z, y, x]` tensor."""
+
+
+@dataclass(frozen=True)
+class Operator:
+    """A symmetric positive definite M-matrix per color.
+
+    `conductances`: c [1/u] on the interior faces along z, y, x, each one entry shorter than a cell array along its axis; `loss`
+    [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0.
+    """
+
+    conductances: tuple[Tensor, Tensor, Tensor]
+    loss: Tensor
+
+    @cached_property
+    def diagonal(self) -> Tensor:
+        """The diagonal of A [1/u]."""
+        total = self.loss.clone()
+        for axis, conductance in zip(AXES, self.conductances, strict=True):
+            lower(total, axis).add_(conductance)
+            upper(total, axis).add_(conductance)
+        return total
+
+    def apply(self, u: Tensor) -> Tensor:
+        """A u, `[C, z, y, x]`."""
+        return subtract_neighbors(self.diagonal * u, u, self.conductances)
+
+
+def lower(u: Tensor, axis: int) -> Tensor:
+    """The cells on the low side of every interior face along `axis` (a view)."""
+    return u.narrow(axis, 0, u.shape[axis] - 1)
+
+
+def upper(u: Tensor, axis: int) -> Tensor:
+    """The cells on the high side of every interior face along `axis` (a view)."""
+    return u.narrow(axis, 1, u.shape[axis] - 1)
+
+
+def difference(u: Tensor, axis: int) -> Tensor:
+    """G u along `axis`: high side minus low side of every interior face."""
+    return upper(u, axis) - lower(u, axis)
+
+
+def subtract_neighbors(result: Tensor, u: Tensor, conductances: tuple[Tensor, ...]) -> Tensor:
+    """`result` minus conductance times neighbor, over all interior faces; `result` is changed in place and returned."""
+    for axis, conductance in zip(AXES, conductances, strict=True):
+        lower(result, axis).addcmul_(conductance, upper(u, axis), value=-1)
+        upper(result, axis).addcmul_(conductance, lower(u, axis), value=-1)
+    return result
+
+
+def accumulate(faces: Tensor, axis: int) -> Tensor:
+    """G^T f along `axis`: each cell gets what its low face brings minus what its high face brings."""
+    nothing = faces.new_zeros(_with(faces.shape, axis, 1))
+    return torch.cat([nothing, faces], axis) - torch.cat([faces, nothing], axis)
+
+
+def conductances(diffusion: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
+    """c = harmonic mean of D on the interior faces / h^2 [1/u], along z, y, x (E7); `diffusion`: D [u], `[C, z, y, x]`, > 0."""
+    z, y, x = (2 / (1 / lower(diffusion, axis) + 1 / upper(diffusion, axis)) / step**2 for axis, step in zip(AXES, grid.spacing, strict=True))
+    return z, y, x
+
+
+def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
+    """What a cell loses through the faces of the box per unit L0 [1/u]: 1 / (h (2 + h / (2 D))) for each such face (Marshak, E6)."""
+    loss = torch.zeros_like(diffusion)
+    for axis, step in zip(AXES, grid.spacing, strict=True):
+        escape = 1 / (step * (2 + step / (2 * diffusion)))
+        loss = loss + escape * _on_box(diffusion, axis)
+    return loss
+
+
+def face_fluxes(radiance: Tensor | None, source_flux: Tensor | None, diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
+    """Flux F = D (-grad L0 + kappa_s Q1) along `axis` on all faces, those of the box included (E5 without its 3, and E6).
+
+    `radiance`: L0 [C, z, y, x] or None for zero; `source_flux`: the component of kappa_s Q1 along `axis`, same shape, or None.
+    Returns an array one entry longer than the cells along `axis`, positive towards higher indices.
+    """
+    step = grid.spacing[axis - 1]
+    interior = 2 / (1 / lower(diffusion, axis) + 1 / upper(diffusion, axis))
+    escape = 1 / (2 + step / (2 * diffusion))
+    inside, low, high = torch.zeros_like(interior), torch.zeros_like(_first(escape, axis)), torch.zeros_like(_last(escape, axis))
+    if radiance is not None:
+        inside = inside - interior * difference(radiance, axis) / step
+        low = low - _first(escape * radiance, axis)
+        high = high + _last(escape * radiance, axis)
+    if source_flux is not None:
+        inside = inside + interior * 0.5 * (lower(source_flux, axis) + upper(source_flux, axis))
+        outflow = escape * (step / 2) * source_flux
+        low, high = low + _first(outflow, axis), high + _last(outflow, axis)
+    return torch.cat([low, inside, high], axis)
+
+
+def _on_box(u: Tensor, axis: int) -> Tensor:
+    """How many of a cell's two faces along `axis` lie on the box: 0, 1 or 2, shaped to broadcast."""
+    counts = torch.zeros(u.shape[axis], dtype=u.dtype, device=u.device)
+    counts[0] += 1
+    counts[-1] += 1
+    return counts.view(_with([1, 1, 1, 1], axis, -1))
+
+
+def _first(u: Tensor, axis: int) -> Tensor:
+    return u.narrow(axis, 0, 1)
+
+
+def _last(u: Tensor, axis: int) -> Tensor:
+    return u.narrow(axis, u.shape[axis] - 1, 1)
+
+
+def _with(shape: list[int] | torch.Size, axis: int, size: int) -> list[int]:
+    return [size if other == axis else old for other, old in enumerate(shape)]

@@ -1,0 +1,33 @@
+"""Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952, doi:10.6028/jres.049.044), all colors at once."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, inner
+
+MAX_ITERATIONS = 20_000
+CHECK_EVERY = 4
+"""Residuals are looked at every few iterations only: on a GPU each look waits for the device."""
+
+
+def conjugate_gradient(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float) -> Solution:
+    """The solution of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError when it is not reached."""
+    system = ScaledSystem.of(operator, source)
+    y, residual = system.start(guess)
+    direction, square = residual.clone(), inner(residual, residual)
+    tiny = torch.finfo(source.dtype).tiny
+    for iteration in range(MAX_ITERATIONS + 1):
+        if iteration % CHECK_EVERY == 0 and not (relative := system.relative(residual)) > tolerance:
+            break
+        product = system.apply(direction)
+        step = square / inner(direction, product).clamp(min=tiny)
+        y.addcmul_(step, direction)
+        residual.addcmul_(step, product, value=-1)
+        previous, square = square, inner(residual, residual)
+        direction.mul_(square / previous.clamp(min=tiny)).add_(residual)
+    if not relative <= tolerance:
+        raise system.give_up("conjugate_gradient", iteration, relative)
+    return Solution(system.scale * y, iteration, relative)

@@ -1,0 +1,25 @@
+"""Jacobi iteration, as the paper uses it; on the conservative M-matrix it always converges, if slowly."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution
+
+MAX_ITERATIONS = 200_000
+CHECK_EVERY = 16
+
+
+def jacobi(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float) -> Solution:
+    """The solution of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError when it is not reached."""
+    system = ScaledSystem.of(operator, source)
+    y, residual = system.start(guess)
+    for iteration in range(MAX_ITERATIONS + 1):
+        if iteration % CHECK_EVERY == 0 and not (relative := system.relative(residual)) > tolerance:
+            break
+        y += residual
+        residual = system.source - system.apply(y)
+    if not relative <= tolerance:
+        raise system.give_up("jacobi", iteration, relative)
+    return Solution(system.scale * y, iteration, relative)

@@ -1,0 +1,69 @@
+"""The system scaled to a unit diagonal, which every solver iterates on, and what a solve returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import AXES, Operator, lower, subtract_neighbors, upper
+from ddrecon.errors import SolveError
+
+
+@dataclass(frozen=True)
+class Solution:
+    """`value` [C, z, y, x] solves the system to `residual` (relative, largest over the colors), found in `iterations`."""
+
+    value: Tensor
+    iterations: int
+    residual: float
+
+
+@dataclass(frozen=True)
+class ScaledSystem:
+    """S A S y = S b with unit diagonal, and u = S y; `scale` is S, `conductances` those of S A S."""
+
+    scale: Tensor
+    conductances: tuple[Tensor, ...]
+    source: Tensor
+    source_norm: Tensor
+
+    @staticmethod
+    def of(operator: Operator, source: Tensor) -> ScaledSystem:
+        """The scaled form of `operator` u = `source`."""
+        scale = operator.diagonal.rsqrt()
+        scaled = tuple(c * lower(scale, axis) * upper(scale, axis) for axis, c in zip(AXES, operator.conductances, strict=True))
+        return ScaledSystem(scale, scaled, scale * source, norm(scale * source))
+
+    def apply(self, y: Tensor) -> Tensor:
+        """S A S y."""
+        return subtract_neighbors(y.clone(), y, self.conductances)
+
+    def start(self, guess: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The first iterate, from a guess of u, and its residual; where the guess is worse than zero, zero."""
+        nothing = torch.zeros_like(self.source)
+        if guess is None or guess.shape != self.source.shape:
+            return nothing, self.source.clone()
+        y = guess / self.scale
+        residual = self.source - self.apply(y)
+        helps = norm(residual) < self.source_norm
+        return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
+
+    def relative(self, residual: Tensor) -> float:
+        """The norm of `residual` over that of the right side, largest over the colors; 0 for a color without source."""
+        return float((norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)).max())
+
+    def give_up(self, name: str, iterations: int, residual: float) -> SolveError:
+        """The error of a solve that did not converge."""
+        return SolveError(f"{name} did not reach its tolerance", iterations, residual, "raise diffusion.tolerance or use --dtype float64")
+
+
+def inner(a: Tensor, b: Tensor) -> Tensor:
+    """Inner product per color, `[C, 1, 1, 1]`."""
+    return (a * b).sum((1, 2, 3), keepdim=True)
+
+
+def norm(a: Tensor) -> Tensor:
+    """Euclidean norm per color, `[C, 1, 1, 1]`."""
+    return inner(a, a).sqrt()

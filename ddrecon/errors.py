@@ -1,0 +1,42 @@
+"""The ways ddrecon refuses its input or gives up, each with the exit code of the command line.
+
+Everything a user can cause is a `DdreconError`; whatever else is raised is a bug and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class DdreconError(Exception):
+    """Base of every error a user can cause; `exit_code` is what the command line returns."""
+
+    exit_code = 2
+
+
+class SceneError(DdreconError):
+    """A scene that cannot be used: one line per problem, `file:line:column: key.path: what is wrong`."""
+
+    def __init__(self, problems: str | Sequence[str]):
+        self.problems = [problems] if isinstance(problems, str) else list(problems)
+        super().__init__("\n".join(self.problems))
+
+
+class FormatError(DdreconError):
+    """A data file that exists but cannot be used."""
+
+    exit_code = 3
+
+    def __init__(self, path: object, reason: str):
+        self.path, self.reason = str(path), reason
+        super().__init__(f"{path}: {reason}")
+
+
+class SolveError(DdreconError):
+    """A linear solve or an optimization that did not converge; the last good state is kept."""
+
+    exit_code = 4
+
+    def __init__(self, what: str, iterations: int, residual: float, advice: str):
+        self.iterations, self.residual, self.advice = iterations, residual, advice
+        super().__init__(f"{what} after {iterations} iterations (residual {residual:.2e}); {advice}")

@@ -1,0 +1,73 @@
+"""The cell-centered grid: where its cells lie in the world.
+
+The one convention: users speak (x, y, z), arrays are `[z, y, x]` with x fastest. This is the only file that turns one into
+the other; inside the physics, vectors are in array order too, so component 0 belongs to array axis 0 (z).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A box of `shape` cells between the corners `lower` and `upper`, all in array order (z, y, x).
+
+    `shape` counts cells, at least one along each axis; `lower` and `upper` are in world units u, `lower < upper`.
+    """
+
+    shape: tuple[int, int, int]
+    lower: Triple
+    upper: Triple
+
+    @staticmethod
+    def from_xyz(resolution: tuple[int, int, int], lower: Triple, upper: Triple) -> Grid:
+        """The grid of `resolution` = (nx, ny, nz) cells between world corners given as (x, y, z)."""
+        x, y, z = resolution
+        return Grid((z, y, x), (lower[2], lower[1], lower[0]), (upper[2], upper[1], upper[0]))
+
+    @property
+    def extent(self) -> Triple:
+        """Side lengths of the box [u]."""
+        z, y, x = (hi - lo for lo, hi in zip(self.lower, self.upper, strict=True))
+        return z, y, x
+
+    @property
+    def spacing(self) -> Triple:
+        """Side lengths of a cell [u]."""
+        z, y, x = (side / cells for side, cells in zip(self.extent, self.shape, strict=True))
+        return z, y, x
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+    @property
+    def bounds_xyz(self) -> tuple[Triple, Triple]:
+        """The world corners as (x, y, z)."""
+        (lz, ly, lx), (uz, uy, ux) = self.lower, self.upper
+        return (lx, ly, lz), (ux, uy, uz)
+
+    def centers(self, like: Tensor) -> list[Tensor]:
+        """World coordinates [u] of the cell centers: one tensor per axis, shaped to broadcast to `[z, y, x]`."""
+        coordinates = []
+        for axis, (cells, low, step) in enumerate(zip(self.shape, self.lower, self.spacing, strict=True)):
+            line = low + step * (torch.arange(cells, dtype=like.dtype, device=like.device) + 0.5)
+            coordinates.append(line.view([-1 if axis == other else 1 for other in range(3)]))
+        return coordinates
+
+    def coarsened(self, factor: int) -> Grid:
+        """The grid over the same box with about `factor` times fewer cells along each axis (at least one)."""
+        z, y, x = (max(1, round(cells / factor)) for cells in self.shape)
+        return Grid((z, y, x), self.lower, self.upper)
+
+
+def array_order(vector: Tensor) -> Tensor:
+    """A vector `[..., 3]` given as (x, y, z) in array order (z, y, x), or back: the swap is its own inverse."""
+    return vector.flip(-1)

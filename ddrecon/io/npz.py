@@ -1,0 +1,51 @@
+"""Volumes as NumPy archives: each field under its own name, with `bounds` [[xmin, ymin, zmin], [xmax, ymax, zmax]] beside it."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from ddrecon.errors import FormatError
+from ddrecon.io.arrays import read_npy
+from ddrecon.io.atomic import replacing
+from ddrecon.io.field import Field, checked_field
+
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError)
+
+
+def read_npz(path: Path, name: str) -> Field:
+    """The field `name` of the archive at `path`; raises FormatError when it is damaged, absent or not a legal field."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [entry.removesuffix(".npy") for entry in archive.namelist()]
+            if name not in names:
+                raise FormatError(path, _absence(name, [other for other in names if other != "bounds"]))
+            bounds = _read_entry(archive, "bounds", path) if "bounds" in names else None
+            values = _read_entry(archive, name, path)
+    except zipfile.BadZipFile as error:
+        raise FormatError(path, f"not a complete .npz archive: {error}; write it with numpy.savez_compressed") from error
+    except _DAMAGE as error:
+        raise FormatError(path, f"cannot be read: {error}") from error
+    return checked_field(path, name, values, bounds)
+
+
+def write_npz(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
+    """Writes `values` [z, y, x] or [z, y, x, 3] as float32 under `name`, with `bounds` [2, 3] (x, y, z), compressed."""
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        arrays = {name: np.asarray(values, np.float32), "bounds": np.asarray(bounds, np.float64)}
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+
+def _read_entry(archive: zipfile.ZipFile, name: str, path: Path) -> np.ndarray:
+    entry = archive.getinfo(f"{name}.npy")
+    with archive.open(entry) as stream:
+        return read_npy(stream, entry.file_size, path, name)
+
+
+def _absence(name: str, others: list[str]) -> str:
+    if len(others) == 1:
+        return f"has no field {name!r}, only {others[0]!r}; save that array under the name {name!r}"
+    return f"has no field {name!r}; it has {', '.join(map(repr, others)) or 'none'}"

@@ -1,0 +1,86 @@
+"""Float TIFF images: the baseline of TIFF 6.0 (Adobe, 1992) that holds uncompressed 32-bit float gray, RGB or RGBA in strips.
+
+imageio alone writes no float colors, and this much needs no library.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from ddrecon.errors import FormatError
+from ddrecon.io.atomic import replacing
+
+WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, OFFSETS = 256, 257, 258, 259, 262, 273
+ORIENTATION, SAMPLES, ROWS, COUNTS, PLANAR, SAMPLE_FORMAT = 274, 277, 278, 279, 284, 339
+_TYPES = {3: "H", 4: "I"}
+_DEFAULTS = {COMPRESSION: (1,), SAMPLES: (1,), PLANAR: (1,), SAMPLE_FORMAT: (1,), ORIENTATION: (1,), BITS: (1,)}
+
+
+def write_tiff(path: Path, pixels: np.ndarray) -> None:
+    """Writes `pixels` [h, w] or [h, w, 3] as one strip of little-endian float32."""
+    height, width = pixels.shape[:2]
+    samples = 1 if pixels.ndim == 2 else pixels.shape[2]
+    data = np.ascontiguousarray(pixels, "<f4").tobytes()
+    tags = {WIDTH: [width], HEIGHT: [height], BITS: [32] * samples, COMPRESSION: [1], PHOTOMETRIC: [1 if samples == 1 else 2]}
+    tags |= {OFFSETS: [8], SAMPLES: [samples], ROWS: [height], COUNTS: [len(data)], PLANAR: [1], SAMPLE_FORMAT: [3] * samples}
+    with replacing(path) as temporary:
+        temporary.write_bytes(struct.pack("<2sHI", b"II", 42, 8 + len(data)) + data + _directory(tags, 8 + len(data)))
+
+
+def _directory(tags: dict[int, list[int]], start: int) -> bytes:
+    entries, overflow = b"", b""
+    overflow_start = start + 2 + 12 * len(tags) + 4
+    for tag, values in sorted(tags.items()):
+        packed = struct.pack(f"<{len(values)}I", *values)
+        if len(packed) > 4:
+            packed, overflow = struct.pack("<I", overflow_start + len(overflow)), overflow + packed
+        entries += struct.pack("<HHI", tag, 4, len(values)) + packed
+    return struct.pack("<H", len(tags)) + entries + bytes(4) + overflow
+
+
+def read_tiff(path: Path) -> np.ndarray:
+    """The pixels of the TIFF file at `path`, float32 [h, w] or [h, w, samples]; raises FormatError for any other kind of TIFF."""
+    data = path.read_bytes()
+    try:
+        order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
+        tags = _DEFAULTS | _read_tags(data, order)
+        height, width, samples = tags[HEIGHT][0], tags[WIDTH][0], tags[SAMPLES][0]
+    except (KeyError, struct.error, IndexError) as error:
+        raise FormatError(path, "not a TIFF file, or a damaged one") from error
+    if reason := _unsupported(tags):
+        raise FormatError(path, f"{reason}; only uncompressed 32-bit float TIFF, gray or RGB in strips, is read: save it so, or as .exr")
+    strips = zip(tags[OFFSETS], tags.get(COUNTS, (len(data),)), strict=False)
+    pixels = b"".join(data[offset : offset + count] for offset, count in strips)
+    if len(pixels) != 4 * height * width * samples:
+        raise FormatError(path, f"is damaged: {len(pixels)} bytes of pixels, {width} x {height} x {samples} floats expected")
+    image = np.frombuffer(pixels, f"{order}f4").reshape(height, width, samples).astype(np.float32)
+    return image[..., 0] if samples == 1 else image
+
+
+def _read_tags(data: bytes, order: str) -> dict[int, tuple[int, ...]]:
+    (start,) = struct.unpack_from(f"{order}I", data, 4)
+    (entries,) = struct.unpack_from(f"{order}H", data, start)
+    tags = {}
+    for position in range(start + 2, start + 2 + 12 * entries, 12):
+        tag, kind, count = struct.unpack_from(f"{order}HHI", data, position)
+        if kind in _TYPES and count <= len(data):
+            layout = f"{order}{count}{_TYPES[kind]}"
+            inline = struct.calcsize(layout) <= 4
+            offset = position + 8 if inline else struct.unpack_from(f"{order}I", data, position + 8)[0]
+            tags[tag] = struct.unpack_from(layout, data, offset)
+    return tags
+
+
+def _unsupported(tags: dict[int, tuple[int, ...]]) -> str | None:
+    if tags[COMPRESSION][0] != 1:
+        return f"is compressed (scheme {tags[COMPRESSION][0]})"
+    if OFFSETS not in tags or tags[PLANAR][0] != 1 or tags[ORIENTATION][0] != 1:
+        return "has tiles, separate color planes or turned rows"
+    if set(tags[SAMPLE_FORMAT]) != {3} or set(tags[BITS]) != {32}:
+        return f"holds {tags[BITS][0]}-bit samples of format {tags[SAMPLE_FORMAT][0]}"
+    if tags.get(PHOTOMETRIC, (2,))[0] not in (1, 2):
+        return f"has photometric interpretation {tags[PHOTOMETRIC][0]}"
+    return None

@@ -1,0 +1,41 @@
+"""Volumes by suffix: `FORMATS` is the table; adding a format is one file and one line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ddrecon.errors import FormatError
+from ddrecon.io.field import Field
+from ddrecon.io.npz import read_npz, write_npz
+
+
+@dataclass(frozen=True)
+class VolumeFormat:
+    """How one kind of volume file is read and written: `read(path, name)`, `write(path, name, values, bounds)`."""
+
+    read: Callable[[Path, str], Field]
+    write: Callable[[Path, str, np.ndarray, np.ndarray], None]
+
+
+FORMATS: dict[str, VolumeFormat] = {".npz": VolumeFormat(read_npz, write_npz)}
+
+
+def read_field(path: Path, name: str) -> Field:
+    """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`; raises FormatError when it cannot be used."""
+    return _format_of(path).read(path, name)
+
+
+def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
+    """Writes `values` [z, y, x] or [z, y, x, 3] and `bounds` [2, 3] (x, y, z) in the format of `path`'s suffix, as float32."""
+    _format_of(path).write(path, name, values, bounds)
+
+
+def _format_of(path: Path) -> VolumeFormat:
+    try:
+        return FORMATS[path.suffix.lower()]
+    except KeyError:
+        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {', '.join(FORMATS)}") from None

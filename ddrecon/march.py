@@ -1,0 +1,177 @@
+"""View rays: the integral of what the medium sends towards the camera (THEORY E1-E3).
+
+Rays are marched slice by slice along the axis the view looks along, with two-dimensional interpolation in each slice; where
+that is not possible (a camera inside the box, rays nearly along a slice) by three-dimensional interpolation at equal steps.
+Between two nodes of a ray density and optical depth are taken as linear, so emission times transmittance has a closed form.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from ddrecon.cameras import Rays
+from ddrecon.grid import Grid
+from ddrecon.medium import Coefficient
+from ddrecon.phase import henyey_greenstein
+from ddrecon.reduced import Beam, decay_mean
+from ddrecon.sampling import sample_slices, sample_volume
+
+CHUNK_NODES = 1 << 18
+"""Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and memory does not grow with pixels."""
+STEEPEST = 0.2
+"""Smallest direction cosine, against the axis across the slices, of rays that are marched by slices."""
+
+
+@dataclass(frozen=True)
+class Emission:
+    """What a volume sends towards one camera: its `extinction`, `scattering`, light `beams`, and `diffuse` [C, z, y, x].
+
+    `diffuse` is the radiance that scatters into the camera's rays from all other light, so that emission per unit length is
+    kappa_s (diffuse + sum over beams of p E tau / (4 pi)); `g` is the mean cosine of p.
+    """
+
+    grid: Grid
+    extinction: Coefficient
+    scattering: Coefficient
+    beams: tuple[Beam, ...]
+    diffuse: Tensor
+    g: Tensor
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """The part of each ray inside the box: where rays `hit` it (indices), and distances [u] to `near` and `far` there."""
+
+    hit: Tensor
+    near: Tensor
+    far: Tensor
+
+
+def march(emission: Emission, rays: Rays, steps_per_voxel: int) -> tuple[Tensor, Tensor]:
+    """Radiance [C, R] scattered towards the camera along `rays`, and transmittance [C, R] of the whole volume along them."""
+    crossing = cross_box(emission.grid, rays)
+    colors = emission.diffuse.shape[0]
+    blank = emission.diffuse.new_zeros(colors, rays.direction.shape[0])
+    if crossing.hit.numel() == 0:
+        return blank, blank + 1
+    sampler = _sampler(emission, rays, crossing, steps_per_voxel)
+
+    def run(chunk: Tensor) -> tuple[Tensor, Tensor]:
+        chosen = crossing.hit[chunk]
+        direction = rays.direction[chosen]
+        values, lengths = sampler.sample(rays.origin[chosen], direction, crossing.near[chunk], crossing.far[chunk])
+        return _integrate(emission, values, lengths, direction)
+
+    chunks = torch.arange(crossing.hit.numel(), device=blank.device).split(max(1, CHUNK_NODES // sampler.nodes))
+    if torch.is_grad_enabled():
+        parts = [checkpoint(run, chunk, use_reentrant=False, preserve_rng_state=False) for chunk in chunks]
+    else:
+        parts = [run(chunk) for chunk in chunks]
+    scattered, transmittance = (torch.cat(part, 1) for part in zip(*parts, strict=True))
+    return blank.index_copy(1, crossing.hit, scattered), (blank + 1).index_copy(1, crossing.hit, transmittance)
+
+
+def cross_box(grid: Grid, rays: Rays) -> Crossing:
+    """Where `rays` run inside the box of `grid`, in front of the camera."""
+    low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
+    tiny = torch.finfo(rays.direction.dtype).tiny
+    safe = torch.where(rays.direction.abs() < tiny, torch.full_like(rays.direction, tiny), rays.direction)
+    one, other = (low - rays.origin) / safe, (high - rays.origin) / safe
+    near = torch.minimum(one, other).amax(-1).clamp(min=0)
+    far = torch.maximum(one, other).amin(-1)
+    hit = (far > near).nonzero()[:, 0]
+    return Crossing(hit, near[hit], far[hit])
+
+
+class _Slices:
+    """Values where rays cross the planes through the cell centers across `axis`, and the two faces of the box."""
+
+    def __init__(self, fields: Tensor, grid: Grid, axis: int, is_reversed: bool, steps: int):
+        self.axis, self.across = axis, [other for other in range(3) if other != axis]
+        self.lower, self.extent = grid.lower, grid.extent
+        slices = fields.permute(1 + axis, 0, *(1 + other for other in self.across))
+        slices = torch.cat([slices[:1], slices, slices[-1:]])
+        center = (torch.arange(grid.shape[axis], dtype=fields.dtype, device=fields.device) + 0.5) / grid.shape[axis]
+        planes = torch.nn.functional.pad(center, (1, 0))
+        planes = torch.cat([planes, torch.ones_like(planes[:1])]) * grid.extent[axis] + grid.lower[axis]
+        slices, planes = _subdivided(slices, steps), _subdivided(planes, steps)
+        self.slices, self.planes = (slices.flip(0), planes.flip(0)) if is_reversed else (slices, planes)
+        self.nodes = len(self.planes)
+
+    def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+        distance = (self.planes[:, None] - origin[:, self.axis]) / direction[:, self.axis]
+        points = [2 * (origin[:, a] + distance * direction[:, a] - self.lower[a]) / self.extent[a] - 1 for a in self.across]
+        values = sample_slices(self.slices, torch.stack([points[1], points[0]], -1))
+        inside = torch.minimum(torch.maximum(distance, near), far)
+        return values, (inside[1:] - inside[:-1])[:, None]
+
+
+class _Equidistant:
+    """Values at equal steps along rays, wherever these run."""
+
+    def __init__(self, fields: Tensor, grid: Grid, longest: float, steps: int):
+        self.fields, self.lower, self.extent = fields, fields.new_tensor(grid.lower), fields.new_tensor(grid.extent)
+        self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
+
+    def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+        part = torch.linspace(0, 1, self.nodes, dtype=near.dtype, device=near.device)[:, None]
+        distance = near + part * (far - near)
+        points = 2 * (origin + distance[..., None] * direction - self.lower) / self.extent - 1
+        values = sample_volume(self.fields, points.flip(-1))
+        lengths = (far - near) / (self.nodes - 1)
+        return values.transpose(0, 1), lengths.expand(self.nodes - 1, 1, -1)
+
+
+def _sampler(emission: Emission, rays: Rays, crossing: Crossing, steps: int) -> _Slices | _Equidistant:
+    """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps."""
+    fields = _stacked(emission)
+    direction = rays.direction[crossing.hit]
+    axis = int(direction.abs().mean(0).argmax())
+    along = direction[:, axis]
+    is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
+    if is_steep and bool((crossing.near > 0).all()):
+        return _Slices(fields, emission.grid, axis, bool(along[0] < 0), steps)
+    return _Equidistant(fields, emission.grid, float((crossing.far - crossing.near).max()), steps)
+
+
+def _subdivided(values: Tensor, steps: int) -> Tensor:
+    """`values` along axis 0 with `steps` - 1 linearly interpolated entries between each pair of neighbors."""
+    if steps == 1:
+        return values
+    low, high = values[:-1], values[1:]
+    between = torch.stack([low + (high - low) * (i / steps) for i in range(steps)], 1).flatten(0, 1)
+    return torch.cat([between, values[-1:]])
+
+
+def _stacked(emission: Emission) -> Tensor:
+    """The fields to interpolate, `[channels, z, y, x]`; scattering only where it is not the extinction's field again."""
+    fields = [emission.extinction.field, emission.diffuse, *(beam.mass for beam in emission.beams)]
+    if emission.scattering.field is not emission.extinction.field:
+        fields.append(emission.scattering.field)
+    return torch.cat(fields)
+
+
+def _integrate(emission: Emission, values: Tensor, lengths: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Scattered radiance and transmittance, each [C, R], from node `values` [N, channels, R] and segment `lengths` [N - 1, 1, R]."""
+    fields, colors = emission.extinction.field.shape[0], emission.diffuse.shape[0]
+    extinction, diffuse, *masses = values[:, : fields * (1 + len(emission.beams)) + colors].split([fields, colors] + [fields] * len(emission.beams), 1)
+    scattering = values[:, -emission.scattering.field.shape[0] :] if emission.scattering.field is not emission.extinction.field else extinction
+    scale = emission.extinction.scale.view(1, -1, 1)
+    mass = 0.5 * (extinction[:-1] + extinction[1:]) * lengths
+    reached = mass.cumsum(0)
+    begin = reached - mass
+    emitted = scattering * diffuse
+    scattered = (0.5 * (emitted[:-1] + emitted[1:]) * lengths * torch.exp(-scale * begin) * decay_mean(scale * mass)).sum(0)
+    if masses:
+        weight = 0.5 * (scattering[:-1] + scattering[1:]) * lengths
+    for beam, beam_mass in zip(emission.beams, masses, strict=True):
+        first, last = begin + beam_mass[:-1], reached + beam_mass[1:]
+        arriving = torch.exp(-scale * torch.minimum(first, last)) * decay_mean(scale * (last - first).abs())
+        phase = henyey_greenstein(-(direction @ beam.direction), emission.g)
+        scattered = scattered + (weight * arriving).sum(0) * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
+    return scattered * emission.scattering.scale.view(-1, 1), torch.exp(-scale[0] * reached[-1])

@@ -1,0 +1,169 @@
+"""The paper on one page: light not yet scattered, light scattered many times, and the view rays that collect both.
+
+`render` composes only the terms a scene needs: no diffusion solve when the model is `none` or nothing shines or scatters, no
+fluxes Q1 and L1 when g = 0, one color channel when all is gray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
+from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
+from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductances, face_fluxes
+from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.lights import AmbientLight, Light
+from ddrecon.march import Emission, march
+from ddrecon.medium import Medium, medium_of
+from ddrecon.phase import forward_fraction
+from ddrecon.reduced import ReducedLight, reduced_light
+from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.world import Scene, View
+
+
+@dataclass(frozen=True)
+class DiffuseLight:
+    """Multiply scattered light: `mean` L0 [C, z, y, x] and `flux` L1 [3, C, z, y, x] (array order; None where g = 0)."""
+
+    mean: Tensor
+    flux: Tensor | None
+
+
+@dataclass(frozen=True)
+class LightField:
+    """All light inside a medium: what arrives unscattered and what has been scattered (None where nothing multiply scatters)."""
+
+    medium: Medium
+    reduced: ReducedLight
+    diffuse: DiffuseLight | None
+
+
+@dataclass(frozen=True)
+class Components:
+    """The terms of E1, each [3, h, w]; they sum to the image. Forward-peaked light counts as `multiple`, as in path tracing."""
+
+    reduced: Tensor
+    single: Tensor
+    multiple: Tensor
+
+
+def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
+    """Images `[views, 3, h, w]` (linear radiance) of all views of `scene`, or of the one named `view`.
+
+    Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume`. `memory` carries the last solutions
+    from one call to the next, as starting points. Raises ValueError when views differ in size: render those one by one.
+    """
+    views = scene.views if view is None else [scene.view(view)]
+    if len({item.camera.size for item in views}) > 1:
+        raise ValueError("the views differ in size; render them one by one: render(scene, view=name)")
+    light_field = solve_light(scene, memory or SolveMemory())
+    return torch.stack([view_image(light_field, scene, item.camera) for item in views])
+
+
+def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
+    """The light inside the volume of `scene`: E4 and E5 on top of the reduced light."""
+    medium = medium_of(scene.volume)
+    reduced = reduced_light(medium, scene.lights, has_flux(medium))
+    return LightField(medium, reduced, solve_diffuse(medium, reduced, scene.diffusion, memory))
+
+
+def has_flux(medium: Medium) -> bool:
+    """Whether light's direction matters to scattering: g is not 0, or may become so because it is being differentiated."""
+    return medium.g.requires_grad or bool(medium.g.detach() != 0)
+
+
+def solve_diffuse(medium: Medium, reduced: ReducedLight, settings: DiffusionSettings, memory: SolveMemory) -> DiffuseLight | None:
+    """L0 from the P1 balance E4 with the Marshak boundary E6, and L1 from E5; None for the model `none`."""
+    if settings.model == "none":
+        return None
+    grid = medium.grid
+    scattering = medium.diffuse_scattering.value
+    diffusion = CLOSURES[settings.closure](medium.transport_extinction, grid)
+    operator = Operator(conductances(diffusion, grid), medium.absorption.value + boundary_loss(diffusion, grid))
+    source = scattering * reduced.source_mean
+    source_flux: Sequence[Tensor | None] = (None, None, None)
+    if reduced.source_flux is not None:
+        source_flux = (scattering * reduced.source_flux).unbind(0)
+        for axis in AXES:
+            fluxes = face_fluxes(None, source_flux[axis - 1], diffusion, grid, axis)
+            source = source - fluxes.diff(dim=axis) / grid.spacing[axis - 1]
+    mean = solve_diffusion(Solve(SOLVERS[settings.solver], settings.tolerance, memory), operator, source)
+    if reduced.source_flux is None:
+        return DiffuseLight(mean, None)
+    faces = [face_fluxes(mean, source_flux[axis - 1], diffusion, grid, axis) for axis in AXES]
+    flux = [1.5 * (face.narrow(axis, 0, n) + face.narrow(axis, 1, n)) for axis, n, face in zip(AXES, grid.shape, faces, strict=True)]
+    return DiffuseLight(mean, torch.stack(flux))
+
+
+def view_image(light_field: LightField, scene: Scene, camera: Camera) -> Tensor:
+    """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1)."""
+    return _average(camera, scene.render, lambda bundle: _radiance(light_field, scene, bundle))
+
+
+def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
+    """The image of `camera` split into its terms; `light_field` must be that of `scene`.
+
+    With forward scattering the image sees the delta-Eddington scaled medium; reduced and single radiance are those of the medium
+    itself, and the difference, light scattered forward once or more, belongs to `multiple`.
+    """
+    medium = light_field.medium
+    exact = replace(medium, extinction=medium.unscaled_extinction)
+    once = LightField(exact, reduced_light(exact, scene.lights, has_flux(medium)), None)
+    dark = replace(scene, render=replace(scene.render, background=False))
+    image = view_image(light_field, scene, camera)
+    single = view_image(once, dark, camera)
+    reduced = view_image(once, scene, camera) - single
+    return Components(reduced, single, image - reduced - single)
+
+
+def _average(camera: Camera, settings: RenderSettings, radiance) -> Tensor:
+    offsets = subpixel_offsets(settings.samples_per_pixel)
+    total = sum(radiance(rays(camera, offset)) for offset in offsets) / len(offsets)
+    return total.unflatten(-1, camera.size)
+
+
+def _radiance(light_field: LightField, scene: Scene, bundle: Rays) -> Tensor:
+    """Radiance [3, R] along `bundle`: E1."""
+    medium, reduced = light_field.medium, light_field.reduced
+    diffuse = diffuse_radiance(light_field, bundle)
+    emission = Emission(medium.grid, medium.extinction, medium.scattering, reduced.beams, diffuse, medium.g)
+    scattered, transmittance = march(emission, bundle, scene.render.steps_per_voxel)
+    if scene.render.background:
+        for light in scene.lights:
+            if isinstance(light, AmbientLight):
+                scattered = scattered + transmittance * light.radiance.view(-1, 1)
+    return scattered.expand(3, -1)
+
+
+def diffuse_radiance(light_field: LightField, bundle: Rays) -> Tensor:
+    """What one more scattering by kappa_s sends towards the camera, beams aside, per unit length and kappa_s: [C, z, y, x].
+
+    (1 - f) (L0 + g' L1.w) of the diffuse light (E3), and int p L_ri / (4 pi) of ambient light (E2) to first order in angle.
+    Every ray through a cell's center has the same direction w, so this is a field of the camera, interpolated like any other.
+    """
+    medium, reduced, diffuse = light_field.medium, light_field.reduced, light_field.diffuse
+    towards = _towards_camera(medium, bundle)
+    radiance = torch.zeros_like(reduced.source_mean)
+    if diffuse is not None:
+        scattered = diffuse.mean
+        if diffuse.flux is not None:
+            scattered = scattered + medium.mean_cosine * (diffuse.flux * towards).sum(0)
+        radiance = (1 - forward_fraction(medium.g)) * scattered
+    if reduced.ambient_mean is not None:
+        radiance = radiance + reduced.ambient_mean
+        if has_flux(medium):
+            radiance = radiance + 3 * medium.g * (reduced.ambient_flux * towards).sum(0)
+    return radiance
+
+
+def _towards_camera(medium: Medium, bundle: Rays) -> Tensor:
+    """Unit directions `[3, 1, z, y, x]` (or `[3, 1, 1, 1, 1]` for parallel rays) from the cells towards the camera."""
+    if bundle.eye is None:
+        return -bundle.direction[0].view(3, 1, 1, 1, 1)
+    offsets = torch.broadcast_tensors(*(e - c for e, c in zip(bundle.eye, medium.grid.centers(bundle.eye), strict=True)))
+    return torch.nn.functional.normalize(torch.stack(offsets), dim=0)[:, None]

@@ -1,0 +1,45 @@
+"""What a renderer can be told: the `render` and `diffusion` sections of a scene, with their defaults and legal values.
+
+Each field's metadata is what the scene loader checks: `minimum`, `above`, `maximum`, or `choices`, a table of implementations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.solvers import SOLVERS
+
+
+def bounded(default: Any, *, minimum: float | None = None, above: float | None = None, maximum: float | None = None) -> Any:
+    """A number field whose value is at least `minimum`, greater than `above` and at most `maximum`, where given."""
+    return field(default=default, metadata={"minimum": minimum, "above": above, "maximum": maximum})
+
+
+def one_of(default: str, choices: Collection[str]) -> Any:
+    """A text field whose value is one of `choices`."""
+    return field(default=default, metadata={"choices": tuple(choices)})
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How view rays are sampled. `background`: ambient light is also seen directly."""
+
+    samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
+    steps_per_voxel: int = bounded(1, minimum=1, maximum=8)
+    background: bool = True
+
+
+@dataclass(frozen=True)
+class DiffusionSettings:
+    """How multiply scattered light is found; `tolerance` is the relative residual of each linear solve."""
+
+    model: str = one_of("p1", ("none", "p1"))
+    scheme: str = one_of("conservative", ("conservative",))
+    closure: str = one_of("smooth", CLOSURES)
+    solver: str = one_of("conjugate_gradient", SOLVERS)
+    tolerance: float = bounded(1e-4, above=0, maximum=0.5)
+    warm_start: bool = True
+    transport_rounds: int = bounded(0, minimum=0, maximum=0)
