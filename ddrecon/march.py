@@ -15,10 +15,11 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ddrecon.cameras import Rays
+from ddrecon.decay import decay_mean
 from ddrecon.grid import Grid
 from ddrecon.medium import Coefficient
 from ddrecon.phase import henyey_greenstein
-from ddrecon.reduced import Beam, decay_mean
+from ddrecon.reduced import Beam
 from ddrecon.sampling import sample_slices, sample_volume
 
 CHUNK_NODES = 1 << 18

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from ddrecon.decay import decay_mean
 from ddrecon.grid import Grid, array_order
 from ddrecon.lights import AmbientLight, DirectionalLight, Light
 from ddrecon.medium import Coefficient, Medium
@@ -152,11 +153,3 @@ def _lattice_points(like: Tensor, lattice: tuple[int, int], slope: Tensor, sourc
     rows, columns = lines
     grid = torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
     return grid.flatten(1, 2)
-
-
-def decay_mean(depth: Tensor) -> Tensor:
-    """The mean of exp(-depth s) over s in [0, 1]: (1 - exp(-depth)) / depth, by its series near 0, for `depth` >= 0."""
-    is_small = depth < 0.03
-    safe = torch.where(is_small, torch.ones_like(depth), depth)
-    series = 1 - depth / 2 * (1 - depth / 3 * (1 - depth / 4 * (1 - depth / 5 * (1 - depth / 6))))
-    return torch.where(is_small, series, -torch.expm1(-safe) / safe)

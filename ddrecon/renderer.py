@@ -152,18 +152,24 @@ def diffuse_radiance(light_field: LightField, bundle: Rays) -> Tensor:
     if diffuse is not None:
         scattered = diffuse.mean
         if diffuse.flux is not None:
-            scattered = scattered + medium.mean_cosine * (diffuse.flux * towards).sum(0)
+            scattered = scattered + medium.mean_cosine * _along(diffuse.flux, towards)
         radiance = (1 - forward_fraction(medium.g)) * scattered
     if reduced.ambient_mean is not None:
         radiance = radiance + reduced.ambient_mean
         if has_flux(medium):
-            radiance = radiance + 3 * medium.g * (reduced.ambient_flux * towards).sum(0)
+            radiance = radiance + 3 * medium.g * _along(reduced.ambient_flux, towards)
     return radiance
 
 
-def _towards_camera(medium: Medium, bundle: Rays) -> Tensor:
-    """Unit directions `[3, 1, z, y, x]` (or `[3, 1, 1, 1, 1]` for parallel rays) from the cells towards the camera."""
+def _along(flux: Tensor, towards: tuple[Tensor, ...]) -> Tensor:
+    z, y, x = towards
+    return torch.addcmul(torch.addcmul(flux[0] * z, flux[1], y), flux[2], x)
+
+
+def _towards_camera(medium: Medium, bundle: Rays) -> tuple[Tensor, ...]:
+    """Components along z, y, x, each broadcasting to `[z, y, x]`, of unit directions from the cells towards the camera."""
     if bundle.eye is None:
-        return -bundle.direction[0].view(3, 1, 1, 1, 1)
-    offsets = torch.broadcast_tensors(*(e - c for e, c in zip(bundle.eye, medium.grid.centers(bundle.eye), strict=True)))
-    return torch.nn.functional.normalize(torch.stack(offsets), dim=0)[:, None]
+        return (-bundle.direction[0]).unbind()
+    offsets = [e - c for e, c in zip(bundle.eye, medium.grid.centers(bundle.eye), strict=True)]
+    distance = (offsets[0] ** 2 + offsets[1] ** 2 + offsets[2] ** 2).sqrt().clamp(min=torch.finfo(bundle.eye.dtype).tiny)
+    return tuple(offset / distance for offset in offsets)
