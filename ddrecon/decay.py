@@ -1,4 +1,9 @@
-"""Exponential decay averaged over a step: the closed form by which emission and beams are integrated within cells."""
+"""Exponential decay integrated in closed form over steps in which the optical depth grows linearly.
+
+With phi(d) = (1 - exp(-d)) / d the mean of exp(-depth) between depths a and b is exp(-min) phi(|b - a|). Its derivatives are
+-exp(-min) psi for the smaller depth and exp(-min) (psi - phi) for the larger, psi = phi + phi' = (1 - phi) / d. Both functions here
+are differentiated by hand, in both modes: autograd would keep and revisit a dozen arrays instead of two.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,37 @@ import torch
 from torch import Tensor
 
 SERIES_BELOW = 1e-2
+"""Depths below this take psi from its series, since 1 - phi cancels there."""
+
+
+def decay_mean(depth: Tensor) -> Tensor:
+    """phi: the mean of exp(-depth s) over s in [0, 1], 1 at 0; `depth` >= 0, any shape."""
+    return _DecayMean.apply(depth)
+
+
+def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Tensor:
+    """Sum over segments of `weight` times the mean of exp(-depth) there, `[C, R]`.
+
+    `begin`, `end`: [S, K, R] >= 0, what `scale` [C, 1] multiplies to give the depths at both ends of segment S, in either order;
+    `weight`: [S, K or C, R]. K is 1 or C.
+    """
+    return _DecayedSum.apply(weight, begin, end, scale)
+
+
+def _phi(depth: Tensor) -> Tensor:
+    shifted = depth + torch.finfo(depth.dtype).tiny
+    return torch.expm1(-shifted).div_(shifted).neg_()
+
+
+def _psi(depth: Tensor, phi: Tensor) -> Tensor:
+    series = 1 / 2 - depth * (1 / 6 - depth * (1 / 24 - depth * (1 / 120 - depth / 720)))
+    return torch.where(depth < SERIES_BELOW, series, (1 - phi).div_(depth.clamp(min=SERIES_BELOW)))
 
 
 class _DecayMean(torch.autograd.Function):
     @staticmethod
     def forward(depth: Tensor) -> Tensor:
-        shifted = depth + torch.finfo(depth.dtype).tiny
-        return torch.expm1(-shifted).div_(shifted).neg_()
+        return _phi(depth)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
@@ -22,21 +51,57 @@ class _DecayMean(torch.autograd.Function):
         ctx.save_for_forward(inputs[0], output)
 
     @staticmethod
-    def backward(ctx: Any, mean_bar: Tensor) -> Tensor:
-        return mean_bar * _slope(*ctx.saved_tensors)
+    def backward(ctx: Any, phi_bar: Tensor) -> Tensor:
+        depth, phi = ctx.saved_tensors
+        return phi_bar * (_psi(depth, phi) - phi)
 
     @staticmethod
     def jvp(ctx: Any, d_depth: Tensor) -> Tensor:
-        return d_depth * _slope(*ctx.saved_tensors)
+        depth, phi = ctx.saved_tensors
+        return d_depth * (_psi(depth, phi) - phi)
 
 
-def decay_mean(depth: Tensor) -> Tensor:
-    """The mean of exp(-depth s) over s in [0, 1]: (1 - exp(-depth)) / depth, and 1 at 0; `depth` >= 0, any shape."""
-    return _DecayMean.apply(depth)
+class _DecayedSum(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Tensor:
+        decay = torch.exp(torch.minimum(begin, end) * -scale)
+        phi = _phi((end - begin).abs_() * scale)
+        ctx.save_for_backward(weight, begin, end, scale, decay, phi)
+        ctx.save_for_forward(weight, begin, end, scale, decay, phi)
+        return (decay * phi).mul_(weight).sum(0)
+
+    @staticmethod
+    def backward(ctx: Any, out_bar: Tensor) -> tuple[Tensor | None, ...]:
+        weight, begin, end, scale, decay, phi = ctx.saved_tensors
+        mean_bar = decay * phi * out_bar
+        weight_bar = mean_bar.sum(1, keepdim=True) if weight.shape[1] < mean_bar.shape[1] else mean_bar
+        both_bar = mean_bar * weight
+        low_bar = _psi((end - begin).abs_() * scale, phi).mul_(decay).mul_(weight).mul_(out_bar).neg_()
+        high_bar = both_bar.add_(low_bar).neg_()
+        is_rising = begin <= end
+        scale_bar = None
+        if ctx.needs_input_grad[3]:
+            low, high = torch.minimum(begin, end), torch.maximum(begin, end)
+            scale_bar = (low_bar * low + high_bar * high).sum((0, 2))[:, None]
+        low_bar, high_bar = (_to_fields(bar.mul_(scale), begin) for bar in (low_bar, high_bar))
+        return weight_bar, torch.where(is_rising, low_bar, high_bar), torch.where(is_rising, high_bar, low_bar), scale_bar
+
+    @staticmethod
+    def jvp(ctx: Any, d_weight: Tensor | None, d_begin: Tensor | None, d_end: Tensor | None, d_scale: Tensor | None) -> Tensor:
+        weight, begin, end, scale, decay, phi = ctx.saved_tensors
+        psi = _psi((end - begin).abs() * scale, phi)
+        low_slope, high_slope = -decay * psi, decay * (psi - phi)
+        is_rising = begin <= end
+        begin_slope, end_slope = torch.where(is_rising, low_slope, high_slope), torch.where(is_rising, high_slope, low_slope)
+        d_mean = torch.zeros_like(decay)
+        for value, d_value, slope in ((begin, d_begin, begin_slope), (end, d_end, end_slope)):
+            if d_value is not None:
+                d_mean = d_mean + slope * scale * d_value
+            if d_scale is not None:
+                d_mean = d_mean + slope * d_scale * value
+        d_out = (weight * d_mean).sum(0)
+        return d_out if d_weight is None else d_out + (d_weight * decay * phi).sum(0)
 
 
-def _slope(depth: Tensor, mean: Tensor) -> Tensor:
-    """The derivative of `mean`: (exp(-depth) - mean) / depth; by its series near 0, where that cancels."""
-    series = -1 / 2 + depth * (1 / 3 - depth * (1 / 8 - depth * (1 / 30 - depth / 144)))
-    closed = (1 - mean) / depth.clamp(min=SERIES_BELOW) - mean
-    return torch.where(depth < SERIES_BELOW, series, closed)
+def _to_fields(bar: Tensor, field: Tensor) -> Tensor:
+    return bar.sum(1, keepdim=True) if field.shape[1] < bar.shape[1] else bar

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ddrecon.cameras import Rays
-from ddrecon.decay import decay_mean
+from ddrecon.decay import decayed_sum
 from ddrecon.grid import Grid
 from ddrecon.medium import Coefficient
 from ddrecon.phase import henyey_greenstein
@@ -162,17 +162,15 @@ def _integrate(emission: Emission, values: Tensor, lengths: Tensor, direction: T
     fields, colors = emission.extinction.field.shape[0], emission.diffuse.shape[0]
     extinction, diffuse, *masses = values[:, : fields * (1 + len(emission.beams)) + colors].split([fields, colors] + [fields] * len(emission.beams), 1)
     scattering = values[:, -emission.scattering.field.shape[0] :] if emission.scattering.field is not emission.extinction.field else extinction
-    scale = emission.extinction.scale.view(1, -1, 1)
+    scale = emission.extinction.scale.view(-1, 1)
     mass = 0.5 * (extinction[:-1] + extinction[1:]) * lengths
-    reached = mass.cumsum(0)
-    begin = reached - mass
+    end = mass.cumsum(0)
+    begin = end - mass
     emitted = scattering * diffuse
-    scattered = (0.5 * (emitted[:-1] + emitted[1:]) * lengths * torch.exp(-scale * begin) * decay_mean(scale * mass)).sum(0)
-    if masses:
-        weight = 0.5 * (scattering[:-1] + scattering[1:]) * lengths
+    scattered = decayed_sum(0.5 * (emitted[:-1] + emitted[1:]) * lengths, begin, end, scale)
+    weight = 0.5 * (scattering[:-1] + scattering[1:]) * lengths
     for beam, beam_mass in zip(emission.beams, masses, strict=True):
-        first, last = begin + beam_mass[:-1], reached + beam_mass[1:]
-        arriving = torch.exp(-scale * torch.minimum(first, last)) * decay_mean(scale * (last - first).abs())
+        arriving = decayed_sum(weight, begin + beam_mass[:-1], end + beam_mass[1:], scale)
         phase = henyey_greenstein(-(direction @ beam.direction), emission.g)
-        scattered = scattered + (weight * arriving).sum(0) * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
-    return scattered * emission.scattering.scale.view(-1, 1), torch.exp(-scale[0] * reached[-1])
+        scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
+    return scattered * emission.scattering.scale.view(-1, 1), torch.exp(-scale * end[-1])

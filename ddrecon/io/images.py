@@ -46,7 +46,8 @@ def read_image(path: Path) -> Image:
 
 def read_mask(path: Path) -> np.ndarray:
     """The mask at `path`: float32 [h, w], 0 where its image is black (ignore the pixel) or empty and 1 elsewhere."""
-    return (read_image(path).pixels.max(axis=2) > 0).astype(np.float32)
+    brightest: np.ndarray = read_image(path).pixels.max(axis=2)
+    return as_float32(brightest > 0)
 
 
 def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
@@ -86,8 +87,8 @@ def _finite(values: np.ndarray, path: Path) -> np.ndarray:
     if flawed.any():
         row, column = np.argwhere(flawed)[0]
         what = "NaN" if np.isnan(values[row, column]).any() else "an infinite value"
-        count = np.count_nonzero(flawed)
-        raise FormatError(path, f"{what} at row {row}, column {column} ({count} such pixels); repair the image, or mask the pixels")
+        where = f"row {row}, column {column} ({np.count_nonzero(flawed)} such pixels)"
+        raise FormatError(path, f"{what} at {where}; repair it: a pixel to ignore may hold any finite number")
     return values
 
 

@@ -1,0 +1,1 @@
+"""From images to volumes: the reconstruction loop. It knows of physics only `renderer.render`."""

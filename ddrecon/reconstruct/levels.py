@@ -1,0 +1,61 @@
+"""Coarse to fine: the same scene with fewer cells and pixels, and fields carried from one resolution to the next."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interpolate
+
+from ddrecon.grid import Grid
+from ddrecon.medium import Volume
+from ddrecon.world import Scene, View
+
+FEWEST_CELLS = 8
+FEWEST_PIXELS = 16
+"""No side of a grid or image longer than these is coarsened below them."""
+
+
+def factors(scene: Scene, refine_at: tuple[float, ...]) -> list[int]:
+    """The coarsening factor of each stage, the last of them 1; stages too coarse for the scene's grid take the coarsest that fits."""
+    longest = max(scene.volume.grid.shape)
+    fits = [factor for factor in (2**k for k in range(len(refine_at), -1, -1)) if longest // factor >= FEWEST_CELLS or factor == 1]
+    return [max(fits[0], 1)] * (len(refine_at) + 1 - len(fits)) + fits
+
+
+def stage_of(iteration: int, iterations: int, refine_at: tuple[float, ...]) -> int:
+    """The stage that `iteration` of `iterations` belongs to: how many fractions of `refine_at` it has passed."""
+    return sum(iteration >= round(fraction * iterations) for fraction in refine_at)
+
+
+def at_level(scene: Scene, factor: int) -> Scene:
+    """`scene` with about `factor` times fewer cells and pixels along each side; targets are averaged over the larger pixels."""
+    if factor == 1:
+        return scene
+    volume, grid = scene.volume, scene.volume.grid.coarsened(factor)
+    coarse = Volume(
+        grid, resampled(volume.density, grid), _resampled_colors(volume.sigma_a, grid), _resampled_colors(volume.sigma_s, grid), volume.g
+    )
+    return replace(scene, volume=coarse, views=[_at_level(view, factor) for view in scene.views])
+
+
+def resampled(field: Tensor, grid: Grid) -> Tensor:
+    """`field` [z, y, x] on `grid` over the same box: averaged where `grid` is coarser, trilinearly interpolated where finer."""
+    if tuple(field.shape) == grid.shape:
+        return field
+    if field.numel() > grid.cells:
+        return adaptive_avg_pool3d(field[None], grid.shape)[0]
+    return interpolate(field[None, None], grid.shape, mode="trilinear", align_corners=False)[0, 0]
+
+
+def _resampled_colors(sigma: Tensor, grid: Grid) -> Tensor:
+    return sigma if sigma.ndim == 1 else torch.stack([resampled(field, grid) for field in sigma])
+
+
+def _at_level(view: View, factor: int) -> View:
+    factor = max([f for f in (2**k for k in range(factor.bit_length())) if f <= factor and min(view.camera.size) // f >= FEWEST_PIXELS], default=1)
+    camera = view.camera.resized(factor)
+    image = adaptive_avg_pool2d(view.image, camera.size) if view.image is not None else None
+    mask = (adaptive_avg_pool2d(view.mask[None], camera.size)[0] > 0.5).to(view.mask.dtype) if view.mask is not None else None
+    return replace(view, camera=camera, image=image, mask=mask)

@@ -1,0 +1,47 @@
+"""How far rendered images are from their targets, and how rough a field is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+ROUNDING = 1e-3
+"""Differences of density below this are smoothed quadratically rather than as total variation."""
+
+
+def l2(error: Tensor) -> Tensor:
+    """The square of `error`, entry by entry."""
+    return error**2
+
+
+LOSSES: dict[str, Callable[[Tensor], Tensor]] = {"l2": l2}
+
+
+def image_loss(loss: str, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean of `loss` over the pixels and colors of `image` [3, h, w]; pixels where `mask` [h, w] is 0 do not count."""
+    values = LOSSES[loss](image - target)
+    if mask is None:
+        return values.mean()
+    return (values * mask).sum() / (3 * mask.sum()).clamp(min=1)
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    """Peak signal-to-noise ratio [dB] of `image` against `target`, both [3, h, w]; the peak is the target's largest value."""
+    error = image_loss("l2", image.detach(), target, mask)
+    tiny = torch.finfo(target.dtype).tiny
+    return float(10 * torch.log10(target.max().clamp(min=tiny) ** 2 / error.clamp(min=tiny)))
+
+
+def total_variation(field: Tensor) -> Tensor:
+    """Mean over cells of the length of the difference vector to the next cell along each axis; `field`: [z, y, x].
+
+    Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), rounded off at zero so that its
+    derivative is finite in flat regions.
+    """
+    square = torch.full_like(field, ROUNDING**2)
+    for axis in range(3):
+        step = field.diff(dim=axis) ** 2
+        square = square + torch.cat([step, torch.zeros_like(field.narrow(axis, 0, 1))], axis)
+    return (square.sqrt() - ROUNDING).mean()

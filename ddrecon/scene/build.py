@@ -1,0 +1,62 @@
+"""Scene files as tensors: the front door `load_scene`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+import torch
+
+from ddrecon.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.scene.build_views import build_views
+from ddrecon.scene.build_volume import build_volume
+from ddrecon.scene.files import require
+from ddrecon.scene.load import SceneFile, read_scene
+from ddrecon.scene.problems import Problems
+from ddrecon.scene.schema import Color, DirectionalSection, FieldFile, LightSection
+from ddrecon.world import Scene
+
+
+def load_scene(
+    path: str | os.PathLike[str],
+    *,
+    overrides: Iterable[str] = (),
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Scene:
+    """The scene in the file at `path`, with `overrides` (`key.path=value`), as tensors of `dtype` on `device`.
+
+    Raises SceneError with one line per problem of the scene, or FormatError for a file it names that cannot be used.
+    """
+    return build_scene(read_scene(path, overrides), dtype=dtype, device=device)
+
+
+def build_scene(scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Scene:
+    """The scene of a file that was read, as tensors of `dtype` on `device`; raises as `load_scene` does."""
+    place, tree, problems, grid = torch.device(device), scene_file.tree, Problems(), None
+    with problems.collecting():
+        volume = build_volume(scene_file, dtype, place)
+        grid = volume.grid
+    with problems.collecting():
+        views = build_views(scene_file, grid, dtype, place)
+    with problems.collecting():
+        _require_starts(scene_file)
+    problems.raise_any()
+    lights = [_build_light(light, dtype, place) for light in tree.lights]
+    return Scene(volume, lights, views, tree.render, tree.diffusion, tree.optimize, scene_file.path)
+
+
+def _require_starts(scene_file: SceneFile) -> None:
+    optimize = scene_file.tree.optimize
+    for name, settings in optimize.parameters.items() if optimize else ():
+        if isinstance(settings.init, FieldFile):
+            require(scene_file, f"optimize.parameters.{name}.init.file", settings.init.file)
+
+
+def _build_light(section: LightSection, dtype: torch.dtype, device: torch.device) -> Light:
+    def color(value: Color) -> torch.Tensor:
+        return torch.tensor([value] if isinstance(value, float) else value, dtype=dtype, device=device)
+
+    if isinstance(section, DirectionalSection):
+        return DirectionalLight(torch.tensor(section.direction, dtype=dtype, device=device), color(section.irradiance))
+    return AmbientLight(color(section.radiance))

@@ -1,0 +1,23 @@
+"""Files a scene refers to: absent ones are the scene's mistake, unusable ones the file's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from ddrecon.scene.load import SceneFile
+
+T = TypeVar("T")
+
+
+def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[[Path], T]) -> T:
+    """What `read` makes of the file `path` named at `key`; raises SceneError if there is none, FormatError if it is unusable."""
+    require(scene_file, key, path)
+    return read(path)
+
+
+def require(scene_file: SceneFile, key: str, path: Path) -> None:
+    """Raises SceneError unless `path`, named at `key`, is a file."""
+    if not path.is_file():
+        raise scene_file.refused(key, f"{path} {'is not a file' if path.exists() else 'does not exist'}")

@@ -1,0 +1,145 @@
+"""Reading records: any frozen dataclass of the schema from a mapping, by its fields' types. One function per shape of type."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from ddrecon.scene.leaves import LEAVES, Rule, read_color, read_each, read_list, read_number, read_text
+from ddrecon.scene.nodes import Node, found
+from ddrecon.scene.problems import Problems, suggestion
+from ddrecon.scene.ring import read_ring_views
+from ddrecon.scene.schema import PARAMETERS, Constant, Density, FieldFile, ParameterSettings, Quantity, RingViews, ViewSection
+
+R = TypeVar("R")
+
+
+def read_record(node: Node, kind: type[R], folder: Path) -> R:
+    """The record of type `kind` that the mapping `node` describes; raises SceneError with everything wrong in it."""
+    entries = _mapping(node)
+    declared: dict[str, Field[Any]] = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    known = [*(["type"] if hasattr(kind, "type") else []), *declared]
+    problems, values = Problems(), {}
+    for name, child in entries.items():
+        if name not in known:
+            problems.note(child.key_refused(f"unknown key{suggestion(name, known)}"))
+    for what in _absences(kind, declared, entries):
+        problems.note(node.refused(what))
+    hints = get_type_hints(kind)
+    for name in declared.keys() & entries.keys():
+        with problems.collecting():
+            values[name] = read_value(entries[name], Rule(hints[name], declared[name].metadata, folder))
+    problems.raise_any()
+    return _checked(node, kind(**values))
+
+
+def read_value(node: Node, rule: Rule) -> Any:
+    """The value of `node` by `rule`: a leaf, a record, a list of records, or one of several records told apart by `type`."""
+    if read := READERS.get(rule.hint):
+        return read(node, rule)
+    arguments = get_args(rule.hint)
+    if type(None) in arguments:
+        rest = reduce(or_, (argument for argument in arguments if argument is not type(None)))
+        return None if node.value is None else read_value(node, Rule(rest, rule.limits, rule.folder))
+    if is_dataclass(rule.hint):
+        return read_record(node, rule.hint, rule.folder)  # type: ignore[arg-type]
+    if get_origin(rule.hint) is tuple:
+        return read_each(read_list(node), Rule(arguments[0], rule.limits, rule.folder), read_value)
+    return _read_tagged(node, {kind.type: kind for kind in arguments}, rule.folder)
+
+
+def _mapping(node: Node) -> dict[str, Node]:
+    if not isinstance(node.value, dict):
+        raise node.refused(f"expected a mapping, found {found(node)}")
+    return node.value
+
+
+def _absences(kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]) -> list[str]:
+    """What is wrong with the set of keys given: required ones missing, or not exactly one group of alternatives."""
+    required = [name for name, field in declared.items() if field.default is MISSING and field.default_factory is MISSING]
+    groups: tuple[tuple[str, ...], ...] = getattr(kind, "ALTERNATIVES", ())
+    given = [group for group in groups if any(name in entries for name in group)]
+    if len(given) == 1:
+        required += [name for name in given[0] if declared[name].default is None]
+    wrong = [f"missing key {name!r}" for name in required if name not in entries]
+    if groups and len(given) != 1:
+        names = " or ".join(" and ".join(name for name in group if declared[name].default is None) for group in groups)
+        wrong.append(f"{'give only one of' if given else 'missing'} {names}")
+    return wrong
+
+
+def _checked(node: Node, record: R) -> R:
+    """`record`, unless it breaks a rule about several of its values."""
+    problems = Problems()
+    for name, what in getattr(record, "problems", tuple)():
+        problems.note(_mapping(node).get(name, node).refused(what))
+    problems.raise_any()
+    return record
+
+
+def _read_tagged(node: Node, kinds: Mapping[str, type], folder: Path) -> Any:
+    entries = _mapping(node)
+    if "type" not in entries:
+        raise node.refused(f"missing key 'type', one of {', '.join(kinds)}")
+    name = read_text(entries["type"], Rule(str, {"choices": tuple(kinds)}, folder))
+    return read_record(node, kinds[name], folder)
+
+
+def _read_density(node: Node, rule: Rule) -> float | FieldFile:
+    if not isinstance(node.value, dict):
+        if isinstance(node.value, str | list) or node.value is None:
+            raise node.refused(f"expected a number, {{constant: number}} or {{file: path}}, found {found(node)}")
+        return read_number(node, rule)
+    if "file" in node.value:
+        return read_record(node, FieldFile, rule.folder)
+    return read_record(node, Constant, rule.folder).constant
+
+
+def _read_quantity(node: Node, rule: Rule) -> Any:
+    return read_record(node, FieldFile, rule.folder) if isinstance(node.value, dict) else read_color(node, rule)
+
+
+def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
+    problems, parameters = Problems(), {}
+    for name, child in _mapping(node).items():
+        with problems.collecting():
+            if name not in PARAMETERS:
+                raise child.key_refused(f"unknown parameter{suggestion(name, PARAMETERS)}")
+            parameters[name] = read_record(child, ParameterSettings, rule.folder)
+    problems.raise_any()
+    if not parameters:
+        raise node.refused(f"names no parameter; known: {', '.join(PARAMETERS)}")
+    return parameters
+
+
+def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
+    if isinstance(node.value, dict):
+        return read_ring_views(node, read_record(node, RingViews, rule.folder), rule.folder)
+    entries = read_list(node)
+    for index, entry in enumerate(entries):
+        if isinstance(entry.value, dict):
+            entry.value.setdefault("name", Node(entry.child_key("name"), entry.where, entry.where, f"view_{index:02d}"))
+    views = read_each(entries, Rule(ViewSection, {}, rule.folder), read_value)
+    _check_unique(entries, [view.name for view in views])
+    return views
+
+
+def _check_unique(entries: list[Node], names: list[str]) -> None:
+    problems = Problems()
+    for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
+        if name in names[:index]:
+            problems.note(_mapping(entry)["name"].refused(f"{name!r} is already the name of view {names.index(name)}"))
+    problems.raise_any()
+
+
+READERS: dict[Any, Callable[[Node, Rule], Any]] = {
+    **LEAVES,
+    Density: _read_density,
+    Quantity: _read_quantity,
+    Mapping[str, ParameterSettings]: _read_parameters,
+    tuple[ViewSection, ...]: _read_views,
+}

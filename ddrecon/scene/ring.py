@@ -1,0 +1,37 @@
+"""A ring of cameras as the views it stands for."""
+
+from __future__ import annotations
+
+import glob
+import math
+from pathlib import Path
+
+from ddrecon.scene.nodes import Node
+from ddrecon.scene.schema import PerspectiveSection, RingSection, RingViews, ViewSection
+
+
+def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
+    """Camera i of n stands at target + (r sin(2 pi i/n), height, r cos(2 pi i/n))."""
+    x, y, z = ring.target
+    turns = [2 * math.pi * index / ring.count for index in range(ring.count)]
+    origins = [(x + ring.radius * math.sin(turn), y + ring.height, z + ring.radius * math.cos(turn)) for turn in turns]
+    return [
+        PerspectiveSection(origin=origin, target=ring.target, up=ring.up, fov=ring.fov, resolution=ring.resolution) for origin in origins
+    ]
+
+
+def read_ring_views(node: Node, views: RingViews, folder: Path) -> tuple[ViewSection, ...]:
+    """The views of the section `node`, named ring_00, ring_01, ...; raises SceneError unless there are as many images as cameras."""
+    cameras = ring_cameras(views.ring)
+    images: list[Path] | list[None] = [None] * len(cameras)
+    if views.images is not None:
+        images = matches(views.images, folder)
+        if len(images) != len(cameras):
+            entry = node.value["images"] if isinstance(node.value, dict) else node
+            raise entry.refused(f"{views.images!r} matches {len(images)} files, but the ring has {len(cameras)} cameras")
+    return tuple(ViewSection(f"ring_{index:02d}", camera, image) for index, (camera, image) in enumerate(zip(cameras, images, strict=True)))
+
+
+def matches(pattern: str, folder: Path) -> list[Path]:
+    """The files that match the glob `pattern`, relative to `folder`, as sorted absolute paths."""
+    return sorted((folder / name).absolute() for name in glob.glob(pattern, root_dir=folder))

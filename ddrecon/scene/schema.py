@@ -1,0 +1,254 @@
+"""What a scene file may say: one frozen record per section, with its defaults and legal values.
+
+Vectors are (x, y, z). A field's metadata holds the bounds `minimum`, `above`, `maximum`, `below` or the `choices` of each number or
+text in it; `ALTERNATIVES` are groups of keys of which exactly one is given; `problems` yields (key, what is wrong) for
+rules about several values at once. Defaults are here and in `ddrecon.settings`, and nowhere else.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ddrecon.grid import Triple
+from ddrecon.settings import DiffusionSettings, RenderSettings, bounded, one_of
+
+Count = tuple[int, int, int]
+Size = tuple[int, int]
+Color = float | Triple
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row, Row]
+Problem = tuple[str, str]
+
+MAX_CELLS = 2**30
+
+
+def limited(**limits: float) -> Any:
+    """A required number, or numbers, within `limits`."""
+    return field(metadata=limits)
+
+
+def optional(**limits: float) -> Any:
+    """A number, or numbers, within `limits`, that may be left out."""
+    return field(default=None, metadata=limits)
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same value everywhere."""
+
+    constant: float = limited(minimum=0)
+
+
+@dataclass(frozen=True)
+class FieldFile:
+    """Values per cell, from a volume file."""
+
+    file: Path
+
+
+Density = float | FieldFile
+Quantity = Color | FieldFile
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The volume's box [u]."""
+
+    min: Triple
+    max: Triple
+
+    def problems(self) -> Iterator[Problem]:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if low >= high:
+                yield "max", f"{high:g} along {axis} is not above min, {low:g}"
+
+
+@dataclass(frozen=True)
+class VolumeSection:
+    """`bounds` and `resolution` may be left out where a field's file has them."""
+
+    ALTERNATIVES: ClassVar = (("sigma_a", "sigma_s"), ("sigma_t", "albedo"))
+
+    density: Density = limited(minimum=0)
+    bounds: Bounds | None = None
+    resolution: Count | None = optional(minimum=1, maximum=4096)
+    sigma_a: Quantity | None = optional(minimum=0)
+    sigma_s: Quantity | None = optional(minimum=0)
+    sigma_t: Quantity | None = optional(minimum=0)
+    albedo: Quantity | None = optional(minimum=0, maximum=1)
+    g: float = field(default=0.0, metadata={"above": -1, "below": 1})
+
+    def problems(self) -> Iterator[Problem]:
+        x, y, z = self.resolution or (1, 1, 1)
+        if x * y * z > MAX_CELLS:
+            yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
+
+
+@dataclass(frozen=True)
+class DirectionalSection:
+    """`direction`: the way the light travels; `irradiance` on a plane facing it."""
+
+    type: ClassVar[str] = "directional"
+
+    direction: Triple
+    irradiance: Color = limited(minimum=0)
+
+    def problems(self) -> Iterator[Problem]:
+        if not any(self.direction):
+            yield "direction", "must not be zero"
+
+
+@dataclass(frozen=True)
+class AmbientSection:
+    """The same radiance from everywhere."""
+
+    type: ClassVar[str] = "ambient"
+
+    radiance: Color = limited(minimum=0)
+
+
+LightSection = DirectionalSection | AmbientSection
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseSection:
+    """Where a camera stands: `origin`, `target` and `up` [u], or `matrix`, camera to world with OpenGL axes; its pixels (w, h)."""
+
+    ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
+
+    origin: Triple | None = None
+    target: Triple | None = None
+    up: Triple = (0.0, 1.0, 0.0)
+    matrix: Matrix | None = None
+    resolution: Size | None = optional(minimum=1, maximum=16384)
+
+    def problems(self) -> Iterator[Problem]:
+        if self.matrix is not None:
+            yield from _rigidity(np.array(self.matrix))
+
+
+def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
+    turn = matrix[:3, :3]
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-4:
+        yield "matrix", "its last row must be [0, 0, 0, 1]"
+    elif np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
+        yield "matrix", "must be rigid, but its first three columns are not of unit length and perpendicular"
+    elif np.linalg.det(turn) < 0:
+        yield "matrix", "must be rigid, but it mirrors (determinant -1)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerspectiveSection(PoseSection):
+    """`fov`: horizontal field of view [degrees]."""
+
+    type: ClassVar[str] = "perspective"
+
+    fov: float = limited(above=0, below=180)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrthographicSection(PoseSection):
+    """`width` of the image [u]."""
+
+    type: ClassVar[str] = "orthographic"
+
+    width: float = limited(above=0)
+
+
+CameraSection = PerspectiveSection | OrthographicSection
+
+
+@dataclass(frozen=True)
+class ViewSection:
+    """One view; `resolution` of its camera may be left out where there is an image."""
+
+    name: str
+    camera: CameraSection
+    image: Path | None = None
+    mask: Path | None = None
+    split: str = one_of("train", ("train", "test"))
+
+    def problems(self) -> Iterator[Problem]:
+        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
+            yield "name", f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.', the last not at its start"
+        if self.image is None and self.camera.resolution is None:
+            yield "camera", "missing key 'resolution'; only a view with an image can go without"
+
+
+@dataclass(frozen=True)
+class RingSection:
+    """Cameras around `target`, in the horizontal plane `height` above it, the first towards +z and the next towards +x."""
+
+    count: int = limited(minimum=1, maximum=10000)
+    radius: float = limited(above=0)
+    fov: float = limited(above=0, below=180)
+    height: float = 0.0
+    target: Triple = (0.0, 0.0, 0.0)
+    up: Triple = (0.0, 1.0, 0.0)
+    resolution: Size | None = optional(minimum=1, maximum=16384)
+
+
+@dataclass(frozen=True)
+class RingViews:
+    """Views from a ring; `images` is a glob pattern whose matches, sorted, belong to the cameras in turn."""
+
+    ring: RingSection
+    images: str | None = None
+
+    def problems(self) -> Iterator[Problem]:
+        if self.images is None and self.ring.resolution is None:
+            yield "ring", "missing key 'resolution'; only views with images can go without"
+
+
+PARAMETERS = ("density",)
+"""What a scene may ask to be reconstructed."""
+
+
+@dataclass(frozen=True)
+class ParameterSettings:
+    """How one parameter is optimized: from `init` (None: what the scene says), within [`min`, `max`], `tv` its total variation weight."""
+
+    init: Density | None = optional()
+    lr: float = bounded(0.05, above=0)
+    min: float = bounded(0.0, minimum=0)
+    max: float | None = None
+    tv: float = bounded(1e-4, minimum=0)
+
+    def problems(self) -> Iterator[Problem]:
+        if self.max is not None and self.max <= self.min:
+            yield "max", f"{self.max:g} is not above min, {self.min:g}"
+        elif isinstance(self.init, float) and not self.min <= self.init <= (self.init if self.max is None else self.max):
+            yield "init", f"{self.init:g} is not between min and max"
+
+
+@dataclass(frozen=True)
+class OptimizeSettings:
+    """`refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine."""
+
+    parameters: Mapping[str, ParameterSettings]
+    iterations: int = bounded(300, minimum=1)
+    loss: str = one_of("l2", ("l2",))
+    optimizer: str = one_of("adam", ("adam",))
+    refine_at: tuple[float, ...] = field(default=(0.3, 0.6), metadata={"above": 0, "below": 1})
+
+    def problems(self) -> Iterator[Problem]:
+        if any(later <= earlier for earlier, later in zip(self.refine_at, self.refine_at[1:], strict=False)):
+            yield "refine_at", "must increase from each entry to the next"
+
+
+@dataclass(frozen=True)
+class SceneTree:
+    """A whole scene file; a ring of views is already the views it stands for, and paths are absolute."""
+
+    volume: VolumeSection
+    lights: tuple[LightSection, ...]
+    views: tuple[ViewSection, ...]
+    render: RenderSettings = field(default_factory=RenderSettings)
+    diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
+    optimize: OptimizeSettings | None = None

@@ -1,0 +1,34 @@
+"""Whether a camera sees the volume at all."""
+
+from __future__ import annotations
+
+import torch
+
+from ddrecon.cameras import Camera, Rays, rays
+from ddrecon.grid import Grid
+
+COARSER = 8
+
+
+def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
+    """Which rays pass through the box of `grid` in front of their origin: bool [R], by the slab test (Kay and Kajiya 1986)."""
+    direction = torch.where(view_rays.direction == 0, torch.finfo(view_rays.direction.dtype).tiny ** 0.5, view_rays.direction)
+    lower, upper = (view_rays.origin.new_tensor(corner) for corner in (grid.lower, grid.upper))
+    first, second = (lower - view_rays.origin) / direction, (upper - view_rays.origin) / direction
+    enter = torch.minimum(first, second).amax(dim=-1)
+    leave = torch.maximum(first, second).amin(dim=-1)
+    return leave > enter.clamp_min(0)
+
+
+def sees_box(camera: Camera, grid: Grid) -> bool:
+    """Whether any pixel of `camera` looks through the box of `grid`; a coarser image is tried first, because it is quick."""
+    return any(bool(rays_hit_box(rays(image), grid).any()) for image in (camera.resized(COARSER), camera))
+
+
+def blindness(camera: Camera, grid: Grid) -> str:
+    """Why, most likely, `camera` does not see the box of `grid`."""
+    (low, high), pose = grid.bounds_xyz, camera.pose.double()
+    center = (pose.new_tensor(low) + pose.new_tensor(high)) / 2
+    if torch.dot(center - pose[:, 3], -pose[:, 2]) < 0:
+        return "the volume lies behind the camera (a camera looks along its -z axis, as in OpenGL)"
+    return "the camera looks past it: check its target, its field of view or width, and volume.bounds"
