@@ -160,9 +160,13 @@ def _stacked(emission: Emission) -> Tensor:
 def _integrate(emission: Emission, values: Tensor, lengths: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Scattered radiance and transmittance, each [C, R], from node `values` [N, channels, R] and segment `lengths` [N - 1, 1, R]."""
     fields, colors = emission.extinction.field.shape[0], emission.diffuse.shape[0]
-    extinction, diffuse, *masses = values[:, : fields * (1 + len(emission.beams)) + colors].split([fields, colors] + [fields] * len(emission.beams), 1)
-    scattering = values[:, -emission.scattering.field.shape[0] :] if emission.scattering.field is not emission.extinction.field else extinction
-    scale = emission.extinction.scale.view(-1, 1)
+    extinction, diffuse, *masses = values[:, : fields * (1 + len(emission.beams)) + colors].split(
+        [fields, colors] + [fields] * len(emission.beams), 1
+    )
+    scattering = (
+        values[:, -emission.scattering.field.shape[0] :] if emission.scattering.field is not emission.extinction.field else extinction
+    )
+    scale = emission.extinction.scale.view(-1, 1).expand(colors, 1)
     mass = 0.5 * (extinction[:-1] + extinction[1:]) * lengths
     end = mass.cumsum(0)
     begin = end - mass

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from itertools import permutations, product
 
-import torch
 from torch import Tensor
 
 _ORBITS = (
@@ -21,9 +20,14 @@ _ORBITS = (
 
 def sphere_quadrature(like: Tensor) -> tuple[Tensor, Tensor]:
     """Unit directions `[50, 3]` and weights `[50]` whose sum is 1: the mean over the sphere is the weighted sum."""
-    directions, weights = [], []
+    directions: list[tuple[float, ...]] = []
+    weights: list[float] = []
     for corner, weight in _ORBITS:
-        orbit = {tuple(s * c for s, c in zip(signs, order, strict=True)) for order in permutations(corner) for signs in product((1, -1), repeat=3)}
+        orbit = {
+            tuple(s * c for s, c in zip(signs, order, strict=True))
+            for order in permutations(corner)
+            for signs in product((1, -1), repeat=3)
+        }
         directions += sorted({tuple(c + 0.0 for c in point) for point in orbit})
         weights += [weight] * (len(directions) - len(weights))
     return like.new_tensor(directions), like.new_tensor(weights)

@@ -6,7 +6,7 @@ fluxes Q1 and L1 when g = 0, one color channel when all is gray.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,7 +17,7 @@ from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductances, face_fluxes
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.lights import AmbientLight, Light
+from ddrecon.lights import AmbientLight
 from ddrecon.march import Emission, march
 from ddrecon.medium import Medium, medium_of
 from ddrecon.phase import forward_fraction
@@ -61,8 +61,13 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
     views = scene.views if view is None else [scene.view(view)]
     if len({item.camera.size for item in views}) > 1:
         raise ValueError("the views differ in size; render them one by one: render(scene, view=name)")
-    light_field = solve_light(scene, memory or SolveMemory())
-    return torch.stack([view_image(light_field, scene, item.camera) for item in views])
+    return torch.stack(render_each(scene, views, memory or SolveMemory()))
+
+
+def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> list[Tensor]:
+    """The images `[3, h, w]` of `views`, which may differ in size, in the one light field of `scene`."""
+    light_field = solve_light(scene, memory)
+    return [view_image(light_field, scene, view.camera) for view in views]
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
@@ -77,9 +82,14 @@ def has_flux(medium: Medium) -> bool:
     return medium.g.requires_grad or bool(medium.g.detach() != 0)
 
 
+def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
+    """Whether light may be scattered more than once: the model is not `none`, and sigma_s is not 0."""
+    return settings.model != "none" and bool((medium.scattering.scale != 0).any())
+
+
 def solve_diffuse(medium: Medium, reduced: ReducedLight, settings: DiffusionSettings, memory: SolveMemory) -> DiffuseLight | None:
-    """L0 from the P1 balance E4 with the Marshak boundary E6, and L1 from E5; None for the model `none`."""
-    if settings.model == "none":
+    """L0 from the P1 balance E4 with the Marshak boundary E6, and L1 from E5; None where nothing scatters more than once."""
+    if not multiply_scatters(medium, settings):
         return None
     grid = medium.grid
     scattering = medium.diffuse_scattering.value
@@ -121,9 +131,9 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     return Components(reduced, single, image - reduced - single)
 
 
-def _average(camera: Camera, settings: RenderSettings, radiance) -> Tensor:
+def _average(camera: Camera, settings: RenderSettings, radiance: Callable[[Rays], Tensor]) -> Tensor:
     offsets = subpixel_offsets(settings.samples_per_pixel)
-    total = sum(radiance(rays(camera, offset)) for offset in offsets) / len(offsets)
+    total = torch.stack([radiance(rays(camera, offset)) for offset in offsets]).mean(0)
     return total.unflatten(-1, camera.size)
 
 
@@ -154,7 +164,7 @@ def diffuse_radiance(light_field: LightField, bundle: Rays) -> Tensor:
         if diffuse.flux is not None:
             scattered = scattered + medium.mean_cosine * _along(diffuse.flux, towards)
         radiance = (1 - forward_fraction(medium.g)) * scattered
-    if reduced.ambient_mean is not None:
+    if reduced.ambient_mean is not None and reduced.ambient_flux is not None:
         radiance = radiance + reduced.ambient_mean
         if has_flux(medium):
             radiance = radiance + 3 * medium.g * _along(reduced.ambient_flux, towards)

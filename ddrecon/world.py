@@ -36,7 +36,10 @@ class View:
 
 @dataclass(eq=False)
 class Scene:
-    """A loaded scene. `optimize` and `path` are what its file says of reconstruction and where that file lies."""
+    """A loaded scene. `optimize`, `starts` and `path` are what its file says of reconstruction, and where that file lies.
+
+    `starts` holds, for each optimized parameter, the field it starts from.
+    """
 
     volume: Volume
     lights: list[Light]
@@ -44,6 +47,7 @@ class Scene:
     render: RenderSettings = field(default_factory=RenderSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
+    starts: dict[str, Tensor] = field(default_factory=dict)
     path: Path | None = None
 
     def view(self, name: str) -> View:

@@ -93,5 +93,9 @@ class _Solve(torch.autograd.Function):
 
 
 def solve_diffusion(solve: Solve, operator: Operator, source: Tensor) -> Tensor:
-    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes with respect to `source` and the operator."""
-    return _Solve.apply(solve, source, operator.loss, *operator.conductances)
+    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes with respect to `source` and the operator.
+
+    An operator of one color serves a source of several.
+    """
+    coefficients = (c.expand(source.shape[0], -1, -1, -1) for c in (operator.loss, *operator.conductances))
+    return _Solve.apply(solve, source, *coefficients)

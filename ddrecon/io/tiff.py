@@ -52,11 +52,11 @@ def read_tiff(path: Path) -> np.ndarray:
         raise FormatError(path, "not a TIFF file, or a damaged one") from error
     if reason := _unsupported(tags):
         raise FormatError(path, f"{reason}; only uncompressed 32-bit float TIFF, gray or RGB in strips, is read: save it so, or as .exr")
-    strips = zip(tags[OFFSETS], tags.get(COUNTS, (len(data),)), strict=False)
-    pixels = b"".join(data[offset : offset + count] for offset, count in strips)
-    if len(pixels) != 4 * height * width * samples:
-        raise FormatError(path, f"is damaged: {len(pixels)} bytes of pixels, {width} x {height} x {samples} floats expected")
-    image = np.frombuffer(pixels, f"{order}f4").reshape(height, width, samples).astype(np.float32)
+    offsets, counts, size = tags[OFFSETS], tags.get(COUNTS, (len(data),)), 4 * height * width * samples
+    strips = [data[offset : offset + count] for offset, count in zip(offsets, counts, strict=False)] if sum(counts) <= len(data) else []
+    if sum(map(len, strips)) != size:
+        raise FormatError(path, f"is damaged: its strips do not hold {width} x {height} x {samples} floats")
+    image = np.frombuffer(b"".join(strips), f"{order}f4").reshape(height, width, samples).astype(np.float32)
     return image[..., 0] if samples == 1 else image
 
 
@@ -66,7 +66,7 @@ def _read_tags(data: bytes, order: str) -> dict[int, tuple[int, ...]]:
     tags = {}
     for position in range(start + 2, start + 2 + 12 * entries, 12):
         tag, kind, count = struct.unpack_from(f"{order}HHI", data, position)
-        if kind in _TYPES and count <= len(data):
+        if kind in _TYPES and 0 < count <= len(data):
             layout = f"{order}{count}{_TYPES[kind]}"
             inline = struct.calcsize(layout) <= 4
             offset = position + 8 if inline else struct.unpack_from(f"{order}I", data, position + 8)[0]

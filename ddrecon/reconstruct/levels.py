@@ -54,7 +54,9 @@ def _resampled_colors(sigma: Tensor, grid: Grid) -> Tensor:
 
 
 def _at_level(view: View, factor: int) -> View:
-    factor = max([f for f in (2**k for k in range(factor.bit_length())) if f <= factor and min(view.camera.size) // f >= FEWEST_PIXELS], default=1)
+    factor = max(
+        [f for f in (2**k for k in range(factor.bit_length())) if f <= factor and min(view.camera.size) // f >= FEWEST_PIXELS], default=1
+    )
     camera = view.camera.resized(factor)
     image = adaptive_avg_pool2d(view.image, camera.size) if view.image is not None else None
     mask = (adaptive_avg_pool2d(view.mask[None], camera.size)[0] > 0.5).to(view.mask.dtype) if view.mask is not None else None

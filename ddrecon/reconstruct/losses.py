@@ -7,8 +7,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-ROUNDING = 1e-3
-"""Differences of density below this are smoothed quadratically rather than as total variation."""
+from ddrecon.grid import Grid
+
+ROUNDING = 1e-2
+"""Gradients below this, in units of one over the box's shortest side, are penalized quadratically rather than as total variation."""
 
 
 def l2(error: Tensor) -> Tensor:
@@ -34,14 +36,15 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
     return float(10 * torch.log10(target.max().clamp(min=tiny) ** 2 / error.clamp(min=tiny)))
 
 
-def total_variation(field: Tensor) -> Tensor:
-    """Mean over cells of the length of the difference vector to the next cell along each axis; `field`: [z, y, x].
+def total_variation(field: Tensor, grid: Grid) -> Tensor:
+    """Mean over the cells of `grid` of the length of the gradient of `field` [z, y, x], times the box's shortest side.
 
-    Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), rounded off at zero so that its
-    derivative is finite in flat regions.
+    Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), the same at every resolution and world
+    scale, and rounded off at zero so that its derivative is finite in flat regions.
     """
+    side = min(grid.extent)
     square = torch.full_like(field, ROUNDING**2)
-    for axis in range(3):
-        step = field.diff(dim=axis) ** 2
-        square = square + torch.cat([step, torch.zeros_like(field.narrow(axis, 0, 1))], axis)
+    for axis, spacing in enumerate(grid.spacing):
+        slope = (field.diff(dim=axis) * (side / spacing)) ** 2
+        square = square + torch.cat([slope, torch.zeros_like(field.narrow(axis, 0, 1))], axis)
     return (square.sqrt() - ROUNDING).mean()

@@ -19,5 +19,9 @@ def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[
 
 def require(scene_file: SceneFile, key: str, path: Path) -> None:
     """Raises SceneError unless `path`, named at `key`, is a file."""
-    if not path.is_file():
-        raise scene_file.refused(key, f"{path} {'is not a file' if path.exists() else 'does not exist'}")
+    try:
+        is_file, exists = path.is_file(), path.exists()
+    except OSError as error:
+        raise scene_file.refused(key, f"{path} cannot be reached: {error.strerror or error}") from error
+    if not is_file:
+        raise scene_file.refused(key, f"{path} {'is not a file' if exists else 'does not exist'}")

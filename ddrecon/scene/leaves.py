@@ -111,7 +111,7 @@ def _quoting(node: Node) -> str:
 
 def read_path(node: Node, rule: Rule) -> Path:
     """The path of a file, made absolute."""
-    return (rule.folder / Path(read_text(node, rule)).expanduser()).absolute()
+    return (rule.folder / read_text(node, rule)).absolute()
 
 
 def read_vector(node: Node, rule: Rule) -> tuple[float, ...]:

@@ -23,16 +23,15 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
     entries = _mapping(node)
     declared: dict[str, Field[Any]] = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
-    problems, values = Problems(), {}
-    for name, child in entries.items():
-        if name not in known:
-            problems.note(child.key_refused(f"unknown key{suggestion(name, known)}"))
+    hints, problems, values = get_type_hints(kind), Problems(), {}
     for what in _absences(kind, declared, entries):
         problems.note(node.refused(what))
-    hints = get_type_hints(kind)
-    for name in declared.keys() & entries.keys():
+    for name, child in entries.items():
         with problems.collecting():
-            values[name] = read_value(entries[name], Rule(hints[name], declared[name].metadata, folder))
+            if name not in known:
+                raise child.key_refused(f"unknown key{suggestion(name, known)}")
+            if name in declared:
+                values[name] = read_value(child, Rule(hints[name], declared[name].metadata, folder))
     problems.raise_any()
     return _checked(node, kind(**values))
 
@@ -90,13 +89,13 @@ def _read_tagged(node: Node, kinds: Mapping[str, type], folder: Path) -> Any:
 
 
 def _read_density(node: Node, rule: Rule) -> float | FieldFile:
-    if not isinstance(node.value, dict):
-        if isinstance(node.value, str | list) or node.value is None:
-            raise node.refused(f"expected a number, {{constant: number}} or {{file: path}}, found {found(node)}")
-        return read_number(node, rule)
-    if "file" in node.value:
+    if isinstance(node.value, dict) and "file" in node.value:
         return read_record(node, FieldFile, rule.folder)
-    return read_record(node, Constant, rule.folder).constant
+    if isinstance(node.value, dict) and "constant" in node.value:
+        return read_record(node, Constant, rule.folder).constant
+    if node.value is None or isinstance(node.value, str | list | dict):
+        raise node.refused(f"expected a number, {{constant: number}} or {{file: path}}, found {found(node)}")
+    return read_number(node, rule)
 
 
 def _read_quantity(node: Node, rule: Rule) -> Any:

@@ -34,4 +34,4 @@ def read_ring_views(node: Node, views: RingViews, folder: Path) -> tuple[ViewSec
 
 def matches(pattern: str, folder: Path) -> list[Path]:
     """The files that match the glob `pattern`, relative to `folder`, as sorted absolute paths."""
-    return sorted((folder / name).absolute() for name in glob.glob(pattern, root_dir=folder))
+    return sorted(path for name in glob.glob(pattern, root_dir=folder) if (path := (folder / name).absolute()).is_file())

@@ -212,10 +212,13 @@ PARAMETERS = ("density",)
 
 @dataclass(frozen=True)
 class ParameterSettings:
-    """How one parameter is optimized: from `init` (None: what the scene says), within [`min`, `max`], `tv` its total variation weight."""
+    """How one parameter is optimized: from `init` (None: what the scene says), within [`min`, `max`], by learning rate `lr`.
+
+    `tv` weighs its total variation; 1 would weigh it as much as the whole brightness of the targets.
+    """
 
     init: Density | None = optional()
-    lr: float = bounded(0.05, above=0)
+    lr: float = bounded(0.1, above=0)
     min: float = bounded(0.0, minimum=0)
     max: float | None = None
     tv: float = bounded(1e-4, minimum=0)

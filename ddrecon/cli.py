@@ -1,0 +1,146 @@
+"""The command line: parse, call, print. Results go to stdout, progress and logs to stderr.
+
+torch is imported inside the commands, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ddrecon import __version__
+from ddrecon.errors import DdreconError
+
+if TYPE_CHECKING:
+    from ddrecon.session import Session
+
+COMMON = (
+    click.option("-D", "overrides", multiple=True, metavar="KEY.PATH=VALUE", help="Override a value of the scene file; repeatable."),
+    click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True),
+    click.option("--threads", type=click.IntRange(min=1), help="Processor threads; all cores unless given."),
+    click.option("--seed", type=int, default=0, show_default=True),
+    click.option("-q", "--quiet", is_flag=True, help="No progress line."),
+    click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),
+    click.option("--debug", is_flag=True, help="Show the traceback of an error."),
+)
+DTYPE = click.option("--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True)
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+SCENE = click.argument("scene", type=click.Path(path_type=Path))
+OUTPUT = click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
+OVERWRITE = click.option("--overwrite", is_flag=True, help="Write into a folder that is not empty.")
+
+
+def in_session(command: Callable[..., None]) -> Callable[..., None]:
+    """Adds the common options, handed on as one `Session`; an error of the user's becomes one line and an exit code."""
+
+    @functools.wraps(command)
+    def wrapped(
+        overrides: tuple[str, ...], device: str, threads: int | None, seed: int, quiet: bool, verbose: bool, debug: bool, **others: Any
+    ) -> None:
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        try:
+            from ddrecon.session import open_session
+
+            printing = {"dtype": others.pop("dtype", "float64"), "as_json": others.pop("as_json", False)}
+            command(session=open_session(overrides, device, threads, seed, quiet, verbose, **printing), **others)
+        except DdreconError as error:
+            if debug:
+                raise
+            click.echo(str(error), err=True)
+            sys.exit(error.exit_code)
+        except KeyboardInterrupt:
+            click.echo("interrupted", err=True)
+            sys.exit(130)
+
+    for option in reversed(COMMON):
+        wrapped = option(wrapped)
+    return wrapped
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+def main() -> None:
+    """Density volumes from pictures of smoke and clouds, by differential diffusion."""
+
+
+@main.command()
+@SCENE
+@OUTPUT
+@OVERWRITE
+@click.option("--view", "names", multiple=True, metavar="NAME", help="Render only this view; repeatable.")
+@click.option("--components", is_flag=True, help="Also write reduced, single and multiple radiance, which sum to the image.")
+@DTYPE
+@AS_JSON
+@in_session
+def render(session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], components: bool) -> None:
+    """Render the views of SCENE."""
+    from ddrecon.io.folders import prepare_folder
+    from ddrecon.render_folder import render_to_folder
+
+    loaded = session.load(scene)
+    views = session.chosen_views(loaded, names)
+    prepare_folder(output, may_exist=overwrite)
+    report = render_to_folder(loaded, views, output, components, session.progress)
+    session.show(report, session.render_lines(report, output))
+
+
+@main.command()
+@SCENE
+@OUTPUT
+@OVERWRITE
+@click.option("--iterations", type=click.IntRange(min=1), help="Total number of iterations, also after --resume.")
+@click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
+@click.option("--preview-every", type=click.IntRange(min=1), metavar="K", help="Write pictures every K iterations.")
+@DTYPE
+@AS_JSON
+@in_session
+def optimize(
+    session: Session, scene: Path, output: Path, overwrite: bool, iterations: int | None, resume: bool, preview_every: int | None
+) -> None:
+    """Reconstruct what SCENE asks for from its views' images."""
+    from ddrecon.reconstruct.drive import drive, open_run
+
+    if iterations is not None:
+        session = session.overriding(f"optimize.iterations={iterations}")
+    scene_file = session.read(scene)
+    run, folder = open_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume)
+    summary = drive(run, folder, preview_every, session.is_quiet)
+    session.show(summary, session.summary_lines(summary, output))
+
+
+@main.command()
+@SCENE
+@click.option("--parameter", "names", multiple=True, metavar="NAME", help="Check only this parameter; repeatable.")
+@click.option("--samples", type=click.IntRange(min=2), default=8, show_default=True, help="Cells checked one by one.")
+@click.option("--json", "report", type=click.Path(path_type=Path), metavar="FILE", help="Also write the result to FILE.")
+@in_session
+def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: int, report: Path | None) -> None:
+    """Check tangent against adjoint against finite differences of the program, in float64."""
+    from ddrecon.io.json_file import write_json
+    from ddrecon.validate.gradcheck import check_parameters, describe
+
+    checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
+    click.echo("\n".join(line for check in checks for line in check.lines()))
+    if report is not None:
+        write_json(report, describe(checks))
+    if not all(check.has_passed for check in checks):
+        sys.exit(1)
+
+
+@main.command()
+@SCENE
+@DTYPE
+@AS_JSON
+@in_session
+def check(session: Session, scene: Path) -> None:
+    """Validate SCENE and print its grid, views, memory and the physics it needs."""
+    from ddrecon.terms import describe, lines
+
+    report = describe(session.load(scene))
+    session.show(report, lines(report))

@@ -1,0 +1,45 @@
+"""Pictures of a run: targets beside renders beside differences, and slices of the volume. Arrays here are numpy, [h, w, 3]."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+ENLARGED = 4
+"""Differences are shown this many times enlarged, around mid-gray."""
+GAP = 4
+"""Pixels between pictures."""
+
+
+def pixels(image: Tensor) -> np.ndarray:
+    """`image` [3, h, w] as float32 [h, w, 3]."""
+    array: np.ndarray = image.detach().permute(1, 2, 0).float().cpu().numpy()
+    return array
+
+
+def comparison(target: Tensor, image: Tensor) -> np.ndarray:
+    """Target, render and enlarged difference side by side; brightness scaled so that the target's brightest pixels are just white."""
+    wanted, got = pixels(target), pixels(image)
+    white = max(float(np.quantile(wanted.max(-1), 0.999)), 1e-6)
+    difference = np.clip(0.5 + ENLARGED * (got - wanted) / (2 * white), 0, 1) ** 2.2
+    return beside([wanted / white, got / white, difference])
+
+
+def slices(field: Tensor) -> np.ndarray:
+    """The middle slices of `field` [z, y, x] across z, x and y, seen with y (or z) upwards; the largest value is white."""
+    array = field.detach().float().cpu().numpy()
+    z, y, x = (size // 2 for size in array.shape)
+    white = max(float(np.quantile(array, 0.999)), 1e-6)
+    views = [array[z, ::-1, :], array[:, ::-1, x].T, array[::-1, y, :]]
+    return beside([np.repeat(view[..., None] / white, 3, axis=2) for view in views])
+
+
+def beside(pictures: list[np.ndarray]) -> np.ndarray:
+    """`pictures` in a row, top-aligned, on gray."""
+    height = max(picture.shape[0] for picture in pictures)
+    row = []
+    for picture in pictures:
+        frame = np.full((height, picture.shape[1] + GAP, 3), 0.2, np.float32)
+        frame[: picture.shape[0], : picture.shape[1]] = picture
+        row.append(frame)
+    return np.concatenate(row, axis=1)[:, :-GAP]

@@ -1,0 +1,118 @@
+"""One command's surroundings: device, precision, threads, how scenes are loaded and how results are shown."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ddrecon import __version__
+from ddrecon.errors import SceneError
+from ddrecon.scene.build import build_scene
+from ddrecon.scene.load import SceneFile, read_scene
+from ddrecon.world import Scene, View
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+@dataclass(frozen=True)
+class Session:
+    """What the common options of a command say."""
+
+    overrides: tuple[str, ...]
+    device: torch.device
+    dtype: torch.dtype
+    seed: int
+    is_quiet: bool
+    is_verbose: bool
+    as_json: bool
+
+    def overriding(self, *overrides: str) -> Session:
+        """The same session with more overrides of the scene file."""
+        return replace(self, overrides=self.overrides + overrides)
+
+    def read(self, path: Path) -> SceneFile:
+        """The scene file at `path`, checked."""
+        return read_scene(path, self.overrides)
+
+    def build(self, scene_file: SceneFile) -> Scene:
+        """The scene as tensors on this session's device."""
+        return build_scene(scene_file, dtype=self.dtype, device=self.device)
+
+    def load(self, path: Path) -> Scene:
+        """The scene at `path` as tensors."""
+        return self.build(self.read(path))
+
+    def chosen_views(self, scene: Scene, names: tuple[str, ...]) -> list[View]:
+        """The views of `scene` called `names`, or all; raises SceneError for a name that is none."""
+        known = [view.name for view in scene.views]
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise SceneError(f"--view {unknown[0]}: no such view; the views are {', '.join(known)}")
+        return [view for view in scene.views if not names or view.name in names]
+
+    def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
+        """`items` with a progress bar on stderr, unless quiet."""
+        return tqdm(items, desc=what, file=sys.stderr, disable=self.is_quiet, leave=self.is_verbose)
+
+    def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
+        """Prints `report` as JSON where that was asked for, else `lines`."""
+        click.echo(json.dumps(report, indent=1) if self.as_json else "\n".join(lines))
+
+    @staticmethod
+    def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
+        """What `render` prints: files, quality and time of each view."""
+        lines = []
+        for name, files in report["files"].items():
+            quality = f", PSNR {report['psnr'][name]:.1f} dB" if name in report["psnr"] else ""
+            lines.append(f"{name}: {', '.join(files)} ({report['seconds'][name]:.2f} s{quality})")
+        if any(file.endswith(".tif") for files in report["files"].values() for file in files):
+            lines.append('no OpenEXR here, so float .tif instead of .exr; for EXR: pip install "ddrecon[exr]"')
+        return [*lines, f"written to {folder}"]
+
+    @staticmethod
+    def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
+        """What `optimize` prints when it is done."""
+        test = f", test PSNR {summary['test_psnr']:.2f} dB" if summary["test_psnr"] is not None else ""
+        line = (
+            f"{summary['iterations']} iterations in {summary['seconds']:.1f} s: loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
+        )
+        return [line + test, f"density and all else written to {folder}"]
+
+    def environment(self) -> dict[str, Any]:
+        """What a run's result may depend on besides its scene."""
+        return {
+            "ddrecon": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "platform": platform.platform(),
+            "device": torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",
+            "dtype": str(self.dtype).removeprefix("torch."),
+            "threads": torch.get_num_threads(),
+            "seed": self.seed,
+            "overrides": list(self.overrides),
+            "command": sys.argv,
+        }
+
+
+def open_session(
+    overrides: tuple[str, ...], device: str, threads: int | None, seed: int, is_quiet: bool, is_verbose: bool, dtype: str, as_json: bool
+) -> Session:
+    """Sets torch up as the options say; raises SceneError for a device that is not there."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise SceneError("--device cuda: torch sees no CUDA device here; leave --device out, or install a CUDA build of torch")
+    place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+    torch.set_num_threads(threads or os.cpu_count() or 1)
+    torch.manual_seed(seed)
+    return Session(overrides, place, DTYPES[dtype], seed, is_quiet, is_verbose, as_json)

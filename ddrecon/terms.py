@@ -1,0 +1,96 @@
+"""What physics a scene needs, in words: the same conditions the renderer composes its terms by."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from ddrecon.lights import AmbientLight, DirectionalLight
+from ddrecon.medium import medium_of
+from ddrecon.renderer import has_flux, multiply_scatters
+from ddrecon.world import Scene, View
+
+
+def needed_terms(scene: Scene) -> list[str]:
+    """One line per term that rendering `scene` computes, in the order it is computed."""
+    medium = medium_of(scene.volume)
+    colors = medium.extinction.scale.shape[0]
+    terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
+    beams = sum(isinstance(light, DirectionalLight) for light in scene.lights)
+    if beams:
+        terms.append(f"transmittance towards {beams} directional light{'s' if beams > 1 else ''}")
+    if any(isinstance(light, AmbientLight) for light in scene.lights):
+        terms.append("ambient light by quadrature over 50 directions")
+    if bool(medium.g > 0):
+        terms.append("delta-Eddington scaling of the forward peak (g > 0)")
+    if multiply_scatters(medium, scene.diffusion):
+        terms.append(
+            f"multiple scattering by {scene.diffusion.model} diffusion, {scene.diffusion.closure} closure, {scene.diffusion.solver}"
+        )
+        terms.append("fluxes Q1 and L1 (g is not 0)" if has_flux(medium) else "no fluxes Q1 and L1 (g = 0)")
+    else:
+        terms.append("no multiple scattering: no diffusion solve")
+    return terms
+
+
+def memory_estimate(scene: Scene) -> int:
+    """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself.
+
+    A fit, in arrays of one value per cell, to peaks measured on grids from 16^3 to 128^3 (docs/theory.md says how).
+    """
+    colors = medium_of(scene.volume).extinction.scale.shape[0]
+    size = torch.finfo(scene.volume.density.dtype).bits // 8
+    arrays = 40 * colors
+    if scene.optimize is not None:
+        arrays += 30 * colors + (5 + 4 * colors) * len(scene.views)
+    return arrays * scene.volume.grid.cells * size
+
+
+def describe(scene: Scene) -> dict[str, Any]:
+    """What `ddrecon check` reports of `scene`: grid, views, physics and memory."""
+    grid = scene.volume.grid
+    low, high = grid.bounds_xyz
+    return {
+        "resolution": list(reversed(grid.shape)),
+        "bounds": [list(low), list(high)],
+        "voxel": list(reversed(grid.spacing)),
+        "views": [_describe_view(view) for view in scene.views],
+        "physics": needed_terms(scene),
+        "optimizes": list(scene.optimize.parameters) if scene.optimize else [],
+        "memory_bytes": memory_estimate(scene),
+    }
+
+
+def lines(report: dict[str, Any]) -> list[str]:
+    """The report of `describe` as lines of text."""
+    low, high = report["bounds"]
+    views = [
+        f"  {v['name']}: {v['camera']}, {v['width']} x {v['height']} pixels, {v['split']}{', with image' * v['has_image']}"
+        for v in report["views"]
+    ]
+    return [
+        f"grid: {_by(report['resolution'])} cells of {_by(report['voxel'])} u, from {low} to {high}",
+        f"views: {len(views)}",
+        *views,
+        "physics:",
+        *(f"  {term}" for term in report["physics"]),
+        f"optimizes: {', '.join(report['optimizes']) or 'nothing'}",
+        f"memory: about {report['memory_bytes'] / 2**20:.0f} MiB at the peak, besides torch itself",
+    ]
+
+
+def _by(sizes: list[float]) -> str:
+    return " x ".join(f"{size:.4g}" for size in sizes)
+
+
+def _describe_view(view: View) -> dict[str, Any]:
+    height, width = view.camera.size
+    return {
+        "name": view.name,
+        "camera": "perspective" if view.camera.is_perspective else "orthographic",
+        "width": width,
+        "height": height,
+        "split": "test" if view.is_test else "train",
+        "has_image": view.image is not None,
+    }

@@ -1,0 +1,17 @@
+"""The ball scene, small enough to reconstruct in a test."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from ddrecon.scene.build import load_scene
+from ddrecon.world import Scene
+
+BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
+
+
+@pytest.fixture
+def ball_scene() -> Scene:
+    torch.set_num_threads(2)
+    return load_scene(BALL, overrides=["optimize.iterations=8"])

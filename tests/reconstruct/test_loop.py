@@ -1,0 +1,111 @@
+"""The loop: it gets closer, it stays within bounds, it stops cleanly, and it goes on as if it had never stopped."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from ddrecon.errors import FormatError, SceneError, SolveError
+from ddrecon.io.volumes import read_field
+from ddrecon.reconstruct.checkpoint import load_checkpoint, save_checkpoint
+from ddrecon.reconstruct.loop import Reconstruction, optimize
+from ddrecon.world import Scene
+
+TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
+
+
+def error_of(density: torch.Tensor) -> float:
+    truth = torch.as_tensor(read_field(TRUTH, "density").values)
+    return float((density - truth).abs().sum() / truth.sum())
+
+
+def test_an_empty_volume_comes_closer_to_the_truth(ball_scene: Scene) -> None:
+    result = optimize(ball_scene, iterations=12)
+    losses = [row.loss for row in result.rows]
+    assert losses[-1] < 0.2 * losses[0]
+    assert error_of(result.scene.volume.density) < 0.8
+    assert result.scene.volume.density.shape == ball_scene.volume.density.shape
+    assert result.rows[-1].test_psnr is not None
+
+
+def test_the_scene_itself_is_left_alone(ball_scene: Scene) -> None:
+    before = ball_scene.volume.density.clone()
+    optimize(ball_scene, iterations=2)
+    assert torch.equal(ball_scene.volume.density, before)
+    assert not ball_scene.volume.density.requires_grad
+
+
+def test_bounds_hold_at_every_step(ball_scene: Scene) -> None:
+    settings = replace(ball_scene.optimize.parameters["density"], min=0.01, max=0.3, lr=1.0)
+    scene = replace(ball_scene, optimize=replace(ball_scene.optimize, parameters={"density": settings}))
+    run = Reconstruction(scene)
+    for _ in range(3):
+        run.step()
+        assert run.density.value.min() >= 0.01
+        assert run.density.value.max() <= 0.3
+
+
+def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
+    views = [replace(view, image=view.image * 0 if view.is_test else view.image) for view in ball_scene.views]
+    spoiled = optimize(replace(ball_scene, views=views), iterations=3)
+    assert torch.equal(spoiled.scene.volume.density, optimize(ball_scene, iterations=3).scene.volume.density)
+
+
+def test_brightness_of_the_light_does_not_matter(ball_scene: Scene) -> None:
+    from ddrecon.lights import AmbientLight, DirectionalLight
+
+    def brighter(light: DirectionalLight | AmbientLight) -> DirectionalLight | AmbientLight:
+        if isinstance(light, DirectionalLight):
+            return DirectionalLight(light.direction, 16 * light.irradiance)
+        return AmbientLight(16 * light.radiance)
+
+    views = [replace(view, image=16 * view.image) for view in ball_scene.views]
+    bright = replace(ball_scene, views=views, lights=[brighter(light) for light in ball_scene.lights])
+    plain, scaled = optimize(ball_scene, iterations=3), optimize(bright, iterations=3)
+    assert torch.allclose(plain.scene.volume.density, scaled.scene.volume.density, atol=1e-3)
+
+
+@pytest.mark.parametrize("stop", [2, 5])
+def test_resuming_gives_the_same_bits_as_not_stopping(ball_scene: Scene, tmp_path: Path, stop: int) -> None:
+    through = optimize(ball_scene)
+    first = Reconstruction(ball_scene)
+    for _ in range(stop):
+        first.step()
+    save_checkpoint(tmp_path / "last.pt", first.state(), "scene")
+    second = Reconstruction(ball_scene)
+    second.restore(load_checkpoint(tmp_path / "last.pt", "scene"))
+    while not second.is_done:
+        second.step()
+    assert torch.equal(second.result().scene.volume.density, through.scene.volume.density)
+    assert [row.loss for row in second.rows] == [row.loss for row in through.rows]
+
+
+def test_a_checkpoint_of_another_scene_is_refused(ball_scene: Scene, tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "last.pt", Reconstruction(ball_scene).state(), "g: 0.1")
+    with pytest.raises(SceneError, match=r"g: 0\.1.*g: 0\.2"):
+        load_checkpoint(tmp_path / "last.pt", "g: 0.2")
+
+
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "last.pt").write_bytes(b"PK\x03\x04 not really")
+    with pytest.raises(FormatError, match="not a usable checkpoint"):
+        load_checkpoint(tmp_path / "last.pt", "scene")
+
+
+def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
+    run = Reconstruction(ball_scene)
+    run.step()
+    good = run.density.value.detach().clone()
+    run.train_level.views[0].image[0, 3, 4] = float("inf")
+    with pytest.raises(SolveError, match="not finite"):
+        run.step()
+    assert torch.equal(run.density.value, good)
+    assert run.iteration == 1
+
+
+def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
+    with pytest.raises(SceneError, match="nothing to reconstruct from"):
+        Reconstruction(replace(ball_scene, views=[view for view in ball_scene.views if view.is_test]))
+    with pytest.raises(SceneError, match="missing section"):
+        Reconstruction(replace(ball_scene, optimize=None))
