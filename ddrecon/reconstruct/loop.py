@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError, SolveError
+from ddrecon.medium import Volume
 from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
 from ddrecon.reconstruct.losses import image_loss, psnr, total_variation
 from ddrecon.reconstruct.parameters import Parameter
@@ -24,7 +25,9 @@ from ddrecon.world import Scene, View
 
 TEST_EVERY = 10
 """Test views are rendered every so many iterations, and at the last."""
-FINAL_RATE = 0.1
+WARM_UP = 5
+"""Iterations over which learning rates rise to their value: Adam's first steps are all of full size, whatever the derivative."""
+FINAL_RATE = 0.2
 """Learning rates fall exponentially over a run, to this part of their value."""
 
 
@@ -82,7 +85,8 @@ class Reconstruction:
         self.test = _with_images(scene, is_test=True)
         self.power = float(torch.stack([view.image.square().mean() for view in self.train.views if view.image is not None]).mean())
         self.factors = factors(scene, self.settings.refine_at)
-        self.density = Parameter(self.settings.parameters["density"], scene.starts["density"], scene.volume.grid)
+        settings = self.settings.parameters["density"]
+        self.density = Parameter(settings, settings.lr or unit_depth(scene.volume), scene.starts["density"], scene.volume.grid)
         self.rows: list[Row] = []
         self.elapsed = 0.0
         self.memory = SolveMemory(scene.diffusion.warm_start)
@@ -107,10 +111,11 @@ class Reconstruction:
         self.memory.records.clear()
         images = self._render(self.train_level)
         loss = self._loss(images)
+        self._require_finite(loss, loss)
         (gradient,) = torch.autograd.grad(loss, self.density.value)
         self._require_finite(loss, gradient)
         solves = {kind: sum(r.iterations for r in self.memory.records if r.kind == kind) for kind in ("forward", "adjoint")}
-        self.density.step(gradient, FINAL_RATE ** (self.iteration / self.settings.iterations))
+        self.density.step(gradient, rate_at(self.iteration, self.settings.iterations))
         quality = _mean_psnr(images, self.train_level.views)
         last = self.iteration + 1
         test = self._test_psnr() if last % TEST_EVERY == 0 or last == self.settings.iterations else None
@@ -147,7 +152,7 @@ class Reconstruction:
         self.rows = [Row(*row) for row in state["rows"]]
         self.elapsed = state["elapsed"]
         self._enter_stage(state["stage"])
-        self.memory.last = dict(state["solutions"])
+        self.memory.last = {kind: field.to(self.density.value) for kind, field in state["solutions"].items()}
 
     def _enter_stage(self, stage: int) -> None:
         self.stage = stage
@@ -173,11 +178,24 @@ class Reconstruction:
         with torch.no_grad():
             return _mean_psnr(self._render(self.test_level), self.test_level.views)
 
-    def _require_finite(self, loss: Tensor, gradient: Tensor) -> None:
-        if bool(torch.isfinite(loss)) and bool(torch.isfinite(gradient).all()):
+    def _require_finite(self, loss: Tensor, values: Tensor) -> None:
+        if bool(torch.isfinite(values).all()):
             return
         what = "the loss or its derivative with respect to density is not finite"
         raise SolveError(what, self.iteration, float(loss.detach()), "lower optimize.parameters.density.lr")
+
+
+def rate_at(iteration: int, iterations: int) -> float:
+    """The part of their value that learning rates have in `iteration` of `iterations`, in (0, 1]."""
+    warm_up: float = min(1.0, (iteration + 1) / WARM_UP)
+    fall: float = FINAL_RATE ** (iteration / iterations)
+    return warm_up * fall
+
+
+def unit_depth(volume: Volume) -> float:
+    """The density whose optical depth across the box's shortest side is 1 (1 where nothing extinguishes)."""
+    extinction = float(volume.sigma_a.mean() + volume.sigma_s.mean())
+    return 1 / (extinction * min(volume.grid.extent)) if extinction > 0 else 1.0
 
 
 def _with_images(scene: Scene, is_test: bool) -> Scene:

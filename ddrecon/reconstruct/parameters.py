@@ -20,15 +20,15 @@ TINY = 1e-15
 class Parameter:
     """A field [z, y, x] on `grid`, kept within its bounds, with the optimizer (Kingma and Ba 2015, arXiv:1412.6980) that moves it."""
 
-    def __init__(self, settings: ParameterSettings, value: Tensor, grid: Grid):
-        self.settings, self.grid = settings, grid
+    def __init__(self, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid):
+        self.settings, self.rate, self.grid = settings, rate, grid
         self.value = value.clone().requires_grad_()
         self.optimizer = self._new_optimizer()
 
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Moves the field against `gradient` with `rate` times its learning rate, and back within its bounds."""
+        """Moves the field against `gradient` by `rate` times its learning rate, and back within its bounds."""
         self.value.grad = gradient
-        self.optimizer.param_groups[0]["lr"] = rate * self.settings.lr
+        self.optimizer.param_groups[0]["lr"] = rate * self.rate
         self.optimizer.step()
         with torch.no_grad():
             self.value.clamp_(self.settings.min, self.settings.max)
@@ -56,4 +56,4 @@ class Parameter:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def _new_optimizer(self) -> torch.optim.Adam:
-        return torch.optim.Adam([self.value], lr=self.settings.lr, betas=BETAS, eps=TINY)
+        return torch.optim.Adam([self.value], lr=self.rate, betas=BETAS, eps=TINY)

@@ -214,11 +214,12 @@ PARAMETERS = ("density",)
 class ParameterSettings:
     """How one parameter is optimized: from `init` (None: what the scene says), within [`min`, `max`], by learning rate `lr`.
 
+    Without `lr` it is the density whose optical depth across the box's shortest side is 1: so much may a cell change in one step.
     `tv` weighs its total variation; 1 would weigh it as much as the whole brightness of the targets.
     """
 
     init: Density | None = optional()
-    lr: float = bounded(0.1, above=0)
+    lr: float | None = optional(above=0)
     min: float = bounded(0.0, minimum=0)
     max: float | None = None
     tv: float = bounded(1e-4, minimum=0)

@@ -1,0 +1,95 @@
+"""Derivatives of a solve: tangent and adjoint agree with differences and with each other, and solves are remembered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solvers import SOLVERS
+
+SHAPES = [(2, 3, 2), (1, 2, 4), (1, 1, 1)]
+
+
+def solving(memory: SolveMemory | None = None, solver: str = "conjugate_gradient") -> Callable[..., Tensor]:
+    """u as a function of source, loss and the three conductances, solved to rounding."""
+    solve = Solve(SOLVERS[solver], 1e-14, memory or SolveMemory())
+    return lambda source, loss, *conductances: solve_diffusion(solve, Operator(conductances, loss), source)
+
+
+@pytest.fixture
+def inputs(random):
+    """source, loss and conductances of a small system of two colors, or of a gray operator under a colored source."""
+
+    def make(shape: tuple[int, int, int] = (2, 3, 2), colors: int = 2) -> list[Tensor]:
+        faces = [[n - (axis == other) for other, n in enumerate(shape)] for axis in range(3)]
+        return [random(2, *shape) - 0.5, *(0.1 + random(colors, *size, seed=1 + i) for i, size in enumerate([shape, *faces]))]
+
+    return make
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_both_derivatives_agree_with_differences(solver: str, shape: tuple[int, int, int], inputs):
+    arguments = [tensor.requires_grad_() for tensor in inputs(shape)]
+    assert torch.autograd.gradcheck(solving(solver=solver), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True)
+
+
+@pytest.mark.parametrize("wanted", range(5))
+def test_each_argument_can_be_differentiated_by_itself(wanted: int, inputs):
+    arguments = [tensor.requires_grad_(i == wanted) for i, tensor in enumerate(inputs())]
+    assert torch.autograd.gradcheck(solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True)
+
+
+def test_a_gray_operator_serves_a_colored_source(inputs):
+    arguments = [tensor.requires_grad_() for tensor in inputs(colors=1)]
+    assert torch.autograd.gradcheck(solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True)
+
+
+def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
+    arguments = inputs((4, 5, 3))
+    directions = [torch.randn_like(tensor) for tensor in arguments]
+    leaves = [tensor.clone().requires_grad_() for tensor in arguments]
+    u = solving()(*leaves)
+    u_bar = torch.randn_like(u)
+    along = sum((bar * d).sum() for bar, d in zip(torch.autograd.grad(u, leaves, u_bar), directions, strict=True))
+    with forward_ad.dual_level():
+        duals = [forward_ad.make_dual(tensor, d) for tensor, d in zip(arguments, directions, strict=True)]
+        tangent = forward_ad.unpack_dual(solving()(*duals)).tangent
+    assert float(((u_bar * tangent).sum() - along).abs()) < 1e-10 * float((u_bar * tangent).abs().sum())
+
+
+def test_every_solve_is_recorded(inputs):
+    memory = SolveMemory()
+    source, *coefficients = inputs()
+    u = solving(memory)(source.requires_grad_(), *coefficients)
+    u.sum().backward()
+    with forward_ad.dual_level():
+        solving(memory)(forward_ad.make_dual(source.detach(), source.detach()), *coefficients)
+    assert [record.kind for record in memory.records] == ["forward", "adjoint", "forward", "tangent"]
+    assert all(record.residual <= 1e-14 and record.seconds > 0 for record in memory.records)
+
+
+@pytest.mark.parametrize("is_warm", [True, False])
+def test_a_second_solve_starts_from_the_first(is_warm: bool, inputs):
+    memory, arguments = SolveMemory(is_warm), inputs((4, 5, 3))
+    solve = Solve(SOLVERS["conjugate_gradient"], 1e-10, memory)
+    operator = Operator(tuple(arguments[2:]), arguments[1])
+    first = solve("forward", operator, arguments[0])
+    Solve(solve.solver, 1e-9, memory)("forward", operator, arguments[0])
+    assert memory.records[0].iterations > 0
+    assert (memory.records[1].iterations == 0) == is_warm
+    assert (memory.last.get("forward") is not None) == is_warm
+    assert first.shape == arguments[0].shape
+
+
+def test_what_is_remembered_is_not_what_the_caller_may_change(inputs):
+    memory, arguments = SolveMemory(), inputs()
+    u = solving(memory)(*arguments)
+    u.zero_()
+    assert bool(memory.last["forward"].any())

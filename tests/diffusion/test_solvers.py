@@ -1,0 +1,126 @@
+"""Every solver reaches its tolerance on every system, agrees with a dense solve, and says so when it cannot."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.errors import SolveError
+
+SHAPE = (4, 5, 3)
+TOLERANCES = {torch.float32: 1e-5, torch.float64: 1e-11}
+pytestmark = pytest.mark.parametrize("solve", SOLVERS.values(), ids=SOLVERS.keys())
+each_dtype = pytest.mark.parametrize("dtype", TOLERANCES, ids=str)
+
+
+@pytest.fixture
+def system(box, random, make_operator):
+    """An operator whose conductances span `contrast`, differently in each color, and a source."""
+
+    def make(dtype: torch.dtype, contrast: float = 1e3, colors: int = 2) -> tuple[Operator, Tensor]:
+        size = contrast ** torch.arange(colors, dtype=torch.float64).div(max(1, colors - 1)).view(-1, 1, 1, 1)
+        diffusion = size * contrast ** -random(colors, *SHAPE, seed=1)
+        operator = make_operator(box(SHAPE), diffusion.to(dtype), (0.1 * random(colors, *SHAPE, seed=2)).to(dtype))
+        return operator, random(colors, *SHAPE, seed=3, dtype=dtype)
+
+    return make
+
+
+def relative_residual(operator: Operator, u: Tensor, source: Tensor) -> float:
+    """The residual the solvers promise: scaled by diagonal^(-1/2), relative to the source, largest over colors; in float64."""
+    operator = Operator(tuple(c.double() for c in operator.conductances), operator.loss.double())
+    source, scale = source.double(), operator.diagonal.rsqrt()
+    residual = (scale * (source - operator.apply(u.double()))).flatten(1).norm(dim=1)
+    return float((residual / (scale * source).flatten(1).norm(dim=1)).max())
+
+
+@each_dtype
+@pytest.mark.parametrize("contrast", [1.0, 1e3, 1e6])
+def test_the_residual_is_reached(solve, dtype: torch.dtype, contrast: float, system):
+    """What rounding adds along the way, a few epsilons an iteration of the largest solution, is allowed for."""
+    operator, source = system(dtype, contrast)
+    solution = solve(operator, source, None, TOLERANCES[dtype])
+    assert solution.residual <= TOLERANCES[dtype] and solution.iterations > 0
+    assert relative_residual(operator, solution.value, source) < 2 * TOLERANCES[dtype]
+
+
+@each_dtype
+def test_the_solution_is_that_of_a_dense_solve(solve, dtype: torch.dtype, system, dense):
+    operator, source = system(dtype)
+    exact = torch.linalg.solve(dense(operator).double(), source.double().flatten(1)).view_as(source)
+    found = solve(operator, source, None, TOLERANCES[dtype]).value
+    assert float((found - exact).norm() / exact.norm()) < 100 * TOLERANCES[dtype]
+
+
+def test_colors_do_not_mix(solve, system):
+    operator, source = system(torch.float64, 1e6, colors=3)
+    together = solve(operator, source, None, 1e-11).value
+    for c in range(3):
+        one = Operator(tuple(k[c : c + 1] for k in operator.conductances), operator.loss[c : c + 1])
+        torch.testing.assert_close(solve(one, source[c : c + 1], None, 1e-11).value, together[c : c + 1], rtol=1e-8, atol=0)
+
+
+@each_dtype
+def test_starting_from_the_solution_takes_no_iteration(solve, dtype: torch.dtype, system):
+    operator, source = system(dtype)
+    solved = solve(operator, source, None, TOLERANCES[dtype]).value
+    again = solve(operator, source, solved, 10 * TOLERANCES[dtype])
+    assert again.iterations == 0
+    torch.testing.assert_close(again.value, solved)
+
+
+def test_a_start_closer_by_takes_fewer_iterations(solve, system):
+    operator, source = system(torch.float64)
+    solved = solve(operator, source, None, 1e-11).value
+    assert solve(operator, source, solved * (1 + 1e-6), 1e-8).iterations < solve(operator, source, None, 1e-8).iterations
+
+
+@pytest.mark.parametrize("is_fitting", [True, False])
+def test_a_useless_start_does_no_harm(solve, is_fitting: bool, system, random):
+    """A guess that is worse than zero, or of another grid, is not used."""
+    operator, source = system(torch.float64)
+    guess = 1e9 * random(*source.shape) if is_fitting else random(2, 3, 3, 3)
+    assert torch.equal(solve(operator, source, guess, 1e-8).value, solve(operator, source, None, 1e-8).value)
+
+
+def test_no_source_no_light(solve, system):
+    operator, source = system(torch.float64)
+    solution = solve(operator, torch.zeros_like(source), None, 1e-8)
+    assert solution.iterations == 0 and solution.residual == 0 and not solution.value.any()
+
+
+def test_a_color_without_source_stays_dark_beside_another(solve, system):
+    operator, source = system(torch.float64)
+    source[0] = 0
+    value = solve(operator, source, None, 1e-10).value
+    assert not value[0].any() and bool((value[1] > 0).all())
+
+
+def test_a_source_makes_light_everywhere(solve, system):
+    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance of the solve."""
+    operator, source = system(torch.float64, contrast=10.0)
+    source = torch.zeros_like(source)
+    source[:, 0, 0, 0] = 1
+    assert bool((solve(operator, source, None, 1e-13).value > 0).all())
+
+
+def test_a_solve_that_does_not_converge_says_so(solve, system, monkeypatch):
+    operator, source = system(torch.float64)
+    monkeypatch.setattr(sys.modules[solve.__module__], "MAX_ITERATIONS", 4)
+    with pytest.raises(SolveError, match=solve.__name__) as caught:
+        solve(operator, source, None, 1e-12)
+    assert caught.value.iterations == 4 and caught.value.residual > 1e-12
+
+
+@pytest.mark.parametrize("where", ["source", "loss"])
+def test_a_system_that_is_not_finite_is_an_error(solve, where: str, system, monkeypatch):
+    operator, source = system(torch.float64)
+    {"source": source, "loss": operator.loss}[where][0, 0, 0, 0] = float("nan")
+    monkeypatch.setattr(sys.modules[solve.__module__], "MAX_ITERATIONS", 50)
+    with pytest.raises(SolveError):
+        solve(operator, source, None, 1e-8)

@@ -1,0 +1,89 @@
+"""Cameras: rays go through the pixels they belong to, in array order."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ddrecon.cameras import Camera, look_at, rays, subpixel_offsets
+
+ORIGIN, TARGET, UP = (torch.tensor(v, dtype=torch.float64) for v in ([1.0, 2.0, 5.0], [0.3, -0.2, 0.1], [0.1, 1.0, 0.2]))
+
+
+def camera(size: tuple[int, int] = (3, 5), half_width: float = 0.4, is_perspective: bool = True) -> Camera:
+    return Camera(look_at(ORIGIN, TARGET, UP), size, half_width, is_perspective)
+
+
+def test_a_pose_is_rigid_and_looks_at_its_target():
+    pose = look_at(ORIGIN, TARGET, UP)
+    right, up, backward, origin = pose.unbind(1)
+    torch.testing.assert_close(pose[:, :3].T @ pose[:, :3], torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-15)
+    torch.testing.assert_close(torch.linalg.cross(right, up), backward, rtol=0, atol=1e-15)
+    torch.testing.assert_close(origin - backward * (TARGET - ORIGIN).norm(), TARGET, rtol=0, atol=1e-14)
+    assert up @ UP > 0 and abs(right @ UP) < 1e-15
+
+
+@pytest.mark.parametrize(("target", "up"), [(ORIGIN, UP), (TARGET, TARGET - ORIGIN), (TARGET, 3 * (ORIGIN - TARGET))])
+def test_a_view_without_a_direction_is_refused(target: torch.Tensor, up: torch.Tensor):
+    with pytest.raises(ValueError, match="do not span a view"):
+        look_at(ORIGIN, target, up)
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_every_ray_against_explicit_pixel_arithmetic(is_perspective: bool):
+    """Row 0 is the top, column 0 the left, and pixels are square, whatever the picture's shape."""
+    view = camera(is_perspective=is_perspective)
+    bundle = rays(view, (0.25, 0.75))
+    right, up, backward, origin = view.pose.unbind(1)
+    height, width = view.size
+    for row in range(height):
+        for column in range(width):
+            x = (2 * (column + 0.75) / width - 1) * view.half_width
+            y = (height - 2 * (row + 0.25)) / width * view.half_width
+            shift = x * right + y * up
+            start, toward = (origin, shift - backward) if is_perspective else (origin + shift, -backward)
+            index = row * width + column
+            torch.testing.assert_close(bundle.origin[index].flip(0), start, rtol=0, atol=1e-14)
+            torch.testing.assert_close(bundle.direction[index].flip(0), toward / toward.norm(), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_the_middle_ray_goes_from_origin_to_target(is_perspective: bool):
+    bundle = rays(camera(is_perspective=is_perspective))
+    middle = len(bundle.direction) // 2
+    toward = ((TARGET - ORIGIN) / (TARGET - ORIGIN).norm()).flip(0)
+    torch.testing.assert_close(bundle.direction[middle], toward, rtol=0, atol=1e-15)
+    torch.testing.assert_close(bundle.origin[middle], ORIGIN.flip(0), rtol=0, atol=1e-15)
+
+
+def test_the_field_of_view_is_that_of_the_outermost_columns():
+    view = camera((1, 2), half_width=math.tan(0.3))
+    left, right = rays(view, (0.5, 0.0)).direction[0], rays(view, (0.5, 1.0)).direction[1]
+    assert math.acos(left @ right) == pytest.approx(2 * 0.3, rel=1e-12)
+
+
+def test_only_perspective_rays_meet():
+    assert rays(camera(is_perspective=False)).eye is None
+    torch.testing.assert_close(rays(camera()).eye, ORIGIN.flip(0), rtol=0, atol=0)
+
+
+def test_a_smaller_picture_sees_the_same():
+    view = camera((6, 8))
+    torch.testing.assert_close(rays(view.resized(2), (0.5, 0.5)).direction[0], rays(view, (1.0, 1.0)).direction[0], rtol=0, atol=1e-15)
+    assert view.resized(100).size == (1, 1)
+
+
+@given(st.integers(1, 64))
+def test_samples_are_centers_of_equal_parts(samples: int):
+    offsets = torch.tensor(subpixel_offsets(samples), dtype=torch.float64)
+    assert len({(round(a, 9), round(b, 9)) for a, b in offsets.tolist()}) == samples
+    torch.testing.assert_close(offsets.mean(0), torch.full((2,), 0.5, dtype=torch.float64), rtol=0, atol=1e-14)
+    rows, columns = (len(set(line.tolist())) for line in offsets.unbind(1))
+    assert rows * columns == samples
+    second_moments = ((offsets - 0.5) ** 2).mean(0)
+    expected = [(1 - 1 / count**2) / 12 for count in (rows, columns)]
+    assert second_moments.tolist() == pytest.approx(expected, abs=1e-14)

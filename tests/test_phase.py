@@ -1,0 +1,78 @@
+"""The phase function and the scaling of its peak, checked by their moments over the sphere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ddrecon.medium import Volume, medium_of
+from ddrecon.phase import forward_fraction, henyey_greenstein, scaled_mean_cosine
+
+MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(100)
+
+
+def scalar(value: float) -> torch.Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def legendre_moment(g: float, degree: int) -> float:
+    """The average of P_degree(cosine) over the sphere, weighted by the phase function: g^degree."""
+    polynomial = np.polynomial.legendre.Legendre.basis(degree)(NODES)
+    return float((henyey_greenstein(torch.tensor(NODES), scalar(g)).numpy() * polynomial * WEIGHTS).sum() / 2)
+
+
+@pytest.mark.parametrize("g", MEAN_COSINES)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_moments_are_powers_of_the_mean_cosine(g: float, degree: int):
+    assert legendre_moment(g, degree) == pytest.approx(g**degree, abs=1e-12)
+
+
+def test_isotropic_scattering_is_one_everywhere():
+    assert torch.equal(henyey_greenstein(torch.linspace(-1, 1, 7, dtype=torch.float64), scalar(0.0)), torch.ones(7, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("g", [0.1, 0.5, 0.95])
+def test_scaling_a_forward_peak_keeps_its_first_two_moments(g: float):
+    f, rest = forward_fraction(scalar(g)), scaled_mean_cosine(scalar(g))
+    assert (f + (1 - f) * rest).item() == pytest.approx(g, rel=1e-14)
+    assert f.item() == pytest.approx(g**2, rel=1e-14)
+
+
+@pytest.mark.parametrize("g", [-0.95, -0.2, 0.0])
+def test_nothing_is_scaled_without_a_forward_peak(g: float):
+    assert forward_fraction(scalar(g)) == 0 and scaled_mean_cosine(scalar(g)) == g
+
+
+@pytest.mark.parametrize("function", [forward_fraction, scaled_mean_cosine])
+def test_the_scaling_has_a_continuous_derivative_at_zero(function):
+    slopes = torch.autograd.functional.jacobian(lambda g: function(g).sum(), torch.tensor([-1e-9, 1e-9], dtype=torch.float64))
+    assert slopes[0].item() == pytest.approx(slopes[1].item(), abs=1e-8)
+
+
+@pytest.mark.parametrize("g", MEAN_COSINES)
+def test_scaling_leaves_the_transport_extinction_alone(g: float, random, box):
+    sigma_a, sigma_s = random(3, seed=1), random(3, seed=2)
+    density = random(2, 3, 4)
+    medium = medium_of(Volume(box((2, 3, 4)), density, sigma_a, sigma_s, scalar(g)))
+    exact = (sigma_a + (1 - g) * sigma_s).view(3, 1, 1, 1) * density
+    torch.testing.assert_close(medium.transport_extinction, exact, rtol=1e-14, atol=0)
+    removed = medium.unscaled_extinction.value - medium.extinction.value
+    torch.testing.assert_close(removed, max(g, 0) ** 2 * medium.scattering.value, rtol=1e-12, atol=1e-15)
+
+
+def test_a_constant_cross_section_equals_the_same_one_in_every_cell(random, box):
+    sigma_a, sigma_s, density, grid = random(3, seed=1), random(3, seed=2), random(2, 3, 4), box((2, 3, 4))
+    fields = [sigma.view(3, 1, 1, 1).expand(3, *grid.shape) for sigma in (sigma_a, sigma_s)]
+    constant, varying = (
+        medium_of(Volume(grid, density, sigma_a, sigma_s, scalar(0.3))),
+        medium_of(Volume(grid, density, *fields, scalar(0.3))),
+    )
+    for name in ("extinction", "unscaled_extinction", "scattering", "diffuse_scattering", "absorption"):
+        torch.testing.assert_close(getattr(constant, name).value, getattr(varying, name).value, rtol=1e-15, atol=0)
+
+
+def test_a_density_of_another_shape_is_refused(random, box):
+    with pytest.raises(ValueError, match=r"\(2, 3, 5\).*\(2, 3, 4\)"):
+        Volume(box((2, 3, 4)), random(2, 3, 5), random(1), random(1), scalar(0.0))

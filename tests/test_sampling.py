@@ -1,0 +1,83 @@
+"""Interpolation: linear fields exactly, the same as explicit index arithmetic, and both derivatives."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from ddrecon.sampling import sample_slices, sample_volume
+
+
+def interior_points(random, count: int, shape: tuple[int, ...]) -> Tensor:
+    """Points between the first and the last cell center, last array axis first."""
+    reach = torch.tensor([1 - 1 / cells for cells in reversed(shape)], dtype=torch.float64)
+    return (2 * random(count, len(shape), seed=5) - 1) * reach
+
+
+def linear_field(shape: tuple[int, ...], slope: Tensor) -> Tensor:
+    """slope . position on cell centers, position in [-1, 1], last array axis first in `slope`."""
+    axes = [(2 * torch.arange(cells, dtype=torch.float64) + 1) / cells - 1 for cells in shape]
+    return sum(s * axis for s, axis in zip(slope.flip(0), torch.meshgrid(*axes, indexing="ij"), strict=True))
+
+
+def interpolated(values: Tensor, point: Tensor, padding: str) -> Tensor:
+    """Multilinear interpolation of `values` [K, ...] at one point, corner by corner."""
+    sizes = values.shape[1:]
+    place = [((point[len(sizes) - 1 - axis].item() + 1) * size - 1) / 2 for axis, size in enumerate(sizes)]
+    if padding == "border":
+        place = [min(max(p, 0), size - 1) for p, size in zip(place, sizes, strict=True)]
+    total = torch.zeros_like(values[(slice(None), *[0] * len(sizes))])
+    for corner in itertools.product((0, 1), repeat=len(sizes)):
+        index = [math.floor(p) + up for p, up in zip(place, corner, strict=True)]
+        weight = math.prod(1 - abs(p - i) for p, i in zip(place, index, strict=True))
+        if all(0 <= i < size for i, size in zip(index, sizes, strict=True)):
+            total = total + weight * values[(slice(None), *index)]
+    return total
+
+
+@pytest.mark.parametrize("padding", ["zeros", "border"])
+def test_slices_against_explicit_corners(padding: str, random):
+    slices, points = random(2, 3, 4, 5), 2.6 * random(2, 9, 2, seed=1) - 1.3
+    sampled = sample_slices(slices, points, padding)
+    for n, p in itertools.product(range(2), range(9)):
+        torch.testing.assert_close(sampled[n, :, p], interpolated(slices[n], points[n, p], padding), rtol=1e-13, atol=1e-14)
+
+
+def test_volumes_against_explicit_corners(random):
+    volume, points = random(2, 3, 4, 5), 2.6 * random(1, 9, 3, seed=1) - 1.3
+    sampled = sample_volume(volume, points)
+    for p in range(9):
+        torch.testing.assert_close(sampled[:, 0, p], interpolated(volume, points[0, p], "border"), rtol=1e-13, atol=1e-14)
+
+
+def test_linear_fields_are_exact_in_slices(random):
+    slope, shape = random(2), (4, 6)
+    points = interior_points(random, 20, shape)
+    sampled = sample_slices(linear_field(shape, slope)[None, None], points[None])[0, 0]
+    torch.testing.assert_close(sampled, points @ slope, rtol=0, atol=1e-14)
+
+
+def test_linear_fields_are_exact_in_volumes(random):
+    slope, shape = random(3), (4, 6, 3)
+    points = interior_points(random, 20, shape)
+    sampled = sample_volume(linear_field(shape, slope)[None], points[None])[0, 0]
+    torch.testing.assert_close(sampled, points @ slope, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("padding", ["zeros", "border"])
+@pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
+def test_slices_have_both_derivatives(padding: str, wanted: tuple[bool, bool], random):
+    slices, points = random(2, 2, 3, 4), 2.4 * random(2, 5, 2, seed=1) - 1.2
+    inputs = [tensor.requires_grad_(is_wanted) for tensor, is_wanted in zip((slices, points), wanted, strict=True)]
+    assert torch.autograd.gradcheck(lambda s, p: sample_slices(s, p, padding), inputs, check_forward_ad=True)
+
+
+@pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
+def test_volumes_have_both_derivatives(wanted: tuple[bool, bool], random):
+    volume, points = random(2, 3, 2, 4), 2.4 * random(2, 3, 3, seed=1) - 1.2
+    inputs = [tensor.requires_grad_(is_wanted) for tensor, is_wanted in zip((volume, points), wanted, strict=True)]
+    assert torch.autograd.gradcheck(sample_volume, inputs, check_forward_ad=True)
