@@ -95,13 +95,14 @@ class _Slices:
     def __init__(self, fields: Tensor, grid: Grid, axis: int, is_reversed: bool, steps: int):
         self.axis, self.across = axis, [other for other in range(3) if other != axis]
         self.lower, self.extent = grid.lower, grid.extent
-        slices = fields.permute(1 + axis, 0, *(1 + other for other in self.across))
-        slices = torch.cat([slices[:1], slices, slices[-1:]])
-        center = (torch.arange(grid.shape[axis], dtype=fields.dtype, device=fields.device) + 0.5) / grid.shape[axis]
-        planes = torch.nn.functional.pad(center, (1, 0))
-        planes = torch.cat([planes, torch.ones_like(planes[:1])]) * grid.extent[axis] + grid.lower[axis]
-        slices, planes = _subdivided(slices, steps), _subdivided(planes, steps)
-        self.slices, self.planes = (slices.flip(0), planes.flip(0)) if is_reversed else (slices, planes)
+        count = grid.shape[axis]
+        place = torch.arange(count + 2, dtype=fields.dtype, device=fields.device) - 0.5
+        planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
+        index = (place - 0.5).clamp(0, count - 1).long()
+        if is_reversed:
+            index, planes = index.flip(0), planes.flip(0)
+        slices = fields.permute(1 + axis, 0, *(1 + other for other in self.across)).index_select(0, index)
+        self.slices, self.planes = _subdivided(slices, steps), _subdivided(planes, steps)
         self.nodes = len(self.planes)
 
     def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:

@@ -17,6 +17,7 @@ from ddrecon.decay import decay_mean
 from ddrecon.grid import Grid, array_order
 from ddrecon.lights import AmbientLight, DirectionalLight, Light
 from ddrecon.medium import Coefficient, Medium
+from ddrecon.moments import Moments, beam_moments
 from ddrecon.quadrature import sphere_quadrature
 from ddrecon.sampling import sample_slices
 
@@ -35,70 +36,63 @@ class Beam:
 
 @dataclass(frozen=True)
 class ReducedLight:
-    """Light not yet scattered: the beams, and the moments of everything else that shines (`ambient_*`, None without).
+    """Light not yet scattered.
 
-    `source_mean` Q0 [C, z, y, x] and `source_flux` Q1 [3, C, z, y, x] (array order, None where g = 0) are of all lights, as
-    averages over cells; `ambient_mean` [C, z, y, x] and `ambient_flux` [3, C, z, y, x] are int L_ri and int L_ri w over the
-    sphere, divided by 4 pi, of ambient light alone.
+    `beams` of directional lights; `ambient`: the moments int L_ri and int L_ri w over the sphere, divided by 4 pi, of ambient light (None
+    without); and the `source` Q0, Q1 of all lights, averaged over cells. Fluxes are None where g = 0.
     """
 
     beams: tuple[Beam, ...]
-    ambient_mean: Tensor | None
-    ambient_flux: Tensor | None
-    source_mean: Tensor
-    source_flux: Tensor | None
+    ambient: Moments | None
+    source: Moments
 
 
 def reduced_light(medium: Medium, lights: list[Light], has_flux: bool) -> ReducedLight:
     """The light of `lights` that reaches each cell of `medium` unscattered; `has_flux`: whether Q1 is needed (g is not 0)."""
-    extinction = medium.extinction
-    mean = torch.zeros_like(extinction.scale)
-    flux = torch.zeros_like(extinction.scale) if has_flux else None
-    beams = []
-    for light in lights:
-        if isinstance(light, DirectionalLight):
-            beam, received = _beam(extinction, medium.grid, light)
-            beams.append(beam)
-            mean = mean + received
-            if flux is not None:
-                flux = flux + received * beam.direction.view(3, 1, 1, 1, 1)
-    ambient_mean, ambient_flux = _ambient(extinction, medium.grid, lights)
-    if ambient_mean is not None and ambient_flux is not None:
-        mean = mean + ambient_mean
-        flux = flux + ambient_flux if flux is not None else None
-    shape = (*torch.broadcast_shapes(mean.shape[:1], extinction.scale.shape[:1]), *medium.grid.shape)
-    source_flux = 3 * medium.mean_cosine * flux.expand(3, *shape) if flux is not None else None
-    return ReducedLight(tuple(beams), ambient_mean, ambient_flux, mean.expand(shape), source_flux)
+    directional = [light for light in lights if isinstance(light, DirectionalLight)]
+    radiances = [light.radiance for light in lights if isinstance(light, AmbientLight)]
+    beams, total = [], Moments(torch.zeros_like(medium.extinction.value))
+    for light in directional:
+        beam, received = _beam(medium, light, has_flux)
+        beams.append(beam)
+        total = total.plus(received)
+    ambient = _ambient(medium, _sum(radiances), has_flux) if radiances else None
+    if ambient is not None:
+        total = total.plus(ambient)
+    return ReducedLight(tuple(beams), ambient, total.scaled(1.0, 3 * medium.mean_cosine))
 
 
-def _beam(extinction: Coefficient, grid: Grid, light: DirectionalLight) -> tuple[Beam, Tensor]:
-    """The beam of `light`, and E tau / (4 pi) averaged over each cell along the beam."""
+def _sum(colors: list[Tensor]) -> Tensor:
+    return torch.stack(torch.broadcast_tensors(*colors)).sum(0).view(-1, 1, 1, 1)
+
+
+def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
+    """The beam of `light`, and the moments of E tau / (4 pi) averaged over each cell along the beam."""
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
-    entered, step = entered_mass(extinction.field, grid, direction)
-    own = extinction.field * step
-    received = torch.exp(-extinction.scale * entered) * decay_mean(extinction.scale * own)
-    return Beam(entered + 0.5 * own, direction, irradiance), irradiance / (4 * math.pi) * received
+    entered, step = entered_mass(medium.extinction.field, medium.grid, direction)
+    received = irradiance / (4 * math.pi) * _cell_mean(medium.extinction, entered, step)
+    beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
+    return beam, beam_moments(received, direction, has_flux)
 
 
-def _ambient(extinction: Coefficient, grid: Grid, lights: list[Light]) -> tuple[Tensor | None, Tensor | None]:
-    """Mean and flux over directions of all ambient light; one direction at a time, so that memory does not grow with their number."""
-    radiance = [light.radiance.view(-1, 1, 1, 1) for light in lights if isinstance(light, AmbientLight)]
-    if not radiance:
-        return None, None
-    directions, weights = sphere_quadrature(extinction.field)
-    mean, flux = torch.zeros_like(extinction.value), torch.zeros_like(extinction.value).expand(3, -1, -1, -1, -1).clone()
-    for direction, weight in zip(directions, weights, strict=True):
-        arriving = weight * checkpoint(_visibility, extinction, grid, direction, use_reentrant=False, preserve_rng_state=False)
-        mean = mean + arriving
-        flux = flux + arriving * direction.view(3, 1, 1, 1, 1)
-    total = torch.stack(torch.broadcast_tensors(*radiance)).sum(0) if len(radiance) > 1 else radiance[0]
-    return total * mean, total * flux
+def _ambient(medium: Medium, radiance: Tensor, has_flux: bool) -> Moments:
+    """The moments of ambient light; one direction at a time, so that memory does not grow with their number."""
+    total = Moments(torch.zeros_like(medium.extinction.value))
+    for direction, weight in zip(*sphere_quadrature(medium.extinction.field), strict=True):
+        visible = checkpoint(_visibility, medium, direction, use_reentrant=False, preserve_rng_state=False)
+        total = total.plus(beam_moments(weight * visible, direction, has_flux))
+    return total.scaled(radiance, radiance)
 
 
-def _visibility(extinction: Coefficient, grid: Grid, direction: Tensor) -> Tensor:
-    entered, step = entered_mass(extinction.field, grid, direction)
-    return torch.exp(-extinction.scale * entered) * decay_mean(extinction.scale * extinction.field * step)
+def _visibility(medium: Medium, direction: Tensor) -> Tensor:
+    """Transmittance from the box to each cell along `direction`, averaged over the cell."""
+    return _cell_mean(medium.extinction, *entered_mass(medium.extinction.field, medium.grid, direction))
+
+
+def _cell_mean(extinction: Coefficient, entered: Tensor, step: Tensor) -> Tensor:
+    """exp(-depth) averaged over each cell, along a beam that has `entered` mass behind it and crosses `step` [u] of the cell."""
+    return torch.exp(-extinction.scale * entered) * decay_mean(extinction.scale * (extinction.field * step))
 
 
 def entered_mass(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,11 +15,12 @@ from torch import Tensor
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
-from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductances, face_fluxes
+from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductances, face_fluxes
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.lights import AmbientLight
 from ddrecon.march import Emission, march
 from ddrecon.medium import Medium, medium_of
+from ddrecon.moments import Moments, Vector
 from ddrecon.phase import forward_fraction
 from ddrecon.reduced import ReducedLight, reduced_light
 from ddrecon.settings import DiffusionSettings, RenderSettings
@@ -27,20 +28,16 @@ from ddrecon.world import Scene, View
 
 
 @dataclass(frozen=True)
-class DiffuseLight:
-    """Multiply scattered light: `mean` L0 [C, z, y, x] and `flux` L1 [3, C, z, y, x] (array order; None where g = 0)."""
-
-    mean: Tensor
-    flux: Tensor | None
-
-
-@dataclass(frozen=True)
 class LightField:
-    """All light inside a medium: what arrives unscattered and what has been scattered (None where nothing multiply scatters)."""
+    """All light inside a medium: what arrives unscattered, and `outgoing`, what one more scattering makes of all other light.
+
+    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w) of diffuse light (E3), and int p L_ri / (4 pi) of ambient light (E2)
+    to first order in angle.
+    """
 
     medium: Medium
     reduced: ReducedLight
-    diffuse: DiffuseLight | None
+    outgoing: Moments
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,18 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     """The light inside the volume of `scene`: E4 and E5 on top of the reduced light."""
     medium = medium_of(scene.volume)
     reduced = reduced_light(medium, scene.lights, has_flux(medium))
-    return LightField(medium, reduced, solve_diffuse(medium, reduced, scene.diffusion, memory))
+    return collect(medium, reduced, solve_diffuse(medium, reduced, scene.diffusion, memory))
+
+
+def collect(medium: Medium, reduced: ReducedLight, diffuse: Moments | None) -> LightField:
+    """The light field of reduced and `diffuse` light (L0, L1; None for no multiple scattering)."""
+    outgoing = Moments(torch.zeros_like(reduced.source.mean))
+    if diffuse is not None:
+        kept = 1 - forward_fraction(medium.g)
+        outgoing = diffuse.scaled(kept, kept * medium.mean_cosine)
+    if reduced.ambient is not None:
+        outgoing = outgoing.plus(reduced.ambient.scaled(1.0, 3 * medium.g))
+    return LightField(medium, reduced, outgoing)
 
 
 def has_flux(medium: Medium) -> bool:
@@ -87,7 +95,7 @@ def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
     return settings.model != "none" and bool((medium.scattering.scale != 0).any())
 
 
-def solve_diffuse(medium: Medium, reduced: ReducedLight, settings: DiffusionSettings, memory: SolveMemory) -> DiffuseLight | None:
+def solve_diffuse(medium: Medium, reduced: ReducedLight, settings: DiffusionSettings, memory: SolveMemory) -> Moments | None:
     """L0 from the P1 balance E4 with the Marshak boundary E6, and L1 from E5; None where nothing scatters more than once."""
     if not multiply_scatters(medium, settings):
         return None
@@ -95,19 +103,16 @@ def solve_diffuse(medium: Medium, reduced: ReducedLight, settings: DiffusionSett
     scattering = medium.diffuse_scattering.value
     diffusion = CLOSURES[settings.closure](medium.transport_extinction, grid)
     operator = Operator(conductances(diffusion, grid), medium.absorption.value + boundary_loss(diffusion, grid))
-    source = scattering * reduced.source_mean
-    source_flux: Sequence[Tensor | None] = (None, None, None)
-    if reduced.source_flux is not None:
-        source_flux = (scattering * reduced.source_flux).unbind(0)
-        for axis in AXES:
-            fluxes = face_fluxes(None, source_flux[axis - 1], diffusion, grid, axis)
-            source = source - fluxes.diff(dim=axis) / grid.spacing[axis - 1]
-    mean = solve_diffusion(Solve(SOLVERS[settings.solver], settings.tolerance, memory), operator, source)
-    if reduced.source_flux is None:
-        return DiffuseLight(mean, None)
-    faces = [face_fluxes(mean, source_flux[axis - 1], diffusion, grid, axis) for axis in AXES]
-    flux = [1.5 * (face.narrow(axis, 0, n) + face.narrow(axis, 1, n)) for axis, n, face in zip(AXES, grid.shape, faces, strict=True)]
-    return DiffuseLight(mean, torch.stack(flux))
+    source = reduced.source.scaled(scattering, scattering)
+    solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
+    if source.flux is None:
+        return Moments(solve_diffusion(solve, operator, source.mean))
+    right = source.mean
+    for axis, component in zip(AXES, source.flux, strict=True):
+        right = right - face_fluxes(None, component, diffusion, grid, axis).diff(dim=axis) / grid.spacing[axis - 1]
+    mean = solve_diffusion(solve, operator, right)
+    z, y, x = (3 * cell_average(face_fluxes(mean, f, diffusion, grid, axis), axis) for axis, f in zip(AXES, source.flux, strict=True))
+    return Moments(mean, (z, y, x))
 
 
 def view_image(light_field: LightField, scene: Scene, camera: Camera) -> Tensor:
@@ -123,7 +128,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     """
     medium = light_field.medium
     exact = replace(medium, extinction=medium.unscaled_extinction)
-    once = LightField(exact, reduced_light(exact, scene.lights, has_flux(medium)), None)
+    once = collect(exact, reduced_light(exact, scene.lights, has_flux(medium)), None)
     dark = replace(scene, render=replace(scene.render, background=False))
     image = view_image(light_field, scene, camera)
     single = view_image(once, dark, camera)
@@ -140,7 +145,7 @@ def _average(camera: Camera, settings: RenderSettings, radiance: Callable[[Rays]
 def _radiance(light_field: LightField, scene: Scene, bundle: Rays) -> Tensor:
     """Radiance [3, R] along `bundle`: E1."""
     medium, reduced = light_field.medium, light_field.reduced
-    diffuse = diffuse_radiance(light_field, bundle)
+    diffuse = light_field.outgoing.along(_towards_camera(medium, bundle))
     emission = Emission(medium.grid, medium.extinction, medium.scattering, reduced.beams, diffuse, medium.g)
     scattered, transmittance = march(emission, bundle, scene.render.steps_per_voxel)
     if scene.render.background:
@@ -150,36 +155,15 @@ def _radiance(light_field: LightField, scene: Scene, bundle: Rays) -> Tensor:
     return scattered.expand(3, -1)
 
 
-def diffuse_radiance(light_field: LightField, bundle: Rays) -> Tensor:
-    """What one more scattering by kappa_s sends towards the camera, beams aside, per unit length and kappa_s: [C, z, y, x].
+def _towards_camera(medium: Medium, bundle: Rays) -> Vector:
+    """Components along z, y, x, each broadcasting to `[z, y, x]`, of unit directions from the cells towards the camera.
 
-    (1 - f) (L0 + g' L1.w) of the diffuse light (E3), and int p L_ri / (4 pi) of ambient light (E2) to first order in angle.
-    Every ray through a cell's center has the same direction w, so this is a field of the camera, interpolated like any other.
+    All rays through a cell's center have the same direction, so that outgoing light is a field of the camera, interpolated like any other.
     """
-    medium, reduced, diffuse = light_field.medium, light_field.reduced, light_field.diffuse
-    towards = _towards_camera(medium, bundle)
-    radiance = torch.zeros_like(reduced.source_mean)
-    if diffuse is not None:
-        scattered = diffuse.mean
-        if diffuse.flux is not None:
-            scattered = scattered + medium.mean_cosine * _along(diffuse.flux, towards)
-        radiance = (1 - forward_fraction(medium.g)) * scattered
-    if reduced.ambient_mean is not None and reduced.ambient_flux is not None:
-        radiance = radiance + reduced.ambient_mean
-        if has_flux(medium):
-            radiance = radiance + 3 * medium.g * _along(reduced.ambient_flux, towards)
-    return radiance
-
-
-def _along(flux: Tensor, towards: tuple[Tensor, ...]) -> Tensor:
-    z, y, x = towards
-    return torch.addcmul(torch.addcmul(flux[0] * z, flux[1], y), flux[2], x)
-
-
-def _towards_camera(medium: Medium, bundle: Rays) -> tuple[Tensor, ...]:
-    """Components along z, y, x, each broadcasting to `[z, y, x]`, of unit directions from the cells towards the camera."""
     if bundle.eye is None:
-        return (-bundle.direction[0]).unbind()
+        z, y, x = -bundle.direction[0]
+        return z, y, x
     offsets = [e - c for e, c in zip(bundle.eye, medium.grid.centers(bundle.eye), strict=True)]
     distance = (offsets[0] ** 2 + offsets[1] ** 2 + offsets[2] ** 2).sqrt().clamp(min=torch.finfo(bundle.eye.dtype).tiny)
-    return tuple(offset / distance for offset in offsets)
+    z, y, x = (offset / distance for offset in offsets)
+    return z, y, x

@@ -105,8 +105,8 @@ def _order(steps: list[float], errors: list[float]) -> float:
     return float((x * y).sum() / (x * x).sum())
 
 
-def _factory(function: Callable[..., Any]) -> Callable[..., Any]:
-    return pytest.fixture(scope="session", name=function.__name__[1:])(lambda: function)
+def _factory(function: Callable[..., Any]) -> Any:
+    return pytest.fixture(scope="session")(lambda: function)
 
 
 random = _factory(_random)

@@ -112,6 +112,11 @@ def face_fluxes(radiance: Tensor | None, source_flux: Tensor | None, diffusion: 
     return torch.cat([low, inside, high], axis)
 
 
+def cell_average(faces: Tensor, axis: int) -> Tensor:
+    """Half the sum of a cell's two faces along `axis`; `faces` is one entry longer there than the cells."""
+    return 0.5 * (lower(faces, axis) + upper(faces, axis))
+
+
 def _on_box(u: Tensor, axis: int) -> Tensor:
     """How many of a cell's two faces along `axis` lie on the box: 0, 1 or 2, shaped to broadcast."""
     counts = torch.zeros(u.shape[axis], dtype=u.dtype, device=u.device)
