@@ -62,9 +62,8 @@ def main() -> None:
     with torch.no_grad():
         images = render_each(scene, scene.views, SolveMemory())
     values = [psnr(image, view.image, None) for image, view in zip(images, scene.views, strict=True)]
-    print(
-        f"PSNR against path tracing at the true density: {sum(values) / len(values):.2f} dB; {torch.get_num_threads()} threads, {args.device}"
-    )
+    print(f"PSNR against path tracing at the true density: {sum(values) / len(values):.2f} dB")
+    print(f"{args.device}, {torch.get_num_threads()} threads, torch {torch.__version__}")
 
 
 if __name__ == "__main__":

@@ -49,31 +49,43 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Medium:
-    """Coefficients of one medium: `extinction` and `scattering` for beams, and what diffusion needs.
+    """Coefficients of one medium, seen with the part `forward_fraction` f of its scattering taken as not scattered.
 
-    `unscaled_extinction` is kappa_t itself; `extinction` and `diffuse_scattering` are those of the delta-Eddington scaled
-    medium, `mean_cosine` its g'; `scattering` is the unscaled kappa_s, for single scattering with the exact phase function.
+    `scattering` is kappa_s itself, which beams scatter by with the exact phase function of mean cosine `g`; `extinction` is
+    kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that remains.
     """
 
     grid: Grid
     extinction: Coefficient
-    unscaled_extinction: Coefficient
     scattering: Coefficient
-    diffuse_scattering: Coefficient
     absorption: Coefficient
     g: Tensor
     mean_cosine: Tensor
+    forward_fraction: Tensor
+
+    @property
+    def remaining_scattering(self) -> Tensor:
+        """(1 - f) kappa_s [1/u], `[C, z, y, x]`."""
+        return (1 - self.forward_fraction) * self.scattering.value
 
     @property
     def transport_extinction(self) -> Tensor:
         """kappa_tr = kappa_a + (1 - g) kappa_s [1/u], `[C, z, y, x]`; delta-Eddington scaling leaves it unchanged."""
-        return self.absorption.value + (1 - self.mean_cosine) * self.diffuse_scattering.value
+        return self.absorption.value + (1 - self.g) * self.scattering.value
 
 
-def medium_of(volume: Volume) -> Medium:
-    """The medium of `volume`: kappa = rho sigma, with kappa_s' = (1 - f) kappa_s and g' (THEORY section 5)."""
+def scaled_medium(volume: Volume) -> Medium:
+    """The delta-Eddington scaled medium of `volume`, which the whole image is rendered by (docs/theory.md, section 5)."""
+    return _medium(volume, forward_fraction(volume.g), scaled_mean_cosine(volume.g))
+
+
+def unscaled_medium(volume: Volume) -> Medium:
+    """The medium of `volume` as it is, by which path tracing separates single from multiple scattering."""
+    return _medium(volume, torch.zeros_like(volume.g), volume.g)
+
+
+def _medium(volume: Volume, fraction: Tensor, mean_cosine: Tensor) -> Medium:
     sigma_a, sigma_s = _broadcast(volume.sigma_a), _broadcast(volume.sigma_s)
-    scaled = (1 - forward_fraction(volume.g)) * sigma_s
     density = volume.density[None]
 
     def coefficient(sigma: Tensor) -> Coefficient:
@@ -83,13 +95,12 @@ def medium_of(volume: Volume) -> Medium:
 
     return Medium(
         volume.grid,
-        extinction=coefficient(sigma_a + scaled),
-        unscaled_extinction=coefficient(sigma_a + sigma_s),
+        extinction=coefficient(sigma_a + (1 - fraction) * sigma_s),
         scattering=coefficient(sigma_s),
-        diffuse_scattering=coefficient(scaled),
         absorption=coefficient(sigma_a),
         g=volume.g,
-        mean_cosine=scaled_mean_cosine(volume.g),
+        mean_cosine=mean_cosine,
+        forward_fraction=fraction,
     )
 
 

@@ -36,34 +36,39 @@ class Beam:
 
 @dataclass(frozen=True)
 class ReducedLight:
-    """Light not yet scattered.
-
-    `beams` of directional lights; `ambient`: the moments int L_ri and int L_ri w over the sphere, divided by 4 pi, of ambient light (None
-    without); and the `source` Q0, Q1 of all lights, averaged over cells. Fluxes are None where g = 0.
-    """
+    """Light of directional lights not yet scattered: its `beams`, and its `source` Q0, Q1, averaged over cells (no Q1 where g = 0)."""
 
     beams: tuple[Beam, ...]
-    ambient: Moments | None
     source: Moments
 
 
 def reduced_light(medium: Medium, lights: list[Light], has_flux: bool) -> ReducedLight:
-    """The light of `lights` that reaches each cell of `medium` unscattered; `has_flux`: whether Q1 is needed (g is not 0)."""
-    directional = [light for light in lights if isinstance(light, DirectionalLight)]
-    radiances = [light.radiance for light in lights if isinstance(light, AmbientLight)]
+    """The light of directional `lights` that reaches each cell unscattered; `has_flux`: whether Q1 is needed (g is not 0)."""
     beams, total = [], Moments(torch.zeros_like(medium.extinction.value))
-    for light in directional:
-        beam, received = _beam(medium, light, has_flux)
-        beams.append(beam)
-        total = total.plus(received)
-    ambient = _ambient(medium, _sum(radiances), has_flux) if radiances else None
-    if ambient is not None:
-        total = total.plus(ambient)
-    return ReducedLight(tuple(beams), ambient, total.scaled(1.0, 3 * medium.mean_cosine))
+    for light in lights:
+        if isinstance(light, DirectionalLight):
+            beam, received = _beam(medium, light, has_flux)
+            beams.append(beam)
+            total = total.plus(received)
+    return ReducedLight(tuple(beams), total.scaled(1.0, 3 * medium.mean_cosine))
 
 
-def _sum(colors: list[Tensor]) -> Tensor:
-    return torch.stack(torch.broadcast_tensors(*colors)).sum(0).view(-1, 1, 1, 1)
+def ambient_radiance(lights: list[Light], like: Tensor) -> Tensor:
+    """The radiance `[C, 1, 1, 1]` that all ambient `lights` together send in from every direction."""
+    radiances = [light.radiance for light in lights if isinstance(light, AmbientLight)]
+    return torch.stack(torch.broadcast_tensors(*radiances, like.new_zeros(1))).sum(0).view(-1, 1, 1, 1)
+
+
+def unscattered_ambient(medium: Medium, radiance: Tensor, has_flux: bool) -> Moments:
+    """Ambient light not yet scattered, to first order in angle: int L_ri and 3 int L_ri w over the sphere, divided by 4 pi.
+
+    One direction at a time, so that memory does not grow with their number. `radiance`: [C, 1, 1, 1].
+    """
+    total = Moments(torch.zeros_like(medium.extinction.value))
+    for direction, weight in zip(*sphere_quadrature(medium.extinction.field), strict=True):
+        visible = checkpoint(_visibility, medium, direction, use_reentrant=False, preserve_rng_state=False)
+        total = total.plus(beam_moments(weight * visible, direction, has_flux))
+    return total.scaled(radiance, 3 * radiance)
 
 
 def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
@@ -74,15 +79,6 @@ def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam
     received = irradiance / (4 * math.pi) * _cell_mean(medium.extinction, entered, step)
     beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
     return beam, beam_moments(received, direction, has_flux)
-
-
-def _ambient(medium: Medium, radiance: Tensor, has_flux: bool) -> Moments:
-    """The moments of ambient light; one direction at a time, so that memory does not grow with their number."""
-    total = Moments(torch.zeros_like(medium.extinction.value))
-    for direction, weight in zip(*sphere_quadrature(medium.extinction.field), strict=True):
-        visible = checkpoint(_visibility, medium, direction, use_reentrant=False, preserve_rng_state=False)
-        total = total.plus(beam_moments(weight * visible, direction, has_flux))
-    return total.scaled(radiance, radiance)
 
 
 def _visibility(medium: Medium, direction: Tensor) -> Tensor:

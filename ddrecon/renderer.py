@@ -11,32 +11,31 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductances, face_fluxes
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.lights import AmbientLight
+from ddrecon.lights import AmbientLight, Light
 from ddrecon.march import Emission, march
-from ddrecon.medium import Medium, medium_of
+from ddrecon.medium import Medium, scaled_medium, unscaled_medium
 from ddrecon.moments import Moments, Vector
-from ddrecon.phase import forward_fraction
-from ddrecon.reduced import ReducedLight, reduced_light
+from ddrecon.reduced import Beam, ambient_radiance, reduced_light, unscattered_ambient
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.world import Scene, View
 
 
 @dataclass(frozen=True)
 class LightField:
-    """All light inside a medium: what arrives unscattered, and `outgoing`, what one more scattering makes of all other light.
+    """All light inside a medium: the beams of directional lights, and `outgoing`, what one more scattering makes of all other light.
 
-    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w) of diffuse light (E3), and int p L_ri / (4 pi) of ambient light (E2)
-    to first order in angle.
+    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3.
     """
 
     medium: Medium
-    reduced: ReducedLight
+    beams: tuple[Beam, ...]
     outgoing: Moments
 
 
@@ -69,25 +68,32 @@ def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> lis
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     """The light inside the volume of `scene`: E4 and E5 on top of the reduced light."""
-    medium = medium_of(scene.volume)
+    medium = scaled_medium(scene.volume)
+    if not multiply_scatters(medium, scene.diffusion):
+        return unscattered_light(medium, scene.lights)
     reduced = reduced_light(medium, scene.lights, has_flux(medium))
-    return collect(medium, reduced, solve_diffuse(medium, reduced, scene.diffusion, memory))
+    diffuse = solve_diffuse(medium, reduced.source, ambient_radiance(scene.lights, medium.g), scene.diffusion, memory)
+    return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse))
 
 
-def collect(medium: Medium, reduced: ReducedLight, diffuse: Moments | None) -> LightField:
-    """The light field of reduced and `diffuse` light (L0, L1; None for no multiple scattering)."""
-    outgoing = Moments(torch.zeros_like(reduced.source.mean))
-    if diffuse is not None:
-        kept = 1 - forward_fraction(medium.g)
-        outgoing = diffuse.scaled(kept, kept * medium.mean_cosine)
-    if reduced.ambient is not None:
-        outgoing = outgoing.plus(reduced.ambient.scaled(1.0, 3 * medium.g))
-    return LightField(medium, reduced, outgoing)
+def unscattered_light(medium: Medium, lights: list[Light]) -> LightField:
+    """The light inside `medium` that has not been scattered: beams, and ambient light by quadrature over directions."""
+    beams = reduced_light(medium, lights, False).beams
+    light = Moments(torch.zeros_like(medium.extinction.value))
+    if any(isinstance(item, AmbientLight) for item in lights):
+        light = unscattered_ambient(medium, ambient_radiance(lights, medium.g), has_flux(medium))
+    return LightField(medium, beams, _scattered_once_more(medium, light))
+
+
+def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
+    kept = 1 - medium.forward_fraction
+    return light.scaled(kept, kept * medium.mean_cosine)
 
 
 def has_flux(medium: Medium) -> bool:
-    """Whether light's direction matters to scattering: g is not 0, or may become so because it is being differentiated."""
-    return medium.g.requires_grad or bool(medium.g.detach() != 0)
+    """Whether light's direction matters to scattering: g is not 0, or is being differentiated, in either mode."""
+    is_varied = medium.g.requires_grad or forward_ad.unpack_dual(medium.g).tangent is not None
+    return is_varied or bool(medium.g.detach() != 0)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
@@ -95,23 +101,25 @@ def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
     return settings.model != "none" and bool((medium.scattering.scale != 0).any())
 
 
-def solve_diffuse(medium: Medium, reduced: ReducedLight, settings: DiffusionSettings, memory: SolveMemory) -> Moments | None:
-    """L0 from the P1 balance E4 with the Marshak boundary E6, and L1 from E5; None where nothing scatters more than once."""
-    if not multiply_scatters(medium, settings):
-        return None
-    grid = medium.grid
-    scattering = medium.diffuse_scattering.value
+def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: DiffusionSettings, memory: SolveMemory) -> Moments:
+    """L0 from the P1 balance E4 with the Marshak boundary E6, and L1 from E5.
+
+    `source`: Q0 and Q1 of beams. Ambient light, `outside` [C, 1, 1, 1], enters through the boundary: L0 and L1 hold all of it, scattered
+    or not, which keeps a white furnace exact (docs/theory.md, section 5).
+    """
+    grid, scattering = medium.grid, medium.remaining_scattering
     diffusion = CLOSURES[settings.closure](medium.transport_extinction, grid)
-    operator = Operator(conductances(diffusion, grid), medium.absorption.value + boundary_loss(diffusion, grid))
-    source = reduced.source.scaled(scattering, scattering)
-    solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
-    if source.flux is None:
-        return Moments(solve_diffusion(solve, operator, source.mean))
-    right = source.mean
-    for axis, component in zip(AXES, source.flux, strict=True):
+    escape = boundary_loss(diffusion, grid)
+    operator = Operator(conductances(diffusion, grid), medium.absorption.value + escape)
+    scattered = source.scaled(scattering, scattering)
+    right = scattered.mean + escape * outside
+    for axis, component in zip(AXES, scattered.flux or (), strict=scattered.flux is not None):
         right = right - face_fluxes(None, component, diffusion, grid, axis).diff(dim=axis) / grid.spacing[axis - 1]
-    mean = solve_diffusion(solve, operator, right)
-    z, y, x = (3 * cell_average(face_fluxes(mean, f, diffusion, grid, axis), axis) for axis, f in zip(AXES, source.flux, strict=True))
+    mean = solve_diffusion(Solve(SOLVERS[settings.solver], settings.tolerance, memory), operator, right)
+    if not has_flux(medium):
+        return Moments(mean)
+    fluxes = scattered.flux or (None, None, None)
+    z, y, x = (3 * cell_average(face_fluxes(mean, f, diffusion, grid, axis, outside), axis) for axis, f in zip(AXES, fluxes, strict=True))
     return Moments(mean, (z, y, x))
 
 
@@ -126,9 +134,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     With forward scattering the image sees the delta-Eddington scaled medium; reduced and single radiance are those of the medium
     itself, and the difference, light scattered forward once or more, belongs to `multiple`.
     """
-    medium = light_field.medium
-    exact = replace(medium, extinction=medium.unscaled_extinction)
-    once = collect(exact, reduced_light(exact, scene.lights, has_flux(medium)), None)
+    once = unscattered_light(unscaled_medium(scene.volume), scene.lights)
     dark = replace(scene, render=replace(scene.render, background=False))
     image = view_image(light_field, scene, camera)
     single = view_image(once, dark, camera)
@@ -144,14 +150,12 @@ def _average(camera: Camera, settings: RenderSettings, radiance: Callable[[Rays]
 
 def _radiance(light_field: LightField, scene: Scene, bundle: Rays) -> Tensor:
     """Radiance [3, R] along `bundle`: E1."""
-    medium, reduced = light_field.medium, light_field.reduced
+    medium = light_field.medium
     diffuse = light_field.outgoing.along(_towards_camera(medium, bundle))
-    emission = Emission(medium.grid, medium.extinction, medium.scattering, reduced.beams, diffuse, medium.g)
+    emission = Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)
     scattered, transmittance = march(emission, bundle, scene.render.steps_per_voxel)
     if scene.render.background:
-        for light in scene.lights:
-            if isinstance(light, AmbientLight):
-                scattered = scattered + transmittance * light.radiance.view(-1, 1)
+        scattered = scattered + transmittance * ambient_radiance(scene.lights, medium.g).view(-1, 1)
     return scattered.expand(3, -1)
 
 

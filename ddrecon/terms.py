@@ -7,21 +7,21 @@ from typing import Any
 import torch
 
 from ddrecon.lights import AmbientLight, DirectionalLight
-from ddrecon.medium import medium_of
+from ddrecon.medium import scaled_medium
 from ddrecon.renderer import has_flux, multiply_scatters
 from ddrecon.world import Scene, View
 
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
-    medium = medium_of(scene.volume)
+    medium = scaled_medium(scene.volume)
     colors = medium.extinction.scale.shape[0]
     terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
     beams = sum(isinstance(light, DirectionalLight) for light in scene.lights)
     if beams:
         terms.append(f"transmittance towards {beams} directional light{'s' if beams > 1 else ''}")
     if any(isinstance(light, AmbientLight) for light in scene.lights):
-        terms.append("ambient light by quadrature over 50 directions")
+        terms.append(_ambient_term(multiply_scatters(medium, scene.diffusion)))
     if bool(medium.g > 0):
         terms.append("delta-Eddington scaling of the forward peak (g > 0)")
     if multiply_scatters(medium, scene.diffusion):
@@ -34,12 +34,17 @@ def needed_terms(scene: Scene) -> list[str]:
     return terms
 
 
+def _ambient_term(is_diffuse: bool) -> str:
+    way = "as inflow of the diffusion through the box's faces" if is_diffuse else "by quadrature over 50 directions"
+    return f"ambient light, {way}"
+
+
 def memory_estimate(scene: Scene) -> int:
     """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself.
 
     A fit, in arrays of one value per cell, to peaks measured on grids from 16^3 to 128^3 (docs/theory.md says how).
     """
-    colors = medium_of(scene.volume).extinction.scale.shape[0]
+    colors = scaled_medium(scene.volume).extinction.scale.shape[0]
     size = torch.finfo(scene.volume.density.dtype).bits // 8
     arrays = 40 * colors
     if scene.optimize is not None:

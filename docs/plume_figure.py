@@ -1,6 +1,6 @@
 """Draws docs/plume.png, the picture in the README, from a finished run of configs/plume.yaml.
 
-    ddrecon optimize configs/plume.yaml -o runs/plume && python docs/plume_figure.py runs/plume
+ddrecon optimize configs/plume.yaml -o runs/plume && python docs/plume_figure.py runs/plume
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ def pictures(run: Path) -> list[tuple[str, NDArray[np.float32]]]:
 
 def slices(run: Path) -> list[tuple[str, NDArray[np.float32]]]:
     """The middle slice across z of the reconstructed and of the true density, y upwards."""
-    files = [("reconstructed density,\nmiddle slice", run / "volumes" / "density.npz"), ("true density", ROOT / "data" / "plume" / "density.npz")]
+    files = [
+        ("reconstructed density,\nmiddle slice", run / "volumes" / "density.npz"),
+        ("true density", ROOT / "data" / "plume" / "density.npz"),
+    ]
     fields = [(title, read_field(path, "density").values) for title, path in files]
     return [(title, values[values.shape[0] // 2, ::-1]) for title, values in fields]
 

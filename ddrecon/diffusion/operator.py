@@ -91,11 +91,14 @@ def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
     return loss
 
 
-def face_fluxes(radiance: Tensor | None, source_flux: Tensor | None, diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
+def face_fluxes(
+    radiance: Tensor | None, source_flux: Tensor | None, diffusion: Tensor, grid: Grid, axis: int, outside: Tensor | None = None
+) -> Tensor:
     """Flux F = D (-grad L0 + kappa_s Q1) along `axis` on all faces, those of the box included (E5 without its 3, and E6).
 
-    `radiance`: L0 [C, z, y, x] or None for zero; `source_flux`: the component of kappa_s Q1 along `axis`, same shape, or None.
-    Returns an array one entry longer than the cells along `axis`, positive towards higher indices.
+    `radiance`: L0 [C, z, y, x]; `source_flux`: the component of kappa_s Q1 along `axis`, same shape; `outside`: the radiance [C, 1, 1, 1]
+    that enters from outside the box, the same from everywhere; None for zero. Returns an array one entry longer than the cells along
+    `axis`, positive towards higher indices.
     """
     step = grid.spacing[axis - 1]
     interior = 2 / (1 / lower(diffusion, axis) + 1 / upper(diffusion, axis))
@@ -109,6 +112,8 @@ def face_fluxes(radiance: Tensor | None, source_flux: Tensor | None, diffusion: 
         inside = inside + interior * 0.5 * (lower(source_flux, axis) + upper(source_flux, axis))
         outflow = escape * (step / 2) * source_flux
         low, high = low + _first(outflow, axis), high + _last(outflow, axis)
+    if outside is not None:
+        low, high = low + outside * _first(escape, axis), high - outside * _last(escape, axis)
     return torch.cat([low, inside, high], axis)
 
 

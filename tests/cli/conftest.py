@@ -1,0 +1,118 @@
+"""A small legal scene in a folder of its own, and commands run on it in this process."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner, Result
+
+from ddrecon.cli import main
+from ddrecon.io.volumes import write_field
+
+SCENE = """\
+volume:
+  bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}
+  resolution: [6, 5, 4]
+  density: 0.2
+  sigma_a: 0.5
+  sigma_s: [6, 5, 4]
+  g: 0.3
+lights:
+  - {type: directional, direction: [-1, -2, -1], irradiance: 3}
+  - {type: ambient, radiance: 0.1}
+views:
+  - {name: front, image: front.npy, camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
+  - {name: side, image: side.npy, split: test, camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
+optimize:
+  iterations: 4
+  parameters: {density: {init: 0}}
+"""
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture(autouse=True)
+def surroundings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What commands change in their process is put back; Ctrl-C works even where the tests run in the background."""
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+    yield
+    signal.signal(signal.SIGINT, handler)
+    torch.set_num_threads(threads)
+    torch.set_rng_state(state)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with scene.yaml, its images front.npy and side.npy, and density.npz."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(SCENE)
+    y, x = np.mgrid[-1:1:6j, -1:1:8j]
+    picture = np.maximum(0.5 - x**2 - y**2, 0.1)[..., None] * [1.0, 0.8, 0.6]
+    for name in ("front", "side"):
+        np.save(f"{name}.npy", picture.astype(np.float32))
+    values = np.random.default_rng(0).random((4, 5, 6))
+    write_field(Path("density.npz"), "density", values, np.array([[-0.5] * 3, [0.5] * 3]))
+    return tmp_path
+
+
+@pytest.fixture
+def run(folder: Path) -> Run:
+    """Runs a command in `folder`; a bug's exception is not swallowed."""
+
+    def run_command(*arguments: str) -> Result:
+        result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result
+
+    return run_command
+
+
+@pytest.fixture
+def succeed(run: Run) -> Run:
+    """Runs a command that must exit with 0."""
+
+    def run_well(*arguments: str) -> Result:
+        result = run(*arguments)
+        assert result.exit_code == 0, result.stderr
+        return result
+
+    return run_well
+
+
+@pytest.fixture
+def refuse(run: Run, folder: Path) -> Callable[..., list[str]]:
+    """Runs a command that must exit with `code`, print nothing and leave every file as it was; the lines on stderr."""
+
+    def run_badly(code: int, *arguments: str) -> list[str]:
+        before = contents(folder)
+        result = run(*arguments)
+        assert (result.exit_code, result.stdout) == (code, ""), result.output
+        assert contents(folder) == before
+        return [line.replace(f"{folder}/", "") for line in result.stderr.splitlines()]
+
+    return run_badly
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """Every file and folder below `folder`, by path."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def density_of() -> Callable[[str], np.ndarray]:
+    """The density in the folder of a run."""
+
+    def read(run_folder: str) -> np.ndarray:
+        with np.load(Path(run_folder) / "volumes" / "density.npz", allow_pickle=False) as archive:
+            return archive["density"]
+
+    return read

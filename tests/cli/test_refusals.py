@@ -1,0 +1,226 @@
+"""What a user can get wrong: one line a problem, the exit code of its kind, and nothing written."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+Refuse = Callable[..., list[str]]
+
+COMMANDS = {
+    "render": ["render", "scene.yaml", "-o", "out"],
+    "optimize": ["optimize", "scene.yaml", "-o", "out"],
+    "gradcheck": ["gradcheck", "scene.yaml"],
+    "check": ["check", "scene.yaml"],
+}
+AN_OUTPUT = ["render", "optimize"]
+
+EDITS = {
+    "wrong key": ("sigma_s:", "sigma_S:", ["7: volume.sigma_S: unknown key; did you mean 'sigma_s'?", "7: volume: missing key 'sigma_s'"]),
+    "wrong type": ("g: 0.3", "g: soon", ["8:6: volume.g: expected a number, found 'soon'"]),
+    "out of range": ("g: 0.3", "g: 2", ["8:6: volume.g: must be below 1, found 2"]),
+    "repeated key": ("g: 0.3", "g: 0.3\n  g: 0.2", ["9:3: volume.g: repeated key; it is already at scene.yaml:8:3"]),
+    "broken YAML": ("[6, 5, 4]", "[6, 5, 4", ["not YAML"]),
+    "missing image": ("front.npy", "gone.npy", ["views.0.image: gone.npy does not exist"]),
+    "missing volume": ("density: 0.2", "density: {file: gone.npz}", ["5:20: volume.density.file: gone.npz does not exist"]),
+    "blind camera": ("target: [0, 0, 0]", "target: [0, 9, 2.5]", ["views.0.camera: no pixel of view 'front' looks through the volume"]),
+    "size of an image": ("[8, 6]", "[8, 8]", ["views.0.image: is 8 x 6 pixels, but the camera has 8 x 8"]),
+    "size of a field": (
+        "resolution: [6, 5, 4]\n  density: 0.2",
+        "resolution: [4, 5, 6]\n  density: {file: density.npz}",
+        ["volume.density.file: has 6 x 5 x 4 cells in x, y, z, but volume.resolution has 4 x 5 x 6"],
+    ),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("edit", EDITS)
+def test_a_wrong_scene_is_refused_by_every_command(refuse: Refuse, command: str, edit: str) -> None:
+    scene, (right, wrong, expected) = Path("scene.yaml"), EDITS[edit]
+    text = scene.read_text()
+    scene.write_text(text.replace(right, wrong, 1))
+    assert scene.read_text() != text
+    lines = refuse(2, *COMMANDS[command])
+    assert len(lines) == len(expected)
+    assert all(line.startswith("scene.yaml:") for line in lines)
+    for part in expected:
+        assert any(part in line for line in lines), lines
+
+
+def test_everything_wrong_is_told_at_once(refuse: Refuse) -> None:
+    wrong = ["volume.g=2", "views.0.split=trian", "optimize.iterations=0", "lights.0.irradiance=bright"]
+    lines = refuse(2, *COMMANDS["render"], *(word for text in wrong for word in ("-D", text)))
+    assert sorted(line.split(":")[0] for line in lines) == sorted(f"-D {text}" for text in wrong)
+
+
+def test_every_missing_file_is_told_at_once(refuse: Refuse) -> None:
+    wrong = ["volume.density={file: gone.npz}", "views.0.image=gone.npy", "views.1.camera.target=[9, 9, 9]"]
+    lines = refuse(2, *COMMANDS["render"], "-D", wrong[0], "-D", wrong[1])
+    assert len(lines) == 2 and "gone.npz does not exist" in lines[0] and "gone.npy does not exist" in lines[1]
+
+
+@pytest.mark.xfail(strict=True, reason="the first FormatError hides every other problem")
+def test_unreadable_files_are_told_at_once(refuse: Refuse) -> None:
+    for name in ("one.npy", "two.npy"):
+        Path(name).write_bytes(b"no picture")
+    lines = refuse(3, *COMMANDS["render"], "-D", "views.0.image=one.npy", "-D", "views.1.image=two.npy")
+    assert [line.split(":")[0] for line in lines] == ["one.npy", "two.npy"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(("scene", "what"), [("gone.yaml", "No such file or directory"), (".", "Is a directory")])
+def test_no_scene(refuse: Refuse, command: str, scene: str, what: str) -> None:
+    assert refuse(2, *(scene if word == "scene.yaml" else word for word in COMMANDS[command])) == [f"{scene}: cannot be read: {what}"]
+
+
+@pytest.mark.parametrize(
+    ("override", "what"),
+    [
+        ("volume.g", "-D volume.g: expected key.path=value"),
+        ("=3", "-D =3: expected key.path=value"),
+        ("volume.gg=0", "-D volume.gg=0: volume.gg: unknown key"),
+        ("volume.g=[0", "-D volume.g=[0: not YAML"),
+        ("views.7.name=a", "-D views.7.name=a: views.7: no such entry"),
+        ("volume.g.x=1", "-D volume.g.x=1: volume.g.x: volume.g is 0.3"),
+    ],
+)
+def test_bad_override(refuse: Refuse, override: str, what: str) -> None:
+    (line,) = refuse(2, *COMMANDS["check"], "-D", override)
+    assert line.startswith(what)
+
+
+def spoil_image(name: str) -> None:
+    pixels = np.load("front.npy")
+    pixels[3, 4, 1] = np.nan
+    if name.endswith(".exr"):
+        exr = pytest.importorskip("OpenEXR")
+        exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"RGB": pixels}).write(name)
+    else:
+        np.save(name, pixels)
+
+
+@pytest.mark.parametrize("name", ["nan.npy", "nan.exr"])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_image_with_nan(refuse: Refuse, command: str, name: str) -> None:
+    spoil_image(name)
+    (line,) = refuse(3, *COMMANDS[command], "-D", f"views.0.image={name}")
+    assert line.startswith(f"{name}: NaN at row 3, column 4")
+
+
+def cut(name: str, source: str) -> None:
+    data = Path(source).read_bytes()
+    Path(name).write_bytes(data[: len(data) // 2])
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    ("source", "override"), [("density.npz", "volume.density={{file: {}}}"), ("front.npy", "views.0.image={}"), ("front.npy", "views.0.mask={}")]
+)
+def test_a_damaged_file(refuse: Refuse, command: str, source: str, override: str) -> None:
+    name = f"cut_{source}"
+    cut(name, source)
+    (line,) = refuse(3, *COMMANDS[command], "-D", override.format(name))
+    assert line.startswith(f"{name}: ")
+
+
+@pytest.mark.parametrize("command", AN_OUTPUT)
+def test_a_folder_with_something_in_it(refuse: Refuse, command: str) -> None:
+    Path("out").mkdir()
+    Path("out/notes.txt").write_text("mine")
+    (line,) = refuse(2, *COMMANDS[command])
+    assert line == "out: the folder is not empty; choose another, or say --overwrite"
+
+
+@pytest.mark.parametrize("command", AN_OUTPUT)
+def test_a_file_for_a_folder(refuse: Refuse, command: str) -> None:
+    Path("out").write_text("mine")
+    assert refuse(2, *COMMANDS[command]) == ["out: is a file; name a folder for the output"]
+    assert refuse(2, *COMMANDS[command], "--overwrite") == ["out: is a file; name a folder for the output"]
+
+
+def test_unknown_view(refuse: Refuse) -> None:
+    assert refuse(2, *COMMANDS["render"], "--view", "back") == ["--view back: no such view; the views are front, side"]
+
+
+def test_unknown_parameter(refuse: Refuse) -> None:
+    assert refuse(2, *COMMANDS["gradcheck"], "--parameter", "depth") == ["--parameter depth: cannot be checked; known: density"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is here")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_cuda(refuse: Refuse, command: str) -> None:
+    (line,) = refuse(2, *COMMANDS[command], "--device", "cuda")
+    assert line.startswith("--device cuda: ")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["optimize", "scene.yaml"],
+        ["render", "-o", "out"],
+        ["optimize", "scene.yaml", "-o", "out", "--iterations", "0"],
+        ["render", "scene.yaml", "-o", "out", "--threads", "0"],
+        ["check", "scene.yaml", "--dtype", "float16"],
+        ["paint", "scene.yaml"],
+        ["check", "scene.yaml", "--colour"],
+    ],
+)
+def test_usage(refuse: Refuse, arguments: list[str]) -> None:
+    assert refuse(2, *arguments)[-1].startswith("Error: ")
+
+
+def test_nothing_to_optimize(refuse: Refuse) -> None:
+    scene = Path("scene.yaml")
+    scene.write_text(scene.read_text().partition("optimize:")[0])
+    (line,) = refuse(2, *COMMANDS["optimize"])
+    assert "optimize: missing section" in line
+
+
+def test_nothing_to_optimize_from(refuse: Refuse) -> None:
+    (line,) = refuse(2, *COMMANDS["optimize"], "-D", "views.0.split=test")
+    assert "none has split: train and an image" in line
+
+
+def test_resume_without_a_folder(refuse: Refuse) -> None:
+    assert refuse(2, *COMMANDS["optimize"], "--resume") == ["out: there is nothing to resume; run without --resume"]
+
+
+@pytest.mark.xfail(strict=True, reason="leaves empty volumes/, previews/ and checkpoints/ behind")
+def test_resume_without_a_checkpoint(refuse: Refuse) -> None:
+    Path("out").mkdir()
+    Path("out/notes.txt").write_text("mine")
+    (line,) = refuse(2, *COMMANDS["optimize"], "--resume")
+    assert line.startswith("out/checkpoints/last.pt: there is no checkpoint to resume from")
+
+
+def test_resume_of_another_scene(refuse: Refuse, succeed: Callable[..., object]) -> None:
+    succeed(*COMMANDS["optimize"], "--iterations", "1")
+    (line,) = refuse(2, *COMMANDS["optimize"], "--resume", "-D", "volume.g=0.1")
+    assert "belongs to another scene" in line and "0.3" in line and "0.1" in line
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "gone"])
+def test_resume_from_a_damaged_checkpoint(refuse: Refuse, succeed: Callable[..., object], damage: str) -> None:
+    succeed(*COMMANDS["optimize"], "--iterations", "1")
+    path = Path("out/checkpoints/last.pt")
+    if damage == "cut":
+        cut(str(path), str(path))
+    elif damage == "text":
+        path.write_text("no checkpoint")
+    else:
+        shutil.rmtree(path.parent)
+        path.parent.mkdir()
+    (line,) = refuse(2 if damage == "gone" else 3, *COMMANDS["optimize"], "--resume")
+    assert line.startswith(f"{path}: ")
+
+
+def test_debug_shows_where_an_error_comes_from(run: Callable[..., object]) -> None:
+    from ddrecon.errors import SceneError
+
+    with pytest.raises(SceneError, match="must be below 1"):
+        run(*COMMANDS["check"], "--debug", "-D", "volume.g=2")
