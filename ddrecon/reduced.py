@@ -109,7 +109,7 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, 
     step = grid.spacing[axis] / direction[axis].abs()
     sheared = _shear(slices, slope)
     before = (sheared.cumsum(0) - sheared) * step
-    entered = _unshear(before, slope, slices.shape[2:])
+    entered = _unshear(before, slope, (slices.shape[2], slices.shape[3]))
     if is_reversed:
         entered = entered.flip(0)
     return entered.permute([order.index(dim) for dim in range(4)]), step
@@ -117,29 +117,30 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, 
 
 def _shear(slices: Tensor, slope: Tensor) -> Tensor:
     """Slice k of `slices` [N, K, H, W] shifted by -k `slope` cells, on a lattice wide enough to hold every slice."""
-    count, _, height, width = slices.shape
-    reach = [math.ceil(abs(s) * (count - 1) - 1e-9) for s in slope.tolist()]
-    lattice = (height + reach[0], width + reach[1])
-    points = _lattice_points(slices, lattice, slope, (height, width), sign=1)
-    return sample_slices(slices, points, "zeros").unflatten(-1, lattice)
+    height, width = slices.shape[2:]
+    rows, columns = (abs(base) for base in _bases(slices, slope))
+    lattice = (height + rows, width + columns)
+    return sample_slices(slices, _lattice_points(slices, lattice, slope, (height, width), 1), "zeros").unflatten(-1, lattice)
 
 
-def _unshear(sheared: Tensor, slope: Tensor, size: torch.Size) -> Tensor:
+def _unshear(sheared: Tensor, slope: Tensor, size: tuple[int, int]) -> Tensor:
     """The inverse of `_shear`, back on slices of `size` cells."""
-    points = _lattice_points(sheared, (size[0], size[1]), slope, sheared.shape[2:], sign=-1)
-    return sample_slices(sheared, points, "border").unflatten(-1, (size[0], size[1]))
+    height, width = sheared.shape[2:]
+    return sample_slices(sheared, _lattice_points(sheared, size, slope, (height, width), -1), "border").unflatten(-1, size)
 
 
-def _lattice_points(like: Tensor, lattice: tuple[int, int], slope: Tensor, source: tuple[int, ...] | torch.Size, sign: int) -> Tensor:
-    """Where the points of `lattice` fall, slice by slice, in slices of `source` cells shifted by k `slope`, in [-1, 1]."""
-    count = like.shape[0]
-    index = torch.arange(count, dtype=like.dtype, device=like.device)
+def _bases(slices: Tensor, slope: Tensor) -> list[int]:
+    """Cells by which slices drift in all, along rows and columns, with the sign of `slope`; the first slice does not drift."""
+    return [int(math.copysign(math.ceil(abs(s) * (slices.shape[0] - 1) - 1e-9), s)) for s in slope.tolist()]
+
+
+def _lattice_points(slices: Tensor, lattice: tuple[int, int], slope: Tensor, source: tuple[int, int], sign: int) -> Tensor:
+    """Where the points of `lattice` fall, slice by slice, in slices of `source` cells: shifted by `sign` k `slope`, in [-1, 1]."""
+    index = torch.arange(slices.shape[0], dtype=slices.dtype, device=slices.device)
     lines = []
-    for cells, shift, size in zip(lattice, slope, source, strict=True):
-        base = torch.clamp(shift, min=0) * (count - 1)
-        offset = sign * (index * shift - base)
-        position = offset[:, None] + torch.arange(cells, dtype=like.dtype, device=like.device)
+    for cells, shift, base, size in zip(lattice, slope, _bases(slices, slope), source, strict=True):
+        drift = sign * (index * shift - max(base, 0))
+        position = drift[:, None] + torch.arange(cells, dtype=slices.dtype, device=slices.device)
         lines.append((2 * position + 1) / size - 1)
     rows, columns = lines
-    grid = torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1)
-    return grid.flatten(1, 2)
+    return torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1).flatten(1, 2)

@@ -222,7 +222,7 @@ class ParameterSettings:
     lr: float | None = optional(above=0)
     min: float = bounded(0.0, minimum=0)
     max: float | None = None
-    tv: float = bounded(1e-4, minimum=0)
+    tv: float = bounded(3e-3, minimum=0)
 
     def problems(self) -> Iterator[Problem]:
         if self.max is not None and self.max <= self.min:

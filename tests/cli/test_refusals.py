@@ -21,14 +21,14 @@ COMMANDS = {
 AN_OUTPUT = ["render", "optimize"]
 
 EDITS = {
-    "wrong key": ("sigma_s:", "sigma_S:", ["7: volume.sigma_S: unknown key; did you mean 'sigma_s'?", "7: volume: missing key 'sigma_s'"]),
-    "wrong type": ("g: 0.3", "g: soon", ["8:6: volume.g: expected a number, found 'soon'"]),
-    "out of range": ("g: 0.3", "g: 2", ["8:6: volume.g: must be below 1, found 2"]),
-    "repeated key": ("g: 0.3", "g: 0.3\n  g: 0.2", ["9:3: volume.g: repeated key; it is already at scene.yaml:8:3"]),
+    "wrong key": ("sigma_s:", "sigma_S:", ["6:3: volume.sigma_S: unknown key; did you mean 'sigma_s'?", "missing key 'sigma_s'"]),
+    "wrong type": ("g: 0.3", "g: soon", ["7:6: volume.g: expected a number, found 'soon'"]),
+    "out of range": ("g: 0.3", "g: 2", ["7:6: volume.g: must be below 1, found 2"]),
+    "repeated key": ("g: 0.3", "g: 0.3\n  g: 0.2", ["8:3: volume.g: repeated key; it is already at scene.yaml:7:3"]),
     "broken YAML": ("[6, 5, 4]", "[6, 5, 4", ["not YAML"]),
     "missing image": ("front.npy", "gone.npy", ["views.0.image: gone.npy does not exist"]),
-    "missing volume": ("density: 0.2", "density: {file: gone.npz}", ["5:20: volume.density.file: gone.npz does not exist"]),
-    "blind camera": ("target: [0, 0, 0]", "target: [0, 9, 2.5]", ["views.0.camera: no pixel of view 'front' looks through the volume"]),
+    "missing volume": ("density: 0.2", "density: {file: gone.npz}", ["4:19: volume.density.file: gone.npz does not exist"]),
+    "blind camera": ("target: [0, 0, 0]", "target: [9, 0, 2.5]", ["views.0.camera: no pixel of view 'front' looks through the volume"]),
     "size of an image": ("[8, 6]", "[8, 8]", ["views.0.image: is 8 x 6 pixels, but the camera has 8 x 8"]),
     "size of a field": (
         "resolution: [6, 5, 4]\n  density: 0.2",
@@ -59,8 +59,7 @@ def test_everything_wrong_is_told_at_once(refuse: Refuse) -> None:
 
 
 def test_every_missing_file_is_told_at_once(refuse: Refuse) -> None:
-    wrong = ["volume.density={file: gone.npz}", "views.0.image=gone.npy", "views.1.camera.target=[9, 9, 9]"]
-    lines = refuse(2, *COMMANDS["render"], "-D", wrong[0], "-D", wrong[1])
+    lines = refuse(2, *COMMANDS["render"], "-D", "volume.density={file: gone.npz}", "-D", "views.0.image=gone.npy")
     assert len(lines) == 2 and "gone.npz does not exist" in lines[0] and "gone.npy does not exist" in lines[1]
 
 
@@ -119,7 +118,8 @@ def cut(name: str, source: str) -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize(
-    ("source", "override"), [("density.npz", "volume.density={{file: {}}}"), ("front.npy", "views.0.image={}"), ("front.npy", "views.0.mask={}")]
+    ("source", "override"),
+    [("density.npz", "volume.density={{file: {}}}"), ("front.npy", "views.0.image={}"), ("front.npy", "views.0.mask={}")],
 )
 def test_a_damaged_file(refuse: Refuse, command: str, source: str, override: str) -> None:
     name = f"cut_{source}"

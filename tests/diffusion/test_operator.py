@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, boundary_loss, conductances, difference, face_fluxes
+from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.grid import Grid
 
 SHAPES = [(4, 3, 5), (1, 4, 3), (3, 1, 4), (4, 3, 1), (1, 1, 5), (1, 1, 1)]
@@ -99,12 +100,12 @@ def test_energy_is_kept(
     outside = torch.tensor([0.7, 1.3], dtype=torch.float64).view(2, 1, 1, 1) if has_outside else None
     source = injected + boundary_loss(diffusion, grid) * outside if has_outside else injected
     for axis in AXES:
-        faces = face_fluxes(None, source_flux[axis - 1], None, diffusion, grid, axis)
+        faces = face_fluxes(None, source_flux[axis - 1], diffusion, grid, axis)
         source = source - faces.diff(dim=axis) / grid.spacing[axis - 1]
     u = torch.linalg.solve(dense(operator), source.flatten(1)).view_as(source)
     volume, leaked = math.prod(grid.spacing), torch.zeros(2, dtype=torch.float64)
     for axis, step in zip(AXES, grid.spacing, strict=True):
-        faces = face_fluxes(u, source_flux[axis - 1], outside, diffusion, grid, axis).movedim(axis, 0)
+        faces = face_fluxes(u, source_flux[axis - 1], diffusion, grid, axis, outside).movedim(axis, 0)
         leaked += (faces[-1] - faces[0]).sum((1, 2)) * volume / step
     absorbed = inner(absorption, u) * volume
     torch.testing.assert_close(absorbed + leaked, injected.sum((1, 2, 3)) * volume, rtol=1e-10, atol=0)
@@ -113,12 +114,12 @@ def test_energy_is_kept(
 def test_light_that_is_the_same_outside_and_inside_does_not_flow(grid: Grid, diffusion: Tensor):
     radiance = torch.tensor([0.7, 1.3], dtype=torch.float64).view(2, 1, 1, 1)
     for axis in AXES:
-        assert not face_fluxes(radiance.expand_as(diffusion), None, radiance, diffusion, grid, axis).any()
+        assert not face_fluxes(radiance.expand_as(diffusion), None, diffusion, grid, axis, radiance).any()
 
 
 def test_the_divergence_of_the_fluxes_is_the_operator(grid: Grid, diffusion: Tensor, absorption: Tensor, operator: Operator, random):
     u = random(2, *grid.shape, seed=5)
-    divergence = sum(face_fluxes(u, None, None, diffusion, grid, axis).diff(dim=axis) / grid.spacing[axis - 1] for axis in AXES)
+    divergence = sum(face_fluxes(u, None, diffusion, grid, axis).diff(dim=axis) / grid.spacing[axis - 1] for axis in AXES)
     torch.testing.assert_close(divergence + absorption * u, operator.apply(u), rtol=1e-12, atol=1e-12)
 
 
@@ -157,8 +158,6 @@ def discrete_error(cells: int, make_operator, solve) -> float:
 
 
 def test_a_manufactured_solution_is_approached_at_second_order(make_operator, order):
-    from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
-
     counts = [8, 16, 32]
     errors = [discrete_error(cells, make_operator, lambda op, s: conjugate_gradient(op, s, None, 1e-11).value) for cells in counts]
     assert order([1 / cells for cells in counts], errors) >= 1.9, errors
@@ -173,7 +172,7 @@ def test_the_source_flux_of_a_slab_is_exact(order, make_operator, dense):
     length, flux, coefficient = 2.0, 0.7, 0.3
     grid = Grid((9, 1, 1), (0.0, 0.0, 0.0), (length, 1e9, 1e9))
     diffusion = torch.full((1, *grid.shape), coefficient, dtype=torch.float64)
-    faces = face_fluxes(None, torch.full_like(diffusion, flux), None, diffusion, grid, 1)
+    faces = face_fluxes(None, torch.full_like(diffusion, flux), diffusion, grid, 1)
     operator = make_operator(grid, diffusion, torch.zeros_like(diffusion))
     u = torch.linalg.solve(dense(operator)[0], -(faces.diff(dim=1) / grid.spacing[0]).flatten())
     slope = flux / (1 + length / 4 / coefficient)
