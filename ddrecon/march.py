@@ -1,4 +1,4 @@
-"""View rays: the integral of what the medium sends towards the camera (THEORY E1-E3).
+"""View rays: the integral of what the medium sends towards the camera (docs/theory.md E1-E3).
 
 Rays are marched slice by slice along the axis the view looks along, with two-dimensional interpolation in each slice; where
 that is not possible (a camera inside the box, rays nearly along a slice) by three-dimensional interpolation at equal steps.
@@ -43,6 +43,11 @@ class Emission:
     diffuse: Tensor
     g: Tensor
 
+    @property
+    def colors(self) -> int:
+        """How many colors leave: 3 as soon as medium or any light has 3."""
+        return max(self.diffuse.shape[0], self.extinction.scale.shape[0], *(beam.irradiance.shape[0] for beam in self.beams), 1)
+
 
 @dataclass(frozen=True)
 class Crossing:
@@ -56,8 +61,7 @@ class Crossing:
 def march(emission: Emission, rays: Rays, steps_per_voxel: int) -> tuple[Tensor, Tensor]:
     """Radiance [C, R] scattered towards the camera along `rays`, and transmittance [C, R] of the whole volume along them."""
     crossing = cross_box(emission.grid, rays)
-    colors = emission.diffuse.shape[0]
-    blank = emission.diffuse.new_zeros(colors, rays.direction.shape[0])
+    blank = emission.diffuse.new_zeros(emission.colors, rays.direction.shape[0])
     if crossing.hit.numel() == 0:
         return blank, blank + 1
     sampler = _sampler(emission, rays, crossing, steps_per_voxel)
@@ -131,7 +135,7 @@ class _Equidistant:
 
 def _sampler(emission: Emission, rays: Rays, crossing: Crossing, steps: int) -> _Slices | _Equidistant:
     """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps."""
-    fields = _stacked(emission)
+    fields = torch.cat(_fields(emission))
     direction = rays.direction[crossing.hit]
     axis = int(direction.abs().mean(0).argmax())
     along = direction[:, axis]
@@ -150,24 +154,20 @@ def _subdivided(values: Tensor, steps: int) -> Tensor:
     return torch.cat([between, values[-1:]])
 
 
-def _stacked(emission: Emission) -> Tensor:
-    """The fields to interpolate, `[channels, z, y, x]`; scattering only where it is not the extinction's field again."""
+def _fields(emission: Emission) -> list[Tensor]:
+    """The fields to interpolate, each `[channels, z, y, x]`; scattering only where it is not the extinction's field again."""
     fields = [emission.extinction.field, emission.diffuse, *(beam.mass for beam in emission.beams)]
     if emission.scattering.field is not emission.extinction.field:
         fields.append(emission.scattering.field)
-    return torch.cat(fields)
+    return fields
 
 
 def _integrate(emission: Emission, values: Tensor, lengths: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Scattered radiance and transmittance, each [C, R], from node `values` [N, channels, R] and segment `lengths` [N - 1, 1, R]."""
-    fields, colors = emission.extinction.field.shape[0], emission.diffuse.shape[0]
-    extinction, diffuse, *masses = values[:, : fields * (1 + len(emission.beams)) + colors].split(
-        [fields, colors] + [fields] * len(emission.beams), 1
-    )
-    scattering = (
-        values[:, -emission.scattering.field.shape[0] :] if emission.scattering.field is not emission.extinction.field else extinction
-    )
-    scale = emission.extinction.scale.view(-1, 1).expand(colors, 1)
+    sizes = [field.shape[0] for field in _fields(emission)]
+    extinction, diffuse, *others = values.split(sizes, 1)
+    masses, scattering = others[: len(emission.beams)], (others[len(emission.beams) :] or [extinction])[0]
+    scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     mass = 0.5 * (extinction[:-1] + extinction[1:]) * lengths
     end = mass.cumsum(0)
     begin = end - mass

@@ -1,6 +1,6 @@
 """The Henyey-Greenstein phase function and the delta-Eddington scaling of its forward peak.
 
-Phase functions are normalized to 4 pi over the sphere, as in THEORY E2.
+Phase functions are normalized to 4 pi over the sphere, as in docs/theory.md E2.
 """
 
 from __future__ import annotations

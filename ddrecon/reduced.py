@@ -1,4 +1,4 @@
-"""Light not yet scattered: how much of it reaches each cell, and its moments Q0 and Q1 (THEORY section 1).
+"""Light not yet scattered: how much of it reaches each cell, and its moments Q0 and Q1 (docs/theory.md section 1).
 
 A beam is followed by three vectorized operations on slices: shear the grid until the light runs along an axis, sum cumulatively
 along that axis, shear back. Density and optical depth are interpolated, never their exponentials.

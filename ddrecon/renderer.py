@@ -67,10 +67,10 @@ def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> lis
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
-    """The light inside the volume of `scene`: E4 and E5 on top of the reduced light."""
+    """The light inside the volume of `scene`: E4 and E5 on top of the reduced light, or that alone where nothing scatters twice."""
     medium = scaled_medium(scene.volume)
     if not multiply_scatters(medium, scene.diffusion):
-        return unscattered_light(medium, scene.lights)
+        return unscattered_light(unscaled_medium(scene.volume), scene.lights)
     reduced = reduced_light(medium, scene.lights, has_flux(medium))
     diffuse = solve_diffuse(medium, reduced.source, ambient_radiance(scene.lights, medium.g), scene.diffusion, memory)
     return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse))

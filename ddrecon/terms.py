@@ -22,7 +22,7 @@ def needed_terms(scene: Scene) -> list[str]:
         terms.append(f"transmittance towards {beams} directional light{'s' if beams > 1 else ''}")
     if any(isinstance(light, AmbientLight) for light in scene.lights):
         terms.append(_ambient_term(multiply_scatters(medium, scene.diffusion)))
-    if bool(medium.g > 0):
+    if multiply_scatters(medium, scene.diffusion) and bool(medium.g > 0):
         terms.append("delta-Eddington scaling of the forward peak (g > 0)")
     if multiply_scatters(medium, scene.diffusion):
         terms.append(

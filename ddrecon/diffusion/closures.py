@@ -14,7 +14,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 
 FLOOR = 3.3
-"""Optical thickness, across the box's shortest side, of the medium that empty space is given (THEORY section 5)."""
+"""Optical thickness, across the box's shortest side, of the medium that empty space is given (docs/theory.md section 5)."""
 
 
 def smooth(transport_extinction: Tensor, grid: Grid) -> Tensor:

@@ -1,4 +1,4 @@
-"""Derivatives of a diffusion solve: the tangent (THEORY E8) and the adjoint (E9) of the discrete system, both by hand.
+"""Derivatives of a diffusion solve: the tangent (docs/theory.md E8) and the adjoint (E9) of the discrete system, both by hand.
 
 With A u = S and A symmetric, differentiating gives A du = dS - dA u for a tangent; for a cotangent u_bar one solve A lambda = u_bar
 serves all parameters: S_bar = lambda and A_bar = -lambda u^T, of which only the entries A depends on are needed.

@@ -1,4 +1,4 @@
-"""The conservative diffusion operator A = G^T c G + loss (THEORY E7) on cell-centered arrays `[C, z, y, x]`.
+"""The conservative diffusion operator A = G^T c G + loss (docs/theory.md E7) on cell-centered arrays `[C, z, y, x]`.
 
 G is the difference of neighboring cells across each interior face, c the conductance of that face; `loss` is what a cell gives up
 to absorption and through the faces of the box. Every flux that leaves a cell enters its neighbor, so energy is kept to rounding.
