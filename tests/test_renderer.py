@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -110,6 +111,39 @@ def test_a_white_furnace_is_white(thickness: float, g: float, make_scene, make_c
     assert bool(is_miss.any()) and bool((image[:, is_miss] == 1).all())
     error = float((image - 1).abs().max())
     assert error < 1e-10 and (thickness > 0 or error == 0), f"white furnace: {error:.1e} at optical thickness {thickness}, g = {g}"
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
+def test_a_white_furnace_is_white_where_the_medium_touches_its_box(g: float, make_scene, half_empty):
+    scene = make_scene(half_empty(*SHAPE), sigma_a=(0.0,), sigma_s=(6.0,), g=g, directional=None, ambient=(1.0,))
+    image = render(scene)
+    torch.testing.assert_close(image, torch.ones_like(image), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("g", [0.5, 0.9, -0.5])
+def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float, make_scene, random):
+    """The beam's power plus the flux of diffuse light, 4 pi / 3 L1, is the same at every depth of a wide slab.
+
+    `outgoing` holds (1 - f) g' L1, which is g (1 - g) L1 with a forward peak and g L1 without.
+    """
+    grid, sigma = Grid((8, 1, 1), (0.0, 0.0, 0.0), (1.0, 1e9, 1e9)), 3.0
+    scene = make_scene(random(*grid.shape), grid=grid, sigma_a=(0.0,), sigma_s=(sigma,), g=g, directional=(2.0,), travel=(0.0, 0.0, 1.0))
+    flux = solve_light(scene, SolveMemory()).outgoing.flux[0].flatten() / (g * (1 - max(g, 0.0)))
+    depth = (1 - max(g, 0.0) ** 2) * sigma * grid.spacing[0] * scene.volume.density.flatten().cumsum(0)
+    beam = 2.0 * torch.exp(-torch.cat([torch.zeros(1, dtype=torch.float64), depth]))
+    power = (beam[1:] + beam[:-1]) / 2 + 4 * math.pi / 3 * flux
+    torch.testing.assert_close(power, power.mean().expand_as(power), rtol=1e-8, atol=0)
+    assert 0 < power.mean() < 2
+
+
+@pytest.mark.parametrize("g", [0.6, -0.6])
+def test_a_parallel_camera_is_a_perspective_one_from_afar(g: float, make_scene, make_camera, half_empty):
+    far = 1e4
+    images = []
+    for half_width, is_perspective in ((0.5, False), (0.5 / far, True)):
+        camera = make_camera(eye=(0.0, 0.6 * far, 0.8 * far), half_width=half_width, is_perspective=is_perspective)
+        images.append(render(make_scene(half_empty(*SHAPE), g=g, camera=camera)))
+    torch.testing.assert_close(images[0], images[1], rtol=10 / far, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])

@@ -1,0 +1,68 @@
+"""`ddrecon check` says what a scene is and what physics it needs, and writes nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from conftest import contents
+
+Run = Callable[..., Result]
+
+
+def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
+    before = contents(folder)
+    lines = succeed("check", "scene.yaml").stdout.splitlines()
+    assert lines[0].startswith("grid: 6 x 5 x 4 cells of 0.1667 x 0.2 x 0.25")
+    assert "  front: perspective, 8 x 6 pixels, train, with image" in lines
+    assert "  side: perspective, 8 x 6 pixels, test, with image" in lines
+    assert {"views: 2", "physics:", "optimizes: density"} <= set(lines)
+    assert lines[-1].startswith("memory: about ") and "MiB" in lines[-1]
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("override", "present", "absent"),
+    [
+        ("volume.g=0.3", "fluxes Q1 and L1 (g is not 0)", "no fluxes"),
+        ("volume.g=0", "no fluxes Q1 and L1 (g = 0)", "delta-Eddington"),
+        ("diffusion.model=none", "no multiple scattering", "p1 diffusion"),
+        ("volume.sigma_s=0", "no multiple scattering", "p1 diffusion"),
+        ("lights=[{type: ambient, radiance: 1}]", "ambient light", "directional"),
+        ("lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]", "1 directional light", "ambient"),
+        ("volume.sigma_s=2", "1 color channel", "3 color channels"),
+        ("volume.sigma_s=[2, 3, 4]", "3 color channels", "1 color channel"),
+    ],
+)
+def test_only_the_physics_a_scene_needs(succeed: Run, override: str, present: str, absent: str) -> None:
+    physics = "\n".join(json.loads(succeed("check", "scene.yaml", "--json", "-D", override).stdout)["physics"])
+    assert present in physics and absent not in physics
+
+
+def test_json(succeed: Run) -> None:
+    report = json.loads(succeed("check", "scene.yaml", "--json").stdout)
+    assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
+    assert [(view["name"], view["width"], view["height"], view["split"]) for view in report["views"]] == [
+        ("front", 8, 6, "train"),
+        ("side", 8, 6, "test"),
+    ]
+    assert report["optimizes"] == ["density"] and report["memory_bytes"] > 0
+
+
+def test_memory_grows_with_cells_and_precision(succeed: Run) -> None:
+    def memory(*arguments: str) -> int:
+        return json.loads(succeed("check", "scene.yaml", "--json", *arguments).stdout)["memory_bytes"]
+
+    once = memory()
+    assert memory("-D", "volume.resolution=[12, 10, 8]") == 8 * once
+    assert memory("--dtype", "float64") == 2 * once
+
+
+def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
+    scene = Path("scene.yaml")
+    scene.write_text(scene.read_text().partition("optimize:")[0].replace("image: front.npy, ", "").replace("image: side.npy, ", ""))
+    lines = succeed("check", "scene.yaml").stdout.splitlines()
+    assert "optimizes: nothing" in lines and "  front: perspective, 8 x 6 pixels, train" in lines

@@ -1,0 +1,132 @@
+"""What `ddrecon optimize` writes, and that what it writes can be used again."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import Result
+from conftest import contents
+
+Run = Callable[..., Result]
+DensityOf = Callable[[str], np.ndarray]
+OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o"]
+COLUMNS = ["iteration", "seconds", "loss", "psnr", "test_psnr", "forward_iterations", "adjoint_iterations"]
+
+
+def rows(folder: str) -> list[dict[str, str]]:
+    with Path(folder, "loss.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def read_json(path: str) -> Any:
+    return json.loads(Path(path).read_text())
+
+
+def test_the_files_of_a_run(succeed: Run) -> None:
+    succeed(*OPTIMIZE, "out")
+    expected = ["scene.yaml", "environment.json", "loss.csv", "parameters.json", "summary.json", "volumes", "volumes/density.npz"]
+    expected += ["checkpoints", "checkpoints/last.pt", "previews", "previews/density.png", "previews/front.png", "previews/side.png"]
+    assert set(contents(Path("out"))) == set(expected)
+    assert read_json("out/parameters.json") == {"g": pytest.approx(0.3)}
+
+
+def test_the_log_has_a_row_an_iteration(succeed: Run) -> None:
+    succeed(*OPTIMIZE, "out")
+    log = rows("out")
+    assert list(log[0])[: len(COLUMNS)] == COLUMNS
+    assert [int(row["iteration"]) for row in log] == [1, 2, 3, 4]
+    seconds = [float(row["seconds"]) for row in log]
+    assert seconds == sorted(seconds) and seconds[0] > 0
+    assert float(log[-1]["loss"]) < float(log[0]["loss"])
+    assert int(log[-1]["forward_iterations"]) > 0 and int(log[-1]["adjoint_iterations"]) > 0
+    assert float(log[-1]["test_psnr"]) > 0
+
+
+def test_the_summary_agrees_with_the_log(succeed: Run) -> None:
+    result = succeed(*OPTIMIZE, "out", "--json")
+    summary, last = read_json("out/summary.json"), rows("out")[-1]
+    assert json.loads(result.stdout) == summary
+    assert summary["iterations"] == 4
+    for name in ("seconds", "loss", "psnr", "test_psnr"):
+        assert summary[name] == pytest.approx(float(last[name]), rel=1e-6)
+    assert {name: view["split"] for name, view in summary["views"].items()} == {"front": "train", "side": "test"}
+
+
+def test_the_volume_renders_as_the_summary_says(succeed: Run) -> None:
+    succeed(*OPTIMIZE, "out", "-D", "diffusion.tolerance=1e-6")
+    succeed("render", "out/scene.yaml", "-o", "pictures", "-q", "-D", "volume.density={file: out/volumes/density.npz}".replace("out", str(Path("out").absolute())))
+    rendered, summary = read_json("pictures/render.json")["psnr"], read_json("out/summary.json")["views"]
+    assert set(rendered) == {"front", "side"}
+    for name, quality in rendered.items():
+        assert quality == pytest.approx(summary[name]["psnr"], abs=1e-3)
+
+
+def test_the_volume_file(succeed: Run, density_of: DensityOf) -> None:
+    succeed(*OPTIMIZE, "out")
+    density = density_of("out")
+    assert (density.shape, density.dtype) == ((4, 5, 6), np.float32)
+    assert density.min() >= 0 and density.max() > 0
+    with np.load("out/volumes/density.npz", allow_pickle=False) as archive:
+        assert archive["bounds"].tolist() == [[-0.5] * 3, [0.5] * 3]
+
+
+def test_the_resolved_scene_runs_again_to_the_same_bits(succeed: Run, density_of: DensityOf) -> None:
+    succeed(*OPTIMIZE, "out", "-D", "volume.g=0.1", "--iterations", "3")
+    Path("elsewhere").mkdir()
+    scene = Path("out/scene.yaml").rename("elsewhere/scene.yaml")
+    succeed("optimize", str(scene), "-q", "-o", "again")
+    assert np.array_equal(density_of("out"), density_of("again"))
+    assert scene.read_text() == Path("again/scene.yaml").read_text()
+
+
+def test_same_command_same_bits(succeed: Run, density_of: DensityOf) -> None:
+    succeed(*OPTIMIZE, "one")
+    succeed(*OPTIMIZE, "two")
+    assert np.array_equal(density_of("one"), density_of("two"))
+    timeless = [[{key: value for key, value in row.items() if key != "seconds"} for row in rows(name)] for name in ("one", "two")]
+    assert timeless[0] == timeless[1]
+
+
+def test_the_environment(succeed: Run) -> None:
+    succeed(*OPTIMIZE, "out", "--threads", "1", "--seed", "7", "--dtype", "float64", "--device", "cpu")
+    environment = read_json("out/environment.json")
+    given = {"threads": 1, "seed": 7, "dtype": "float64", "device": "cpu", "torch": torch.__version__}
+    assert {key: environment[key] for key in given} == given
+    assert torch.get_num_threads() == 1
+
+
+def test_previews_along_the_way(succeed: Run) -> None:
+    succeed(*OPTIMIZE, "out", "--preview-every", "2")
+    names = {path.stem for path in Path("out/previews").iterdir()}
+    assert names == {f"{name}{mark}" for name in ("density", "front", "side") for mark in ("", "_000002", "_000004")}
+
+
+def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
+    succeed(*OPTIMIZE, "out", "--iterations", "2", "-D", "volume.g=0")
+    Path("out/notes.txt").write_text("mine")
+    succeed(*OPTIMIZE, "out", "--overwrite")
+    succeed(*OPTIMIZE, "fresh")
+    assert np.array_equal(density_of("out"), density_of("fresh"))
+    assert len(rows("out")) == 4 and Path("out/notes.txt").read_text() == "mine"
+
+
+def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
+    loud, quiet = run("optimize", "scene.yaml", "-o", "one"), run(*OPTIMIZE, "two")
+    assert "4/4" in loud.stderr and "PSNR" in loud.stderr and quiet.stderr == ""
+    assert "optimize:" not in loud.stdout and "4 iterations" in quiet.stdout
+
+
+def test_divergence_keeps_the_last_good_state(run: Run) -> None:
+    result = run(*OPTIMIZE, "out", "-D", "optimize.parameters.density.lr=1e37")
+    assert (result.exit_code, result.stdout) == (4, "")
+    (line,) = result.stderr.splitlines()
+    assert "not finite" in line and "lower optimize.parameters.density.lr" in line
+    state = torch.load("out/checkpoints/last.pt", weights_only=True)["state"]
+    assert torch.isfinite(state["density"]["value"]).all() and len(state["rows"]) == len(rows("out"))

@@ -1,0 +1,129 @@
+"""What `ddrecon render` writes and says."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from conftest import contents
+
+from ddrecon.io.images import read_image
+
+Run = Callable[..., Result]
+RENDER = ["render", "scene.yaml", "-o", "out", "-q"]
+
+
+def pixels(name: str) -> np.ndarray:
+    return np.load(f"out/{name}.npy", allow_pickle=False)
+
+
+def encoded(linear: np.ndarray) -> np.ndarray:
+    """8-bit sRGB, written out from IEC 61966-2-1."""
+    clipped = linear.clip(0, 1)
+    return np.round(255 * np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055))
+
+
+def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run) -> None:
+    pytest.importorskip("OpenEXR")
+    succeed(*RENDER)
+    assert set(contents(Path("out"))) == {"render.json", *(f"{name}.{end}" for name in ("front", "side") for end in ("exr", "npy", "png"))}
+    for name in ("front", "side"):
+        image = pixels(name)
+        assert (image.shape, image.dtype) == ((6, 8, 3), np.float32)
+        assert np.isfinite(image).all() and image.max() > 0
+        assert np.array_equal(read_image(Path(f"out/{name}.exr")).pixels, image)
+
+
+def test_the_preview_is_srgb(succeed: Run) -> None:
+    import imageio.v3 as iio
+
+    succeed(*RENDER)
+    preview = iio.imread("out/front.png")
+    assert preview.dtype == np.uint8
+    assert np.abs(preview - encoded(pixels("front").astype(float))).max() <= 1
+
+
+@pytest.mark.parametrize("g", [-0.4, 0, 0.6])
+def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
+    succeed(*RENDER, "--components", "-D", f"volume.g={g}")
+    for name in ("front", "side"):
+        parts = [pixels(f"{name}.{part}") for part in ("reduced", "single", "multiple")]
+        assert np.array_equal(parts[0] + parts[1] + parts[2], pixels(name))
+        assert all(part.any() for part in parts)
+        assert all(Path(f"out/{name}.{part}.png").is_file() for part in ("reduced", "single", "multiple"))
+
+
+def test_components_do_not_change_the_image(succeed: Run) -> None:
+    succeed(*RENDER)
+    alone = pixels("front")
+    succeed(*RENDER, "--overwrite", "--components")
+    np.testing.assert_allclose(pixels("front"), alone, rtol=1e-6, atol=1e-7)
+
+
+def test_the_report(succeed: Run) -> None:
+    result = succeed(*RENDER, "--json", "-D", "diffusion.tolerance=1e-5")
+    report = json.loads(Path("out/render.json").read_text())
+    assert json.loads(result.stdout) == report
+    assert {"light", "front", "side"} <= set(report["seconds"]) and min(report["seconds"].values()) >= 0
+    assert [solve["iterations"] > 0 and solve["residual"] <= 1e-5 for solve in report["solves"]] == [True]
+    named = {file for files in report["files"].values() for file in files}
+    assert named | {"render.json"} == set(contents(Path("out")))
+    target = np.load("front.npy").astype(float)
+    expected = 10 * np.log10(target.max() ** 2 / np.square(pixels("front") - target).mean())
+    assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.xfail(strict=True, reason="a view called light takes the place of the stage called light")
+def test_a_view_may_be_called_light(succeed: Run) -> None:
+    succeed(*RENDER, "-D", "views.0.name=light", "--view", "light")
+    seconds = json.loads(Path("out/render.json").read_text())["seconds"]
+    assert len(json.dumps(seconds).split(":")) > 2
+
+
+def test_one_view_of_several(succeed: Run) -> None:
+    succeed(*RENDER, "--view", "side")
+    assert not list(Path("out").glob("front*")) and Path("out/side.npy").is_file()
+
+
+def test_float_tiff_where_openexr_is_not_installed(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    result = succeed(*RENDER)
+    assert not list(Path("out").glob("*.exr"))
+    assert np.array_equal(read_image(Path("out/front.tif")).pixels, pixels("front"))
+    (line,) = [line for line in result.stdout.splitlines() if "OpenEXR" in line]
+    assert ".tif" in line and "pip install" in line
+
+
+def test_overwrite_replaces_pictures_and_nothing_else(succeed: Run) -> None:
+    succeed(*RENDER)
+    first = pixels("front")
+    Path("out/notes.txt").write_text("mine")
+    succeed(*RENDER, "--overwrite", "-D", "volume.density=1")
+    assert Path("out/notes.txt").read_text() == "mine"
+    assert not np.array_equal(pixels("front"), first)
+
+
+def test_same_command_same_bits(succeed: Run) -> None:
+    succeed(*RENDER)
+    first = pixels("front")
+    succeed(*RENDER, "--overwrite")
+    assert np.array_equal(pixels("front"), first)
+
+
+def test_double_precision_differs_by_rounding_only(succeed: Run) -> None:
+    succeed(*RENDER, "-D", "diffusion.tolerance=1e-6")
+    single = pixels("front")
+    succeed(*RENDER, "-D", "diffusion.tolerance=1e-6", "--overwrite", "--dtype", "float64")
+    assert pixels("front").dtype == np.float32
+    assert 0 < np.abs(pixels("front") - single).max() < 1e-5
+
+
+def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
+    loud, quiet = run(*RENDER[:-1]), run(*RENDER, "--overwrite")
+    assert "2/2" in loud.stderr and quiet.stderr == ""
+    assert "render:" not in loud.stdout and "written to out" in quiet.stdout

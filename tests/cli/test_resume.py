@@ -1,0 +1,140 @@
+"""Runs that stop and go on: an interrupt loses nothing, and resuming changes no bit."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import Result
+
+from ddrecon.reconstruct import loop
+from ddrecon.reconstruct.parameters import Parameter
+
+Run = Callable[..., Result]
+DensityOf = Callable[[str], np.ndarray]
+FINER = ["-D", "volume.resolution=[16, 8, 8]", "-D", "optimize.refine_at=[0.5]"]
+OPTIMIZE = ["optimize", "scene.yaml", "-q", "--iterations", "6", *FINER, "-o"]
+
+
+def iterations(folder: str) -> list[int]:
+    return [int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]]
+
+
+def cells(folder: str) -> list[int]:
+    return [int(line.split(",")[-1]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]]
+
+
+def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int) -> None:
+    """Ctrl-C arrives once, at the end of call number `call` of `owner.name`."""
+    original, calls = getattr(owner, name), []
+
+    def pressed(*arguments: Any, **options: Any) -> Any:
+        result = original(*arguments, **options)
+        calls.append(name)
+        if len(calls) == call:
+            signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(owner, name, pressed)
+
+
+@pytest.mark.parametrize("call", [1, 3, 4, 5])
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        pytest.param(loop, "render_each", id="after the render"),
+        pytest.param(Parameter, "step", id="after the step"),
+    ],
+)
+def test_an_interrupted_run_goes_on_to_the_same_bits(
+    run: Run, succeed: Run, density_of: DensityOf, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int
+) -> None:
+    succeed(*OPTIMIZE, "whole")
+    with monkeypatch.context() as patch:
+        press_ctrl_c_in(patch, owner, name, call)
+        result = run(*OPTIMIZE, "parts")
+    assert (result.exit_code, result.stdout) == (130, "")
+    assert len(result.stderr.splitlines()) == 1 and "interrupted" in result.stderr
+    assert len(iterations("parts")) in (call - 1, call)
+    assert Path("parts/checkpoints/last.pt").is_file()
+    succeed(*OPTIMIZE, "parts", "--resume")
+    assert iterations("parts") == [1, 2, 3, 4, 5, 6]
+    assert np.array_equal(density_of("parts"), density_of("whole"))
+
+
+def test_more_iterations_go_on_from_the_end(succeed: Run) -> None:
+    succeed("optimize", "scene.yaml", "-q", "--iterations", "4", "-o", "out")
+    first = Path("out/loss.csv").read_text()
+    succeed("optimize", "scene.yaml", "-q", "--iterations", "8", "-o", "out", "--resume")
+    assert iterations("out") == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert Path("out/loss.csv").read_text().startswith(first)
+
+
+def test_more_iterations_stay_at_the_resolution_reached(succeed: Run) -> None:
+    succeed("optimize", "scene.yaml", "-q", "--iterations", "2", *FINER, "-o", "out")
+    reached = cells("out")[-1]
+    assert reached == 16 * 8 * 8
+    succeed("optimize", "scene.yaml", "-q", "--iterations", "6", *FINER, "-o", "out", "--resume")
+    assert set(cells("out")[2:]) == {reached}
+
+
+def test_a_finished_run_resumes_to_itself(succeed: Run, density_of: DensityOf) -> None:
+    succeed(*OPTIMIZE, "out")
+    density, log = density_of("out"), Path("out/loss.csv").read_text()
+    succeed(*OPTIMIZE, "out", "--resume")
+    assert np.array_equal(density_of("out"), density) and Path("out/loss.csv").read_text() == log
+
+
+def test_the_folders_own_scene_resumes_it(succeed: Run) -> None:
+    succeed("optimize", "scene.yaml", "-q", "--iterations", "2", "-o", "out")
+    succeed("optimize", "out/scene.yaml", "-q", "--iterations", "3", "-o", "out", "--resume")
+    assert iterations("out") == [1, 2, 3]
+
+
+def test_overwriting_discards_the_old_checkpoint(run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run killed before it could write a checkpoint must not be resumed from that of the run it overwrote."""
+    succeed("optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out")
+
+    def killed(*_: Any) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "render_each", killed)
+        with pytest.raises(MemoryError):
+            run("optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out", "--overwrite")
+    path = Path("out/checkpoints/last.pt")
+    assert not path.exists() or torch.load(path, weights_only=True)["state"]["rows"] == []
+
+
+def wait_for_rows(process: subprocess.Popen[str], log: Path, count: int) -> None:
+    end = time.monotonic() + 60
+    while not log.exists() or log.read_text().count("\n") <= count:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_ctrl_c_in_a_terminal(folder: Path, succeed: Run) -> None:
+    command = [sys.executable, "-m", "ddrecon.cli", "optimize", "scene.yaml", "-o", "out", "--iterations", "100000"]
+    command[1:3] = ["-c", "from ddrecon.cli import main; main()"]
+    process = subprocess.Popen(
+        command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+    )
+    try:
+        wait_for_rows(process, Path("out/loss.csv"), 3)
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert (process.returncode, stdout) == (130, "") and "Traceback" not in stderr
+    done = len(iterations("out"))
+    succeed("optimize", "scene.yaml", "-q", "-o", "out", "--resume", "--iterations", str(done + 2))
+    assert iterations("out") == list(range(1, done + 3))
