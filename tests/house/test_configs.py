@@ -1,0 +1,40 @@
+"""Every scene under configs/ loads, and reconstructs on few cells."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from ddrecon.reconstruct.loop import optimize
+from ddrecon.scene.build import load_scene
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+
+
+def small(config: Path) -> list[str]:
+    """Overrides that leave the config about 8 cells along its shortest side."""
+    (sizes,) = re.findall(r"^  resolution: \[(\d+), (\d+), (\d+)\]", config.read_text(), re.MULTILINE)
+    cells = [int(size) for size in sizes]
+    return [f"volume.resolution={[size * 8 // min(cells) for size in cells]}", "optimize.iterations=2"]
+
+
+def test_there_are_configs() -> None:
+    assert {"ball", "plume"} <= {config.stem for config in CONFIGS}
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
+def test_a_config_runs_small(config: Path) -> None:
+    if ".exr" in config.read_text() and importlib.util.find_spec("OpenEXR") is None:
+        pytest.skip("its images need OpenEXR")
+    torch.set_num_threads(2)
+    scene = load_scene(config, overrides=small(config))
+    result = optimize(scene)
+    density = result.scene.volume.density
+    assert [row.iteration for row in result.rows] == [1, 2]
+    assert result.rows[1].loss < result.rows[0].loss
+    assert torch.isfinite(density).all() and density.min() >= 0 and (density != scene.starts["density"]).any()
