@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import Result
-from conftest import contents
+from small_scene import contents
 
 Run = Callable[..., Result]
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 from click.testing import Result
 from torch import Tensor
 
@@ -15,17 +14,18 @@ from ddrecon.diffusion import implicit
 from ddrecon.validate import gradcheck
 
 Run = Callable[..., Result]
-GRADCHECK = ["gradcheck", "scene.yaml", "-q", "--samples", "4"]
+SMALL = ["-D", "volume.resolution=[4, 3, 3]"]
+GRADCHECK = ["gradcheck", "scene.yaml", "-q", "--samples", "2"]
 
 
 def test_the_program_passes(run: Run) -> None:
-    result = run(*GRADCHECK, "--json", "report.json")
+    result = run(*GRADCHECK, *SMALL, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (0, "")
     assert result.stdout.splitlines()[-1].startswith("density: pass")
     report = json.loads(Path("report.json").read_text())
     assert report["passed"] is True
     (check,) = report["checks"]
-    assert check["parameter"] == "density" and check["passed"] is True and len(check["entries"]) == 4
+    assert check["parameter"] == "density" and check["passed"] is True and len(check["entries"]) == 2
     assert check["modes_error"] < 1e-10 and max(entry["error"] for entry in check["entries"]) < 1e-6
 
 
@@ -42,7 +42,7 @@ def detaching_part(right: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gradcheck, "image_loss", detaching_part(gradcheck.image_loss))
-    result = run(*GRADCHECK, "--json", "report.json")
+    result = run(*GRADCHECK, *SMALL, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (1, "")
     assert result.stdout.splitlines()[-1].startswith("density: FAIL")
     report = json.loads(Path("report.json").read_text())
@@ -53,18 +53,13 @@ def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_wrong_tangent_alone_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     right = implicit._Solve.jvp
     monkeypatch.setattr(implicit._Solve, "jvp", staticmethod(lambda *arguments: 0.99 * right(*arguments)))
-    result = run(*GRADCHECK, "--json", "report.json")
+    result = run(*GRADCHECK, *SMALL, "--json", "report.json")
     assert result.exit_code == 1
     (check,) = json.loads(Path("report.json").read_text())["checks"]
     assert check["modes_error"] > 1e-6 > max(entry["error"] for entry in check["entries"])
 
 
-def test_the_check_leaves_double_precision_behind(succeed: Run) -> None:
-    succeed(*GRADCHECK)
-    assert torch.get_default_dtype() == torch.float32
-
-
-@pytest.mark.xfail(strict=True, reason="with one sample asked for, none is an error; a missing folder for --json is found only at the end")
+@pytest.mark.xfail(strict=True, reason="a missing folder for --json is found only when the check is done")
 def test_a_report_that_cannot_be_written_is_refused_at_once(run: Run) -> None:
-    result = run(*GRADCHECK, "--json", "gone/report.json")
+    result = run(*GRADCHECK, *SMALL, "--json", "gone/report.json")
     assert result.exit_code in (2, 3) and result.stdout == ""

@@ -33,9 +33,9 @@ def test_the_command_line_imports_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("command", main.commands)
-def test_every_option_is_explained(command: str) -> None:
+def test_a_command_says_what_it_does(command: str) -> None:
     result = CliRunner().invoke(main, [command, "--help"])
-    assert result.exit_code == 0 and main.commands[command].help.splitlines()[0] in result.stdout
+    assert result.exit_code == 0 and main.commands[command].help.splitlines()[0] in " ".join(result.stdout.split())
     assert "-D KEY.PATH=VALUE" in result.stdout
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import Result
-from conftest import contents
+from small_scene import contents
 
 Run = Callable[..., Result]
 DensityOf = Callable[[str], np.ndarray]
@@ -61,7 +61,7 @@ def test_the_summary_agrees_with_the_log(succeed: Run) -> None:
 
 def test_the_volume_renders_as_the_summary_says(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out", "-D", "diffusion.tolerance=1e-6")
-    succeed("render", "out/scene.yaml", "-o", "pictures", "-q", "-D", "volume.density={file: out/volumes/density.npz}".replace("out", str(Path("out").absolute())))
+    succeed("render", "out/scene.yaml", "-o", "pictures", "-q", "-D", "volume.density={file: volumes/density.npz}")
     rendered, summary = read_json("pictures/render.json")["psnr"], read_json("out/summary.json")["views"]
     assert set(rendered) == {"front", "side"}
     for name, quality in rendered.items():

@@ -6,11 +6,12 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import Result
-from conftest import contents
+from small_scene import contents
 
 from ddrecon.io.images import read_image
 
@@ -48,6 +49,11 @@ def test_the_preview_is_srgb(succeed: Run) -> None:
     assert np.abs(preview - encoded(pixels("front").astype(float))).max() <= 1
 
 
+def numbers(value: Any) -> list[float]:
+    """All numbers in nested mappings: of `seconds`, the light's and each view's."""
+    return [number for entry in value.values() for number in numbers(entry)] if isinstance(value, dict) else [value]
+
+
 @pytest.mark.parametrize("g", [-0.4, 0, 0.6])
 def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
     succeed(*RENDER, "--components", "-D", f"volume.g={g}")
@@ -69,7 +75,7 @@ def test_the_report(succeed: Run) -> None:
     result = succeed(*RENDER, "--json", "-D", "diffusion.tolerance=1e-5")
     report = json.loads(Path("out/render.json").read_text())
     assert json.loads(result.stdout) == report
-    assert {"light", "front", "side"} <= set(report["seconds"]) and min(report["seconds"].values()) >= 0
+    assert len(numbers(report["seconds"])) == 3 and min(numbers(report["seconds"])) >= 0
     assert [solve["iterations"] > 0 and solve["residual"] <= 1e-5 for solve in report["solves"]] == [True]
     named = {file for files in report["files"].values() for file in files}
     assert named | {"render.json"} == set(contents(Path("out")))
@@ -80,9 +86,8 @@ def test_the_report(succeed: Run) -> None:
 
 @pytest.mark.xfail(strict=True, reason="a view called light takes the place of the stage called light")
 def test_a_view_may_be_called_light(succeed: Run) -> None:
-    succeed(*RENDER, "-D", "views.0.name=light", "--view", "light")
-    seconds = json.loads(Path("out/render.json").read_text())["seconds"]
-    assert len(json.dumps(seconds).split(":")) > 2
+    succeed(*RENDER, "-D", "views.0.name=light")
+    assert len(numbers(json.loads(Path("out/render.json").read_text())["seconds"])) == 3
 
 
 def test_one_view_of_several(succeed: Run) -> None:
@@ -124,6 +129,6 @@ def test_double_precision_differs_by_rounding_only(succeed: Run) -> None:
 
 
 def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
-    loud, quiet = run(*RENDER[:-1]), run(*RENDER, "--overwrite")
+    loud, quiet = run(*RENDER[:-1], "-v"), run(*RENDER, "--overwrite")
     assert "2/2" in loud.stderr and quiet.stderr == ""
     assert "render:" not in loud.stdout and "written to out" in quiet.stdout

@@ -23,7 +23,11 @@ def blocks(language: str) -> list[str]:
 def commands() -> list[str]:
     """Every `ddrecon ...` in the README's code blocks and in comments at the top of configs."""
     typed = [part.strip() for block in blocks("(?:bash|sh|console|)") for line in block.splitlines() for part in line.split("&&")]
-    told = [line for config in sorted((ROOT / "configs").glob("*.yaml")) for line in re.findall(r"^#.*?(ddrecon .*)$", config.read_text(), re.MULTILINE)]
+    told = [
+        line
+        for config in sorted((ROOT / "configs").glob("*.yaml"))
+        for line in re.findall(r"^#.*?(ddrecon .*)$", config.read_text(), re.MULTILINE)
+    ]
     return [line for line in [*typed, *told] if line.startswith("ddrecon ")]
 
 
