@@ -25,6 +25,10 @@ from ddrecon.world import Scene, View
 
 TEST_EVERY = 10
 """Test views are rendered every so many iterations, and at the last."""
+HASTE = 0.1
+"""Largest change of a density in one step, unless the scene says otherwise; densities are usually of order 1."""
+THICKEST = 8
+"""Optical depth that one step may lay across the box; more, and the light is gone before the next step can mend it."""
 WARM_UP = 5
 """Iterations over which learning rates rise to their value: Adam's first steps are all of full size, whatever the derivative."""
 FINAL_RATE = 0.2
@@ -86,7 +90,7 @@ class Reconstruction:
         self.power = float(torch.stack([view.image.square().mean() for view in self.train.views if view.image is not None]).mean())
         self.factors = factors(scene, self.settings.refine_at)
         settings = self.settings.parameters["density"]
-        self.density = Parameter(settings, settings.lr or unit_depth(scene.volume), scene.starts["density"], scene.volume.grid)
+        self.density = Parameter(settings, settings.lr or default_rate(scene.volume), scene.starts["density"], scene.volume.grid)
         self.rows: list[Row] = []
         self.elapsed = 0.0
         self.memory = SolveMemory(scene.diffusion.warm_start)
@@ -192,10 +196,10 @@ def rate_at(iteration: int, iterations: int) -> float:
     return warm_up * fall
 
 
-def unit_depth(volume: Volume) -> float:
-    """The density whose optical depth across the box's shortest side is 1 (1 where nothing extinguishes)."""
-    extinction = float(volume.sigma_a.mean() + volume.sigma_s.mean())
-    return 1 / (extinction * min(volume.grid.extent)) if extinction > 0 else 1.0
+def default_rate(volume: Volume) -> float:
+    """The learning rate of density: HASTE, or a density of THICKEST optical depths across the box's shortest side where that is less."""
+    depth = float(volume.sigma_a.mean() + volume.sigma_s.mean()) * min(volume.grid.extent)
+    return min(HASTE, THICKEST / depth) if depth > 0 else HASTE
 
 
 def _with_images(scene: Scene, is_test: bool) -> Scene:

@@ -214,7 +214,7 @@ PARAMETERS = ("density",)
 class ParameterSettings:
     """How one parameter is optimized: from `init` (None: what the scene says), within [`min`, `max`], by learning rate `lr`.
 
-    Without `lr` it is the density whose optical depth across the box's shortest side is 1: so much may a cell change in one step.
+    Without `lr` a step changes a cell by at most 0.1, or by a density of 8 optical depths across the box where that is less.
     `tv` weighs its total variation; 1 would weigh it as much as the whole brightness of the targets.
     """
 
