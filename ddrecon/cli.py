@@ -54,8 +54,8 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
                 raise
             click.echo(str(error), err=True)
             sys.exit(error.exit_code)
-        except KeyboardInterrupt:
-            click.echo("interrupted", err=True)
+        except KeyboardInterrupt as error:
+            click.echo(f"interrupted {error}".strip(), err=True)
             sys.exit(130)
 
     for option in reversed(COMMON):
@@ -125,6 +125,8 @@ def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: in
     from ddrecon.io.json_file import write_json
     from ddrecon.validate.gradcheck import check_parameters, describe
 
+    if report is not None and not report.absolute().parent.is_dir():
+        raise click.UsageError(f"--json {report}: there is no folder {report.absolute().parent}")
     checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
     click.echo("\n".join(line for check in checks for line in check.lines()))
     if report is not None:

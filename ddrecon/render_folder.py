@@ -28,7 +28,7 @@ def render_to_folder(
     with torch.no_grad():
         start = perf_counter()
         light_field = solve_light(scene, memory)
-        seconds["light"] = perf_counter() - start
+        light_seconds = perf_counter() - start
         for view in progress(views, "render"):
             start = perf_counter()
             images = _images(light_field, scene, view, has_components)
@@ -37,7 +37,13 @@ def render_to_folder(
             if view.image is not None:
                 quality[view.name] = psnr(images[view.name], view.image, view.mask)
     solves = [{"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds} for r in memory.records]
-    report = {"seconds": seconds, "solves": solves, "physics": needed_terms(scene), "psnr": quality, "files": files}
+    report = {
+        "seconds": {"light": light_seconds, "views": seconds},
+        "solves": solves,
+        "physics": needed_terms(scene),
+        "psnr": quality,
+        "files": files,
+    }
     write_json(folder / "render.json", report)
     return report
 

@@ -20,6 +20,7 @@ from ddrecon import __version__
 from ddrecon.errors import SceneError
 from ddrecon.scene.build import build_scene
 from ddrecon.scene.load import SceneFile, read_scene
+from ddrecon.scene.problems import suggestion
 from ddrecon.world import Scene, View
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -58,7 +59,7 @@ class Session:
         known = [view.name for view in scene.views]
         unknown = [name for name in names if name not in known]
         if unknown:
-            raise SceneError(f"--view {unknown[0]}: no such view; the views are {', '.join(known)}")
+            raise SceneError([f"--view {name}: no such view{suggestion(name, known)}" for name in unknown])
         return [view for view in scene.views if not names or view.name in names]
 
     def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
@@ -75,7 +76,7 @@ class Session:
         lines = []
         for name, files in report["files"].items():
             quality = f", PSNR {report['psnr'][name]:.1f} dB" if name in report["psnr"] else ""
-            lines.append(f"{name}: {', '.join(files)} ({report['seconds'][name]:.2f} s{quality})")
+            lines.append(f"{name}: {', '.join(files)} ({report['seconds']['views'][name]:.2f} s{quality})")
         if any(file.endswith(".tif") for files in report["files"].values() for file in files):
             lines.append('no OpenEXR here, so float .tif instead of .exr; for EXR: pip install "ddrecon[exr]"')
         return [*lines, f"written to {folder}"]

@@ -25,7 +25,7 @@ def load_checkpoint(path: Path, scene_text: str) -> dict[str, Any]:
     except FileNotFoundError:
         raise SceneError(f"{path}: there is no checkpoint to resume from; run without --resume") from None
     except Exception as error:  # torch raises whatever its reader stumbles on
-        raise FormatError(path, f"not a usable checkpoint: {str(error).splitlines()[0]}") from error
+        raise FormatError(path, "not a usable checkpoint; start anew without --resume") from error
     if saved != scene_text:
         lines = zip(saved.splitlines(), scene_text.splitlines(), strict=False)
         old, new = next(((a, b) for a, b in lines if a != b), ("(shorter)", "(longer)"))

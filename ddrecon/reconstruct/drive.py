@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from tqdm import tqdm
@@ -12,8 +16,9 @@ from tqdm import tqdm
 from ddrecon.errors import SceneError, SolveError
 from ddrecon.io.folders import prepare_folder
 from ddrecon.io.json_file import write_json
+from ddrecon.reconstruct.checkpoint import load_checkpoint
 from ddrecon.reconstruct.loop import Reconstruction, Row
-from ddrecon.reconstruct.run_folder import RunFolder
+from ddrecon.reconstruct.run_folder import CHECKPOINT, RunFolder
 from ddrecon.scene.dump import describe, dump_scene
 from ddrecon.scene.load import SceneFile
 from ddrecon.world import Scene
@@ -26,16 +31,26 @@ def open_run(
 
     Raises SceneError for a folder that is not empty, unless it may be or the run goes on from the checkpoint in it.
     """
-    run = Reconstruction(scene)
-    if resume and not path.is_dir():
-        raise SceneError(f"{path}: there is nothing to resume; run without --resume")
-    prepare_folder(path, may_exist=may_exist or resume)
-    folder = RunFolder(path, scene_text(scene_file))
+    try:
+        run = Reconstruction(scene)
+    except SceneError as error:
+        raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
+    text = scene_text(scene_file)
     if resume:
-        folder.resume(run)
+        _resume(run, path, text)
+    prepare_folder(path, may_exist=may_exist or resume)
+    folder = RunFolder(path, text)
+    if not resume:
+        folder.forget()
     dump_scene(scene_file, path / "scene.yaml")
     write_json(path / "environment.json", environment)
     return run, folder
+
+
+def _resume(run: Reconstruction, path: Path, text: str) -> None:
+    run.restore(load_checkpoint(path / CHECKPOINT, text))
+    if run.iteration > run.settings.iterations:
+        raise SceneError(f"{path}: {run.iteration} iterations are made already; ask for more than that, in all, with --iterations")
 
 
 def scene_text(scene_file: SceneFile) -> str:
@@ -48,12 +63,16 @@ def scene_text(scene_file: SceneFile) -> str:
 def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool) -> dict[str, Any]:
     """Advances `run` until it is done, writing to `folder`; returns the summary.
 
-    An interrupt or a divergence writes the checkpoint of the last good state before it is passed on.
+    An interrupt (SIGINT or SIGTERM) takes effect between two iterations; it and any failure write a checkpoint of the last good state
+    before they are passed on.
     """
     folder.start_log(run.rows)
     total = run.settings.iterations
     try:
-        with tqdm(total=total, initial=run.iteration, desc="optimize", file=sys.stderr, disable=is_quiet) as bar:
+        with (
+            deferred_interrupt() as asked,
+            tqdm(total=total, initial=run.iteration, desc="optimize", file=sys.stderr, disable=is_quiet) as bar,
+        ):
             while not run.is_done:
                 row = run.step()
                 folder.log(row)
@@ -61,10 +80,30 @@ def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_
                 bar.update()
                 if preview_every and row.iteration % preview_every == 0:
                     folder.preview(run)
+                if asked:
+                    raise KeyboardInterrupt(f"after {run.iteration} iterations; go on with --resume")
     except (KeyboardInterrupt, SolveError):
         folder.save(run)
         raise
     return folder.finish(run)
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[list[int]]:
+    """A list that fills when the process is asked to stop, so that an iteration is never torn; asked twice, it stops at once."""
+    asked: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def progress_text(row: Row, rows: list[Row]) -> str:

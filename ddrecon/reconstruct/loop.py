@@ -110,7 +110,7 @@ class Reconstruction:
         """Makes one iteration and returns its row of the log; raises SolveError, with the state unchanged, when it diverges."""
         start = perf_counter()
         stage = stage_of(self.iteration, self.settings.iterations, self.settings.refine_at)
-        if stage != self.stage:
+        if stage > self.stage:
             self._enter_stage(stage)
         self.memory.records.clear()
         images = self._render(self.train_level)

@@ -15,13 +15,15 @@ from ddrecon.io.atomic import replacing
 from ddrecon.io.images import write_preview
 from ddrecon.io.json_file import write_json
 from ddrecon.io.volumes import write_field
-from ddrecon.reconstruct.checkpoint import load_checkpoint, save_checkpoint
+from ddrecon.reconstruct.checkpoint import save_checkpoint
 from ddrecon.reconstruct.loop import Reconstruction, Row
 from ddrecon.reconstruct.losses import psnr
 from ddrecon.reconstruct.previews import comparison, slices
 from ddrecon.renderer import render_each
 from ddrecon.world import Scene
 
+CHECKPOINT = Path("checkpoints", "last.pt")
+"""Where a run folder keeps its checkpoint."""
 COLUMNS = [field.name for field in fields(Row)]
 
 
@@ -32,11 +34,11 @@ class RunFolder:
         self.path, self.scene_text = path, scene_text
         for name in ("volumes", "previews", "checkpoints"):
             (path / name).mkdir(exist_ok=True)
-        self.checkpoint = path / "checkpoints" / "last.pt"
+        self.checkpoint = path / CHECKPOINT
 
-    def resume(self, run: Reconstruction) -> None:
-        """Puts `run` where the folder's checkpoint left off."""
-        run.restore(load_checkpoint(self.checkpoint, self.scene_text))
+    def forget(self) -> None:
+        """Removes the checkpoint of a run that was made here before."""
+        self.checkpoint.unlink(missing_ok=True)
 
     def start_log(self, rows: list[Row]) -> None:
         """Writes `loss.csv` with the rows made so far: none at first, those of the checkpoint after a resume."""
@@ -70,7 +72,7 @@ class RunFolder:
         return summary
 
     def _pictures(self, scene: Scene, mark: str) -> dict[str, Any]:
-        write_preview(self.path / "previews" / f"density{mark}.png", slices(scene.volume.density))
+        write_preview(self.path / "previews" / f"density.slices{mark}.png", slices(scene.volume.density))
         views = [view for view in scene.views if view.image is not None]
         quality = {}
         with torch.no_grad():

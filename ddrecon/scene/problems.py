@@ -6,31 +6,39 @@ import difflib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import FormatError, SceneError
 
 
 class Problems:
-    """The problem lines found so far."""
+    """The problem lines found so far, and the files that could not be used."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        self.unusable: list[FormatError] = []
 
-    def note(self, error: SceneError) -> None:
+    def note(self, error: SceneError | FormatError) -> None:
         """Notes the problems of `error`."""
-        self.lines.extend(error.problems)
+        if isinstance(error, FormatError):
+            self.unusable.append(error)
+        else:
+            self.lines.extend(error.problems)
 
     @contextmanager
     def collecting(self) -> Iterator[None]:
-        """Notes the problems of a SceneError raised inside the block, which ends there, and goes on after it."""
+        """Notes the problems of an error raised inside the block, which ends there, and goes on after it."""
         try:
             yield
-        except SceneError as error:
+        except (SceneError, FormatError) as error:
             self.note(error)
 
     def raise_any(self) -> None:
-        """Raises SceneError with every problem noted, each once, if there is one."""
+        """Raises an error with every problem noted, each once, if there is one: FormatError where only files are to blame."""
+        files = list(dict.fromkeys(str(error) for error in self.unusable))
         if self.lines:
-            raise SceneError(list(dict.fromkeys(self.lines)))
+            raise SceneError([*dict.fromkeys(self.lines), *files])
+        if self.unusable:
+            first = self.unusable[0]
+            raise FormatError(first.path, "\n".join([first.reason, *files[1:]]))
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

@@ -26,6 +26,8 @@ Matrix = tuple[Row, Row, Row, Row]
 Problem = tuple[str, str]
 
 MAX_CELLS = 2**30
+TAKEN = (".reduced", ".single", ".multiple", ".slices")
+"""Endings of the names of output files, which a view's name must not have."""
 
 
 def limited(**limits: float) -> Any:
@@ -177,6 +179,8 @@ class ViewSection:
     def problems(self) -> Iterator[Problem]:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
             yield "name", f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.', the last not at its start"
+        if self.name.endswith(TAKEN):
+            yield "name", f"{self.name!r} ends as files of other views do; do not end it with {', '.join(TAKEN)}"
         if self.image is None and self.camera.resolution is None:
             yield "camera", "missing key 'resolution'; only a view with an image can go without"
 

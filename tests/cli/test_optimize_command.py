@@ -32,7 +32,7 @@ def read_json(path: str) -> Any:
 def test_the_files_of_a_run(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out")
     expected = ["scene.yaml", "environment.json", "loss.csv", "parameters.json", "summary.json", "volumes", "volumes/density.npz"]
-    expected += ["checkpoints", "checkpoints/last.pt", "previews", "previews/density.png", "previews/front.png", "previews/side.png"]
+    expected += ["checkpoints", "checkpoints/last.pt", "previews", "previews/density.slices.png", "previews/front.png", "previews/side.png"]
     assert set(contents(Path("out"))) == set(expected)
     assert read_json("out/parameters.json") == {"g": pytest.approx(0.3)}
 
@@ -105,7 +105,7 @@ def test_the_environment(succeed: Run) -> None:
 def test_previews_along_the_way(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out", "--preview-every", "2")
     names = {path.stem for path in Path("out/previews").iterdir()}
-    assert names == {f"{name}{mark}" for name in ("density", "front", "side") for mark in ("", "_000002", "_000004")}
+    assert names == {f"{name}{mark}" for name in ("density.slices", "front", "side") for mark in ("", "_000002", "_000004")}
 
 
 def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:

@@ -84,7 +84,6 @@ def test_the_report(succeed: Run) -> None:
     assert report["psnr"]["front"] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.xfail(strict=True, reason="a view called light takes the place of the stage called light")
 def test_a_view_may_be_called_light(succeed: Run) -> None:
     succeed(*RENDER, "-D", "views.0.name=light")
     assert len(numbers(json.loads(Path("out/render.json").read_text())["seconds"])) == 3

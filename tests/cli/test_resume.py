@@ -46,17 +46,12 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
     monkeypatch.setattr(owner, name, pressed)
 
 
-TORN = pytest.mark.xfail(
-    strict=True, reason="an interrupt inside an iteration saves the moved density but not the row: the step is made twice"
-)
-
-
 @pytest.mark.parametrize(
     ("owner", "name", "call"),
     [
         pytest.param(loop, "render_each", 3, id="after a render at a new resolution"),
-        pytest.param(Parameter, "step", 1, id="after the first step", marks=TORN),
-        pytest.param(Parameter, "step", 3, id="after a later step", marks=TORN),
+        pytest.param(Parameter, "step", 1, id="after the first step"),
+        pytest.param(Parameter, "step", 3, id="after a later step"),
     ],
 )
 def test_an_interrupted_run_goes_on_to_the_same_bits(
@@ -83,7 +78,6 @@ def test_more_iterations_go_on_from_the_end(succeed: Run) -> None:
     assert Path("out/loss.csv").read_text().startswith(first)
 
 
-@pytest.mark.xfail(strict=True, reason="the longer run's stages begin later, so the volume is made coarse again")
 def test_more_iterations_stay_at_the_resolution_reached(succeed: Run) -> None:
     succeed("optimize", "scene.yaml", "-q", "--iterations", "2", *FINER, "-o", "out")
     reached = cells("out")[-1]
@@ -105,7 +99,6 @@ def test_the_folders_own_scene_resumes_it(succeed: Run) -> None:
     assert iterations("out") == [1, 2, 3]
 
 
-@pytest.mark.xfail(strict=True, reason="--overwrite leaves the old checkpoint until the new run writes one")
 def test_overwriting_discards_the_old_checkpoint(run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run killed before it could write a checkpoint must not be resumed from that of the run it overwrote."""
     succeed("optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out")
