@@ -224,3 +224,9 @@ def test_debug_shows_where_an_error_comes_from(run: Callable[..., object]) -> No
 
     with pytest.raises(SceneError, match="must be below 1"):
         run(*COMMANDS["check"], "--debug", "-D", "volume.g=2")
+
+
+@pytest.mark.parametrize("ending", [".reduced", ".single", ".multiple", ".slices"])
+def test_a_view_named_like_an_output_file(refuse: Refuse, ending: str) -> None:
+    (line,) = refuse(2, *COMMANDS["render"], "-D", f"views.0.name=front{ending}")
+    assert "do not end it with" in line

@@ -147,3 +147,11 @@ def test_ctrl_c_in_a_terminal(folder: Path, succeed: Run) -> None:
     done = len(iterations("out"))
     succeed("optimize", "scene.yaml", "-q", "-o", "out", "--resume", "--iterations", str(done + 2))
     assert iterations("out") == list(range(1, done + 3))
+
+
+def test_fewer_iterations_than_were_made_are_refused(succeed: Run, run: Run) -> None:
+    succeed("optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out")
+    before = Path("out/scene.yaml").read_text()
+    result = run("optimize", "scene.yaml", "-q", "--iterations", "2", "-o", "out", "--resume")
+    assert result.exit_code == 2 and "3 iterations are made already" in result.stderr
+    assert Path("out/scene.yaml").read_text() == before
