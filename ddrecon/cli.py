@@ -30,7 +30,7 @@ COMMON = (
     click.option("--debug", is_flag=True, help="Show the traceback of an error."),
 )
 THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
-"""Waiting threads spin for a moment, then sleep: 1.5 times faster than sleeping at once, without the stalls of spinning on a busy machine."""
+"""Waiting threads spin for a moment, then sleep: 1.5 times faster than sleeping at once, without the stalls of endless spinning."""
 DTYPE = click.option("--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 SCENE = click.argument("scene", type=click.Path(path_type=Path))
