@@ -2,7 +2,7 @@
 
 G is the difference of neighboring cells across each interior face, c the conductance of that face; `loss` is what a cell gives up
 to absorption and through the faces of the box. Every flux that leaves a cell enters its neighbor, so energy is kept to rounding.
-Neighbors are combined by slicing: conv3d with fixed difference kernels gives the same result about 70 times slower on a CPU
+Neighbors are combined by slicing: conv3d with fixed difference kernels gives the same result 30 to 50 times slower on a CPU
 (`benchmarks/stencil.py` measures both).
 """
 
