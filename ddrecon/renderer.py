@@ -1,7 +1,7 @@
 """The paper on one page: light not yet scattered, light scattered many times, and the view rays that collect both.
 
-`render` composes only the terms a scene needs: no diffusion solve when the model is `none` or nothing shines or scatters, no
-fluxes Q1 and L1 when g = 0, one color channel when all is gray.
+`render` composes only the terms a scene needs: no diffusion solve when the model is `none` or nothing scatters, no quadrature over
+directions but where unscattered ambient light is asked for by itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 """
 
 from __future__ import annotations
