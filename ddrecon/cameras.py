@@ -7,12 +7,12 @@ vectors here are (x, y, z); `rays` hands them on in array order.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from ddrecon.grid import array_order
+from ddrecon.grid import Triple, array_order
 
 
 @dataclass(eq=False)
@@ -32,6 +32,26 @@ class Camera:
         """The same camera with `factor` times fewer pixels along each side (at least one)."""
         height, width = (max(1, side // factor) for side in self.size)
         return Camera(self.pose, (height, width), self.half_width, self.is_perspective)
+
+
+def twisted(camera: Camera, twist: Tensor, pivot: Triple) -> Camera:
+    """`camera` moved by `twist` [6]: turned about `pivot` (x, y, z) by a rotation vector [rad], then shifted [u].
+
+    Both vectors are in the camera's own axes (right, up, backward). With the pivot amid what the camera looks at, a turn shows another side of
+    it and a shift moves it in the image, so that the two are told apart by what they do.
+    """
+    turn, origin = camera.pose[:, :3], camera.pose[:, 3]
+    center = origin.new_tensor(pivot)
+    rotation = turn @ _rotation(twist[:3]) @ turn.T
+    moved = center + rotation @ (origin - center) + turn @ twist[3:]
+    return replace(camera, pose=torch.cat([rotation @ turn, moved[:, None]], 1))
+
+
+def _rotation(vector: Tensor) -> Tensor:
+    """The matrix [3, 3] of the rotation by |vector| about `vector` (Rodrigues), smooth at zero."""
+    x, y, z = vector.unbind()
+    zero = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
 
 
 @dataclass(frozen=True)

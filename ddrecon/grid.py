@@ -54,6 +54,12 @@ class Grid:
         (lz, ly, lx), (uz, uy, ux) = self.lower, self.upper
         return (lx, ly, lz), (ux, uy, uz)
 
+    @property
+    def center_xyz(self) -> Triple:
+        """The middle of the box as (x, y, z)."""
+        (lx, ly, lz), (ux, uy, uz) = self.bounds_xyz
+        return (lx + ux) / 2, (ly + uy) / 2, (lz + uz) / 2
+
     def centers(self, like: Tensor) -> list[Tensor]:
         """World coordinates [u] of the cell centers: one tensor per axis, shaped to broadcast to `[z, y, x]`."""
         coordinates = []

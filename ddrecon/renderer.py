@@ -91,14 +91,18 @@ def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
 
 
 def has_flux(medium: Medium) -> bool:
-    """Whether light's direction matters to scattering: g is not 0, or is being differentiated, in either mode."""
-    is_varied = medium.g.requires_grad or forward_ad.unpack_dual(medium.g).tangent is not None
-    return is_varied or bool(medium.g.detach() != 0)
+    """Whether light's direction matters to scattering: g is not 0, or is being differentiated."""
+    return _is_varied(medium.g) or bool(medium.g != 0)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
-    """Whether light may be scattered more than once: the model is not `none`, and sigma_s is not 0."""
-    return settings.model != "none" and bool((medium.scattering.scale != 0).any())
+    """Whether light may be scattered more than once: the model is not `none`, and sigma_s is not 0 or is being differentiated."""
+    return settings.model != "none" and (_is_varied(medium.scattering.scale) or bool((medium.scattering.scale != 0).any()))
+
+
+def _is_varied(value: Tensor) -> bool:
+    """Whether `value` is being differentiated, in either mode."""
+    return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
 
 
 def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: DiffusionSettings, memory: SolveMemory) -> Moments:
@@ -123,9 +127,25 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
     return Moments(mean, (z, y, x))
 
 
-def view_image(light_field: LightField, scene: Scene, camera: Camera) -> Tensor:
-    """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1)."""
-    return _average(camera, scene.render, lambda bundle: _radiance(light_field, scene, bundle))
+def view_image(light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all") -> Tensor:
+    """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1).
+
+    `derivatives` says which of its radiance passes derivatives on: `all`, `single` (E2 of beams, and what is seen unscattered) or
+    `diffusion` (E3, with the ambient light in it). The image is the same.
+    """
+    if derivatives == "all":
+        return _average(camera, scene.render, lambda bundle: _radiance(light_field, scene, bundle))
+    nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
+    parts = {"single": (replace(light_field, outgoing=nothing), scene), "diffusion": (replace(light_field, beams=()), _without_background(scene))}
+    kept = view_image(*parts.pop(derivatives), camera)
+    ((rest_field, rest_scene),) = parts.values()
+    with torch.no_grad():
+        rest = view_image(rest_field, rest_scene, camera)
+    return kept + rest.detach()
+
+
+def _without_background(scene: Scene) -> Scene:
+    return replace(scene, render=replace(scene.render, background=False))
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
@@ -135,9 +155,8 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     itself, and the difference, light scattered forward once or more, belongs to `multiple`.
     """
     once = unscattered_light(unscaled_medium(scene.volume), scene.lights)
-    dark = replace(scene, render=replace(scene.render, background=False))
     image = view_image(light_field, scene, camera)
-    single = view_image(once, dark, camera)
+    single = view_image(once, _without_background(scene), camera)
     reduced = view_image(once, scene, camera) - single
     return Components(reduced, single, image - reduced - single)
 

@@ -13,6 +13,10 @@ from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.solvers import SOLVERS
 
 
+DERIVATIVES = ("all", "single", "diffusion")
+"""Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the diffusion (the paper's Fig. 9)."""
+
+
 def bounded(default: Any, *, minimum: float | None = None, above: float | None = None, maximum: float | None = None) -> Any:
     """A number field whose value is at least `minimum`, greater than `above` and at most `maximum`, where given."""
     return field(default=default, metadata={"minimum": minimum, "above": above, "maximum": maximum})

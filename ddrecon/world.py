@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 class View:
     """One view: its camera, and its target `image` [3, h, w] (linear radiance) where it has one.
 
-    `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views are never optimized on.
+    `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views are never optimized on;
+    `weight` > 0 is how much a training view counts.
     """
 
     name: str
@@ -32,13 +33,14 @@ class View:
     image: Tensor | None = None
     mask: Tensor | None = None
     is_test: bool = False
+    weight: float = 1.0
 
 
 @dataclass(eq=False)
 class Scene:
     """A loaded scene. `optimize`, `starts` and `path` are what its file says of reconstruction, and where that file lies.
 
-    `starts` holds, for each optimized parameter, the field it starts from.
+    `starts` holds, for each optimized parameter, the value it starts from.
     """
 
     volume: Volume

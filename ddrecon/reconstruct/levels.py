@@ -34,23 +34,25 @@ def at_level(scene: Scene, factor: int) -> Scene:
     if factor == 1:
         return scene
     volume, grid = scene.volume, scene.volume.grid.coarsened(factor)
-    coarse = Volume(
-        grid, resampled(volume.density, grid), _resampled_colors(volume.sigma_a, grid), _resampled_colors(volume.sigma_s, grid), volume.g
-    )
+    sigma_a, sigma_s = (_resampled_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s))
+    coarse = Volume(grid, resampled(volume.density, grid), sigma_a, sigma_s, volume.g)
     return replace(scene, volume=coarse, views=[_at_level(view, factor) for view in scene.views])
 
 
 def resampled(field: Tensor, grid: Grid) -> Tensor:
-    """`field` [z, y, x] on `grid` over the same box: averaged where `grid` is coarser, trilinearly interpolated where finer."""
-    if tuple(field.shape) == grid.shape:
+    """`field` [..., z, y, x] on `grid` over the same box: averaged where `grid` is coarser, trilinearly interpolated where finer."""
+    if tuple(field.shape[-3:]) == grid.shape:
         return field
-    if field.numel() > grid.cells:
-        return adaptive_avg_pool3d(field[None], grid.shape)[0]
-    return interpolate(field[None, None], grid.shape, mode="trilinear", align_corners=False)[0, 0]
+    colors = field.reshape(1, -1, *field.shape[-3:])
+    if colors[0, 0].numel() > grid.cells:
+        changed = adaptive_avg_pool3d(colors, grid.shape)
+    else:
+        changed = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
+    return changed.view(*field.shape[:-3], *grid.shape)
 
 
-def _resampled_colors(sigma: Tensor, grid: Grid) -> Tensor:
-    return sigma if sigma.ndim == 1 else torch.stack([resampled(field, grid) for field in sigma])
+def _resampled_cross_section(sigma: Tensor, grid: Grid) -> Tensor:
+    return sigma if sigma.ndim == 1 else resampled(sigma, grid)
 
 
 def _at_level(view: View, factor: int) -> View:

@@ -1,7 +1,7 @@
 """The reconstruction: render, compare, differentiate, step; coarse to fine.
 
-It knows nothing of physics beyond `render_each`. A `Reconstruction` is advanced one iteration at a time, so that whoever drives it may log,
-preview, stop or save between any two.
+It knows nothing of physics beyond `render_each` and `differentiate`. A `Reconstruction` is advanced one iteration at a time, so that
+whoever drives it may log, preview, stop or save between any two.
 """
 
 from __future__ import annotations
@@ -16,23 +16,18 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError, SolveError
-from ddrecon.medium import Volume
+from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
-from ddrecon.reconstruct.losses import image_loss, psnr, total_variation
+from ddrecon.reconstruct.losses import image_loss, psnr
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.rates import chosen, default_rate, rate_at
 from ddrecon.renderer import render_each
+from ddrecon.scene.schema import ParameterSettings
+from ddrecon.variables import value_of, with_values
 from ddrecon.world import Scene, View
 
 TEST_EVERY = 10
 """Test views are rendered every so many iterations, and at the last."""
-HASTE = 0.1
-"""Largest change of a density in one step, unless the scene says otherwise; densities are usually of order 1."""
-THICKEST = 8
-"""Optical depth that one step may lay across the box; more, and the light is gone before the next step can mend it."""
-WARM_UP = 5
-"""Iterations over which learning rates rise to their value: Adam's first steps are all of full size, whatever the derivative."""
-FINAL_RATE = 0.2
-"""Learning rates fall exponentially over a run, to this part of their value."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +69,7 @@ def optimize(scene: Scene, iterations: int | None = None, watch: Callable[[Row],
 class Reconstruction:
     """The state of a run: what is optimized, at which resolution, and the log so far.
 
-    The objective is the image loss plus, for each parameter, its `tv` times its total variation times `power`, the mean square of the
+    The objective is the weighted mean of the views' image loss plus, for each parameter, its penalty times `power`, the mean square of the
     targets: brighter light or a wider frame change nothing.
     """
 
@@ -89,8 +84,7 @@ class Reconstruction:
         self.test = _with_images(scene, is_test=True)
         self.power = float(torch.stack([view.image.square().mean() for view in self.train.views if view.image is not None]).mean())
         self.factors = factors(scene, self.settings.refine_at)
-        settings = self.settings.parameters["density"]
-        self.density = Parameter(settings, settings.lr or default_rate(scene.volume), scene.starts["density"], scene.volume.grid)
+        self.parameters = [_parameter(scene, name, settings) for name, settings in self.settings.parameters.items()]
         self.rows: list[Row] = []
         self.elapsed = 0.0
         self.memory = SolveMemory(scene.diffusion.warm_start)
@@ -113,37 +107,39 @@ class Reconstruction:
         if stage > self.stage:
             self._enter_stage(stage)
         self.memory.records.clear()
-        images = self._render(self.train_level)
-        loss = self._loss(images)
-        self._require_finite(loss, loss)
-        (gradient,) = torch.autograd.grad(loss, self.density.value)
-        self._require_finite(loss, gradient)
+        seen = self._seen()
+        found = differentiate(self.train_level, [view.name for view in seen], self._values(), self._loss_of(seen), self.memory)
+        loss, gradients = self._penalized(found.loss, found.gradients)
+        self._require_finite(loss, gradients)
         solves = {kind: sum(r.iterations for r in self.memory.records if r.kind == kind) for kind in ("forward", "adjoint")}
-        self.density.step(gradient, rate_at(self.iteration, self.settings.iterations))
-        quality = _mean_psnr(images, self.train_level.views)
+        for parameter in self.parameters:
+            parameter.step(gradients[parameter.name], rate_at(self.iteration, self.settings.iterations))
+        quality = _mean_psnr(found.images, seen)
         last = self.iteration + 1
         test = self._test_psnr() if last % TEST_EVERY == 0 or last == self.settings.iterations else None
         self.elapsed += perf_counter() - start
-        self.rows.append(
-            Row(last, self.elapsed, float(loss.detach()), quality, test, solves["forward"], solves["adjoint"], self.density.grid.cells)
-        )
+        cells = self.train_level.volume.grid.cells
+        self.rows.append(Row(last, self.elapsed, float(loss), quality, test, solves["forward"], solves["adjoint"], cells))
         return self.rows[-1]
 
     def current_scene(self) -> Scene:
-        """The scene at full resolution, with the volume as reconstructed so far."""
+        """The scene at full resolution, with everything as reconstructed so far."""
         with torch.no_grad():
-            density = resampled(self.density.value.detach(), self.full.volume.grid)
-        return replace(self.full, volume=replace(self.full.volume, density=density))
+            values = {
+                p.name: resampled(p.value.detach(), self.full.volume.grid).clone() if p.is_field else p.value.detach().clone()
+                for p in self.parameters
+            }
+            return with_values(self.full, values)
 
     def result(self) -> Result:
-        """The outcome so far."""
+        """The scene as reconstructed, and the log."""
         return Result(self.current_scene(), list(self.rows))
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on as if nothing had happened."""
         rows = [list(vars(row).values()) for row in self.rows]
         return {
-            "density": self.density.state(),
+            "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "stage": self.stage,
             "rows": rows,
             "elapsed": self.elapsed,
@@ -152,54 +148,73 @@ class Reconstruction:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up where the run that made `state` stopped."""
-        self.density.restore(state["density"])
+        for parameter in self.parameters:
+            parameter.restore(state["parameters"][parameter.name])
         self.rows = [Row(*row) for row in state["rows"]]
         self.elapsed = state["elapsed"]
         self._enter_stage(state["stage"])
-        self.memory.last = {kind: field.to(self.density.value) for kind, field in state["solutions"].items()}
+        self.memory.last = {kind: field.to(self.full.volume.density) for kind, field in state["solutions"].items()}
 
     def _enter_stage(self, stage: int) -> None:
         self.stage = stage
         self.train_level, self.test_level = (at_level(scene, self.factors[stage]) for scene in (self.train, self.test))
         grid = self.train_level.volume.grid
-        if self.density.grid != grid:
-            self.density.refine(grid)
-            last = {kind: torch.stack([resampled(color, grid) for color in field]) for kind, field in self.memory.last.items()}
-            self.memory.last = last
+        for parameter in self.parameters:
+            if parameter.grid != grid:
+                parameter.refine(grid)
+        self.memory.last = {kind: resampled(field, grid) for kind, field in self.memory.last.items()}
 
-    def _render(self, level: Scene) -> list[Tensor]:
-        level.volume.density = self.density.value
-        return render_each(level, level.views, self.memory)
+    def _values(self) -> dict[str, Tensor]:
+        return {parameter.name: parameter.value for parameter in self.parameters}
 
-    def _loss(self, images: list[Tensor]) -> Tensor:
-        data = torch.stack([image_loss(self.settings.loss, *compared) for compared in _compared(images, self.train_level.views)]).mean()
-        weight = self.density.settings.tv * self.power
-        return data + weight * total_variation(self.density.value, self.density.grid) if weight else data
+    def _seen(self) -> list[View]:
+        views = self.train_level.views
+        return [views[index] for index in chosen(len(views), self.settings.views_per_iteration, self.iteration)]
+
+    def _loss_of(self, views: list[View]) -> Callable[[View, Tensor], Tensor]:
+        """What a view adds to the objective: its share, by weight, of the mean over `views`."""
+        total = sum(view.weight for view in views)
+
+        def loss_of(view: View, image: Tensor) -> Tensor:
+            ((_, target, mask),) = _compared([image], [view])
+            loss = view.weight / total * image_loss(self.settings.loss, image, target, mask)
+            if not bool(torch.isfinite(loss)):
+                raise self._diverged(f"the loss of view {view.name}", loss)
+            return loss
+
+        return loss_of
+
+    def _penalized(self, loss: Tensor, gradients: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss and gradients with the parameters' penalties added."""
+        gradients = dict(gradients)
+        for parameter in self.parameters:
+            if parameter.tv or parameter.l1:
+                penalty = self.power * parameter.penalty()
+                loss = loss + penalty.detach()
+                gradients[parameter.name] += torch.autograd.grad(penalty, parameter.value)[0]
+        return loss, gradients
 
     def _test_psnr(self) -> float | None:
         if not self.test_level.views:
             return None
         with torch.no_grad():
-            return _mean_psnr(self._render(self.test_level), self.test_level.views)
+            level = with_values(self.test_level, self._values())
+            return _mean_psnr(render_each(level, level.views, self.memory), level.views)
 
-    def _require_finite(self, loss: Tensor, values: Tensor) -> None:
-        if bool(torch.isfinite(values).all()):
-            return
-        what = "the loss or its derivative with respect to density is not finite"
-        raise SolveError(what, self.iteration, float(loss.detach()), "lower optimize.parameters.density.lr")
+    def _require_finite(self, loss: Tensor, gradients: dict[str, Tensor]) -> None:
+        for name, gradient in gradients.items():
+            if not bool(torch.isfinite(gradient).all()):
+                raise self._diverged(f"the derivative of the loss with respect to {name}", loss)
 
-
-def rate_at(iteration: int, iterations: int) -> float:
-    """The part of their value that learning rates have in `iteration` of `iterations`, in (0, 1]."""
-    warm_up: float = min(1.0, (iteration + 1) / WARM_UP)
-    fall: float = FINAL_RATE ** (iteration / iterations)
-    return warm_up * fall
+    def _diverged(self, what: str, loss: Tensor) -> SolveError:
+        rates = " and ".join(f"optimize.parameters.{parameter.name}.lr" for parameter in self.parameters)
+        return SolveError(f"{what} is not finite", self.iteration, float(loss.detach()), f"lower {rates}")
 
 
-def default_rate(volume: Volume) -> float:
-    """The learning rate of density: HASTE, or a density of THICKEST optical depths across the box's shortest side where that is less."""
-    depth = float(volume.sigma_a.mean() + volume.sigma_s.mean()) * min(volume.grid.extent)
-    return min(HASTE, THICKEST / depth) if depth > 0 else HASTE
+def _parameter(scene: Scene, name: str, settings: ParameterSettings) -> Parameter:
+    start = scene.starts.get(name)
+    start = value_of(scene, name) if start is None else start
+    return Parameter(name, settings, settings.lr or default_rate(scene, name, start), start, scene.volume.grid)
 
 
 def _with_images(scene: Scene, is_test: bool) -> Scene:

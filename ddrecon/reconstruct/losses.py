@@ -37,14 +37,14 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
 
 
 def total_variation(field: Tensor, grid: Grid) -> Tensor:
-    """Mean over the cells of `grid` of the length of the gradient of `field` [z, y, x], times the box's shortest side.
+    """Mean over the cells of `grid` of the length of the gradient of `field` [..., z, y, x], times the box's shortest side.
 
     Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), the same at every resolution and world
     scale, and rounded off at zero so that its derivative is finite in flat regions.
     """
     side = min(grid.extent)
     square = torch.full_like(field, ROUNDING**2)
-    for axis, spacing in enumerate(grid.spacing):
+    for axis, spacing in zip((-3, -2, -1), grid.spacing, strict=True):
         slope = (field.diff(dim=axis) * (side / spacing)) ** 2
         square = square + torch.cat([slope, torch.zeros_like(field.narrow(axis, 0, 1))], axis)
     return (square.sqrt() - ROUNDING).mean()

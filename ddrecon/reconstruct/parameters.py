@@ -1,4 +1,4 @@
-"""What is optimized: a field with its bounds, its Adam state, and its way through the resolutions."""
+"""What is optimized: a value with its bounds and regularizers, its Adam state, and its way through the resolutions."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.reconstruct.levels import resampled
+from ddrecon.reconstruct.losses import total_variation
+from ddrecon.scene.parameter_kinds import KINDS, pattern_of
 from ddrecon.scene.schema import ParameterSettings
 
 BETAS = (0.9, 0.99)
@@ -18,26 +20,48 @@ TINY = 1e-15
 
 
 class Parameter:
-    """A field [z, y, x] on `grid`, kept within its bounds, with the optimizer (Kingma and Ba 2015, arXiv:1412.6980) that moves it."""
+    """The value of one variable and the optimizer that moves it (Adam: Kingma and Ba 2015, arXiv:1412.6980), within its bounds.
 
-    def __init__(self, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid):
-        self.settings, self.rate, self.grid = settings, rate, grid
+    A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at every resolution.
+    """
+
+    def __init__(self, name: str, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid):
+        kind = KINDS[pattern_of(name)]
+        self.name, self.rate, self.grid = name, rate, grid
+        self.low = kind.low if settings.min is None else settings.min
+        self.high = kind.high if settings.max is None else settings.max
+        self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
+        self.tv = (kind.tv if settings.tv is None else settings.tv) if self.is_field else 0.0
+        self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.optimizer = self._new_optimizer()
 
+    def penalty(self) -> Tensor:
+        """What its regularizers add to the loss, in units of the targets' mean square; see `ParameterSettings`."""
+        total = self.value.new_zeros(())
+        if self.tv:
+            total = total + self.tv * total_variation(self.value, self.grid)
+        return total + self.l1 * self.value.abs().mean() if self.l1 else total
+
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Moves the field against `gradient` by `rate` times its learning rate, and back within its bounds."""
+        """Moves the value against `gradient` by `rate` times its learning rate, and back within its bounds."""
         self.value.grad = gradient
         self.optimizer.param_groups[0]["lr"] = rate * self.rate
+        length = self.value.detach().norm()
         self.optimizer.step()
+        self.value.grad = None
         with torch.no_grad():
-            self.value.clamp_(self.settings.min, self.settings.max)
+            self.value.clamp_(self.low, self.high)
+            if self.name.endswith(".direction"):
+                self.value.mul_(length / self.value.norm())
 
     def refine(self, grid: Grid) -> None:
         """Carries field and moments to `grid`; a derivative with respect to a cell shrinks with the cell's volume."""
         share = self.grid.cells / grid.cells
         state = self.optimizer.state.get(self.value, {})
         self.grid = grid
+        if not self.is_field:
+            return
         self.value = resampled(self.value.detach(), grid).clone().requires_grad_()
         self.optimizer = self._new_optimizer()
         if state:

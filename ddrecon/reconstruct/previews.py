@@ -26,12 +26,13 @@ def comparison(target: Tensor, image: Tensor) -> np.ndarray:
 
 
 def slices(field: Tensor) -> np.ndarray:
-    """The middle slices of `field` [z, y, x] across z, x and y, seen with y (or z) upwards; the largest value is white."""
-    array = field.detach().float().cpu().numpy()
-    z, y, x = (size // 2 for size in array.shape)
+    """The middle slices of `field` [z, y, x] or [C, z, y, x] across z, x and y, with y (or z) upwards; the largest value is white."""
+    colors = field if field.ndim == 4 else field[None]
+    array = colors.detach().expand(3, -1, -1, -1).permute(1, 2, 3, 0).float().cpu().numpy()
+    z, y, x = (size // 2 for size in array.shape[:3])
     white = max(float(np.quantile(array, 0.999)), 1e-6)
-    views = [array[z, ::-1, :], array[:, ::-1, x].T, array[::-1, y, :]]
-    return beside([np.repeat(view[..., None] / white, 3, axis=2) for view in views])
+    views = [array[z, ::-1, :], array[:, ::-1, x].transpose(1, 0, 2), array[::-1, y, :]]
+    return beside([view / white for view in views])
 
 
 def beside(pictures: list[np.ndarray]) -> np.ndarray:

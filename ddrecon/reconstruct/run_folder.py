@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.io.atomic import replacing
-from ddrecon.io.images import write_preview
+from ddrecon.io.images import write_linear, write_preview
 from ddrecon.io.json_file import write_json
 from ddrecon.io.volumes import write_field
 from ddrecon.reconstruct.checkpoint import save_checkpoint
@@ -20,6 +21,7 @@ from ddrecon.reconstruct.loop import Reconstruction, Row
 from ddrecon.reconstruct.losses import psnr
 from ddrecon.reconstruct.previews import comparison, slices
 from ddrecon.renderer import render_each
+from ddrecon.variables import VOLUME, value_of, variable_names
 from ddrecon.world import Scene
 
 CHECKPOINT = Path("checkpoints", "last.pt")
@@ -64,15 +66,39 @@ class RunFolder:
         """Writes checkpoint, volume, parameters, pictures and `summary.json`, and returns what the summary says."""
         self.save(run)
         scene = run.current_scene()
-        low, high = scene.volume.grid.bounds_xyz
-        write_field(self.path / "volumes" / "density.npz", "density", scene.volume.density.float().cpu().numpy(), np.array([low, high]))
-        write_json(self.path / "parameters.json", {"g": float(scene.volume.g)})
+        fields = {"density"} | {parameter.name for parameter in run.parameters if parameter.is_field}
+        for name in sorted(fields):
+            self._write_volume(scene, name)
+        write_json(self.path / "parameters.json", self._parameters(scene))
         summary = _summary(run) | {"views": self._pictures(scene, "")}
         write_json(self.path / "summary.json", summary)
         return summary
 
+    def _write_volume(self, scene: Scene, name: str) -> None:
+        value = value_of(scene, name).float().cpu()
+        array = value.numpy() if value.ndim == 3 else value.expand(3 if len(value) > 1 else 1, -1, -1, -1).permute(1, 2, 3, 0).squeeze(-1).numpy()
+        write_field(self.path / "volumes" / f"{name}.npz", name, array, np.array(scene.volume.grid.bounds_xyz))
+
+    def _parameters(self, scene: Scene) -> dict[str, Any]:
+        """Everything of `scene` that is not a volume, as plain values; maps become files of their own."""
+        volume = {name: value.tolist() for name in ("sigma_a", "sigma_s", "g") if (value := value_of(scene, name)).ndim < 2}
+        lights: dict[str, Any] = {}
+        for name in variable_names(scene):
+            if name.startswith("lights."):
+                value = value_of(scene, name)
+                lights[name] = self._write_map(name, value) if value.ndim == 3 else value.tolist()
+        cameras = {f"views.{view.name}.camera": {"matrix": [*view.camera.pose.tolist(), [0, 0, 0, 1]]} for view in scene.views}
+        return volume | lights | cameras
+
+    def _write_map(self, name: str, radiance: Tensor) -> str:
+        """Writes a map of radiance [C, h, w]; returns its file's name."""
+        write_linear(self.path / name, radiance.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy())
+        return f"{name}.npy"
+
     def _pictures(self, scene: Scene, mark: str) -> dict[str, Any]:
-        write_preview(self.path / "previews" / f"density.slices{mark}.png", slices(scene.volume.density))
+        for name in VOLUME:
+            if (value := value_of(scene, name)).ndim >= 3:
+                write_preview(self.path / "previews" / f"{name}.slices{mark}.png", slices(value))
         views = [view for view in scene.views if view.image is not None]
         quality = {}
         with torch.no_grad():
@@ -99,5 +125,5 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
         "test_psnr": tests[-1] if tests else None,
         "forward_iterations": sum(row.forward_iterations for row in run.rows),
         "adjoint_iterations": sum(row.adjoint_iterations for row in run.rows),
-        "cells": run.density.grid.cells,
+        "cells": last.cells,
     }

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from functools import partial
+from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from ddrecon.io.volumes import read_field
 from ddrecon.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.medium import Volume
+from ddrecon.scene.build_starts import build_starts, require_start_files
 from ddrecon.scene.build_views import build_views
 from ddrecon.scene.build_volume import build_volume
-from ddrecon.scene.files import read_referenced
 from ddrecon.scene.load import SceneFile, read_scene
 from ddrecon.scene.problems import Problems
-from ddrecon.scene.schema import Color, DirectionalSection, FieldFile, LightSection
+from ddrecon.scene.schema import Color, DirectionalSection, LightSection
 from ddrecon.world import Scene
 
 
@@ -44,37 +41,11 @@ def build_scene(scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, de
         grid = volume.grid
     with problems.collecting():
         views = build_views(scene_file, grid, dtype, place)
-    starts: dict[str, Tensor] = {}
-    with problems.collecting():
-        starts = _starts(scene_file, volume, problems)
+    require_start_files(scene_file, problems)
     problems.raise_any()
     lights = [_build_light(light, dtype, place) for light in tree.lights]
-    return Scene(volume, lights, views, tree.render, tree.diffusion, tree.optimize, starts, scene_file.path)
-
-
-def _starts(scene_file: SceneFile, volume: Volume | None, problems: Problems) -> dict[str, Tensor]:
-    """The field each optimized parameter starts from."""
-    optimize, starts = scene_file.tree.optimize, {}
-    for name, settings in optimize.parameters.items() if optimize else ():
-        with problems.collecting():
-            start = _start(scene_file, name, settings.init, volume)
-            if start is not None:
-                starts[name] = start
-    return starts
-
-
-def _start(scene_file: SceneFile, name: str, init: float | FieldFile | None, volume: Volume | None) -> Tensor | None:
-    """The field that `init` of parameter `name` describes; what the volume has where it is None; None without a volume."""
-    field: Tensor | None = None if volume is None else getattr(volume, name).clone()
-    if isinstance(init, FieldFile):
-        key = f"optimize.parameters.{name}.init.file"
-        values = read_referenced(scene_file, key, init.file, partial(read_field, name=name)).values
-        if field is not None and values.shape != tuple(field.shape):
-            raise scene_file.refused(key, f"has {list(values.shape)} values [z, y, x] but the volume has {list(field.shape)}")
-        return None if field is None else torch.as_tensor(values).to(field)
-    if init is not None and field is not None:
-        field.fill_(init)
-    return field
+    scene = Scene(volume, lights, views, tree.render, tree.diffusion, tree.optimize, {}, scene_file.path)
+    return replace(scene, starts=build_starts(scene_file, scene))
 
 
 def _build_light(section: LightSection, dtype: torch.dtype, device: torch.device) -> Light:

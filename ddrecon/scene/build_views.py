@@ -52,7 +52,7 @@ def _build_view(scene_file: SceneFile, index: int, grid: Grid | None, dtype: tor
                 )
     problems.raise_any()
     camera = Camera(camera.pose.to(device, dtype), camera.size, camera.half_width, camera.is_perspective)
-    return View(section.name, camera, image, mask, section.split == "test")
+    return View(section.name, camera, image, mask, section.split == "test", section.weight)
 
 
 def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None:

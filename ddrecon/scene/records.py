@@ -12,8 +12,9 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 from ddrecon.scene.leaves import LEAVES, Rule, read_color, read_each, read_list, read_number, read_text
 from ddrecon.scene.nodes import Node, found
 from ddrecon.scene.problems import Problems, suggestion
+from ddrecon.scene.parameter_kinds import KINDS, Kind, pattern_of
 from ddrecon.scene.ring import read_ring_views
-from ddrecon.scene.schema import PARAMETERS, Constant, Density, FieldFile, ParameterSettings, Quantity, RingViews, ViewSection
+from ddrecon.scene.schema import Constant, Density, FieldFile, ParameterSettings, Quantity, RingViews, Start, ViewSection
 
 R = TypeVar("R")
 
@@ -106,13 +107,37 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
     problems, parameters = Problems(), {}
     for name, child in _mapping(node).items():
         with problems.collecting():
-            if name not in PARAMETERS:
-                raise child.key_refused(f"unknown parameter{suggestion(name, PARAMETERS)}")
-            parameters[name] = read_record(child, ParameterSettings, rule.folder)
+            if (kind := KINDS.get(pattern_of(name))) is None:
+                raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
+            parameters[name] = _legal(child, read_record(child, ParameterSettings, rule.folder), kind)
     problems.raise_any()
     if not parameters:
-        raise node.refused(f"names no parameter; known: {', '.join(PARAMETERS)}")
+        raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
+    for name, other in (("sigma_t", "sigma_a"), ("sigma_t", "sigma_s"), ("albedo", "sigma_a"), ("albedo", "sigma_s")):
+        if name in parameters and other in parameters:
+            raise _mapping(node)[name].key_refused(f"cannot be optimized beside {other}: take sigma_a and sigma_s, or sigma_t and albedo")
     return parameters
+
+
+def _legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSettings:
+    """`settings`, unless they leave what is legal for a parameter of `kind`."""
+    problems = Problems()
+    numbers = {"min": settings.min, "max": settings.max} | {"init": settings.init if isinstance(settings.init, float) else None}
+    for name, number in numbers.items():
+        if number is not None and not kind.low <= number <= kind.high:
+            problems.note(_mapping(node)[name].refused(f"must be at least {kind.low:g} and at most {kind.high:g}, found {number:g}"))
+    if isinstance(settings.init, tuple) and not all(kind.low <= entry <= kind.high for entry in settings.init):
+        problems.note(_mapping(node)["init"].refused(f"each entry must be at least {kind.low:g} and at most {kind.high:g}"))
+    if not kind.is_cellwise:
+        for name in ("field", "tv"):
+            if getattr(settings, name):
+                problems.note(_mapping(node)[name].refused("it is not a field, so it has none"))
+    problems.raise_any()
+    return settings
+
+
+def _read_start(node: Node, rule: Rule) -> Any:
+    return read_each(read_list(node), rule, read_number) if isinstance(node.value, list) else _read_density(node, rule)
 
 
 def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
@@ -139,6 +164,7 @@ READERS: dict[Any, Callable[[Node, Rule], Any]] = {
     **LEAVES,
     Density: _read_density,
     Quantity: _read_quantity,
+    Start: _read_start,
     Mapping[str, ParameterSettings]: _read_parameters,
     tuple[ViewSection, ...]: _read_views,
 }

@@ -7,6 +7,7 @@ rules about several values at once. Defaults are here and in `ddrecon.settings`,
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ddrecon.grid import Triple
-from ddrecon.settings import DiffusionSettings, RenderSettings, bounded, one_of
+from ddrecon.settings import DERIVATIVES, DiffusionSettings, RenderSettings, bounded, one_of
 
 Count = tuple[int, int, int]
 Size = tuple[int, int]
@@ -26,7 +27,7 @@ Matrix = tuple[Row, Row, Row, Row]
 Problem = tuple[str, str]
 
 MAX_CELLS = 2**30
-TAKEN = (".reduced", ".single", ".multiple", ".slices")
+TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
 """Endings of the names of output files, which a view's name must not have."""
 
 
@@ -56,6 +57,7 @@ class FieldFile:
 
 Density = float | FieldFile
 Quantity = Color | FieldFile
+Start = float | tuple[float, ...] | FieldFile
 
 
 @dataclass(frozen=True)
@@ -168,13 +170,14 @@ CameraSection = PerspectiveSection | OrthographicSection
 
 @dataclass(frozen=True)
 class ViewSection:
-    """One view; `resolution` of its camera may be left out where there is an image."""
+    """One view; `resolution` of its camera may be left out where there is an image. `weight`: how much it counts in the loss."""
 
     name: str
     camera: CameraSection
     image: Path | None = None
     mask: Path | None = None
     split: str = one_of("train", ("train", "test"))
+    weight: float = bounded(1.0, above=0)
 
     def problems(self) -> Iterator[Problem]:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
@@ -210,39 +213,45 @@ class RingViews:
             yield "ring", "missing key 'resolution'; only views with images can go without"
 
 
-PARAMETERS = ("density",)
-"""What a scene may ask to be reconstructed."""
-
-
 @dataclass(frozen=True)
 class ParameterSettings:
     """How one parameter is optimized: from `init` (None: what the scene says), within [`min`, `max`], by learning rate `lr`.
 
-    Without `lr` a step changes a cell by at most 0.1, or by a density of 8 optical depths across the box where that is less.
-    `tv` weighs its total variation; 1 would weigh it as much as the whole brightness of the targets.
+    `field`: whether it differs from cell to cell (None: if it does so where it starts; density always does). `tv` weighs its total
+    variation and `l1` its mean; 1 would weigh them as much as the whole brightness of the targets.
     """
 
-    init: Density | None = optional()
+    init: Start | None = None
     lr: float | None = optional(above=0)
-    min: float = bounded(0.0, minimum=0)
+    min: float | None = None
     max: float | None = None
-    tv: float = bounded(3e-3, minimum=0)
+    tv: float | None = optional(minimum=0)
+    l1: float = bounded(0.0, minimum=0)
+    field: bool | None = None
 
     def problems(self) -> Iterator[Problem]:
-        if self.max is not None and self.max <= self.min:
-            yield "max", f"{self.max:g} is not above min, {self.min:g}"
-        elif isinstance(self.init, float) and not self.min <= self.init <= (self.init if self.max is None else self.max):
-            yield "init", f"{self.init:g} is not between min and max"
+        low, high = -math.inf if self.min is None else self.min, math.inf if self.max is None else self.max
+        entries = self.init if isinstance(self.init, tuple) else (self.init,)
+        if high <= low:
+            yield "max", f"{high:g} is not above min, {low:g}"
+        elif any(isinstance(entry, float) and not low <= entry <= high for entry in entries):
+            yield "init", "is not between min and max"
 
 
 @dataclass(frozen=True)
 class OptimizeSettings:
-    """`refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine."""
+    """`refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
+
+    `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for all. `derivatives`: which radiance passes
+    derivatives on: all of it, that scattered once, or that scattered more often.
+    """
 
     parameters: Mapping[str, ParameterSettings]
     iterations: int = bounded(300, minimum=1)
     loss: str = one_of("l2", ("l2",))
     optimizer: str = one_of("adam", ("adam",))
+    views_per_iteration: int = bounded(0, minimum=0)
+    derivatives: str = one_of("all", DERIVATIVES)
     refine_at: tuple[float, ...] = field(default=(0.3, 0.6), metadata={"above": 0, "below": 1})
 
     def problems(self) -> Iterator[Problem]:

@@ -1,56 +1,65 @@
 """Derivatives checked against each other: tangent against adjoint, and the adjoint against finite differences of the program.
 
-Everything runs in float64 with solves to nearly its precision. Where the scene's density is the same everywhere, and above all where it is
-empty, the check is made at a random density, half of whose cells are empty.
+Everything runs in float64 with solves to nearly its precision, for every parameter alone and for all of them at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError
-from ddrecon.reconstruct.losses import image_loss
-from ddrecon.renderer import render_each
+from ddrecon.scene.problems import suggestion
+from ddrecon.validate.point import chosen_entries, entry_name, loss_at, random_like, starting_point, steps_of
+from ddrecon.variables import variable_names
 from ddrecon.world import Scene
 
-TOLERANCE = 1e-13
-"""Relative residual of the solves."""
-STEPS = (3e-2, 1e-2, 3e-3)
-"""Changes of density by which finite differences are taken; the one that agrees best counts, the rest suffer truncation or rounding."""
 AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6
+NEGLIGIBLE = 1e-6
+"""Errors are relative to the derivative they are of, or to this part of the parameter's largest where that is more."""
+TOGETHER = "all at once"
+
+Loss = Callable[[Mapping[str, Tensor]], Tensor]
+Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True)
 class EntryCheck:
-    """One cell (x, y, z): its density, derivative by the adjoint, by finite differences, and relative error."""
+    """One entry of a parameter, or a random direction in it: derivative by the adjoint, by central differences, relative error.
 
-    cell: tuple[int, int, int]
-    density: float
+    `differences` are those of all `steps`; `difference`, taken with `step`, is the one that agrees best: larger steps suffer from truncation,
+    smaller ones from rounding.
+    """
+
+    entry: str
+    value: float
     adjoint: float
     difference: float
+    step: float
     error: float
+    steps: tuple[float, ...]
+    differences: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """The check of one parameter: relative difference of the two modes along a random direction, and of single cells."""
+    """The check of one parameter: relative difference of tangent and adjoint along a random direction, and the entries looked at."""
 
     parameter: str
+    tangent: float
     modes_error: float
     entries: tuple[EntryCheck, ...]
 
     @property
     def worst(self) -> EntryCheck:
-        """The cell with the largest error."""
-        return max(self.entries, key=lambda entry: entry.error)
+        """The entry with the largest error; NaN counts as largest."""
+        return max(self.entries, key=lambda entry: entry.error if entry.error == entry.error else float("inf"))
 
     @property
     def has_passed(self) -> bool:
@@ -59,23 +68,33 @@ class GradientCheck:
 
     def lines(self) -> list[str]:
         """The check as a table."""
-        header = f"{'cell (x, y, z)':>16}  {'density':>10}  {'adjoint':>14}  {'difference':>14}  {'relative error':>14}"
-        rows = [f"{e.cell!s:>16}  {e.density:10.4g}  {e.adjoint:14.7e}  {e.difference:14.7e}  {e.error:14.1e}" for e in self.entries]
+        header = f"{self.parameter:>24}  {'value':>10}  {'adjoint':>14}  {'difference':>14}  {'step':>8}  {'relative error':>14}"
+        rows = [f"{e.entry:>24}  {e.value:10.4g}  {e.adjoint:14.7e}  {e.difference:14.7e}  {e.step:8.1e}  {e.error:14.1e}" for e in self.entries]
         verdict = "pass" if self.has_passed else "FAIL"
-        worst = f"worst cell {self.worst.cell}: {self.worst.error:.1e} (allowed {AGREE_DIFFERENCES:.0e})"
+        worst = f"central differences {self.worst.error:.1e} at worst, {self.worst.entry} (allowed {AGREE_DIFFERENCES:.0e})"
         modes = f"tangent against adjoint {self.modes_error:.1e} (allowed {AGREE_MODES:.0e})"
         return [header, *rows, f"{self.parameter}: {verdict}; {modes}; {worst}"]
 
 
-def check_parameters(
-    scene: Scene, names: tuple[str, ...], samples: int, seed: int, progress: Callable[[Sequence[int], str], Iterable[int]]
-) -> list[GradientCheck]:
-    """Checks the parameters called `names`, or all that `scene` (float64) optimizes; raises SceneError for one it cannot check."""
-    known = list(CHECKS)
+def check_parameters(scene: Scene, names: tuple[str, ...], samples: int, seed: int, progress: Progress) -> list[GradientCheck]:
+    """Checks the parameters called `names`, or all that `scene` (float64) optimizes (density where that is none), and all at once.
+
+    `samples` entries of each are looked at one by one. Raises SceneError for a name the scene does not have.
+    """
+    known = variable_names(scene)
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise SceneError(f"--parameter {unknown[0]}: cannot be checked; known: {', '.join(known)}")
-    return [CHECKS[name](scene, samples, seed, progress) for name in names or known]
+        raise SceneError([f"--parameter {name}: the scene has no such number{suggestion(name, known)}" for name in unknown])
+    chosen = tuple(dict.fromkeys(names)) or tuple(scene.optimize.parameters if scene.optimize else ("density",))
+    generator = torch.Generator().manual_seed(seed)
+    point = starting_point(scene, chosen, generator)
+    loss = loss_at(scene, point, generator)
+    values = {name: point[name] for name in chosen}
+    gradients = _gradients(loss, values)
+    checks = [
+        _check(loss, {name: values[name]}, gradients, samples if name else 0, generator, name) for name in progress(chosen, "gradcheck")
+    ]
+    return checks if len(chosen) == 1 else [*checks, _check(loss, values, gradients, 0, generator, TOGETHER)]
 
 
 def describe(checks: list[GradientCheck]) -> dict[str, Any]:
@@ -86,82 +105,65 @@ def describe(checks: list[GradientCheck]) -> dict[str, Any]:
     }
 
 
-def check_density(scene: Scene, samples: int, seed: int, progress: Callable[[Sequence[int], str], Iterable[int]]) -> GradientCheck:
-    """Checks the derivative of the image loss of `scene` (float64) with respect to density in `samples` cells, empty ones among them.
+def _gradients(loss: Loss, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    bars = torch.autograd.grad(loss(leaves), list(leaves.values()), allow_unused=True)
+    return {name: torch.zeros_like(values[name]) if bar is None else bar for name, bar in zip(values, bars, strict=True)}
 
-    The loss is that of the views' images where they have them, else against random targets.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    scene = replace(scene, volume=replace(scene.volume), diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
-    density = _point(scene.volume.density, generator)
-    loss = _loss_of(scene, generator)
-    variable = density.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(loss(variable), variable)
-    direction = _random(density, generator) - 0.5
+
+def _check(
+    loss: Loss, values: Mapping[str, Tensor], gradients: Mapping[str, Tensor], samples: int, generator: torch.Generator, label: str
+) -> GradientCheck:
+    """The check of `values`: along a random direction in all of them, and at `samples` entries where it is one parameter."""
+    steps = {name: steps_of(name, value) for name, value in values.items()}
+    direction = {name: 2 * (random_like(value, generator) - 0.5) * steps[name][0] for name, value in values.items()}
+    along = float(sum((gradients[name] * direction[name]).sum() for name in values))
+    tangent = _tangent(loss, values, direction)
+    fractions = tuple(step / first[0] for first in [next(iter(steps.values()))] for step in first)
+    ways = [("a random direction", float("nan"), along, direction, fractions, 0.0)]
+    for name, value in values.items() if samples else ():
+        floor = NEGLIGIBLE * float(gradients[name].abs().max())
+        for index in chosen_entries(name, value, samples, generator):
+            unit = torch.zeros_like(value)
+            unit.view(-1)[index] = 1
+            derivative = float(gradients[name].flatten()[index])
+            ways.append((entry_name(name, value, index), float(value.flatten()[index]), derivative, {name: unit}, steps[name], floor))
+    entries = tuple(_check_way(loss, values, *way) for way in ways)
+    modes_error = abs(tangent - along) / max(abs(along), torch.finfo(torch.float64).tiny)
+    return GradientCheck(label, tangent, modes_error, entries)
+
+
+def _tangent(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, Tensor]) -> float:
     with forward_ad.dual_level():
-        tangent = forward_ad.unpack_dual(loss(forward_ad.make_dual(density, direction))).tangent
-    along = (gradient * direction).sum()
-    modes_error = float((tangent - along).abs() / along.abs().clamp(min=torch.finfo(along.dtype).tiny))
-    entries = tuple(_check_entry(loss, density, gradient, index) for index in progress(_choose(density, samples, generator), "gradcheck"))
-    return GradientCheck("density", modes_error, entries)
+        duals = {name: forward_ad.make_dual(value, direction[name]) for name, value in values.items()}
+        tangent = forward_ad.unpack_dual(loss(duals)).tangent
+    return 0.0 if tangent is None else float(tangent)
 
 
-CHECKS = {"density": check_density}
-"""The parameters whose derivatives can be checked."""
+def _check_way(
+    loss: Loss,
+    values: Mapping[str, Tensor],
+    entry: str,
+    value: float,
+    adjoint: float,
+    direction: Mapping[str, Tensor],
+    steps: tuple[float, ...],
+    floor: float,
+) -> EntryCheck:
+    differences = tuple(_difference(loss, values, direction, step) for step in steps)
+    tiny = torch.finfo(torch.float64).tiny
+    errors = [abs(difference - adjoint) / max(abs(difference), abs(adjoint), floor, tiny) for difference in differences]
+    best = min(range(len(steps)), key=lambda i: errors[i])
+    return EntryCheck(entry, value, adjoint, differences[best], steps[best], errors[best], steps, differences)
 
 
-def _loss_of(scene: Scene, generator: torch.Generator) -> Callable[[Tensor], Tensor]:
-    views = [view for view in scene.views if view.image is not None] or scene.views
-    targets = [
-        view.image if view.image is not None else _random(scene.volume.density.new_empty(3, *view.camera.size), generator) for view in views
-    ]
-    memory = SolveMemory()
-
-    def loss(density: Tensor) -> Tensor:
-        scene.volume.density = density
-        images = render_each(scene, views, memory)
-        parts = [image_loss("l2", image, target, view.mask) for image, target, view in zip(images, targets, views, strict=True)]
-        return torch.stack(parts).mean()
-
-    return loss
-
-
-def _point(density: Tensor, generator: torch.Generator) -> Tensor:
-    if bool((density != density.flatten()[0]).any()):
-        return density
-    return (2 * _random(density, generator) - 1).clamp(min=0)
-
-
-def _choose(density: Tensor, samples: int, generator: torch.Generator) -> list[int]:
-    """Flat indices of `samples` random cells, half of them empty where enough are."""
-    order = torch.randperm(density.numel(), generator=generator)
-    is_empty = (density.flatten().cpu()[order] == 0).tolist()
-    empty = [i for i, e in zip(order.tolist(), is_empty, strict=True) if e][: samples // 2]
-    filled = [i for i, e in zip(order.tolist(), is_empty, strict=True) if not e][: samples - len(empty)]
-    return filled + empty
-
-
-def _check_entry(loss: Callable[[Tensor], Tensor], density: Tensor, gradient: Tensor, index: int) -> EntryCheck:
-    adjoint = float(gradient.flatten()[index])
-    differences = [_difference(loss, density, index, step) for step in STEPS]
-    errors = [abs(difference - adjoint) / max(abs(difference), abs(adjoint), 1e-300) for difference in differences]
-    best = min(range(len(STEPS)), key=lambda i: errors[i])
-    _, ny, nx = density.shape
-    cell = (index % nx, index // nx % ny, index // (nx * ny))
-    return EntryCheck(cell, float(density.flatten()[index]), adjoint, differences[best], errors[best])
-
-
-def _difference(loss: Callable[[Tensor], Tensor], density: Tensor, index: int, step: float) -> float:
-    """The central difference of fourth order."""
+def _difference(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, Tensor], step: float) -> float:
+    """The central difference of fourth order along `direction`."""
 
     def shifted(steps: int) -> float:
-        moved = density.clone()
-        moved.view(-1)[index] += steps * step
         with torch.no_grad():
-            return float(loss(moved))
+            return float(loss({name: value + steps * step * direction[name] for name, value in values.items() if name in direction}))
 
     return (8 * (shifted(1) - shifted(-1)) - (shifted(2) - shifted(-2))) / (12 * step)
 
 
-def _random(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.rand(like.shape, generator=generator, dtype=torch.float64).to(like)

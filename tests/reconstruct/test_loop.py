@@ -42,8 +42,8 @@ def test_bounds_hold_at_every_step(ball_scene: Scene) -> None:
     run = Reconstruction(scene)
     for _ in range(3):
         run.step()
-        assert run.density.value.min() >= 0.01
-        assert run.density.value.max() <= 0.3
+        assert run.parameters[0].value.min() >= 0.01
+        assert run.parameters[0].value.max() <= 0.3
 
 
 def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
@@ -96,11 +96,11 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
 def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
     run = Reconstruction(ball_scene)
     run.step()
-    good = run.density.value.detach().clone()
+    good = run.parameters[0].value.detach().clone()
     run.train_level.views[0].image[0, 3, 4] = float("inf")
     with pytest.raises(SolveError, match="not finite"):
         run.step()
-    assert torch.equal(run.density.value, good)
+    assert torch.equal(run.parameters[0].value, good)
     assert run.iteration == 1
 
 

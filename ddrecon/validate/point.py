@@ -1,0 +1,95 @@
+"""Where derivatives are checked: the values all parameters have there, the loss as a function of them, and the entries looked at.
+
+Where the scene's density is the same everywhere, and above all where it is empty, the check is made at a random density, half of whose
+cells are empty: an empty volume would hide all but density from the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.reconstruct.losses import image_loss
+from ddrecon.renderer import render_each
+from ddrecon.scene.parameter_kinds import pattern_of
+from ddrecon.variables import component_names, value_of, with_values
+from ddrecon.world import Scene
+
+TOLERANCE = 1e-13
+"""Relative residual of the solves."""
+STEPS = (3e-2, 1e-2, 3e-3)
+"""Changes by which finite differences are taken, as parts of the parameter's largest value."""
+SHORT_STEPS = (1e-4, 1e-5, 1e-6)
+"""The same for what moves rays or beams: interpolation has a kink at every cell center, and fewer are crossed by a short step."""
+SHORT = {"lights.N.direction", "lights.N.position", "lights.N.rotation", "views.NAME.camera"}
+
+
+def starting_point(scene: Scene, names: tuple[str, ...], generator: torch.Generator) -> dict[str, Tensor]:
+    """The value of density, of each optimized parameter and of each of `names`."""
+    wanted = dict.fromkeys([*scene.starts, *names, "density"])
+    point = {name: scene.starts[name] if name in scene.starts else value_of(scene, name) for name in wanted}
+    density = point["density"]
+    if density.ndim == 3 and bool((density == density.flatten()[0]).all()):
+        point["density"] = (2 * random_like(density, generator) - 1).clamp(min=0)
+    return point
+
+
+def loss_at(scene: Scene, point: Mapping[str, Tensor], generator: torch.Generator) -> Callable[[Mapping[str, Tensor]], Tensor]:
+    """The image loss of `scene` (float64) as a function of some parameters, the others being as in `point`.
+
+    Targets are the views' images where they have them, else random ones.
+    """
+    exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
+    views = [view for view in scene.views if view.image is not None] or scene.views
+    targets = [
+        view.image if view.image is not None else random_like(scene.volume.density.new_empty(3, *view.camera.size), generator) for view in views
+    ]
+    memory = SolveMemory()
+
+    def loss(values: Mapping[str, Tensor]) -> Tensor:
+        world = with_values(exact, {**point, **values})
+        seen = [world.view(view.name) for view in views]
+        images = render_each(world, seen, memory)
+        return torch.stack([image_loss("l2", *compared, view.mask) for *compared, view in zip(images, targets, seen, strict=True)]).mean()
+
+    return loss
+
+
+def steps_of(name: str, value: Tensor) -> tuple[float, ...]:
+    """The steps of finite differences for the parameter `name` at `value`."""
+    largest = float(value.abs().max())
+    steps = SHORT_STEPS if pattern_of(name) in SHORT else STEPS
+    return tuple(step * (largest if largest > 0 else 1.0) for step in steps)
+
+
+def chosen_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:
+    """Flat indices of `samples` random entries, of density half of them empty where enough are."""
+    order = torch.randperm(value.numel(), generator=generator)
+    if name != "density":
+        return sorted(order[:samples].tolist())
+    is_empty = (value.flatten().cpu()[order] == 0).tolist()
+    empty = [i for i, e in zip(order.tolist(), is_empty, strict=True) if e][: samples // 2]
+    filled = [i for i, e in zip(order.tolist(), is_empty, strict=True) if not e][: samples - len(empty)]
+    return filled + empty
+
+
+def entry_name(name: str, value: Tensor, index: int) -> str:
+    """What a user calls the entry at flat `index`: a component, a cell (x, y, z) or a pixel (x, y), with its color."""
+    place = []
+    for size in reversed(value.shape):
+        place.append(index % size)
+        index //= size
+    components = component_names(name, value)
+    color = f"{components[place.pop()]} " if components else ""
+    if not components and value.ndim in (1, 4):
+        place.pop()
+    return f"{color}{tuple(place) if len(place) > 1 else ''}".strip() or "its value"
+
+
+def random_like(like: Tensor, generator: torch.Generator) -> Tensor:
+    """Uniform numbers in [0, 1) in the shape of `like`, the same whatever its type and device."""
+    return torch.rand(like.shape, generator=generator, dtype=torch.float64).to(like)
