@@ -78,18 +78,26 @@ def main() -> None:
 @OVERWRITE
 @click.option("--view", "names", multiple=True, metavar="NAME", help="Render only this view; repeatable.")
 @click.option("--components", is_flag=True, help="Also write reduced, single and multiple radiance, which sum to the image.")
+@click.option("--gradient", "parameter", metavar="PARAM", help="Also write each image's derivative: density, g, lights.0.direction.x, ...")
 @DTYPE
 @AS_JSON
 @in_session
-def render(session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], components: bool) -> None:
+def render(
+    session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], components: bool, parameter: str | None
+) -> None:
     """Render the views of SCENE."""
     from ddrecon.io.folders import prepare_folder
-    from ddrecon.render_folder import render_to_folder
+    from ddrecon.render_folder import render_gradient_to_folder, render_to_folder, require_variation
 
     loaded = session.load(scene)
     views = session.chosen_views(loaded, names)
-    prepare_folder(output, may_exist=overwrite)
-    report = render_to_folder(loaded, views, output, components, session.progress)
+    if parameter is None:
+        prepare_folder(output, may_exist=overwrite)
+        report = render_to_folder(loaded, views, output, components, session.progress)
+    else:
+        require_variation(loaded, parameter)
+        prepare_folder(output, may_exist=overwrite)
+        report = render_gradient_to_folder(loaded, views, output, components, parameter, session.progress)
     session.show(report, session.render_lines(report, output))
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.medium import Volume
 from ddrecon.renderer import render
+from ddrecon.variables import with_values
 from ddrecon.world import Scene
 
 
@@ -31,19 +31,15 @@ class VolumeRenderer(torch.nn.Module):
         sigma_s: Tensor | None = None,
         g: Tensor | None = None,
         view: str | None = None,
+        values: Mapping[str, Tensor] | None = None,
     ) -> Tensor:
         """Images `[views, 3, h, w]` of all views, or of the one named `view`.
 
-        `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar in (-1, 1). What is None is the
-        scene's. Raises ValueError for a density of another shape than the grid's.
+        `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar in (-1, 1); `values`: anything else by
+        name, such as `lights.0.irradiance` (`ddrecon.variables`). What is not given is the scene's. Raises KeyError for a name the scene does
+        not have, ValueError for a density of another shape than the grid's.
         """
-        own = self.scene.volume
-        volume = Volume(
-            own.grid,
-            own.density if density is None else density,
-            own.sigma_a if sigma_a is None else sigma_a,
-            own.sigma_s if sigma_s is None else sigma_s,
-            own.g if g is None else g,
-        )
+        given = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
+        chosen = {name: value for name, value in given.items() if value is not None} | dict(values or {})
         self.memory.records.clear()
-        return render(replace(self.scene, volume=volume), view, self.memory)
+        return render(with_values(self.scene, chosen), view, self.memory)

@@ -1,4 +1,4 @@
-"""Rendered views as files: linear pixels, previews, and a report of what it took."""
+"""Rendered views as files: linear pixels, previews, derivative images, and a report of what it took."""
 
 from __future__ import annotations
 
@@ -11,18 +11,22 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.errors import SceneError
 from ddrecon.io.images import write_linear, write_preview
 from ddrecon.io.json_file import write_json
 from ddrecon.reconstruct.losses import psnr
-from ddrecon.reconstruct.previews import pixels
+from ddrecon.reconstruct.previews import diverging, pixels
 from ddrecon.renderer import LightField, solve_light, view_components, view_image
+from ddrecon.tangents import render_tangent, variation
 from ddrecon.terms import needed_terms
 from ddrecon.world import Scene, View
 
+GRADIENT = "gradient"
+"""Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""
+Progress = Callable[[list[View], str], Iterable[View]]
 
-def render_to_folder(
-    scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Callable[[list[View], str], Iterable[View]]
-) -> dict[str, Any]:
+
+def render_to_folder(scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Progress) -> dict[str, Any]:
     """Renders `views` of `scene` into `folder` and returns the report that `render.json` holds."""
     memory, files, seconds, quality = SolveMemory(), {}, {}, {}
     with torch.no_grad():
@@ -36,16 +40,53 @@ def render_to_folder(
             files[view.name] = [path.name for name, image in images.items() for path in _write(folder / name, image)]
             if view.image is not None:
                 quality[view.name] = psnr(images[view.name], view.image, view.mask)
-    solves = [{"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds} for r in memory.records]
-    report = {
-        "seconds": {"light": light_seconds, "views": seconds},
-        "solves": solves,
-        "physics": needed_terms(scene),
-        "psnr": quality,
-        "files": files,
-    }
+    report = _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {"psnr": quality}
     write_json(folder / "render.json", report)
     return report
+
+
+def render_gradient_to_folder(
+    scene: Scene, views: list[View], folder: Path, has_components: bool, parameter: str, progress: Progress
+) -> dict[str, Any]:
+    """Renders `views` of `scene` and their derivatives with respect to `parameter` (see `require_variation`); else as `render_to_folder`."""
+    memory, scales = SolveMemory(), {}
+    seconds: dict[str, Any] = {"views": {}}
+    files: dict[str, list[str]] = {view.name: [] for view in views}
+
+    def images_of(world: Scene) -> dict[tuple[str, str], Tensor]:
+        start, images = perf_counter(), dict[tuple[str, str], Tensor]()
+        light_field = solve_light(world, memory)
+        seconds["light"] = perf_counter() - start
+        for view in progress([world.view(view.name) for view in views], "render"):
+            begun = perf_counter()
+            images |= {(view.name, name): image for name, image in _images(light_field, world, view, has_components).items()}
+            seconds["views"][view.name] = perf_counter() - begun
+        return images
+
+    with torch.no_grad():
+        rendered = render_tangent(scene, parameter, images_of)
+    for (view, name), (image, derivative) in rendered.items():
+        derived = f"{view}.{GRADIENT}{name.removeprefix(view)}"
+        picture, scales[derived] = diverging(derivative)
+        written = [*_write(folder / name, image), *write_linear(folder / derived, pixels(derivative)), folder / f"{derived}.png"]
+        write_preview(written[-1], picture)
+        files[view] += [path.name for path in written]
+    report = _report(scene, memory, seconds, files) | {"psnr": {}, "gradient": {"parameter": parameter, "full_scale": scales}}
+    write_json(folder / "render.json", report)
+    return report
+
+
+def require_variation(scene: Scene, parameter: str) -> None:
+    """Raises SceneError unless `parameter` names a number of `scene` or a component of one."""
+    try:
+        variation(scene, parameter)
+    except KeyError as error:
+        raise SceneError(f"--gradient {parameter}: {error.args[0]}") from None
+
+
+def _report(scene: Scene, memory: SolveMemory, seconds: dict[str, Any], files: dict[str, list[str]]) -> dict[str, Any]:
+    solves = [{"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds} for r in memory.records]
+    return {"seconds": seconds, "solves": solves, "physics": needed_terms(scene), "files": files}
 
 
 def _images(light_field: LightField, scene: Scene, view: View, has_components: bool) -> dict[str, Tensor]:

@@ -75,8 +75,9 @@ class Session:
         """What `render` prints: files, quality and time of each view."""
         lines = []
         for name, files in report["files"].items():
-            quality = f", PSNR {report['psnr'][name]:.1f} dB" if name in report["psnr"] else ""
-            lines.append(f"{name}: {', '.join(files)} ({report['seconds']['views'][name]:.2f} s{quality})")
+            notes = [f"{report['seconds']['views'][name]:.2f} s"]
+            notes += [f"PSNR {report['psnr'][name]:.1f} dB"] if name in report["psnr"] else []
+            lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
         if any(file.endswith(".tif") for files in report["files"].values() for file in files):
             lines.append('no OpenEXR here, so float .tif instead of .exr; for EXR: pip install "ddrecon[exr]"')
         return [*lines, f"written to {folder}"]

@@ -47,7 +47,13 @@ def value_of(scene: Scene, name: str) -> Tensor:
 
 
 def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
-    """`scene` with its variables replaced by `values`; a density of one number fills the grid. `scene` itself stays as it is."""
+    """`scene` with its variables replaced by `values`; a density of one number fills the grid. `scene` itself stays as it is.
+
+    Raises KeyError for a name that is none, ValueError for a density of another shape than the grid's.
+    """
+    unknown = [name for name in values if name not in variable_names(scene)]
+    if unknown:
+        raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(variable_names(scene))}")
     lights = [
         _replaced_light(light, {name: values[key] for name in _tensors(light) if (key := f"lights.{index}.{name}") in values})
         for index, light in enumerate(scene.lights)
@@ -95,7 +101,7 @@ def _replaced_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     if "sigma_t" in values or "albedo" in values:
         sigma_t, albedo = (values[name] if name in values else _volume_value(volume, name) for name in ("sigma_t", "albedo"))
         sigma_a, sigma_s = cross_sections(sigma_t, albedo)
-    return Volume(volume.grid, density.expand(volume.grid.shape), sigma_a, sigma_s, g)
+    return Volume(volume.grid, density.expand(volume.grid.shape) if density.ndim == 0 else density, sigma_a, sigma_s, g)
 
 
 def _replaced_light(light: Light, values: Mapping[str, Tensor]) -> Light:

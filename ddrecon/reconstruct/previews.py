@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
+from ddrecon.io.srgb import decode
+
 ENLARGED = 4
 """Differences are shown this many times enlarged, around mid-gray."""
+BLUE, RED = (0.13, 0.30, 0.70), (0.70, 0.09, 0.13)
+"""Ends of the diverging scale, as sRGB values."""
 GAP = 4
 """Pixels between pictures."""
 
@@ -33,6 +37,15 @@ def slices(field: Tensor) -> np.ndarray:
     white = max(float(np.quantile(array, 0.999)), 1e-6)
     views = [array[z, ::-1, :], array[:, ::-1, x].transpose(1, 0, 2), array[::-1, y, :]]
     return beside([view / white for view in views])
+
+
+def diverging(image: Tensor) -> tuple[np.ndarray, float]:
+    """Signed `image` [3, h, w], averaged over colors, in blue (negative), white (zero) and red; and the value of full red."""
+    values = pixels(image).mean(-1)
+    full = max(float(np.quantile(np.abs(values), 0.999)), float(np.finfo(np.float32).tiny))
+    part = np.clip(values / full, -1, 1)[..., None]
+    strong = np.where(part < 0, np.float32(BLUE), np.float32(RED))
+    return decode((1 - np.abs(part)) + np.abs(part) * strong), full
 
 
 def beside(pictures: list[np.ndarray]) -> np.ndarray:

@@ -234,8 +234,9 @@ class ParameterSettings:
         entries = self.init if isinstance(self.init, tuple) else (self.init,)
         if high <= low:
             yield "max", f"{high:g} is not above min, {low:g}"
-        elif any(isinstance(entry, float) and not low <= entry <= high for entry in entries):
-            yield "init", "is not between min and max"
+        for entry in entries if low < high else ():
+            if isinstance(entry, float) and not low <= entry <= high:
+                yield "init", f"{entry:g} is not between min and max"
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ class EntryCheck:
     """
 
     entry: str
-    value: float
+    value: float | None
     adjoint: float
     difference: float
     step: float
@@ -69,7 +69,10 @@ class GradientCheck:
     def lines(self) -> list[str]:
         """The check as a table."""
         header = f"{self.parameter:>24}  {'value':>10}  {'adjoint':>14}  {'difference':>14}  {'step':>8}  {'relative error':>14}"
-        rows = [f"{e.entry:>24}  {e.value:10.4g}  {e.adjoint:14.7e}  {e.difference:14.7e}  {e.step:8.1e}  {e.error:14.1e}" for e in self.entries]
+        rows = [
+            f"{e.entry:>24}  {'' if e.value is None else f'{e.value:.4g}':>10}  {e.adjoint:14.7e}  {e.difference:14.7e}  {e.step:8.1e}  {e.error:14.1e}"
+            for e in self.entries
+        ]
         verdict = "pass" if self.has_passed else "FAIL"
         worst = f"central differences {self.worst.error:.1e} at worst, {self.worst.entry} (allowed {AGREE_DIFFERENCES:.0e})"
         modes = f"tangent against adjoint {self.modes_error:.1e} (allowed {AGREE_MODES:.0e})"
@@ -120,7 +123,7 @@ def _check(
     along = float(sum((gradients[name] * direction[name]).sum() for name in values))
     tangent = _tangent(loss, values, direction)
     fractions = tuple(step / first[0] for first in [next(iter(steps.values()))] for step in first)
-    ways = [("a random direction", float("nan"), along, direction, fractions, 0.0)]
+    ways = [("a random direction", None, along, direction, fractions, 0.0)]
     for name, value in values.items() if samples else ():
         floor = NEGLIGIBLE * float(gradients[name].abs().max())
         for index in chosen_entries(name, value, samples, generator):
@@ -144,7 +147,7 @@ def _check_way(
     loss: Loss,
     values: Mapping[str, Tensor],
     entry: str,
-    value: float,
+    value: float | None,
     adjoint: float,
     direction: Mapping[str, Tensor],
     steps: tuple[float, ...],

@@ -24,17 +24,19 @@ TOLERANCE = 1e-13
 STEPS = (3e-2, 1e-2, 3e-3)
 """Changes by which finite differences are taken, as parts of the parameter's largest value."""
 SHORT_STEPS = (1e-4, 1e-5, 1e-6)
-"""The same for what moves rays or beams: interpolation has a kink at every cell center, and fewer are crossed by a short step."""
-SHORT = {"lights.N.direction", "lights.N.position", "lights.N.rotation", "views.NAME.camera"}
+"""The same for what moves rays or beams, since interpolation has a kink at every cell center and a short step crosses few, and for g, whose
+delta-Eddington scaling has a second derivative that jumps at 0."""
+SHORT = {"g", "lights.N.direction", "lights.N.position", "lights.N.rotation", "views.NAME.camera"}
 
 
 def starting_point(scene: Scene, names: tuple[str, ...], generator: torch.Generator) -> dict[str, Tensor]:
-    """The value of density, of each optimized parameter and of each of `names`."""
+    """The value of density (the scene's own before that it starts from), of each optimized parameter and of each of `names`."""
     wanted = dict.fromkeys([*scene.starts, *names, "density"])
     point = {name: scene.starts[name] if name in scene.starts else value_of(scene, name) for name in wanted}
-    density = point["density"]
-    if density.ndim == 3 and bool((density == density.flatten()[0]).all()):
-        point["density"] = (2 * random_like(density, generator) - 1).clamp(min=0)
+    own = scene.volume.density
+    if point["density"].ndim == 3:
+        candidates = [own, point["density"], (2 * random_like(own, generator) - 1).clamp(min=0)]
+        point["density"] = next(density for density in candidates if bool((density != density.flatten()[0]).any()))
     return point
 
 

@@ -147,7 +147,13 @@ def test_unknown_view(refuse: Refuse) -> None:
 
 
 def test_unknown_parameter(refuse: Refuse) -> None:
-    assert refuse(2, *COMMANDS["gradcheck"], "--parameter", "depth") == ["--parameter depth: cannot be checked; known: density"]
+    (line,) = refuse(2, *COMMANDS["gradcheck"], "--parameter", "densty")
+    assert line == "--parameter densty: the scene has no such number; did you mean 'density'?"
+
+
+def test_unknown_gradient(refuse: Refuse) -> None:
+    (line,) = refuse(2, *COMMANDS["render"], "--gradient", "sigma_q")
+    assert line == "--gradient sigma_q: the scene has no number sigma_q"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is here")

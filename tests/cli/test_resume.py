@@ -49,7 +49,7 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
 @pytest.mark.parametrize(
     ("owner", "name", "call"),
     [
-        pytest.param(loop, "render_each", 3, id="after a render at a new resolution"),
+        pytest.param(loop, "differentiate", 3, id="after a render at a new resolution"),
         pytest.param(Parameter, "step", 1, id="after the first step"),
         pytest.param(Parameter, "step", 3, id="after a later step"),
     ],

@@ -33,6 +33,8 @@ def test_a_config_runs_small(config: Path) -> None:
         pytest.skip("its images need OpenEXR")
     torch.set_num_threads(2)
     scene = load_scene(config, overrides=small(config))
+    if all(view.image is None for view in scene.views):
+        pytest.skip("it has no images to reconstruct from: tests/validate checks its derivatives")
     scene.views = [scene.views[0], scene.views[-1]]
     result = optimize(scene)
     density = result.scene.volume.density

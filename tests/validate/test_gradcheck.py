@@ -1,33 +1,89 @@
-"""The derivative check passes for the program and catches a derivative that is wrong."""
+"""The derivative check passes for every kind of parameter, alone and together, and catches each derivative that is wrong."""
 
 from pathlib import Path
 
 import pytest
 import torch
+from torch.autograd import Function
 
+from ddrecon import decay, sampling
 from ddrecon.diffusion import implicit
+from ddrecon.errors import SceneError
 from ddrecon.scene.build import load_scene
-from ddrecon.validate.gradcheck import check_density
+from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
 
-BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
-SMALL = ["volume.resolution=[6, 5, 4]", "diffusion.solver=conjugate_gradient"]
-
-
-def check():
-    torch.set_num_threads(2)
-    scene = load_scene(BALL, overrides=SMALL, dtype=torch.float64)
-    scene.views = scene.views[:2]
-    return check_density(scene, 4, 0, lambda items, _: items)
+CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
+SMALL = ["volume.resolution=[6, 5, 4]", "views.0.camera.resolution=[7, 6]", "views.1.camera.resolution=[6, 5]"]
+NAMES = tuple(load_scene(CONFIG).starts)
 
 
-def test_the_program_passes() -> None:
-    result = check()
-    assert result.has_passed, result.lines()
-    assert {entry.density == 0 for entry in result.entries} == {True, False}
+def check(*names: str, samples: int = 3, overrides: tuple[str, ...] = ()) -> list[GradientCheck]:
+    scene = load_scene(CONFIG, overrides=[*SMALL, *overrides], dtype=torch.float64)
+    return check_parameters(scene, names, samples, 0, lambda items, _: items)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_parameter_passes(name: str) -> None:
+    (result,) = check(name)
+    assert result.has_passed, "\n".join(result.lines())
+    assert any(entry.adjoint != 0 for entry in result.entries)
+
+
+@pytest.mark.parametrize("name", ["sigma_t", "albedo"])
+def test_the_other_pair_of_cross_sections_passes(name: str) -> None:
+    (result,) = check(name)
+    assert result.has_passed, "\n".join(result.lines())
+
+
+def test_all_at_once_pass() -> None:
+    result = check(samples=1)[-1]
+    assert result.parameter == TOGETHER
+    assert result.has_passed, "\n".join(result.lines())
+
+
+def test_empty_cells_are_among_those_of_density() -> None:
+    (result,) = check("density", samples=4)
+    assert {entry.value == 0 for entry in result.entries if entry.value is not None} == {True, False}
+
+
+def test_forward_peaks_and_backward_scattering_pass() -> None:
+    for g in ("0.8", "-0.6", "0.0"):
+        for result in check("g", "sigma_s", overrides=(f"optimize.parameters.g.init={g}",)):
+            assert result.has_passed, "\n".join(result.lines())
+
+
+def test_an_unknown_parameter_is_refused() -> None:
+    with pytest.raises(SceneError, match=r"no such number; did you mean 'density'"):
+        check("densty")
+
+
+BROKEN = {
+    "the solve's adjoint": (implicit._Solve, "backward", "density"),
+    "the solve's tangent": (implicit._Solve, "jvp", "density"),
+    "the march's adjoint": (decay._DecayedSum, "backward", "density"),
+    "the march's tangent": (decay._DecayedSum, "jvp", "sigma_s"),
+    "the cell mean's adjoint": (decay._DecayMean, "backward", "sigma_a"),
+    "the interpolation's adjoint": (sampling._Sample, "backward", "views.front.camera"),
+    "the interpolation's tangent": (sampling._Sample, "jvp", "lights.0.direction"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_derivative_one_percent_off_is_caught(monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    owner, mode, parameter = BROKEN[case]
+    right = getattr(owner, mode)
+    monkeypatch.setattr(owner, mode, staticmethod(lambda *arguments: _off(right(*arguments))))
+    assert issubclass(owner, Function) and not check(parameter)[0].has_passed
+
+
+def _off(result: object) -> object:
+    if isinstance(result, tuple):
+        return tuple(_off(entry) for entry in result)
+    return 1.01 * result if isinstance(result, torch.Tensor) else result
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_broken_adjoint_is_caught(monkeypatch: pytest.MonkeyPatch, axis: int) -> None:
+def test_a_conductance_along_one_axis_is_caught(monkeypatch: pytest.MonkeyPatch, axis: int) -> None:
     right = implicit._Solve.backward
 
     def wrong(ctx, u_bar):
@@ -36,4 +92,4 @@ def test_a_broken_adjoint_is_caught(monkeypatch: pytest.MonkeyPatch, axis: int) 
         return tuple(bars)
 
     monkeypatch.setattr(implicit._Solve, "backward", staticmethod(wrong))
-    assert not check().has_passed
+    assert not check("density")[0].has_passed
