@@ -17,9 +17,9 @@ WARM_UP = 5
 """Iterations over which learning rates rise to their value: Adam's first steps are all of full size, whatever the derivative."""
 FINAL_RATE = 0.2
 """Learning rates fall exponentially over a run, to this part of their value."""
-SHARE = 0.05
+SHARE = 0.1
 """Change, in one step, of a quantity as a part of its mean."""
-ABSOLUTE = {"albedo": 0.02, "g": 0.02, "lights.N.rotation": 1.0, "views.NAME.camera": 3e-3}
+ABSOLUTE = {"albedo": 0.02, "g": 0.05, "lights.N.rotation": 1.0, "views.NAME.camera": 0.01}
 """Change in one step of what has a natural unit: albedo and g, degrees, and radians or box sides."""
 
 
@@ -40,7 +40,7 @@ def default_rate(scene: Scene, name: str, start: Tensor) -> float:
     if pattern == "lights.N.position":
         return SHARE * side
     if pattern == "lights.N.direction":
-        return SHARE * float(start.norm())
+        return SHARE / 2 * float(start.norm())
     least = 1 / side if pattern.startswith("sigma") else SHARE
     return SHARE * max(float(start.mean()), least)
 

@@ -13,7 +13,8 @@ from ddrecon.reconstruct.loop import optimize
 from ddrecon.scene.build import load_scene
 
 ROOT = Path(__file__).parents[2]
-CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+CONFIGS = [config for config in sorted((ROOT / "configs").glob("*.yaml")) if config.stem != "gradcheck_all"]
+"""Those with images to reconstruct from; the derivatives of the other are checked in tests/validate."""
 
 
 def small(config: Path) -> list[str]:
@@ -33,8 +34,6 @@ def test_a_config_runs_small(config: Path) -> None:
         pytest.skip("its images need OpenEXR")
     torch.set_num_threads(2)
     scene = load_scene(config, overrides=small(config))
-    if all(view.image is None for view in scene.views):
-        pytest.skip("it has no images to reconstruct from: tests/validate checks its derivatives")
     scene.views = [scene.views[0], scene.views[-1]]
     result = optimize(scene)
     density = result.scene.volume.density
