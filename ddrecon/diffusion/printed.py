@@ -73,7 +73,7 @@ class PrintedOperator:
 
 
 def jacobi(operator: PrintedOperator, source: Tensor, guess: Tensor | None, tolerance: float) -> Solution:
-    """The solution of `operator` u = `source` [C, z, y, x] by Eq. 25, from `guess` or from random values.
+    """The solution of `operator` u = `source` [C, z, y, x] by Eq. 25, from `guess` or from random values; 0 for a color without source.
 
     Stops, as Algorithm 3 does, when the mean squared change of an iteration is small, for every color: below `tolerance`^2 times that of
     the first iteration from zero. A change is the residual over the diagonal, so this is a relative residual, as in other solvers.
@@ -82,7 +82,8 @@ def jacobi(operator: PrintedOperator, source: Tensor, guess: Tensor | None, tole
     size = (source / operator.diagonal).abs().amax((1, 2, 3), keepdim=True)
     size = torch.where(size > 0, size, 1)
     first = source / operator.diagonal / size
-    u = _random_start(first) if guess is None or guess.shape != source.shape else guess / size
+    start = _random_values(first) if guess is None or guess.shape != source.shape else guess / size
+    u = start * (first != 0).any(-1).any(-1).any(-1)[:, None, None, None]
     goal, rounding = tolerance**2 * _mean_square(first), (ROUNDING * torch.finfo(u.dtype).eps) ** 2
     smallest = float("inf")
     for iteration in range(1, MAX_ITERATIONS + 1):
@@ -97,10 +98,9 @@ def jacobi(operator: PrintedOperator, source: Tensor, guess: Tensor | None, tole
     raise SolveError("Jacobi on the printed scheme did not reach its tolerance", iteration, relative, "raise diffusion.tolerance")
 
 
-def _random_start(first: Tensor) -> Tensor:
-    """Random values in [0, 1), the same in every run; 0 for a color without source."""
-    values = torch.rand(first.shape, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64).to(first)
-    return values * first.any(-1).any(-1).any(-1)[:, None, None, None]
+def _random_values(like: Tensor) -> Tensor:
+    """Random values in [0, 1), the same in every run."""
+    return torch.rand(like.shape, generator=torch.Generator().manual_seed(SEED), dtype=torch.float64).to(like)
 
 
 def _mean_square(u: Tensor) -> Tensor:

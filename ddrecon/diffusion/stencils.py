@@ -3,7 +3,7 @@
 The stencils of the paper's Appendix B, for cells that need not be cubes: each axis carries its own 1 / h^2 or 1 / (2 h), which the paper,
 whose h is the same along all axes, leaves in front. In its numbering, with d for a derivative and kappa = 3 D:
 
-- Sigma3 / h^2, the Laplacian, is `NEIGHBORS` minus the diagonal; Sigma5 / h^2 is `NEIGHBORS` by itself;
+- Sigma3 / h^2, the Laplacian, is the sum of neighbors minus the diagonal; Sigma5 / h^2 is that sum by itself, the first of `terms`;
 - Sigma4 / (4 h^2), grad kappa . grad L0, is the product of two `gradient`s; Sigma1 has d kappa in it and Sigma2 d L0;
 - Sigma7, div Q1, is `divergence`, Sigma8 the same of d Q1; Sigma6 and Sigma9 are the derivatives of S and of L1, which autograd takes.
 
