@@ -113,13 +113,16 @@ def _relative(change: Tensor, first: Tensor) -> float:
 
 
 def _diverged(operator: PrintedOperator, iteration: int, relative: float) -> SolveError:
+    advice = "raise the floor or use diffusion.scheme=conservative"
+    if iteration == 1 and relative != relative:
+        return SolveError("the system of the printed scheme is not finite", 0, relative, "look for NaN or infinity in the scene")
     factor, cell = operator.steepest()
     where = f"kappa changes by a factor {factor:.1f} between neighbors at cell {cell}"
     if factor > DOMINANCE:
         what = f"{where}, and above {DOMINANCE:.0f} Jacobi on the printed scheme may diverge: it did"
     else:
         what = f"Jacobi on the printed scheme diverged, although {where} at most,"
-    return SolveError(what, iteration, relative, "raise the floor or use diffusion.scheme=conservative")
+    return SolveError(what, iteration, relative, advice)
 
 
 class _Solve(torch.autograd.Function):
