@@ -17,6 +17,7 @@ from ddrecon.io.arrays import check_size
 
 MAX_HEADER = 65536
 MAX_SIDE = 65536
+_BEGINNING = re.compile(rb"(.*?)\n\r?\n([^\n]*)\n", re.DOTALL)
 _SIZE = re.compile(rb"([-+])([XY]) +(\d{1,9}) +([-+])([XY]) +(\d{1,9})\s*")
 
 
@@ -42,12 +43,11 @@ def read_hdr(path: Path) -> np.ndarray:
     data = path.read_bytes()
     if not data.startswith(b"#?"):
         raise FormatError(path, "not a Radiance picture: it does not begin with #?")
-    header, blank, rest = data.partition(b"\n\n") if b"\r\n\r\n" not in data[:MAX_HEADER] else data.partition(b"\r\n\r\n")
-    size, newline, _ = rest[:MAX_HEADER].partition(b"\n")
-    if not blank or not newline or len(header) > MAX_HEADER:
+    match = _BEGINNING.match(data[:MAX_HEADER])
+    if match is None:
         raise FormatError(path, "is damaged: its header does not end")
-    exposure, layout = _exposure(header, path), _layout(size, path)
-    lines = _scanlines(rest, len(size) + 1, layout, path)
+    exposure, layout = _exposure(match[1], path), _layout(match[2], path)
+    lines = _scanlines(data, match.end(), layout, path)
     with np.errstate(over="ignore"):
         return layout.arranged((_radiance(lines) / exposure).astype(np.float32))
 

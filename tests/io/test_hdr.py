@@ -142,6 +142,11 @@ def test_other_headers_are_understood(tmp_path: Path, header: bytes):
     assert np.array_equal(read_hdr(path), decoded(pixels))
 
 
+def test_line_ends_among_pixels_do_not_end_the_header(tmp_path: Path):
+    pixels = np.frombuffer(b"\r\n\r\n\n\n\n\n" * 4, np.uint8).reshape(1, 8, 4)
+    assert np.array_equal(read_hdr(save(tmp_path, flat(pixels), "-Y 1 +X 8")), decoded(pixels))
+
+
 HEADERS = {
     "another format": (b"P6\n", "not a Radiance picture"),
     "XYZE": (b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n", "32-bit_rle_xyze.*save it as 32-bit_rle_rgbe"),
