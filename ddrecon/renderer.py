@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
+from ddrecon.diffusion import printed
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductances, face_fluxes
@@ -113,9 +114,12 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
     """
     grid, scattering = medium.grid, medium.remaining_scattering
     diffusion = CLOSURES[settings.closure](medium.transport_extinction, grid)
+    scattered = source.scaled(scattering, scattering)
+    if settings.scheme == "printed":
+        by_jacobi = Solve(printed.jacobi, settings.tolerance, memory)
+        return printed.diffuse_light(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
     escape = boundary_loss(diffusion, grid)
     operator = Operator(conductances(diffusion, grid), medium.absorption.value + escape)
-    scattered = source.scaled(scattering, scattering)
     right = scattered.mean + escape * outside
     for axis, component in zip(AXES, scattered.flux or (), strict=scattered.flux is not None):
         right = right - face_fluxes(None, component, diffusion, grid, axis).diff(dim=axis) / grid.spacing[axis - 1]

@@ -38,10 +38,13 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class DiffusionSettings:
-    """How multiply scattered light is found; `tolerance` is the relative residual of each linear solve."""
+    """How multiply scattered light is found; `tolerance` is the relative residual of each linear solve.
+
+    The scheme `printed` is the paper's own, always solved by Jacobi iteration: `solver` is for `conservative`.
+    """
 
     model: str = one_of("p1", ("none", "p1"))
-    scheme: str = one_of("conservative", ("conservative",))
+    scheme: str = one_of("conservative", ("conservative", "printed"))
     closure: str = one_of("smooth", CLOSURES)
     solver: str = one_of("conjugate_gradient", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)

@@ -26,9 +26,8 @@ def needed_terms(scene: Scene) -> list[str]:
     if multiply_scatters(medium, scene.diffusion) and bool(medium.g > 0):
         terms.append("delta-Eddington scaling of the forward peak (g > 0)")
     if multiply_scatters(medium, scene.diffusion):
-        terms.append(
-            f"multiple scattering by {scene.diffusion.model} diffusion, {scene.diffusion.closure} closure, {scene.diffusion.solver}"
-        )
+        how = scene.diffusion.solver if scene.diffusion.scheme == "conservative" else f"{scene.diffusion.scheme} scheme by Jacobi iteration"
+        terms.append(f"multiple scattering by {scene.diffusion.model} diffusion, {scene.diffusion.closure} closure, {how}")
         terms.append("fluxes Q1 and L1 (g is not 0)" if has_flux(medium) else "no fluxes Q1 and L1 (g = 0)")
     else:
         terms.append("no multiple scattering: no diffusion solve")

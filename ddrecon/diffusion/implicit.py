@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,7 +18,8 @@ from torch import Tensor
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.solvers.scaled import Solution
 
-Solver = Callable[[Operator, Tensor, Tensor | None, float], Solution]
+System = TypeVar("System")
+"""What a solver solves: an operator."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,14 @@ class SolveMemory:
 
 
 @dataclass(frozen=True)
-class Solve:
+class Solve(Generic[System]):
     """How to solve: the solver, its tolerance, and the memory that its solves share."""
 
-    solver: Solver
+    solver: Callable[[System, Tensor, Tensor | None, float], Solution]
     tolerance: float
     memory: SolveMemory
 
-    def __call__(self, kind: str, operator: Operator, source: Tensor) -> Tensor:
+    def __call__(self, kind: str, operator: System, source: Tensor) -> Tensor:
         """u with `operator` u = `source` [C, z, y, x]."""
         start = perf_counter()
         guess = self.memory.last.get(kind) if self.memory.is_warm and kind != "tangent" else None
@@ -64,7 +65,7 @@ class Solve:
 
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(solve: Solve, source: Tensor, loss: Tensor, c_z: Tensor, c_y: Tensor, c_x: Tensor) -> Tensor:
+    def forward(solve: Solve[Operator], source: Tensor, loss: Tensor, c_z: Tensor, c_y: Tensor, c_x: Tensor) -> Tensor:
         return solve("forward", Operator((c_z, c_y, c_x), loss), source).clone()
 
     @staticmethod
@@ -92,7 +93,7 @@ class _Solve(torch.autograd.Function):
         return ctx.solve("tangent", Operator(tuple(conductances), loss), right).clone()
 
 
-def solve_diffusion(solve: Solve, operator: Operator, source: Tensor) -> Tensor:
+def solve_diffusion(solve: Solve[Operator], operator: Operator, source: Tensor) -> Tensor:
     """u with `operator` u = `source` [C, z, y, x], differentiable in both modes with respect to `source` and the operator.
 
     An operator of one color serves a source of several.

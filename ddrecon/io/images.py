@@ -1,6 +1,6 @@
 """Images by suffix, in linear radiance. Row 0 is the top.
 
-Float formats (.exr, .npy, .tif) are linear and, where they have alpha, premultiplied; 8- and 16-bit ones (.png, .jpg, .webp) are
+Float formats (.exr, .hdr, .npy, .tif) are linear and, where they have alpha, premultiplied; 8- and 16-bit ones (.png, .jpg, .webp) are
 decoded from sRGB and multiplied by their alpha. Either way a pixel of alpha 0 is empty: black.
 """
 
@@ -17,6 +17,7 @@ from ddrecon.io import srgb
 from ddrecon.io.arrays import as_float32, read_npy
 from ddrecon.io.atomic import replacing
 from ddrecon.io.exr import has_exr, read_exr, write_exr
+from ddrecon.io.hdr import read_hdr
 from ddrecon.io.tiff import read_tiff, write_tiff
 
 
@@ -123,6 +124,7 @@ def _decoded(stored: np.ndarray) -> np.ndarray:
 
 READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".exr": read_exr,
+    ".hdr": read_hdr,
     ".npy": _read_array,
     ".tif": read_tiff,
     ".tiff": read_tiff,

@@ -29,6 +29,8 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
     [
         ("volume.g=0.3", "fluxes Q1 and L1 (g is not 0)", "no fluxes"),
         ("volume.g=0", "no fluxes Q1 and L1 (g = 0)", "delta-Eddington"),
+        ("diffusion.scheme=printed", "printed scheme by Jacobi", "conjugate_gradient"),
+        ("diffusion.scheme=conservative", "conjugate_gradient", "printed"),
         ("diffusion.model=none", "no multiple scattering", "p1 diffusion"),
         ("volume.sigma_s=0", "no multiple scattering", "p1 diffusion"),
         ("lights=[{type: ambient, radiance: 1}]", "ambient light", "directional"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from click.testing import Result
+
+from ddrecon.io.volumes import write_field
 
 Refuse = Callable[..., list[str]]
 
@@ -223,6 +227,18 @@ def test_resume_from_a_damaged_checkpoint(refuse: Refuse, succeed: Callable[...,
         path.parent.mkdir()
     (line,) = refuse(2 if damage == "gone" else 3, *COMMANDS["optimize"], "--resume")
     assert line.startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("command", ["render", "gradcheck"])
+def test_a_solve_that_diverges(run: Callable[..., Result], folder: Path, command: str) -> None:
+    values = np.zeros((4, 5, 6))
+    values[1:3, 1:4, 1:4] = 1
+    write_field(Path("block.npz"), "density", values, np.array([[-0.5] * 3, [0.5] * 3]))
+    dense_block = ["-D", "volume.density={file: block.npz}", "-D", "volume.sigma_s=2000"]
+    result = run(*COMMANDS[command], *dense_block, "-D", "diffusion.scheme=printed")
+    (line,) = result.stderr.splitlines()
+    assert (result.exit_code, result.stdout) == (4, "")
+    assert re.search(r"kappa changes by a factor \d+\.\d between neighbors at cell \(\d, \d, \d\).*diffusion\.scheme=conservative", line)
 
 
 def test_debug_shows_where_an_error_comes_from(run: Callable[..., object]) -> None:

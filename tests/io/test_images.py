@@ -102,6 +102,8 @@ def test_truncated_files_are_refused(tmp_path: Path, suffix: str, part: float):
     pixels = np.abs(pixels_of(3, 40, 40, 3))
     if suffix in WRITERS:
         WRITERS[suffix](path, pixels)
+    elif suffix == ".hdr":
+        path.write_bytes(b"#?RADIANCE\n\n-Y 40 +X 40\n" + bytes([100, 128, 0, 130]) * 1600)
     else:
         iio.imwrite(path, (pixels * 10 % 255).astype(np.uint8))
     path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
