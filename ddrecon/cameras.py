@@ -48,10 +48,16 @@ def twisted(camera: Camera, twist: Tensor, pivot: Triple) -> Camera:
 
 
 def _rotation(vector: Tensor) -> Tensor:
-    """The matrix [3, 3] of the rotation by |vector| about `vector` (Rodrigues), smooth at zero."""
+    """The matrix [3, 3] of the rotation by |vector| [rad] about `vector`, by Rodrigues' formula; by series near zero, where it is smooth."""
+    square = vector @ vector
+    is_small = square < 1e-3
+    angle = torch.where(is_small, 1, square).sqrt()
+    sine = torch.where(is_small, 1 - square / 6 * (1 - square / 20 * (1 - square / 42)), angle.sin() / angle)
+    rest = torch.where(is_small, 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)), (1 - angle.cos()) / angle**2)
     x, y, z = vector.unbind()
     zero = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+    return torch.eye(3, dtype=vector.dtype, device=vector.device) + sine * cross + rest * cross @ cross
 
 
 @dataclass(frozen=True)

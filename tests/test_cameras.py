@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddrecon.cameras import Camera, look_at, rays, subpixel_offsets
+from ddrecon.cameras import Camera, look_at, rays, subpixel_offsets, twisted
 
 ORIGIN, TARGET, UP = (torch.tensor(v, dtype=torch.float64) for v in ([1.0, 2.0, 5.0], [0.3, -0.2, 0.1], [0.1, 1.0, 0.2]))
 
@@ -87,3 +87,45 @@ def test_samples_are_centers_of_equal_parts(samples: int):
     second_moments = ((offsets - 0.5) ** 2).mean(0)
     expected = [(1 - 1 / count**2) / 12 for count in (rows, columns)]
     assert second_moments.tolist() == pytest.approx(expected, abs=1e-14)
+
+
+# --- twists ----------------------------------------------------------------------------------------------------------
+
+PIVOT = (0.2, -0.1, 0.4)
+small_twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(lambda entries: torch.tensor(entries, dtype=torch.float64))
+
+
+@given(small_twists)
+def test_a_twisted_pose_is_rigid(twist: torch.Tensor):
+    turn = twisted(camera(), twist, PIVOT).pose[:, :3]
+    torch.testing.assert_close(turn.T @ turn, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-13)
+    assert torch.linalg.det(turn) > 0
+
+
+def test_no_twist_changes_nothing():
+    torch.testing.assert_close(twisted(camera(), torch.zeros(6, dtype=torch.float64), PIVOT).pose, camera().pose, rtol=0, atol=1e-14)
+
+
+@given(small_twists)
+def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(twist: torch.Tensor):
+    """Only a shift moves the pivot in the camera's own frame, by just as much the other way."""
+    pivot = torch.tensor(PIVOT, dtype=torch.float64)
+
+    def seen(view: Camera) -> torch.Tensor:
+        return view.pose[:, :3].T @ (pivot - view.pose[:, 3])
+
+    turn = twist.clone()
+    turn[3:] = 0
+    torch.testing.assert_close(seen(twisted(camera(), turn, PIVOT)), seen(camera()), rtol=0, atol=1e-13)
+    shift = twist - turn
+    torch.testing.assert_close(seen(twisted(camera(), shift, PIVOT)), seen(camera()) - shift[3:], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_rotation_vector_turns_by_its_length_about_its_axis_right_handed(axis: int):
+    """A quarter turn about a camera axis takes the next axis to the one after it."""
+    twist = torch.zeros(6, dtype=torch.float64)
+    twist[axis] = math.pi / 2
+    before, after = camera().pose, twisted(camera(), twist, PIVOT).pose
+    torch.testing.assert_close(after[:, axis], before[:, axis], rtol=0, atol=1e-13)
+    torch.testing.assert_close(after[:, (axis + 1) % 3], before[:, (axis + 2) % 3], rtol=0, atol=1e-13)

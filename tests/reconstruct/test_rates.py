@@ -1,0 +1,52 @@
+"""Learning rates: a rise, a fall, and the same run whatever the units; which views an iteration sees."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+import torch
+
+from ddrecon.reconstruct.rates import chosen, default_rate, rate_at
+from ddrecon.variables import value_of, variable_names
+from ddrecon.world import Scene
+
+
+def test_rates_rise_then_fall_and_never_exceed_their_value() -> None:
+    rates = [rate_at(iteration, 100) for iteration in range(100)]
+    top = rates.index(max(rates))
+    assert all(0 < rate <= 1 for rate in rates)
+    assert rates[:top] == sorted(rates[:top]) and rates[top:] == sorted(rates[top:], reverse=True)
+
+
+def test_every_variable_has_a_rate(ball_scene: Scene) -> None:
+    for name in variable_names(ball_scene):
+        assert default_rate(ball_scene, name, value_of(ball_scene, name)) > 0
+
+
+def test_brighter_light_moves_faster_in_proportion(ball_scene: Scene) -> None:
+    one, ten = (default_rate(ball_scene, "lights.0.irradiance", torch.full((3,), value)) for value in (1.0, 10.0))
+    assert ten == pytest.approx(10 * one)
+
+
+def test_all_views_where_no_number_is_asked_for() -> None:
+    assert chosen(5, 0, 3) == chosen(5, 5, 3) == chosen(5, 9, 3) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(10, 3), (7, 1), (4, 3), (6, 2)])
+def test_every_view_is_seen_once_before_any_comes_again(count: int, wanted: int) -> None:
+    seen = [index for iteration in range(count) for index in chosen(count, wanted, iteration)]
+    assert len(seen) == count * wanted
+    for start in range(0, len(seen), count):
+        assert sorted(seen[start : start + count]) == list(range(count))
+    assert Counter(seen) == {index: wanted for index in range(count)}
+
+
+def test_the_order_differs_from_round_to_round_and_follows_the_seed() -> None:
+    rounds = [tuple(index for iteration in range(8) for index in chosen(8, 1, 8 * turn + iteration)) for turn in range(4)]
+    assert len(set(rounds)) > 1
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        other = [chosen(8, 1, iteration) for iteration in range(8)]
+        torch.manual_seed(1)
+        assert other == [chosen(8, 1, iteration) for iteration in range(8)]
