@@ -14,10 +14,9 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
-from ddrecon.diffusion import printed
+from ddrecon.diffusion import conservative, printed
 from ddrecon.diffusion.closures import CLOSURES
-from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
-from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductances, face_fluxes
+from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.lights import AmbientLight, Light
 from ddrecon.march import Emission, march
@@ -107,28 +106,18 @@ def _is_varied(value: Tensor) -> bool:
 
 
 def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: DiffusionSettings, memory: SolveMemory) -> Moments:
-    """L0 from the P1 balance E4 with the Marshak boundary E6, and L1 from E5.
+    """L0 and L1 (E4 to E6) of `source`, Q0 and Q1 of beams, and of ambient light `outside` [C, 1, 1, 1], by the scheme of `settings`."""
 
-    `source`: Q0 and Q1 of beams. Ambient light, `outside` [C, 1, 1, 1], enters through the boundary: L0 and L1 hold all of it, scattered
-    or not, which keeps a white furnace exact (docs/theory.md, section 5).
-    """
-    grid, scattering = medium.grid, medium.remaining_scattering
-    diffusion = CLOSURES[settings.closure](medium.transport_extinction, grid)
-    scattered = source.scaled(scattering, scattering)
+    def closure(transport_extinction: Tensor) -> Tensor:
+        return CLOSURES[settings.closure](transport_extinction, medium.grid, settings.floor)
+
     if settings.scheme == "printed":
         by_jacobi = Solve(printed.jacobi, settings.tolerance, memory)
-        return printed.diffuse_light(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
-    escape = boundary_loss(diffusion, grid)
-    operator = Operator(conductances(diffusion, grid), medium.absorption.value + escape)
-    right = scattered.mean + escape * outside
-    for axis, component in zip(AXES, scattered.flux or (), strict=scattered.flux is not None):
-        right = right - face_fluxes(None, component, diffusion, grid, axis).diff(dim=axis) / grid.spacing[axis - 1]
-    mean = solve_diffusion(Solve(SOLVERS[settings.solver], settings.tolerance, memory), operator, right)
-    if not has_flux(medium):
-        return Moments(mean)
-    fluxes = scattered.flux or (None, None, None)
-    z, y, x = (3 * cell_average(face_fluxes(mean, f, diffusion, grid, axis, outside), axis) for axis, f in zip(AXES, fluxes, strict=True))
-    return Moments(mean, (z, y, x))
+        scattering = medium.remaining_scattering
+        scattered = source.scaled(scattering, scattering)
+        return printed.diffuse_light(medium, closure(medium.transport_extinction), scattered, outside, by_jacobi, has_flux(medium))
+    solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
+    return conservative.diffuse_light(medium, closure, source, outside, solve, has_flux(medium))
 
 
 def view_image(light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all") -> Tensor:

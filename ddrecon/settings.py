@@ -9,7 +9,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.solvers import SOLVERS
 
 
@@ -46,6 +46,7 @@ class DiffusionSettings:
     model: str = one_of("p1", ("none", "p1"))
     scheme: str = one_of("conservative", ("conservative", "printed"))
     closure: str = one_of("smooth", CLOSURES)
+    floor: float = bounded(FLOOR, above=0, maximum=1e3)
     solver: str = one_of("conjugate_gradient", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True

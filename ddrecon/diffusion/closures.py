@@ -17,10 +17,10 @@ FLOOR = 3.3
 """Optical thickness, across the box's shortest side, of the medium that empty space is given (docs/theory.md section 5)."""
 
 
-def smooth(transport_extinction: Tensor, grid: Grid) -> Tensor:
-    """D = 1 / (3 sqrt(kappa_tr^2 + floor^2)) with floor = 3.3 / (shortest side of the box)."""
-    floor = FLOOR / min(grid.extent)
-    return 1 / (3 * torch.sqrt(transport_extinction**2 + floor**2))
+def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
+    """D = 1 / (3 sqrt(kappa_tr^2 + (floor / shortest side of the box)^2))."""
+    least = floor / min(grid.extent)
+    return 1 / (3 * torch.sqrt(transport_extinction**2 + least**2))
 
 
-CLOSURES: dict[str, Callable[[Tensor, Grid], Tensor]] = {"smooth": smooth}
+CLOSURES: dict[str, Callable[[Tensor, Grid, float], Tensor]] = {"smooth": smooth}

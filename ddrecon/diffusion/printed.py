@@ -113,7 +113,7 @@ def _relative(change: Tensor, first: Tensor) -> float:
 
 
 def _diverged(operator: PrintedOperator, iteration: int, relative: float) -> SolveError:
-    advice = "raise the floor or use diffusion.scheme=conservative"
+    advice = "raise diffusion.floor or use diffusion.scheme=conservative"
     if iteration == 1 and relative != relative:
         return SolveError("the system of the printed scheme is not finite", 0, relative, "look for NaN or infinity in the scene")
     factor, cell = operator.steepest()

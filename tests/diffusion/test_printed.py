@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion import printed
-from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.printed import Ghosts, PrintedOperator, diffuse_light, jacobi, solve_printed
 from ddrecon.diffusion.stencils import Stencils, convolve, extend
@@ -311,23 +311,23 @@ def test_a_warm_start_takes_fewer_iterations(smooth_scene):
 def ball(make_scene) -> Callable[..., Scene]:
     """A ball of optical thickness 0.7 `sigma` in empty space, whose surface is `width` cells wide."""
 
-    def make(sigma: float, width: float) -> Scene:
+    def make(sigma: float, width: float, floor: float = FLOOR) -> Scene:
         grid = Grid((16, 16, 16), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
         radius = sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))).sqrt()
         density = (16 * (0.35 - radius) / width + 0.5).clamp(0, 1)
-        return make_scene(density, grid=grid, sigma_a=(0.01 * sigma,), sigma_s=(0.99 * sigma,), scheme="printed", tolerance=1e-4)
+        optics = {"sigma_a": (0.01 * sigma,), "sigma_s": (0.99 * sigma,)}
+        return make_scene(density, grid=grid, **optics, scheme="printed", tolerance=1e-4, floor=floor)
 
     return make
 
 
 def kappa_of(scene: Scene) -> Tensor:
-    return 3 * CLOSURES["smooth"](unscaled_medium(scene.volume).transport_extinction, scene.volume.grid)[0]
+    return 3 * CLOSURES["smooth"](unscaled_medium(scene.volume).transport_extinction, scene.volume.grid, scene.diffusion.floor)[0]
 
 
-def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball, monkeypatch):
+def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):
     """At a floor of 0.1; the cell named is the one whose neighbors differ most, by more than 4 of its own kappa."""
-    monkeypatch.setattr("ddrecon.diffusion.closures.FLOOR", 0.1)
-    scene = ball(20.0, 2.0)
+    scene = ball(20.0, 2.0, floor=0.1)
     with pytest.raises(SolveError, match=r"and above 4 .*diffusion\.scheme=conservative") as caught:
         solve_light(scene, SolveMemory())
     told = re.match(r"kappa changes by a factor ([\d.]+) between neighbors at cell \((\d+), (\d+), (\d+)\)", str(caught.value))
