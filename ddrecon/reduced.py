@@ -7,19 +7,23 @@ along that axis, shear back. Density and optical depth are interpolated, never t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from ddrecon.decay import decay_mean
+from ddrecon.autodiff import is_varied, recomputed
 from ddrecon.grid import Grid, array_order
-from ddrecon.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.medium import Coefficient, Medium
+from ddrecon.lights import AmbientLight, DirectionalLight, PointLight
+from ddrecon.medium import Medium
 from ddrecon.moments import Moments, beam_moments
+from ddrecon.nodes import Nodes
+from ddrecon.phase import henyey_greenstein
+from ddrecon.point_light import PointBeam, point_beam
 from ddrecon.quadrature import sphere_quadrature
 from ddrecon.sampling import sample_slices
+from ddrecon.sky import Sky, Source
 
 
 @dataclass(frozen=True)
@@ -33,27 +37,32 @@ class Beam:
     direction: Tensor
     irradiance: Tensor
 
+    def towards_camera(self, nodes: Nodes, g: Tensor) -> Tensor:
+        """The phase function p `[1, 1, R]` of scattering from the beam into each view ray."""
+        return henyey_greenstein(-(nodes.direction @ self.direction), g)[None, None]
+
 
 @dataclass(frozen=True)
 class ReducedLight:
-    """Light of directional lights not yet scattered: its `beams`, and its `source` Q0, Q1, averaged over cells (no Q1 where g = 0)."""
+    """Light of directional and point lights not yet scattered: `beams`, and their `source` Q0, Q1, averaged over cells (no Q1 for g = 0)."""
 
-    beams: tuple[Beam, ...]
+    beams: tuple[Beam | PointBeam, ...]
     source: Moments
 
 
-def reduced_light(medium: Medium, lights: list[Light], has_flux: bool) -> ReducedLight:
-    """The light of directional `lights` that reaches each cell unscattered; `has_flux`: whether Q1 is needed (g is not 0)."""
-    beams, total = [], Moments(torch.zeros_like(medium.extinction.value))
+def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> ReducedLight:
+    """The light of directional and point `lights` that reaches each cell unscattered; `has_flux`: whether Q1 is needed (g is not 0)."""
+    beams: list[Beam | PointBeam] = []
+    total = Moments(torch.zeros_like(medium.extinction.value))
     for light in lights:
-        if isinstance(light, DirectionalLight):
-            beam, received = _beam(medium, light, has_flux)
+        if isinstance(light, DirectionalLight | PointLight):
+            beam, received = _beam(medium, light, has_flux) if isinstance(light, DirectionalLight) else point_beam(medium, light, has_flux)
             beams.append(beam)
             total = total.plus(received)
     return ReducedLight(tuple(beams), total.scaled(1.0, 3 * medium.mean_cosine))
 
 
-def ambient_radiance(lights: list[Light], like: Tensor) -> Tensor:
+def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
     """The radiance `[C, 1, 1, 1]` that all ambient `lights` together send in from every direction."""
     radiances = [light.radiance for light in lights if isinstance(light, AmbientLight)]
     return torch.stack(torch.broadcast_tensors(*radiances, like.new_zeros(1))).sum(0).view(-1, 1, 1, 1)
@@ -66,9 +75,29 @@ def unscattered_ambient(medium: Medium, radiance: Tensor, has_flux: bool) -> Mom
     """
     total = Moments(torch.zeros_like(medium.extinction.value))
     for direction, weight in zip(*sphere_quadrature(medium.extinction.field), strict=True):
-        visible = checkpoint(_visibility, medium, direction, use_reentrant=False, preserve_rng_state=False)
-        total = total.plus(beam_moments(weight * visible, direction, has_flux))
+        total = total.plus(recomputed(_seen_from, medium, direction, weight, direction[:, None] * weight if has_flux else None))
     return total.scaled(radiance, 3 * radiance)
+
+
+def unscattered_sky(medium: Medium, lights: Sequence[Source], has_flux: bool) -> Moments:
+    """Light of all skies in `lights` not yet scattered: as `unscattered_ambient`, each direction carrying its own irradiance and vector."""
+    total = Moments(torch.zeros_like(medium.extinction.value))
+    for sky in lights:
+        if isinstance(sky, Sky) and (is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())):
+            vectors = sky.vector if has_flux else [None] * len(sky.travel)
+            for travel, irradiance, vector in zip(sky.travel, sky.irradiance, vectors, strict=True):
+                total = total.plus(recomputed(_seen_from, medium, travel, irradiance, vector))
+    return total.scaled(1 / (4 * math.pi), 3 / (4 * math.pi))
+
+
+def _seen_from(medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None) -> Moments:
+    """`irradiance` ([C] or scalar) and `vector` [3, C], each times the transmittance along `direction`, averaged over cells."""
+    visible = medium.extinction.mean_transmittance(*entered_mass(medium.extinction.field, medium.grid, direction))
+    mean = visible * irradiance.view(-1, 1, 1, 1)
+    if vector is None:
+        return Moments(mean)
+    z, y, x = (visible * component.view(-1, 1, 1, 1) for component in vector)
+    return Moments(mean, (z, y, x))
 
 
 def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
@@ -76,19 +105,9 @@ def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
     entered, step = entered_mass(medium.extinction.field, medium.grid, direction)
-    received = irradiance / (4 * math.pi) * _cell_mean(medium.extinction, entered, step)
+    received = irradiance / (4 * math.pi) * medium.extinction.mean_transmittance(entered, step)
     beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
     return beam, beam_moments(received, direction, has_flux)
-
-
-def _visibility(medium: Medium, direction: Tensor) -> Tensor:
-    """Transmittance from the box to each cell along `direction`, averaged over the cell."""
-    return _cell_mean(medium.extinction, *entered_mass(medium.extinction.field, medium.grid, direction))
-
-
-def _cell_mean(extinction: Coefficient, entered: Tensor, step: Tensor) -> Tensor:
-    """exp(-depth) averaged over each cell, along a beam that has `entered` mass behind it and crosses `step` [u] of the cell."""
-    return torch.exp(-extinction.scale * entered) * decay_mean(extinction.scale * (extinction.field * step))
 
 
 def entered_mass(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,31 +11,34 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
+from ddrecon.autodiff import is_varied
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductances, face_fluxes
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.lights import AmbientLight, Light
+from ddrecon.environment import environment_radiance
+from ddrecon.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.march import Emission, march
 from ddrecon.medium import Medium, scaled_medium, unscaled_medium
 from ddrecon.moments import Moments, Vector
-from ddrecon.reduced import Beam, ambient_radiance, reduced_light, unscattered_ambient
+from ddrecon.point_light import PointBeam
+from ddrecon.reduced import Beam, ambient_radiance, reduced_light, unscattered_ambient, unscattered_sky
 from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.sky import sources
 from ddrecon.world import Scene, View
 
 
 @dataclass(frozen=True)
 class LightField:
-    """All light inside a medium: the beams of directional lights, and `outgoing`, what one more scattering makes of all other light.
+    """All light inside a medium: `beams` of directional and point lights, and `outgoing`, what one more scattering makes of the rest.
 
     `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3.
     """
 
     medium: Medium
-    beams: tuple[Beam, ...]
+    beams: tuple[Beam | PointBeam, ...]
     outgoing: Moments
 
 
@@ -71,18 +74,21 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     medium = scaled_medium(scene.volume)
     if not multiply_scatters(medium, scene.diffusion):
         return unscattered_light(unscaled_medium(scene.volume), scene.lights)
-    reduced = reduced_light(medium, scene.lights, has_flux(medium))
-    diffuse = solve_diffuse(medium, reduced.source, ambient_radiance(scene.lights, medium.g), scene.diffusion, memory)
-    return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse))
+    lights = sources(scene.lights)
+    reduced = reduced_light(medium, lights, has_flux(medium))
+    sky = unscattered_sky(medium, lights, has_flux(medium))
+    source = reduced.source.plus(sky.scaled(1.0, medium.mean_cosine))
+    diffuse = solve_diffuse(medium, source, ambient_radiance(lights, medium.g), scene.diffusion, memory)
+    return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse.plus(sky)))
 
 
-def unscattered_light(medium: Medium, lights: list[Light]) -> LightField:
-    """The light inside `medium` that has not been scattered: beams, and ambient light by quadrature over directions."""
-    beams = reduced_light(medium, lights, False).beams
-    light = Moments(torch.zeros_like(medium.extinction.value))
-    if any(isinstance(item, AmbientLight) for item in lights):
-        light = unscattered_ambient(medium, ambient_radiance(lights, medium.g), has_flux(medium))
-    return LightField(medium, beams, _scattered_once_more(medium, light))
+def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
+    """The light inside `medium` that has not been scattered: beams, and by quadrature over directions ambient light and skies."""
+    parts = sources(lights)
+    light = unscattered_sky(medium, parts, has_flux(medium))
+    if any(isinstance(item, AmbientLight) for item in parts):
+        light = light.plus(unscattered_ambient(medium, ambient_radiance(parts, medium.g), has_flux(medium)))
+    return LightField(medium, reduced_light(medium, parts, False).beams, _scattered_once_more(medium, light))
 
 
 def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
@@ -92,8 +98,7 @@ def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
 
 def has_flux(medium: Medium) -> bool:
     """Whether light's direction matters to scattering: g is not 0, or is being differentiated, in either mode."""
-    is_varied = medium.g.requires_grad or forward_ad.unpack_dual(medium.g).tangent is not None
-    return is_varied or bool(medium.g.detach() != 0)
+    return is_varied(medium.g) or bool(medium.g.detach() != 0)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
@@ -155,8 +160,17 @@ def _radiance(light_field: LightField, scene: Scene, bundle: Rays) -> Tensor:
     emission = Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)
     scattered, transmittance = march(emission, bundle, scene.render.steps_per_voxel)
     if scene.render.background:
-        scattered = scattered + transmittance * ambient_radiance(scene.lights, medium.g).view(-1, 1)
+        scattered = scattered + transmittance * _background(scene.lights, bundle)
     return scattered.expand(3, -1)
+
+
+def _background(lights: Sequence[Light], bundle: Rays) -> Tensor:
+    """The radiance [C, R] of ambient light and environment maps along `bundle`, where nothing is in the way."""
+    total = ambient_radiance(lights, bundle.direction).view(-1, 1)
+    for light in lights:
+        if isinstance(light, EnvironmentLight):
+            total = total + environment_radiance(light, bundle.direction)
+    return total
 
 
 def _towards_camera(medium: Medium, bundle: Rays) -> Vector:

@@ -5,19 +5,23 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from functools import partial
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ddrecon.errors import FormatError
+from ddrecon.io.images import read_image
 from ddrecon.io.volumes import read_field
-from ddrecon.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.medium import Volume
 from ddrecon.scene.build_views import build_views
 from ddrecon.scene.build_volume import build_volume
 from ddrecon.scene.files import read_referenced
 from ddrecon.scene.load import SceneFile, read_scene
 from ddrecon.scene.problems import Problems
-from ddrecon.scene.schema import Color, DirectionalSection, FieldFile, LightSection
+from ddrecon.scene.schema import AmbientSection, Color, DirectionalSection, FieldFile, PointSection
 from ddrecon.world import Scene
 
 
@@ -47,8 +51,11 @@ def build_scene(scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, de
     starts: dict[str, Tensor] = {}
     with problems.collecting():
         starts = _starts(scene_file, volume, problems)
+    lights: list[Light] = []
+    for index in range(len(tree.lights)):
+        with problems.collecting():
+            lights.append(_build_light(scene_file, index, dtype, place))
     problems.raise_any()
-    lights = [_build_light(light, dtype, place) for light in tree.lights]
     return Scene(volume, lights, views, tree.render, tree.diffusion, tree.optimize, starts, scene_file.path)
 
 
@@ -77,10 +84,35 @@ def _start(scene_file: SceneFile, name: str, init: float | FieldFile | None, vol
     return field
 
 
-def _build_light(section: LightSection, dtype: torch.dtype, device: torch.device) -> Light:
-    def color(value: Color) -> torch.Tensor:
-        return torch.tensor([value] if isinstance(value, float) else value, dtype=dtype, device=device)
+def _build_light(scene_file: SceneFile, index: int, dtype: torch.dtype, device: torch.device) -> Light:
+    section = scene_file.tree.lights[index]
+
+    def tensor(value: Color) -> Tensor:
+        return torch.tensor(value, dtype=dtype, device=device)
+
+    def color(value: Color) -> Tensor:
+        return tensor(value).view(-1)
 
     if isinstance(section, DirectionalSection):
-        return DirectionalLight(torch.tensor(section.direction, dtype=dtype, device=device), color(section.irradiance))
-    return AmbientLight(color(section.radiance))
+        return DirectionalLight(tensor(section.direction), color(section.irradiance))
+    if isinstance(section, AmbientSection):
+        return AmbientLight(color(section.radiance))
+    if isinstance(section, PointSection):
+        return PointLight(tensor(section.position), color(section.intensity))
+    pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
+    radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
+    return EnvironmentLight(radiance, tensor(section.scale), tensor(section.rotation), section.directions)
+
+
+def _read_map(path: Path) -> np.ndarray:
+    """The radiance of an environment map, float32 [h, w, 3]; raises FormatError where it is not one."""
+    pixels = read_image(path).pixels
+    height, width = pixels.shape[:2]
+    if height < 2 or width < 3:
+        raise FormatError(path, f"an environment map has at least 3 x 2 pixels, and this is {width} x {height}")
+    negative = pixels.min(axis=2) < 0
+    if negative.any():
+        row, column = np.argwhere(negative)[0]
+        count = np.count_nonzero(negative)
+        raise FormatError(path, f"negative radiance at row {row}, column {column} ({count} such pixels); an environment map has none")
+    return pixels
