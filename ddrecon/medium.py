@@ -50,7 +50,7 @@ class Coefficient:
     def mean_transmittance(self, entered: Tensor, step: Tensor) -> Tensor:
         """exp(-depth) averaged over each cell, `[C, z, y, x]`.
 
-        The light has `entered` mass behind it (the integral of `field`, [K, z, y, x]) and crosses `step` [u] of the cell, scalar or [z, y, x].
+        The light has `entered` mass behind it (the integral of `field`, [K, z, y, x]); `step`: what it crosses [u], scalar or [z, y, x].
         """
         return torch.exp(-self.scale * entered) * decay_mean(self.scale * (self.field * step))
 

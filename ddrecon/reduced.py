@@ -44,7 +44,7 @@ class Beam:
 
 @dataclass(frozen=True)
 class ReducedLight:
-    """Light of directional and point lights not yet scattered: `beams`, and their `source` Q0, Q1, averaged over cells (no Q1 for g = 0)."""
+    """Light of directional and point lights not yet scattered: `beams`, and their `source` Q0, Q1 averaged over cells (no Q1 for g = 0)."""
 
     beams: tuple[Beam | PointBeam, ...]
     source: Moments

@@ -107,7 +107,8 @@ diffusion: {tolerance: 0}
         "scene.yaml:5:12: volume.sigma_a: expected a number, found true",
         "scene.yaml:6:19: volume.sigma_s.1: expected a finite number of single precision, found inf",
         "scene.yaml:7:6: volume.g: must be below 1, found 1",
-        "scene.yaml:9:12: lights.0.type: expected one of directional, ambient, environment, point, found 'directonal'; did you mean 'directional'?",
+        "scene.yaml:9:12: lights.0.type: expected one of directional, ambient, environment, point, found 'directonal'; "
+        "did you mean 'directional'?",
         "scene.yaml:10:37: lights.1.radiance.1: must be at least 0, found -0.3",
         "scene.yaml:12:12: views.0.name: 'a/b' is not a file name; use letters, digits, '_', '-' and '.', the last not at its start",
         "scene.yaml:13:24: diffusion.tolerance: must be above 0, found 0",
