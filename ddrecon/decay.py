@@ -79,7 +79,9 @@ class _DecayedSum(torch.autograd.Function):
         ctx.save_for_forward(*inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, out_bar: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, out_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        if out_bar is None:
+            return None, None, None, None
         weight, begin, end, scale, decay, phi = ctx.saved_tensors
         mean_bar = decay * phi * out_bar
         weight_bar = mean_bar.sum(1, keepdim=True) if weight.shape[1] < mean_bar.shape[1] else mean_bar

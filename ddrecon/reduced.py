@@ -17,7 +17,7 @@ from ddrecon.autodiff import is_varied, recomputed
 from ddrecon.grid import Grid, array_order
 from ddrecon.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.medium import Medium
-from ddrecon.moments import Moments, beam_moments
+from ddrecon.moments import Moments, Vector, beam_moments
 from ddrecon.nodes import Nodes
 from ddrecon.phase import henyey_greenstein
 from ddrecon.point_light import PointBeam, point_beam
@@ -68,26 +68,48 @@ def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
     return torch.stack(torch.broadcast_tensors(*radiances, like.new_zeros(1))).sum(0).view(-1, 1, 1, 1)
 
 
-def unscattered_ambient(medium: Medium, radiance: Tensor, has_flux: bool) -> Moments:
-    """Ambient light not yet scattered, to first order in angle: int L_ri and 3 int L_ri w over the sphere, divided by 4 pi.
+def ambient_sky(radiance: Tensor) -> Sky:
+    """Ambient light of `radiance` [C, 1, 1, 1] as light from the directions of a quadrature over the sphere."""
+    directions, weights = sphere_quadrature(radiance)
+    irradiance = 4 * math.pi * weights[:, None] * radiance.flatten()
+    return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
 
-    One direction at a time, so that memory does not grow with their number. `radiance`: [C, 1, 1, 1].
+
+def unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments:
+    """Light of all skies in `lights` not yet scattered, to first order in angle: int L_ri and 3 int L_ri w over the sphere, over 4 pi.
+
+    One direction at a time, so that memory does not grow with their number.
     """
     total = Moments(torch.zeros_like(medium.extinction.value))
-    for direction, weight in zip(*sphere_quadrature(medium.extinction.field), strict=True):
-        total = total.plus(recomputed(_seen_from, medium, direction, weight, direction[:, None] * weight if has_flux else None))
-    return total.scaled(radiance, 3 * radiance)
-
-
-def unscattered_sky(medium: Medium, lights: Sequence[Source], has_flux: bool) -> Moments:
-    """Light of all skies in `lights` not yet scattered: as `unscattered_ambient`, each direction carrying its own irradiance and vector."""
-    total = Moments(torch.zeros_like(medium.extinction.value))
-    for sky in lights:
-        if isinstance(sky, Sky) and (is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())):
-            vectors = sky.vector if has_flux else [None] * len(sky.travel)
-            for travel, irradiance, vector in zip(sky.travel, sky.irradiance, vectors, strict=True):
-                total = total.plus(recomputed(_seen_from, medium, travel, irradiance, vector))
+    for sky in _lit_skies(lights):
+        vectors = sky.vector if has_flux else [None] * len(sky.travel)
+        for travel, irradiance, vector in zip(sky.travel, sky.irradiance, vectors, strict=True):
+            total = total.plus(recomputed(_seen_from, medium, travel, irradiance, vector))
     return total.scaled(1 / (4 * math.pi), 3 / (4 * math.pi))
+
+
+def scattered_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
+    """What one scattering turns `towards` a camera (unit, its components broadcast to cells) of the light of `skies`, `[C, z, y, x]`.
+
+    Per unit length and kappa_s, by the exact phase function: sum of p E tau / (4 pi), one direction at a time.
+    """
+    total = torch.zeros_like(medium.extinction.value)
+    for sky in _lit_skies(skies):
+        for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
+            total = total + recomputed(_turned_towards, medium, travel, irradiance, towards)
+    return total / (4 * math.pi)
+
+
+def _lit_skies(lights: Sequence[object]) -> list[Sky]:
+    """The skies that differ from their mean, or may come to do so because they are being varied."""
+    skies = [light for light in lights if isinstance(light, Sky)]
+    return [sky for sky in skies if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())]
+
+
+def _turned_towards(medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector) -> Tensor:
+    visible = _seen_from(medium, travel, irradiance, None).mean
+    z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
+    return visible * henyey_greenstein(z + y + x, medium.g)
 
 
 def _seen_from(medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None) -> Moments:

@@ -24,9 +24,9 @@ from ddrecon.march import Emission, march
 from ddrecon.medium import Medium, scaled_medium, unscaled_medium
 from ddrecon.moments import Moments, Vector
 from ddrecon.point_light import PointBeam
-from ddrecon.reduced import Beam, ambient_radiance, reduced_light, unscattered_ambient, unscattered_sky
+from ddrecon.reduced import Beam, ambient_radiance, ambient_sky, reduced_light, scattered_sky, unscattered_sky
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.sky import sources
+from ddrecon.sky import Sky, sources
 from ddrecon.world import Scene, View
 
 
@@ -34,12 +34,14 @@ from ddrecon.world import Scene, View
 class LightField:
     """All light inside a medium: `beams` of directional and point lights, and `outgoing`, what one more scattering makes of the rest.
 
-    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3.
+    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3. `skies` are those whose light it lacks: they scatter by
+    the exact phase function, into each camera's rays anew.
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
     outgoing: Moments
+    skies: tuple[Sky, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,14 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
 def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
     """The light inside `medium` that has not been scattered: beams, and by quadrature over directions ambient light and skies."""
     parts = sources(lights)
-    light = unscattered_sky(medium, parts, has_flux(medium))
-    if any(isinstance(item, AmbientLight) for item in parts):
-        light = light.plus(unscattered_ambient(medium, ambient_radiance(parts, medium.g), has_flux(medium)))
-    return LightField(medium, reduced_light(medium, parts, False).beams, _scattered_once_more(medium, light))
+    beams = reduced_light(medium, parts, False).beams
+    skies = tuple(part for part in parts if isinstance(part, Sky))
+    if any(isinstance(part, AmbientLight) for part in parts):
+        skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
+    nothing = Moments(torch.zeros_like(medium.extinction.value))
+    if has_flux(medium):
+        return LightField(medium, beams, nothing, skies)
+    return LightField(medium, beams, unscattered_sky(medium, skies, has_flux=False))
 
 
 def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
@@ -130,7 +136,8 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
 
 def view_image(light_field: LightField, scene: Scene, camera: Camera) -> Tensor:
     """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1)."""
-    return _average(camera, scene.render, lambda bundle: _radiance(light_field, scene, bundle))
+    emission = _emission(light_field, rays(camera))
+    return _average(camera, scene.render, lambda bundle: _radiance(emission, scene, bundle))
 
 
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
@@ -153,11 +160,18 @@ def _average(camera: Camera, settings: RenderSettings, radiance: Callable[[Rays]
     return total.unflatten(-1, camera.size)
 
 
-def _radiance(light_field: LightField, scene: Scene, bundle: Rays) -> Tensor:
-    """Radiance [3, R] along `bundle`: E1."""
+def _emission(light_field: LightField, bundle: Rays) -> Emission:
+    """What the medium sends towards the camera that `bundle` belongs to."""
     medium = light_field.medium
-    diffuse = light_field.outgoing.along(_towards_camera(medium, bundle))
-    emission = Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)
+    towards = _towards_camera(medium, bundle)
+    diffuse = light_field.outgoing.along(towards)
+    if light_field.skies:
+        diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
+    return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)
+
+
+def _radiance(emission: Emission, scene: Scene, bundle: Rays) -> Tensor:
+    """Radiance [3, R] along `bundle`: E1."""
     scattered, transmittance = march(emission, bundle, scene.render.steps_per_voxel)
     if scene.render.background:
         scattered = scattered + transmittance * _background(scene.lights, bundle)

@@ -83,7 +83,9 @@ def test_maps_look_as_they_do_in_mitsuba(rotation: float, random):
     radiance, ways = random(3, 6, 10), directions(300)
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(radiance.permute(1, 2, 0).float().numpy()))
     turn = mitsuba.ScalarTransform4f().rotate([0, 1, 0], rotation)
-    environment = mitsuba.load_dict({"type": "scene", "map": {"type": "envmap", "bitmap": bitmap, "scale": 1.5, "to_world": turn}}).environment()
+    environment = mitsuba.load_dict(
+        {"type": "scene", "map": {"type": "envmap", "bitmap": bitmap, "scale": 1.5, "to_world": turn}}
+    ).environment()
     expected = []
     for way in ways.tolist():
         interaction = mitsuba.SurfaceInteraction3f()
@@ -119,7 +121,9 @@ def test_a_refined_map_is_the_same_function(size: tuple[int, int], random):
     radiance, ways = random(2, 7, 5), array_order(directions(100))
     fine = refined(radiance, *size)
     assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
-    torch.testing.assert_close(environment_radiance(light_of(fine), ways), environment_radiance(light_of(radiance), ways), rtol=1e-11, atol=1e-12)
+    torch.testing.assert_close(
+        environment_radiance(light_of(fine), ways), environment_radiance(light_of(radiance), ways), rtol=1e-11, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])

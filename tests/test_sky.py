@@ -14,10 +14,10 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.environment import pixel_moments
 from ddrecon.grid import Grid, array_order
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight
-from ddrecon.reduced import unscattered_sky
-from ddrecon.renderer import render, solve_light, view_components, view_image
+from ddrecon.lights import DirectionalLight, EnvironmentLight
 from ddrecon.medium import scaled_medium
+from ddrecon.reduced import unscattered_sky
+from ddrecon.renderer import render, solve_light, view_components
 from ddrecon.sky import MAX_SUNS, Sky, count_suns, fibonacci_sphere, taken_apart
 from ddrecon.world import Scene
 
@@ -114,7 +114,9 @@ def test_a_constant_map_looks_as_ambient_light_does(g: float, model: str, make_s
 def test_a_hot_pixel_is_a_directional_light(g: float, pixel: tuple[int, int], make_scene, half_empty):
     scene = make_scene(half_empty(*SHAPE), g=g)
     environment, directional = hot_pixel(32, 64, *pixel)
-    images = [render(replace(scene, lights=[light], render=replace(scene.render, background=False))) for light in (environment, directional)]
+    images = [
+        render(replace(scene, lights=[light], render=replace(scene.render, background=False))) for light in (environment, directional)
+    ]
     assert relative_error(*images) < 0.02
 
 
@@ -135,7 +137,10 @@ def test_a_turned_world_looks_the_same(make_scene):
     density = torch.rand(5, 4, 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     eye, up = torch.tensor([0.4, 0.5, 2.5], dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
     images = []
-    for rotation, field, origin in ((0.0, density, eye), (90.0, density.transpose(0, 2).flip(0), eye[[2, 1, 0]] * eye.new_tensor([1, 1, -1]))):
+    for rotation, field, origin in (
+        (0.0, density, eye),
+        (90.0, density.transpose(0, 2).flip(0), eye[[2, 1, 0]] * eye.new_tensor([1, 1, -1])),
+    ):
         camera = Camera(look_at(origin, torch.zeros_like(eye), up), (4, 5), 0.3)
         scene = make_scene(field.contiguous(), grid=grid, g=0.4, camera=camera)
         images.append(render(replace(scene, lights=[light_of(uneven(6, 8), rotation=rotation)])))
