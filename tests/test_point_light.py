@@ -39,7 +39,9 @@ def offsets(grid: Grid, position: tuple[float, ...]) -> Tensor:
 
 def cell_center(grid: Grid, z: int, y: int, x: int) -> tuple[float, float, float]:
     """The center (x, y, z) of a cell."""
-    z, y, x = (float(axis.flatten()[index]) for axis, index in zip(grid.centers(torch.zeros(1, dtype=torch.float64)), (z, y, x), strict=True))
+    z, y, x = (
+        float(axis.flatten()[index]) for axis, index in zip(grid.centers(torch.zeros(1, dtype=torch.float64)), (z, y, x), strict=True)
+    )
     return x, y, z
 
 
@@ -111,7 +113,11 @@ def test_from_afar_a_point_light_is_a_directional_one(g: float, make_scene, half
     grid, of a density that is the same in every cell.
     """
     scene = make_scene(torch.ones(*SHAPE, dtype=torch.float64), g=g)
-    towards, errors, distances = torch.nn.functional.normalize(torch.tensor([0.5, 1.0, 0.7], dtype=torch.float64), dim=0), [], [1e2, 1e3, 1e4]
+    towards, errors, distances = (
+        torch.nn.functional.normalize(torch.tensor([0.5, 1.0, 0.7], dtype=torch.float64), dim=0),
+        [],
+        [1e2, 1e3, 1e4],
+    )
     images = []
     for distance in (*distances, 1e8):
         point = PointLight(distance * towards, torch.tensor([3.0], dtype=torch.float64) * distance**2)
