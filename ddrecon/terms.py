@@ -47,7 +47,7 @@ def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
 
 def _environment_term(light: EnvironmentLight, way: str) -> str:
     (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
-    as_beams = f"{_counted(suns, 'sun')} as {_counted(suns, 'beam')}, " if suns else ""
+    as_beams = f"{_counted(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
     return f"environment map {width} x {height}: {as_beams}sky by {_counted(directions, 'direction')}, its mean {way}"
 
 
