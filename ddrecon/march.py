@@ -164,21 +164,12 @@ def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> tuple[Tensor
     extinction, diffuse, *others = values.split(sizes, 1)
     masses, scattering = others[: len(emission.beams)], (others[len(emission.beams) :] or [extinction])[0]
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
-    lengths = (nodes.distance[1:] - nodes.distance[:-1])[:, None]
-    mass = _between_nodes(extinction, lengths)
+    mass = nodes.integral(extinction)
     end = mass.cumsum(0)
     begin = end - mass
-    scattered = decayed_sum(_between_nodes(scattering * diffuse, lengths), begin, end, scale)
-    weight = _between_nodes(scattering, lengths)
+    scattered = decayed_sum(nodes.integral(scattering * diffuse), begin, end, scale)
     for beam, beam_mass in zip(emission.beams, masses, strict=True):
-        phase = beam.towards_camera(nodes, emission.g)
-        varies = phase.shape[0] > 1
-        own_weight = _between_nodes(scattering * phase, lengths) if varies else weight
-        arriving = decayed_sum(own_weight, begin + beam_mass[:-1], end + beam_mass[1:], scale)
-        scattered = scattered + (arriving if varies else arriving * phase[0]) * (beam.irradiance.view(-1, 1) / (4 * math.pi))
+        weight, phase = beam.scattered(scattering, nodes, emission.g)
+        arriving = decayed_sum(weight, begin + beam_mass[:-1], end + beam_mass[1:], scale)
+        scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
     return scattered * emission.scattering.scale.view(-1, 1), torch.exp(-scale * end[-1])
-
-
-def _between_nodes(values: Tensor, lengths: Tensor) -> Tensor:
-    """The integral over each segment, of `lengths` [N - 1, 1, R], of what is linear between its values [N, channels, R] at the nodes."""
-    return 0.5 * (values[:-1] + values[1:]) * lengths

@@ -1,4 +1,4 @@
-"""Where view rays are sampled."""
+"""Where view rays are sampled, and how what is linear between samples is integrated."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ class Nodes:
     distance: Tensor
 
     @property
-    def points(self) -> Tensor:
-        """World positions `[N, R, 3]`, array order."""
-        return self.origin + self.distance[..., None] * self.direction
+    def lengths(self) -> Tensor:
+        """The lengths [u] of the segments between nodes, `[N - 1, R]`."""
+        return self.distance[1:] - self.distance[:-1]
+
+    def integral(self, values: Tensor, measure: Tensor | None = None) -> Tensor:
+        """The integral over each segment of what is linear between `values` [N, channels, R], by length or another `measure` [N - 1, R]."""
+        return 0.5 * (values[:-1] + values[1:]) * (self.lengths if measure is None else measure)[:, None]

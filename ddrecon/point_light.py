@@ -38,12 +38,19 @@ class PointBeam:
     irradiance: Tensor
     least: float
 
-    def towards_camera(self, nodes: Nodes, g: Tensor) -> Tensor:
-        """The phase function times the inverse square of the distance, p / r^2 `[N, 1, R]`, at the `nodes` of view rays."""
-        offset = nodes.points - self.position
-        square = _square(offset, self.least)
-        cosine = -(offset * nodes.direction).sum(-1) / square.sqrt()
-        return (henyey_greenstein(cosine, g) / square)[:, None]
+    def scattered(self, scattering: Tensor, nodes: Nodes, g: Tensor) -> tuple[Tensor, Tensor | float]:
+        """The integral over each segment of `scattering` [N, K, R] times p / r^2, `[N - 1, K, R]`, and a factor of 1.
+
+        Scattering times p is linear between nodes; 1 / r^2 over a segment is exactly the angle it subtends over the ray's distance.
+        """
+        offset = nodes.origin - self.position
+        foot = (offset * nodes.direction).sum(-1)
+        across = _square(offset - foot[:, None] * nodes.direction, self.least)
+        along = foot + nodes.distance
+        phase = henyey_greenstein(-along / (across + along * along).sqrt(), g)
+        apart = across.sqrt()
+        angle = torch.atan2(apart * nodes.lengths, across + along[1:] * along[:-1])
+        return nodes.integral(scattering * phase[:, None], angle / apart), 1.0
 
 
 def point_beam(medium: Medium, light: PointLight, has_flux: bool) -> tuple[PointBeam, Moments]:

@@ -37,9 +37,9 @@ class Beam:
     direction: Tensor
     irradiance: Tensor
 
-    def towards_camera(self, nodes: Nodes, g: Tensor) -> Tensor:
-        """The phase function p `[1, 1, R]` of scattering from the beam into each view ray."""
-        return henyey_greenstein(-(nodes.direction @ self.direction), g)[None, None]
+    def scattered(self, scattering: Tensor, nodes: Nodes, g: Tensor) -> tuple[Tensor, Tensor | float]:
+        """The integral over each segment of `scattering` [N, K, R], `[N - 1, K, R]`, and the phase function p, the same all along a ray."""
+        return nodes.integral(scattering), henyey_greenstein(-(nodes.direction @ self.direction), g)
 
 
 @dataclass(frozen=True)

@@ -56,8 +56,8 @@ class Components:
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
     """Images `[views, 3, h, w]` (linear radiance) of all views of `scene`, or of the one named `view`.
 
-    Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume` and of the lights. `memory` carries the last solutions
-    from one call to the next, as starting points. Raises ValueError when views differ in size: render those one by one.
+    Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume` and of its lights. `memory` carries
+    the last solutions from one call to the next, as starting points. Raises ValueError when views differ in size: render those one by one.
     """
     views = scene.views if view is None else [scene.view(view)]
     if len({item.camera.size for item in views}) > 1:

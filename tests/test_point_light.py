@@ -104,7 +104,7 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form(make_ca
     along = ((light - bundle.origin) * bundle.direction).sum(-1)
     apart = (bundle.origin + along[:, None] * bundle.direction - light).norm(dim=-1)
     expected = 3e-9 * 2.0 / (4 * math.pi) * (torch.atan((far - along) / apart) - torch.atan((near - along) / apart)) / apart
-    torch.testing.assert_close(radiance, expected, rtol=5e-3, atol=0)
+    torch.testing.assert_close(radiance, expected, rtol=1e-7, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])
