@@ -37,8 +37,8 @@ class Camera:
 def twisted(camera: Camera, twist: Tensor, pivot: Triple) -> Camera:
     """`camera` moved by `twist` [6]: turned about `pivot` (x, y, z) by a rotation vector [rad], then shifted [u].
 
-    Both vectors are in the camera's own axes (right, up, backward). With the pivot amid what the camera looks at, a turn shows another side of
-    it and a shift moves it in the image, so that the two are told apart by what they do.
+    Both vectors are in the camera's own axes (right, up, backward). With the pivot amid what the camera looks at, a turn shows another
+    side of it and a shift moves it in the image, so that the two are told apart by what they do.
     """
     turn, origin = camera.pose[:, :3], camera.pose[:, 3]
     center = origin.new_tensor(pivot)
@@ -48,7 +48,10 @@ def twisted(camera: Camera, twist: Tensor, pivot: Triple) -> Camera:
 
 
 def _rotation(vector: Tensor) -> Tensor:
-    """The matrix [3, 3] of the rotation by |vector| [rad] about `vector`, by Rodrigues' formula; by series near zero, where it is smooth."""
+    """The matrix [3, 3] of the rotation by |vector| [rad] about `vector`, by Rodrigues' formula.
+
+    Near zero by series: the formula is smooth there, but not term by term.
+    """
     square = vector @ vector
     is_small = square < 1e-3
     angle = torch.where(is_small, 1, square).sqrt()

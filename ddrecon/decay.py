@@ -27,7 +27,8 @@ def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Te
     `begin`, `end`: [S, K, R] >= 0, what `scale` [C, 1] multiplies to give the depths at both ends of segment S, in either order;
     `weight`: [S, K or C, R]. K is 1 or C.
     """
-    return _DecayedSum.apply(weight, begin, end, scale)
+    total: Tensor = _DecayedSum.apply(weight, begin, end, scale)[0]
+    return total
 
 
 def _phi(depth: Tensor) -> Tensor:
@@ -62,16 +63,25 @@ class _DecayMean(torch.autograd.Function):
 
 
 class _DecayedSum(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Tensor:
-        decay = torch.exp(torch.minimum(begin, end) * -scale)
-        phi = _phi((end - begin).abs_() * scale)
-        ctx.save_for_backward(weight, begin, end, scale, decay, phi)
-        ctx.save_for_forward(weight, begin, end, scale, decay, phi)
-        return (decay * phi).mul_(weight).sum(0)
+    """The sum, and the two arrays its derivatives need again, which are not differentiated themselves."""
 
     @staticmethod
-    def backward(ctx: Any, out_bar: Tensor) -> tuple[Tensor | None, ...]:
+    def forward(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        decay = torch.exp(torch.minimum(begin, end) * -scale)
+        phi = _phi((end - begin).abs_() * scale)
+        return (decay * phi).mul_(weight).sum(0), decay, phi
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs, *output[1:])
+        ctx.save_for_forward(*inputs, *output[1:])
+
+    @staticmethod
+    def backward(ctx: Any, out_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        if out_bar is None:
+            return None, None, None, None
         weight, begin, end, scale, decay, phi = ctx.saved_tensors
         mean_bar = decay * phi * out_bar
         weight_bar = mean_bar.sum(1, keepdim=True) if weight.shape[1] < mean_bar.shape[1] else mean_bar
@@ -87,7 +97,9 @@ class _DecayedSum(torch.autograd.Function):
         return weight_bar, torch.where(is_rising, low_bar, high_bar), torch.where(is_rising, high_bar, low_bar), scale_bar
 
     @staticmethod
-    def jvp(ctx: Any, d_weight: Tensor | None, d_begin: Tensor | None, d_end: Tensor | None, d_scale: Tensor | None) -> Tensor:
+    def jvp(
+        ctx: Any, d_weight: Tensor | None, d_begin: Tensor | None, d_end: Tensor | None, d_scale: Tensor | None
+    ) -> tuple[Tensor, None, None]:
         weight, begin, end, scale, decay, phi = ctx.saved_tensors
         psi = _psi((end - begin).abs() * scale, phi)
         low_slope, high_slope = -decay * psi, decay * (psi - phi)
@@ -100,7 +112,7 @@ class _DecayedSum(torch.autograd.Function):
             if d_scale is not None:
                 d_mean = d_mean + slope * d_scale * value
         d_out = (weight * d_mean).sum(0)
-        return d_out if d_weight is None else d_out + (d_weight * decay * phi).sum(0)
+        return d_out if d_weight is None else d_out + (d_weight * decay * phi).sum(0), None, None
 
 
 def _to_fields(bar: Tensor, field: Tensor) -> Tensor:

@@ -36,8 +36,8 @@ class VolumeRenderer(torch.nn.Module):
         """Images `[views, 3, h, w]` of all views, or of the one named `view`.
 
         `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar in (-1, 1); `values`: anything else by
-        name, such as `lights.0.irradiance` (`ddrecon.variables`). What is not given is the scene's. Raises KeyError for a name the scene does
-        not have, ValueError for a density of another shape than the grid's.
+        name, such as `lights.0.irradiance` (`ddrecon.variables`). What is not given is the scene's. Raises KeyError for a name the scene
+        does not have, ValueError for a density of another shape than the grid's.
         """
         given = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
         chosen = {name: value for name, value in given.items() if value is not None} | dict(values or {})

@@ -1,4 +1,4 @@
-"""Lights: radiance that arrives at the volume's box from outside. Vectors are (x, y, z); colors are `[1]` or `[3]`."""
+"""Lights. Vectors are (x, y, z); colors are `[1]` or `[3]`. Every tensor may be varied, in reverse and in forward mode."""
 
 from __future__ import annotations
 
@@ -22,4 +22,26 @@ class AmbientLight:
     radiance: Tensor
 
 
-Light = DirectionalLight | AmbientLight
+@dataclass(eq=False)
+class EnvironmentLight:
+    """A latitude-longitude map of light from infinitely far away; `ddrecon.environment` says which pixel lies where.
+
+    `radiance` [C, h, w] >= 0 of every pixel, h >= 2; `scale`: scalar factor on it; `rotation`: scalar, about +y [degrees];
+    `directions`: how many directions the light on the volume is gathered into.
+    """
+
+    radiance: Tensor
+    scale: Tensor
+    rotation: Tensor
+    directions: int = 48
+
+
+@dataclass(eq=False)
+class PointLight:
+    """Light from one point, inside or outside the box: `position` [3] in u, `intensity` [C], power per solid angle."""
+
+    position: Tensor
+    intensity: Tensor
+
+
+Light = DirectionalLight | AmbientLight | EnvironmentLight | PointLight

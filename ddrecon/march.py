@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
+from ddrecon.autodiff import recomputed
 from ddrecon.cameras import Rays
 from ddrecon.decay import decayed_sum
 from ddrecon.grid import Grid
 from ddrecon.medium import Coefficient
-from ddrecon.phase import henyey_greenstein
+from ddrecon.nodes import Nodes
+from ddrecon.point_light import PointBeam
 from ddrecon.reduced import Beam
 from ddrecon.sampling import sample_slices, sample_volume
 
@@ -33,13 +34,13 @@ class Emission:
     """What a volume sends towards one camera: its `extinction`, `scattering`, light `beams`, and `diffuse` [C, z, y, x].
 
     `diffuse` is the radiance that scatters into the camera's rays from all other light, so that emission per unit length is
-    kappa_s (diffuse + sum over beams of p E tau / (4 pi)); `g` is the mean cosine of p.
+    kappa_s (diffuse + sum over beams of p E tau / (4 pi)); `g` is the mean cosine of p. Point lights have E = I / r^2.
     """
 
     grid: Grid
     extinction: Coefficient
     scattering: Coefficient
-    beams: tuple[Beam, ...]
+    beams: tuple[Beam | PointBeam, ...]
     diffuse: Tensor
     g: Tensor
 
@@ -68,15 +69,12 @@ def march(emission: Emission, rays: Rays, steps_per_voxel: int) -> tuple[Tensor,
 
     def run(chunk: Tensor) -> tuple[Tensor, Tensor]:
         chosen = crossing.hit[chunk]
-        direction = rays.direction[chosen]
-        values, lengths = sampler.sample(rays.origin[chosen], direction, crossing.near[chunk], crossing.far[chunk])
-        return _integrate(emission, values, lengths, direction)
+        origin, direction = rays.origin[chosen], rays.direction[chosen]
+        values, distance = sampler.sample(origin, direction, crossing.near[chunk], crossing.far[chunk])
+        return _integrate(emission, values, Nodes(origin, direction, distance))
 
     chunks = torch.arange(crossing.hit.numel(), device=blank.device).split(max(1, CHUNK_NODES // sampler.nodes))
-    if torch.is_grad_enabled():
-        parts = [checkpoint(run, chunk, use_reentrant=False, preserve_rng_state=False) for chunk in chunks]
-    else:
-        parts = [run(chunk) for chunk in chunks]
+    parts = [recomputed(run, chunk) for chunk in chunks]
     scattered, transmittance = (torch.cat(part, 1) for part in zip(*parts, strict=True))
     return blank.index_copy(1, crossing.hit, scattered), (blank + 1).index_copy(1, crossing.hit, transmittance)
 
@@ -113,8 +111,7 @@ class _Slices:
         distance = (self.planes[:, None] - origin[:, self.axis]) / direction[:, self.axis]
         points = [2 * (origin[:, a] + distance * direction[:, a] - self.lower[a]) / self.extent[a] - 1 for a in self.across]
         values = sample_slices(self.slices, torch.stack([points[1], points[0]], -1))
-        inside = torch.minimum(torch.maximum(distance, near), far)
-        return values, (inside[1:] - inside[:-1])[:, None]
+        return values, torch.minimum(torch.maximum(distance, near), far)
 
 
 class _Equidistant:
@@ -129,8 +126,7 @@ class _Equidistant:
         distance = near + part * (far - near)
         points = 2 * (origin + distance[..., None] * direction - self.lower) / self.extent - 1
         values = sample_volume(self.fields, points.flip(-1))
-        lengths = (far - near) / (self.nodes - 1)
-        return values.transpose(0, 1), lengths.expand(self.nodes - 1, 1, -1)
+        return values.transpose(0, 1), distance
 
 
 def _sampler(emission: Emission, rays: Rays, crossing: Crossing, steps: int) -> _Slices | _Equidistant:
@@ -162,20 +158,18 @@ def _fields(emission: Emission) -> list[Tensor]:
     return fields
 
 
-def _integrate(emission: Emission, values: Tensor, lengths: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Scattered radiance and transmittance, each [C, R], from node `values` [N, channels, R] and segment `lengths` [N - 1, 1, R]."""
+def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> tuple[Tensor, Tensor]:
+    """Scattered radiance and transmittance, each [C, R], from `values` [N, channels, R] at the `nodes`."""
     sizes = [field.shape[0] for field in _fields(emission)]
     extinction, diffuse, *others = values.split(sizes, 1)
     masses, scattering = others[: len(emission.beams)], (others[len(emission.beams) :] or [extinction])[0]
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
-    mass = 0.5 * (extinction[:-1] + extinction[1:]) * lengths
+    mass = nodes.integral(extinction)
     end = mass.cumsum(0)
     begin = end - mass
-    emitted = scattering * diffuse
-    scattered = decayed_sum(0.5 * (emitted[:-1] + emitted[1:]) * lengths, begin, end, scale)
-    weight = 0.5 * (scattering[:-1] + scattering[1:]) * lengths
+    scattered = decayed_sum(nodes.integral(scattering * diffuse), begin, end, scale)
     for beam, beam_mass in zip(emission.beams, masses, strict=True):
+        weight, phase = beam.scattered(scattering, nodes, emission.g)
         arriving = decayed_sum(weight, begin + beam_mass[:-1], end + beam_mass[1:], scale)
-        phase = henyey_greenstein(-(direction @ beam.direction), emission.g)
         scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
     return scattered * emission.scattering.scale.view(-1, 1), torch.exp(-scale * end[-1])

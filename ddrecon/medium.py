@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ddrecon.decay import decay_mean
 from ddrecon.grid import Grid
 from ddrecon.phase import forward_fraction, scaled_mean_cosine
 
@@ -45,6 +46,13 @@ class Coefficient:
     def value(self) -> Tensor:
         """The coefficient itself, `[C, z, y, x]`."""
         return self.scale * self.field
+
+    def mean_transmittance(self, entered: Tensor, step: Tensor) -> Tensor:
+        """exp(-depth) averaged over each cell, `[C, z, y, x]`.
+
+        The light has `entered` mass behind it (the integral of `field`, [K, z, y, x]); `step`: what it crosses [u], scalar or [z, y, x].
+        """
+        return torch.exp(-self.scale * entered) * decay_mean(self.scale * (self.field * step))
 
 
 @dataclass(frozen=True)

@@ -7,19 +7,23 @@ along that axis, shear back. Density and optical depth are interpolated, never t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
-from ddrecon.decay import decay_mean
+from ddrecon.autodiff import is_varied, recomputed
 from ddrecon.grid import Grid, array_order
-from ddrecon.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.medium import Coefficient, Medium
-from ddrecon.moments import Moments, beam_moments
+from ddrecon.lights import AmbientLight, DirectionalLight, PointLight
+from ddrecon.medium import Medium
+from ddrecon.moments import Moments, Vector, beam_moments
+from ddrecon.nodes import Nodes
+from ddrecon.phase import henyey_greenstein
+from ddrecon.point_light import PointBeam, point_beam
 from ddrecon.quadrature import sphere_quadrature
 from ddrecon.sampling import sample_slices
+from ddrecon.sky import Sky, Source
 
 
 @dataclass(frozen=True)
@@ -33,42 +37,89 @@ class Beam:
     direction: Tensor
     irradiance: Tensor
 
+    def scattered(self, scattering: Tensor, nodes: Nodes, g: Tensor) -> tuple[Tensor, Tensor | float]:
+        """The integral over each segment of `scattering` [N, K, R], `[N - 1, K, R]`, and the phase function p, the same all along a ray."""
+        return nodes.integral(scattering), henyey_greenstein(-(nodes.direction @ self.direction), g)
+
 
 @dataclass(frozen=True)
 class ReducedLight:
-    """Light of directional lights not yet scattered: its `beams`, and its `source` Q0, Q1, averaged over cells (no Q1 where g = 0)."""
+    """Light of directional and point lights not yet scattered: `beams`, and their `source` Q0, Q1 averaged over cells (no Q1 for g = 0)."""
 
-    beams: tuple[Beam, ...]
+    beams: tuple[Beam | PointBeam, ...]
     source: Moments
 
 
-def reduced_light(medium: Medium, lights: list[Light], has_flux: bool) -> ReducedLight:
-    """The light of directional `lights` that reaches each cell unscattered; `has_flux`: whether Q1 is needed (g is not 0)."""
-    beams, total = [], Moments(torch.zeros_like(medium.extinction.value))
+def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> ReducedLight:
+    """The light of directional and point `lights` that reaches each cell unscattered; `has_flux`: whether Q1 is needed (g is not 0)."""
+    beams: list[Beam | PointBeam] = []
+    total = Moments(torch.zeros_like(medium.extinction.value))
     for light in lights:
-        if isinstance(light, DirectionalLight):
-            beam, received = _beam(medium, light, has_flux)
+        if isinstance(light, DirectionalLight | PointLight):
+            beam, received = _beam(medium, light, has_flux) if isinstance(light, DirectionalLight) else point_beam(medium, light, has_flux)
             beams.append(beam)
             total = total.plus(received)
     return ReducedLight(tuple(beams), total.scaled(1.0, 3 * medium.mean_cosine))
 
 
-def ambient_radiance(lights: list[Light], like: Tensor) -> Tensor:
+def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
     """The radiance `[C, 1, 1, 1]` that all ambient `lights` together send in from every direction."""
     radiances = [light.radiance for light in lights if isinstance(light, AmbientLight)]
     return torch.stack(torch.broadcast_tensors(*radiances, like.new_zeros(1))).sum(0).view(-1, 1, 1, 1)
 
 
-def unscattered_ambient(medium: Medium, radiance: Tensor, has_flux: bool) -> Moments:
-    """Ambient light not yet scattered, to first order in angle: int L_ri and 3 int L_ri w over the sphere, divided by 4 pi.
+def ambient_sky(radiance: Tensor) -> Sky:
+    """Ambient light of `radiance` [C, 1, 1, 1] as light from the directions of a quadrature over the sphere."""
+    directions, weights = sphere_quadrature(radiance)
+    irradiance = 4 * math.pi * weights[:, None] * radiance.flatten()
+    return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
 
-    One direction at a time, so that memory does not grow with their number. `radiance`: [C, 1, 1, 1].
+
+def unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments:
+    """Light of all skies in `lights` not yet scattered, to first order in angle: int L_ri and 3 int L_ri w over the sphere, over 4 pi.
+
+    One direction at a time, so that memory does not grow with their number.
     """
     total = Moments(torch.zeros_like(medium.extinction.value))
-    for direction, weight in zip(*sphere_quadrature(medium.extinction.field), strict=True):
-        visible = checkpoint(_visibility, medium, direction, use_reentrant=False, preserve_rng_state=False)
-        total = total.plus(beam_moments(weight * visible, direction, has_flux))
-    return total.scaled(radiance, 3 * radiance)
+    for sky in _lit_skies(lights):
+        vectors = sky.vector if has_flux else [None] * len(sky.travel)
+        for travel, irradiance, vector in zip(sky.travel, sky.irradiance, vectors, strict=True):
+            total = total.plus(recomputed(_seen_from, medium, travel, irradiance, vector))
+    return total.scaled(1 / (4 * math.pi), 3 / (4 * math.pi))
+
+
+def scattered_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
+    """What one scattering turns `towards` a camera (unit, its components broadcast to cells) of the light of `skies`, `[C, z, y, x]`.
+
+    Per unit length and kappa_s, by the exact phase function: sum of p E tau / (4 pi), one direction at a time.
+    """
+    total = torch.zeros_like(medium.extinction.value)
+    for sky in _lit_skies(skies):
+        for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
+            total = total + recomputed(_turned_towards, medium, travel, irradiance, towards)
+    return total / (4 * math.pi)
+
+
+def _lit_skies(lights: Sequence[object]) -> list[Sky]:
+    """The skies that differ from their mean, or may come to do so because they are being varied."""
+    skies = [light for light in lights if isinstance(light, Sky)]
+    return [sky for sky in skies if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())]
+
+
+def _turned_towards(medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector) -> Tensor:
+    visible = _seen_from(medium, travel, irradiance, None).mean
+    z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
+    return visible * henyey_greenstein(z + y + x, medium.g)
+
+
+def _seen_from(medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None) -> Moments:
+    """`irradiance` ([C] or scalar) and `vector` [3, C], each times the transmittance along `direction`, averaged over cells."""
+    visible = medium.extinction.mean_transmittance(*entered_mass(medium.extinction.field, medium.grid, direction))
+    mean = visible * irradiance.view(-1, 1, 1, 1)
+    if vector is None:
+        return Moments(mean)
+    z, y, x = (visible * component.view(-1, 1, 1, 1) for component in vector)
+    return Moments(mean, (z, y, x))
 
 
 def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
@@ -76,19 +127,9 @@ def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
     entered, step = entered_mass(medium.extinction.field, medium.grid, direction)
-    received = irradiance / (4 * math.pi) * _cell_mean(medium.extinction, entered, step)
+    received = irradiance / (4 * math.pi) * medium.extinction.mean_transmittance(entered, step)
     beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
     return beam, beam_moments(received, direction, has_flux)
-
-
-def _visibility(medium: Medium, direction: Tensor) -> Tensor:
-    """Transmittance from the box to each cell along `direction`, averaged over the cell."""
-    return _cell_mean(medium.extinction, *entered_mass(medium.extinction.field, medium.grid, direction))
-
-
-def _cell_mean(extinction: Coefficient, entered: Tensor, step: Tensor) -> Tensor:
-    """exp(-depth) averaged over each cell, along a beam that has `entered` mass behind it and crosses `step` [u] of the cell."""
-    return torch.exp(-extinction.scale * entered) * decay_mean(extinction.scale * (extinction.field * step))
 
 
 def entered_mass(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,32 +11,37 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
+from ddrecon.autodiff import is_varied
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
 from ddrecon.diffusion import conservative, printed
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.lights import AmbientLight, Light
+from ddrecon.environment import environment_radiance
+from ddrecon.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.march import Emission, march
 from ddrecon.medium import Medium, scaled_medium, unscaled_medium
 from ddrecon.moments import Moments, Vector
-from ddrecon.reduced import Beam, ambient_radiance, reduced_light, unscattered_ambient
+from ddrecon.point_light import PointBeam
+from ddrecon.reduced import Beam, ambient_radiance, ambient_sky, reduced_light, scattered_sky, unscattered_sky
 from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.sky import Sky, sources
 from ddrecon.world import Scene, View
 
 
 @dataclass(frozen=True)
 class LightField:
-    """All light inside a medium: the beams of directional lights, and `outgoing`, what one more scattering makes of all other light.
+    """All light inside a medium: `beams` of directional and point lights, and `outgoing`, what one more scattering makes of the rest.
 
-    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3.
+    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3. `skies` are those whose light it lacks: they scatter by
+    the exact phase function, into each camera's rays anew.
     """
 
     medium: Medium
-    beams: tuple[Beam, ...]
+    beams: tuple[Beam | PointBeam, ...]
     outgoing: Moments
+    skies: tuple[Sky, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -51,8 +56,8 @@ class Components:
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
     """Images `[views, 3, h, w]` (linear radiance) of all views of `scene`, or of the one named `view`.
 
-    Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume`. `memory` carries the last solutions
-    from one call to the next, as starting points. Raises ValueError when views differ in size: render those one by one.
+    Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume` and of its lights. `memory` carries
+    the last solutions from one call to the next, as starting points. Raises ValueError when views differ in size: render those one by one.
     """
     views = scene.views if view is None else [scene.view(view)]
     if len({item.camera.size for item in views}) > 1:
@@ -71,18 +76,25 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     medium = scaled_medium(scene.volume)
     if not multiply_scatters(medium, scene.diffusion):
         return unscattered_light(unscaled_medium(scene.volume), scene.lights)
-    reduced = reduced_light(medium, scene.lights, has_flux(medium))
-    diffuse = solve_diffuse(medium, reduced.source, ambient_radiance(scene.lights, medium.g), scene.diffusion, memory)
-    return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse))
+    lights = sources(scene.lights)
+    reduced = reduced_light(medium, lights, has_flux(medium))
+    sky = unscattered_sky(medium, lights, has_flux(medium))
+    source = reduced.source.plus(sky.scaled(1.0, medium.mean_cosine))
+    diffuse = solve_diffuse(medium, source, ambient_radiance(lights, medium.g), scene.diffusion, memory)
+    return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse.plus(sky)))
 
 
-def unscattered_light(medium: Medium, lights: list[Light]) -> LightField:
-    """The light inside `medium` that has not been scattered: beams, and ambient light by quadrature over directions."""
-    beams = reduced_light(medium, lights, False).beams
-    light = Moments(torch.zeros_like(medium.extinction.value))
-    if any(isinstance(item, AmbientLight) for item in lights):
-        light = unscattered_ambient(medium, ambient_radiance(lights, medium.g), has_flux(medium))
-    return LightField(medium, beams, _scattered_once_more(medium, light))
+def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
+    """The light inside `medium` that has not been scattered: beams, and by quadrature over directions ambient light and skies."""
+    parts = sources(lights)
+    beams = reduced_light(medium, parts, False).beams
+    skies = tuple(part for part in parts if isinstance(part, Sky))
+    if any(isinstance(part, AmbientLight) for part in parts):
+        skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
+    nothing = Moments(torch.zeros_like(medium.extinction.value))
+    if has_flux(medium):
+        return LightField(medium, beams, nothing, skies)
+    return LightField(medium, beams, unscattered_sky(medium, skies, has_flux=False))
 
 
 def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
@@ -92,17 +104,12 @@ def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
 
 def has_flux(medium: Medium) -> bool:
     """Whether light's direction matters to scattering: g is not 0, or is being differentiated."""
-    return _is_varied(medium.g) or bool(medium.g != 0)
+    return is_varied(medium.g) or bool(medium.g.detach() != 0)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
     """Whether light may be scattered more than once: the model is not `none`, and sigma_s is not 0 or is being differentiated."""
-    return settings.model != "none" and (_is_varied(medium.scattering.scale) or bool((medium.scattering.scale != 0).any()))
-
-
-def _is_varied(value: Tensor) -> bool:
-    """Whether `value` is being differentiated, in either mode."""
-    return value.requires_grad or forward_ad.unpack_dual(value).tangent is not None
+    return settings.model != "none" and (is_varied(medium.scattering.scale) or bool((medium.scattering.scale != 0).any()))
 
 
 def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: DiffusionSettings, memory: SolveMemory) -> Moments:
@@ -127,9 +134,11 @@ def view_image(light_field: LightField, scene: Scene, camera: Camera, derivative
     `diffusion` (E3, with the ambient light in it). The image is the same.
     """
     if derivatives == "all":
-        return _average(camera, scene.render, lambda bundle: _radiance(light_field, scene, bundle))
+        emission = _emission(light_field, rays(camera))
+        return _average(camera, scene.render, lambda bundle: _radiance(emission, scene, bundle))
     nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
-    parts = {"single": (replace(light_field, outgoing=nothing), scene), "diffusion": (replace(light_field, beams=()), _without_background(scene))}
+    once, often = replace(light_field, outgoing=nothing), replace(light_field, beams=(), skies=())
+    parts = {"single": (once, scene), "diffusion": (often, _without_background(scene))}
     kept = view_image(*parts.pop(derivatives), camera)
     ((rest_field, rest_scene),) = parts.values()
     with torch.no_grad():
@@ -160,15 +169,31 @@ def _average(camera: Camera, settings: RenderSettings, radiance: Callable[[Rays]
     return total.unflatten(-1, camera.size)
 
 
-def _radiance(light_field: LightField, scene: Scene, bundle: Rays) -> Tensor:
-    """Radiance [3, R] along `bundle`: E1."""
+def _emission(light_field: LightField, bundle: Rays) -> Emission:
+    """What the medium sends towards the camera that `bundle` belongs to."""
     medium = light_field.medium
-    diffuse = light_field.outgoing.along(_towards_camera(medium, bundle))
-    emission = Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)
+    towards = _towards_camera(medium, bundle)
+    diffuse = light_field.outgoing.along(towards)
+    if light_field.skies:
+        diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
+    return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)
+
+
+def _radiance(emission: Emission, scene: Scene, bundle: Rays) -> Tensor:
+    """Radiance [3, R] along `bundle`: E1."""
     scattered, transmittance = march(emission, bundle, scene.render.steps_per_voxel)
     if scene.render.background:
-        scattered = scattered + transmittance * ambient_radiance(scene.lights, medium.g).view(-1, 1)
+        scattered = scattered + transmittance * _background(scene.lights, bundle)
     return scattered.expand(3, -1)
+
+
+def _background(lights: Sequence[Light], bundle: Rays) -> Tensor:
+    """The radiance [C, R] of ambient light and environment maps along `bundle`, where nothing is in the way."""
+    total = ambient_radiance(lights, bundle.direction).view(-1, 1)
+    for light in lights:
+        if isinstance(light, EnvironmentLight):
+            total = total + environment_radiance(light, bundle.direction)
+    return total
 
 
 def _towards_camera(medium: Medium, bundle: Rays) -> Vector:

@@ -12,7 +12,6 @@ from typing import Any
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.solvers import SOLVERS
 
-
 DERIVATIVES = ("all", "single", "diffusion")
 """Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the diffusion (the paper's Fig. 9)."""
 

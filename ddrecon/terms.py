@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 
-from ddrecon.lights import AmbientLight, DirectionalLight
+from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.march import CHUNK_NODES
 from ddrecon.medium import scaled_medium
 from ddrecon.renderer import has_flux, multiply_scatters
+from ddrecon.sky import count_suns
 from ddrecon.world import Scene, View
 
 
@@ -18,11 +20,7 @@ def needed_terms(scene: Scene) -> list[str]:
     medium = scaled_medium(scene.volume)
     colors = medium.extinction.scale.shape[0]
     terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
-    beams = sum(isinstance(light, DirectionalLight) for light in scene.lights)
-    if beams:
-        terms.append(f"transmittance towards {beams} directional light{'s' if beams > 1 else ''}")
-    if any(isinstance(light, AmbientLight) for light in scene.lights):
-        terms.append(_ambient_term(multiply_scatters(medium, scene.diffusion)))
+    terms += _light_terms(scene.lights, multiply_scatters(medium, scene.diffusion))
     if multiply_scatters(medium, scene.diffusion) and bool(medium.g > 0):
         terms.append("delta-Eddington scaling of the forward peak (g > 0)")
     if multiply_scatters(medium, scene.diffusion):
@@ -34,9 +32,26 @@ def needed_terms(scene: Scene) -> list[str]:
     return terms
 
 
-def _ambient_term(is_diffuse: bool) -> str:
+def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
+    terms = []
+    for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
+        count = sum(isinstance(light, kind) for light in lights)
+        if count:
+            terms.append(f"transmittance towards {_counted(count, name)}")
     way = "as inflow of the diffusion through the box's faces" if is_diffuse else "by quadrature over 50 directions"
-    return f"ambient light, {way}"
+    if any(isinstance(light, AmbientLight) for light in lights):
+        terms.append(f"ambient light, {way}")
+    return terms + [_environment_term(light, way) for light in lights if isinstance(light, EnvironmentLight)]
+
+
+def _environment_term(light: EnvironmentLight, way: str) -> str:
+    (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
+    as_beams = f"{_counted(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
+    return f"environment map {width} x {height}: {as_beams}sky by {_counted(directions, 'direction')}, its mean {way}"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' if count > 1 else ''}"
 
 
 def memory_estimate(scene: Scene) -> int:

@@ -105,7 +105,8 @@ def _replaced_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
 
 
 def _replaced_light(light: Light, values: Mapping[str, Tensor]) -> Light:
-    return replace(light, **values) if values else light
+    changed: Light = replace(light, **values)  # type: ignore[arg-type]
+    return changed
 
 
 def _replaced_view(view: View, twist: Tensor | None, scene: Scene) -> View:

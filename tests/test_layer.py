@@ -40,7 +40,10 @@ def test_a_tiny_network_learns_the_density_behind_an_image(make_scene: Callable[
 
 def test_anything_by_name_replaces_what_the_scene_has(make_scene: Callable[..., Scene], random: Callable[..., Tensor]) -> None:
     scene = make_scene(random(*SHAPE), ambient=(0.2,))
-    brighter = {"lights.0.irradiance": 2 * value_of(scene, "lights.0.irradiance"), "lights.1.radiance": 2 * value_of(scene, "lights.1.radiance")}
+    brighter = {
+        "lights.0.irradiance": 2 * value_of(scene, "lights.0.irradiance"),
+        "lights.1.radiance": 2 * value_of(scene, "lights.1.radiance"),
+    }
     torch.testing.assert_close(VolumeRenderer(scene)(values=brighter), 2 * render(scene), rtol=1e-10, atol=1e-14)
 
 

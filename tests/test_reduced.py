@@ -13,8 +13,9 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.lights import AmbientLight, DirectionalLight
 from ddrecon.medium import Medium, Volume, scaled_medium
+from ddrecon.moments import Moments
 from ddrecon.quadrature import sphere_quadrature
-from ddrecon.reduced import ReducedLight, ambient_radiance, entered_mass, reduced_light, unscattered_ambient
+from ddrecon.reduced import ReducedLight, ambient_radiance, ambient_sky, entered_mass, reduced_light, unscattered_sky
 
 DIRECTIONS = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7), (1.0, 1.0, 1.0)]
 
@@ -155,6 +156,10 @@ def medium_in(grid: Grid, density: Tensor, g: float = 0.4, sigma=((0.5, 1.0), (3
     return scaled_medium(Volume(grid, density, sigma_a, sigma_s, density.new_tensor(g)))
 
 
+def unscattered_ambient(medium: Medium, radiance: Tensor) -> Moments:
+    return unscattered_sky(medium, [ambient_sky(radiance)], has_flux=True)
+
+
 def reduced(grid: Grid, density: Tensor, lights: list, **medium) -> ReducedLight:
     return reduced_light(medium_in(grid, density, **medium), lights, has_flux=True)
 
@@ -192,7 +197,7 @@ def test_without_a_medium_a_beam_arrives_whole(box):
 
 def test_without_a_medium_ambient_light_is_the_same_everywhere(box):
     radiance = torch.tensor([0.7, 2.0], dtype=torch.float64).view(2, 1, 1, 1)
-    light = unscattered_ambient(medium_in(box((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64)), radiance, has_flux=True)
+    light = unscattered_ambient(medium_in(box((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64)), radiance)
     torch.testing.assert_close(light.mean, radiance.expand(2, 3, 4, 2), rtol=1e-15, atol=0)
     assert max(float(component.abs().max()) for component in light.flux) < 1e-14
 
@@ -200,7 +205,7 @@ def test_without_a_medium_ambient_light_is_the_same_everywhere(box):
 def test_ambient_light_is_symmetric_in_a_symmetric_medium():
     """A homogeneous cube: the moments have the symmetries of the cube, and light flows inward."""
     medium = medium_in(Grid((5, 5, 5), (0, 0, 0), (1, 1, 1)), torch.ones(5, 5, 5, dtype=torch.float64))
-    light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64), has_flux=True)
+    light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64))
     for axis in (1, 2, 3):
         torch.testing.assert_close(light.mean, light.mean.flip(axis), rtol=0, atol=1e-14)
         torch.testing.assert_close(light.flux[axis - 1], -light.flux[axis - 1].flip(axis), rtol=0, atol=1e-14)
@@ -213,7 +218,7 @@ def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
     cells, thickness = 6, 0.8
     grid = Grid((cells, 9, 9), (0, -1e3, -1e3), (thickness, 1e3, 1e3))
     medium = medium_in(grid, torch.ones(grid.shape, dtype=torch.float64), g=0.0, sigma=([0.3], [1.7]))
-    light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64), has_flux=True)
+    light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64))
     directions, weights = sphere_quadrature(light.mean)
     for cell in range(cells):
         mean = flux = 0.0

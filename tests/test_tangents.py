@@ -27,7 +27,17 @@ def images_of(scene: Scene) -> dict[str, Tensor]:
     return {"image": render(scene)[0], "reduced": parts.reduced, "single": parts.single, "multiple": parts.multiple}
 
 
-NAMES = ["density", "sigma_a", "sigma_s.g", "sigma_t", "albedo.b", "g", "lights.0.irradiance", "lights.0.direction.x", "lights.1.radiance.r"]
+NAMES = [
+    "density",
+    "sigma_a",
+    "sigma_s.g",
+    "sigma_t",
+    "albedo.b",
+    "g",
+    "lights.0.irradiance",
+    "lights.0.direction.x",
+    "lights.1.radiance.r",
+]
 NAMES += ["views.view.camera.rotation_y", "views.view.camera.z"]
 
 
@@ -55,7 +65,12 @@ def test_a_color_of_light_shows_in_its_own_channel_alone(scene: Scene) -> None:
 
 @pytest.mark.parametrize(
     ("name", "hint"),
-    [("depth", "no number depth"), ("lights.0.direction", "lights.0.direction.x"), ("views.view.camera", "rotation_x"), ("sigma_s.x", "no number")],
+    [
+        ("depth", "no number depth"),
+        ("lights.0.direction", "lights.0.direction.x"),
+        ("views.view.camera", "rotation_x"),
+        ("sigma_s.x", "no number"),
+    ],
 )
 def test_what_cannot_vary_is_refused_with_what_can(scene: Scene, name: str, hint: str) -> None:
     with pytest.raises(KeyError, match=hint):

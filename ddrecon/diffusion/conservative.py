@@ -1,6 +1,6 @@
 """Diffuse light by the conservative scheme: the P1 balance E4 with the Marshak boundary E6 on the operator of E7, and the flux E5.
 
-What the solve needs is made anew in the backward pass rather than kept, so that a color costs a dozen arrays of one value per cell, not a hundred.
+What the solve needs is made anew in the backward pass rather than kept: a color costs a dozen arrays of one value per cell, not a hundred.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Closure = Callable[[Tensor], Tensor]
 def diffuse_light(medium: Medium, closure: Closure, source: Moments, outside: Tensor, solve: Solve, has_flux: bool) -> Moments:
     """L0 and, where `has_flux`, L1 in `medium`.
 
-    `closure` turns transport extinction into D; `source`: Q0 and Q1 of beams; `outside` [C, 1, 1, 1]: radiance that enters through the box's
-    faces. L0 and L1 hold all of that, scattered or not, which keeps a white furnace exact (docs/theory.md, section 5).
+    `closure` turns transport extinction into D; `source`: Q0 and Q1 of beams; `outside` [C, 1, 1, 1]: radiance that enters through the
+    box's faces. L0 and L1 hold all of that, scattered or not, which keeps a white furnace exact (docs/theory.md, section 5).
     """
     z, y, x, loss, right = recomputed(_system, medium, closure, source, outside)
     mean = solve_diffusion(solve, Operator((z, y, x), loss), right)

@@ -1,7 +1,7 @@
 """The derivative of the image loss with respect to everything that is optimized, view by view.
 
-The light inside the volume is solved once and held as if it were given; each view's derivative goes back to it at once and is added up there,
-and the sum goes back through the solve. So memory does not grow with the number of views, and the adjoint (E9) is solved once.
+The light inside the volume is solved once and held as if it were given; each view's derivative goes back to it at once and is added up
+there, and the sum goes back through the solve. So memory does not grow with the number of views, and the adjoint (E9) is solved once.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def diverging(image: Tensor) -> tuple[np.ndarray, float]:
     values = pixels(image).mean(-1)
     full = max(float(np.quantile(np.abs(values), 0.999)), float(np.finfo(np.float32).tiny))
     part = np.clip(values / full, -1, 1)[..., None]
-    strong = np.where(part < 0, np.float32(BLUE), np.float32(RED))
+    strong = np.where(part < 0, np.array(BLUE, np.float32), np.array(RED, np.float32))
     return decode((1 - np.abs(part)) + np.abs(part) * strong), full
 
 

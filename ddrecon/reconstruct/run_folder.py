@@ -76,7 +76,11 @@ class RunFolder:
 
     def _write_volume(self, scene: Scene, name: str) -> None:
         value = value_of(scene, name).float().cpu()
-        array = value.numpy() if value.ndim == 3 else value.expand(3 if len(value) > 1 else 1, -1, -1, -1).permute(1, 2, 3, 0).squeeze(-1).numpy()
+        array = (
+            value.numpy()
+            if value.ndim == 3
+            else value.expand(3 if len(value) > 1 else 1, -1, -1, -1).permute(1, 2, 3, 0).squeeze(-1).numpy()
+        )
         write_field(self.path / "volumes" / f"{name}.npz", name, array, np.array(scene.volume.grid.bounds_xyz))
 
     def _parameters(self, scene: Scene) -> dict[str, Any]:

@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import torch
 
-from ddrecon.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.lights import Light
+from ddrecon.scene.build_lights import build_lights
 from ddrecon.scene.build_starts import build_starts, require_start_files
 from ddrecon.scene.build_views import build_views
 from ddrecon.scene.build_volume import build_volume
 from ddrecon.scene.load import SceneFile, read_scene
 from ddrecon.scene.problems import Problems
-from ddrecon.scene.schema import Color, DirectionalSection, LightSection
 from ddrecon.world import Scene
 
 
@@ -41,17 +41,10 @@ def build_scene(scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, de
         grid = volume.grid
     with problems.collecting():
         views = build_views(scene_file, grid, dtype, place)
+    lights: list[Light] = []
+    with problems.collecting():
+        lights = build_lights(scene_file, dtype, place)
     require_start_files(scene_file, problems)
     problems.raise_any()
-    lights = [_build_light(light, dtype, place) for light in tree.lights]
     scene = Scene(volume, lights, views, tree.render, tree.diffusion, tree.optimize, {}, scene_file.path)
     return replace(scene, starts=build_starts(scene_file, scene))
-
-
-def _build_light(section: LightSection, dtype: torch.dtype, device: torch.device) -> Light:
-    def color(value: Color) -> torch.Tensor:
-        return torch.tensor([value] if isinstance(value, float) else value, dtype=dtype, device=device)
-
-    if isinstance(section, DirectionalSection):
-        return DirectionalLight(torch.tensor(section.direction, dtype=dtype, device=device), color(section.irradiance))
-    return AmbientLight(color(section.radiance))

@@ -89,9 +89,7 @@ def _filled(scene_file: SceneFile, key: str, kind: Kind, init: float | tuple[flo
     raise scene_file.refused(key, f"expected {wanted}, found a list of {len(init)}")
 
 
-def _spread(
-    scene_file: SceneFile, key: str, name: str, settings: ParameterSettings, value: Tensor, shape: tuple[int, int, int]
-) -> Tensor:
+def _spread(scene_file: SceneFile, key: str, name: str, settings: ParameterSettings, value: Tensor, shape: tuple[int, int, int]) -> Tensor:
     """`value` as a field or as one number (a color), as the scene asks for."""
     own = 0 if name == "density" else 1
     is_field = value.ndim == own + 3

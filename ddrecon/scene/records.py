@@ -11,8 +11,8 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from ddrecon.scene.leaves import LEAVES, Rule, read_color, read_each, read_list, read_number, read_text
 from ddrecon.scene.nodes import Node, found
-from ddrecon.scene.problems import Problems, suggestion
 from ddrecon.scene.parameter_kinds import KINDS, Kind, pattern_of
+from ddrecon.scene.problems import Problems, suggestion
 from ddrecon.scene.ring import read_ring_views
 from ddrecon.scene.schema import Constant, Density, FieldFile, ParameterSettings, Quantity, RingViews, Start, ViewSection
 

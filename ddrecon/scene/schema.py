@@ -117,7 +117,32 @@ class AmbientSection:
     radiance: Color = limited(minimum=0)
 
 
-LightSection = DirectionalSection | AmbientSection
+@dataclass(frozen=True)
+class EnvironmentSection:
+    """A latitude-longitude map, +y up, its pixels times `scale`, turned by `rotation` [degrees] about +y.
+
+    `directions`: how many directions its light on the volume is gathered into.
+    """
+
+    type: ClassVar[str] = "environment"
+
+    file: Path
+    scale: float = bounded(1.0, minimum=0)
+    rotation: float = 0.0
+    directions: int = bounded(48, minimum=1, maximum=1024)
+
+
+@dataclass(frozen=True)
+class PointSection:
+    """Light from one point, inside or outside the box; `intensity`: power per solid angle."""
+
+    type: ClassVar[str] = "point"
+
+    position: Triple
+    intensity: Color = limited(minimum=0)
+
+
+LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,8 +33,8 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 class EntryCheck:
     """One entry of a parameter, or a random direction in it: derivative by the adjoint, by central differences, relative error.
 
-    `differences` are those of all `steps`; `difference`, taken with `step`, is the one that agrees best: larger steps suffer from truncation,
-    smaller ones from rounding.
+    `differences` are those of all `steps`; `difference`, taken with `step`, is the one that agrees best: larger steps suffer from
+    truncation, smaller ones from rounding.
     """
 
     entry: str
@@ -69,14 +69,16 @@ class GradientCheck:
     def lines(self) -> list[str]:
         """The check as a table."""
         header = f"{self.parameter:>24}  {'value':>10}  {'adjoint':>14}  {'difference':>14}  {'step':>8}  {'relative error':>14}"
-        rows = [
-            f"{e.entry:>24}  {'' if e.value is None else f'{e.value:.4g}':>10}  {e.adjoint:14.7e}  {e.difference:14.7e}  {e.step:8.1e}  {e.error:14.1e}"
-            for e in self.entries
-        ]
+        rows = [_row(entry) for entry in self.entries]
         verdict = "pass" if self.has_passed else "FAIL"
         worst = f"central differences {self.worst.error:.1e} at worst, {self.worst.entry} (allowed {AGREE_DIFFERENCES:.0e})"
         modes = f"tangent against adjoint {self.modes_error:.1e} (allowed {AGREE_MODES:.0e})"
         return [header, *rows, f"{self.parameter}: {verdict}; {modes}; {worst}"]
+
+
+def _row(e: EntryCheck) -> str:
+    value = "" if e.value is None else f"{e.value:.4g}"
+    return f"{e.entry:>24}  {value:>10}  {e.adjoint:14.7e}  {e.difference:14.7e}  {e.step:8.1e}  {e.error:14.1e}"
 
 
 def check_parameters(scene: Scene, names: tuple[str, ...], samples: int, seed: int, progress: Progress) -> list[GradientCheck]:
@@ -123,6 +125,7 @@ def _check(
     along = float(sum((gradients[name] * direction[name]).sum() for name in values))
     tangent = _tangent(loss, values, direction)
     fractions = tuple(step / first[0] for first in [next(iter(steps.values()))] for step in first)
+    ways: list[tuple[str, float | None, float, Mapping[str, Tensor], tuple[float, ...], float]]
     ways = [("a random direction", None, along, direction, fractions, 0.0)]
     for name, value in values.items() if samples else ():
         floor = NEGLIGIBLE * float(gradients[name].abs().max())
@@ -168,5 +171,3 @@ def _difference(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str
             return float(loss({name: value + steps * step * direction[name] for name, value in values.items() if name in direction}))
 
     return (8 * (shifted(1) - shifted(-1)) - (shifted(2) - shifted(-2))) / (12 * step)
-
-

@@ -48,7 +48,8 @@ def loss_at(scene: Scene, point: Mapping[str, Tensor], generator: torch.Generato
     exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
     views = [view for view in scene.views if view.image is not None] or scene.views
     targets = [
-        view.image if view.image is not None else random_like(scene.volume.density.new_empty(3, *view.camera.size), generator) for view in views
+        view.image if view.image is not None else random_like(scene.volume.density.new_empty(3, *view.camera.size), generator)
+        for view in views
     ]
     memory = SolveMemory()
 
@@ -56,7 +57,8 @@ def loss_at(scene: Scene, point: Mapping[str, Tensor], generator: torch.Generato
         world = with_values(exact, {**point, **values})
         seen = [world.view(view.name) for view in views]
         images = render_each(world, seen, memory)
-        return torch.stack([image_loss("l2", *compared, view.mask) for *compared, view in zip(images, targets, seen, strict=True)]).mean()
+        compared = zip(images, targets, seen, strict=True)
+        return torch.stack([image_loss("l2", image, target, view.mask) for image, target, view in compared]).mean()
 
     return loss
 

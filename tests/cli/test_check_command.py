@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import Result
 from small_scene import contents
@@ -35,6 +36,7 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
         ("volume.sigma_s=0", "no multiple scattering", "p1 diffusion"),
         ("lights=[{type: ambient, radiance: 1}]", "ambient light", "directional"),
         ("lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]", "1 directional light", "ambient"),
+        ("lights=[{type: point, position: [0, 2, 0], intensity: 1}]", "towards 1 point light", "directional"),
         ("volume.sigma_s=2", "1 color channel", "3 color channels"),
         ("volume.sigma_s=[2, 3, 4]", "3 color channels", "1 color channel"),
     ],
@@ -42,6 +44,14 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
 def test_only_the_physics_a_scene_needs(succeed: Run, override: str, present: str, absent: str) -> None:
     physics = "\n".join(json.loads(succeed("check", "scene.yaml", "--json", "-D", override).stdout)["physics"])
     assert present in physics and absent not in physics
+
+
+def test_suns_and_sky_of_an_environment_map(succeed: Run) -> None:
+    pixels = np.ones((32, 64, 3), np.float32)
+    pixels[[8, 20], [10, 40]] = 3000
+    np.save("sky.npy", pixels)
+    report = succeed("check", "scene.yaml", "-D", "lights=[{type: environment, file: sky.npy}]").stdout
+    assert "  environment map 64 x 32: 2 suns as beams, sky by 48 directions, its mean as inflow" in report
 
 
 def test_json(succeed: Run) -> None:

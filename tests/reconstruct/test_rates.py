@@ -39,7 +39,7 @@ def test_every_view_is_seen_once_before_any_comes_again(count: int, wanted: int)
     assert len(seen) == count * wanted
     for start in range(0, len(seen), count):
         assert sorted(seen[start : start + count]) == list(range(count))
-    assert Counter(seen) == {index: wanted for index in range(count)}
+    assert Counter(seen) == dict.fromkeys(range(count), wanted)
 
 
 def test_the_order_differs_from_round_to_round_and_follows_the_seed() -> None:
