@@ -20,8 +20,8 @@ from ddrecon.environment import pixel_moments, refined, turned
 from ddrecon.grid import array_order
 from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 
-PIXELS_PER_REGION = 24
-"""Coarser maps are refined first."""
+PIXELS_PER_REGION = 2
+"""Maps with fewer are refined first; any more would smear a single bright pixel over several regions."""
 MAX_SUNS = 4
 SUN_SHARE = 0.1
 """Part of a map's irradiance that makes a region a sun, if it is also `SUN_CONTRAST` times as bright as the map's mean."""

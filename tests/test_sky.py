@@ -109,11 +109,11 @@ def test_a_constant_map_looks_as_ambient_light_does(g: float, model: str, make_s
     torch.testing.assert_close(found, render(scene), rtol=1e-10, atol=0)
 
 
-@pytest.mark.parametrize("pixel", [(9, 40), (16, 0), (25, 63)], ids=str)
+@pytest.mark.parametrize("place", [(32, 64, 9, 40), (32, 64, 16, 0), (16, 32, 8, 19), (16, 32, 12, 31)], ids=str)
 @pytest.mark.parametrize("g", [0.0, 0.6])
-def test_a_hot_pixel_is_a_directional_light(g: float, pixel: tuple[int, int], make_scene, half_empty):
+def test_a_hot_pixel_is_a_directional_light(g: float, place: tuple[int, int, int, int], make_scene, half_empty):
     scene = make_scene(half_empty(*SHAPE), g=g)
-    environment, directional = hot_pixel(32, 64, *pixel)
+    environment, directional = hot_pixel(*place)
     images = [
         render(replace(scene, lights=[light], render=replace(scene.render, background=False))) for light in (environment, directional)
     ]

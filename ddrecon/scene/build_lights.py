@@ -57,5 +57,7 @@ def _read_map(path: Path) -> np.ndarray:
     if negative.any():
         row, column = np.argwhere(negative)[0]
         count = np.count_nonzero(negative)
-        raise FormatError(path, f"negative radiance at row {row}, column {column} ({count} such pixels); an environment map has none")
+        raise FormatError(
+            path, f"negative radiance at row {row}, column {column} ({count} such pixels); set it to 0: lossy files have some around a sun"
+        )
     return pixels
