@@ -8,14 +8,16 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ddrecon import __version__
-from ddrecon.errors import DdreconError
+from ddrecon.errors import DataWarning, DdreconError
 
 if TYPE_CHECKING:
     from ddrecon.session import Session
@@ -51,7 +53,8 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             from ddrecon.session import open_session
 
             printing = {"dtype": others.pop("dtype", "float64"), "as_json": others.pop("as_json", False)}
-            command(session=open_session(overrides, device, threads, seed, quiet, verbose, **printing), **others)
+            with shown_warnings():
+                command(session=open_session(overrides, device, threads, seed, quiet, verbose, **printing), **others)
         except DdreconError as error:
             if debug:
                 raise
@@ -64,6 +67,16 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     for option in reversed(COMMON):
         wrapped = option(wrapped)
     return wrapped
+
+
+@contextmanager
+def shown_warnings() -> Iterator[None]:
+    """Warnings about data become lines on stderr; those of libraries are for developers and stay unseen."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", DataWarning)
+        warnings.showwarning = lambda message, *_: click.echo(f"warning: {message}", err=True)  # type: ignore[assignment]
+        yield
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

@@ -40,3 +40,7 @@ class SolveError(DdreconError):
     def __init__(self, what: str, iterations: int, residual: float, advice: str):
         self.iterations, self.residual, self.advice = iterations, residual, advice
         super().__init__(f"{what} after {iterations} iterations (residual {residual:.2e}); {advice}")
+
+
+class DataWarning(UserWarning):
+    """Data that was used, but not as it stands."""

@@ -25,6 +25,8 @@ from ddrecon.sampling import sample_slices, sample_volume
 
 CHUNK_NODES = 1 << 18
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and memory does not grow with pixels."""
+CELLS_PER_NODE = 16
+"""In large volumes a chunk has a node for so many cells: its backward pass fills an array of all cells, whatever the number of nodes."""
 STEEPEST = 0.2
 """Smallest direction cosine, against the axis across the slices, of rays that are marched by slices."""
 
@@ -73,7 +75,8 @@ def march(emission: Emission, rays: Rays, steps_per_voxel: int) -> tuple[Tensor,
         values, distance = sampler.sample(origin, direction, crossing.near[chunk], crossing.far[chunk])
         return _integrate(emission, values, Nodes(origin, direction, distance))
 
-    chunks = torch.arange(crossing.hit.numel(), device=blank.device).split(max(1, CHUNK_NODES // sampler.nodes))
+    nodes = max(CHUNK_NODES, emission.grid.cells // CELLS_PER_NODE)
+    chunks = torch.arange(crossing.hit.numel(), device=blank.device).split(max(1, nodes // sampler.nodes))
     parts = [recomputed(run, chunk) for chunk in chunks]
     scattered, transmittance = (torch.cat(part, 1) for part in zip(*parts, strict=True))
     return blank.index_copy(1, crossing.hit, scattered), (blank + 1).index_copy(1, crossing.hit, transmittance)

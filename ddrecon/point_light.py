@@ -1,6 +1,7 @@
 """Point lights: irradiance I tau / r^2, away from a position inside or outside the box.
 
-Every cell is reached by a straight march through the field, from the light or from where its ray enters the box. Nearer than the radius R
+Every cell is reached by a straight march through the field, from the light or from where its ray enters the box, to where it enters the
+cell; within the cell the field is constant. Nearer than the radius R
 of a sphere of one cell's volume, 1 / r^2 is bounded by its mean over that sphere around the light, 3 / R^2, and the light's direction
 fades to none: all is finite, with finite derivatives, also for a light in a cell's center.
 """
@@ -61,10 +62,11 @@ def point_beam(medium: Medium, light: PointLight, has_flux: bool) -> tuple[Point
     square = _square(centers - position, least)
     distance = square.sqrt()
     direction = (centers - position) / distance[..., None]
-    mass = _mass_to_cells(extinction.field, grid, position, centers.flatten(0, 2), distance.flatten())
     speed = (direction.abs() / direction.new_tensor(grid.spacing)).amax(-1)
     step = 1 / torch.maximum(speed, 0.5 / distance)
-    entered = (mass - 0.5 * step * extinction.field).clamp(min=0)
+    entries = centers - 0.5 * step[..., None] * direction
+    entered = _mass_to(extinction.field, grid, position, entries.flatten(0, 2), (distance - 0.5 * step).flatten())
+    mass = entered + 0.5 * step * extinction.field
     received = irradiance / (4 * math.pi) / square * extinction.mean_transmittance(entered, step)
     return PointBeam(mass, position, irradiance, least), beam_moments(received, direction.movedim(-1, 0), has_flux)
 
@@ -78,21 +80,21 @@ def _square(offset: Tensor, least: float) -> Tensor:
     return (offset * offset).sum(-1).clamp(min=least)
 
 
-def _mass_to_cells(field: Tensor, grid: Grid, position: Tensor, centers: Tensor, distance: Tensor) -> Tensor:
-    """The integral of `field` [K, z, y, x] from `position`, or the box, to `centers` [P, 3], which are `distance` [P] away."""
+def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance: Tensor) -> Tensor:
+    """The integral of `field` [K, z, y, x] from `position`, or the box, to `ends` [P, 3], which are `distance` [P] away."""
     pairs = math.ceil(math.hypot(*grid.extent) / (2 * min(grid.spacing)))
     part = _gauss_pairs(pairs).to(field)[:, None]
 
-    def run(centers: Tensor, distance: Tensor) -> Tensor:
-        offset = centers - position
-        inside = _part_inside(grid, position, centers)
-        points = centers - (inside * part)[..., None] * offset
+    def run(ends: Tensor, distance: Tensor) -> Tensor:
+        offset = ends - position
+        inside = _part_inside(grid, position, ends)
+        points = ends - (inside * part)[..., None] * offset
         places = 2 * (points - points.new_tensor(grid.lower)) / points.new_tensor(grid.extent) - 1
         values = sample_volume(field, places.flip(-1))
         return values.mean(1) * (inside * distance)
 
     count = max(1, CHUNK_SAMPLES // (2 * pairs))
-    chunks = zip(centers.split(count), distance.split(count), strict=True)
+    chunks = zip(ends.split(count), distance.split(count), strict=True)
     return torch.cat([recomputed(run, *chunk) for chunk in chunks], 1).unflatten(1, grid.shape)
 
 
@@ -105,10 +107,10 @@ def _gauss_pairs(count: int) -> Tensor:
     return torch.cat([middle - shift, middle + shift]) / count
 
 
-def _part_inside(grid: Grid, position: Tensor, centers: Tensor) -> Tensor:
-    """Which part of the way from `position` to each of `centers` [P, 3] lies inside the box: 1 for a light inside."""
+def _part_inside(grid: Grid, position: Tensor, ends: Tensor) -> Tensor:
+    """Which part of the way from `position` to each of `ends` [P, 3] lies inside the box: 1 for a light inside."""
     low, high = (position.new_tensor(corner) for corner in (grid.lower, grid.upper))
     is_below, is_above = position < low, position > high
-    offset = torch.where(is_below | is_above, centers - position, 1.0)
-    beyond = torch.where(is_below, centers - low, torch.where(is_above, centers - high, 1.0))
+    offset = torch.where(is_below | is_above, ends - position, 1.0)
+    beyond = torch.where(is_below, ends - low, torch.where(is_above, ends - high, 1.0))
     return (beyond / offset).amin(-1)

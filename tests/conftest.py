@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
-from ddrecon.diffusion.operator import Operator, boundary_loss, conductances
+from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
 from ddrecon.lights import AmbientLight, DirectionalLight
 from ddrecon.medium import Volume
@@ -76,7 +76,8 @@ def _scene(
 
 
 def _operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
-    return Operator(conductances(diffusion, grid), absorption + boundary_loss(diffusion, grid))
+    z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
+    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid))
 
 
 def _dense(operator: Operator) -> Tensor:

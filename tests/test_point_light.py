@@ -139,7 +139,7 @@ def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one(make_scene, o
         point, parallel = PointLight(1e6 * towards, 1e12 * intensity), DirectionalLight(-towards, intensity)
         images = [render(replace(scene, lights=[light])) for light in (point, parallel)]
         errors.append(float((images[0] - images[1]).norm() / images[1].norm()))
-    assert errors[-1] < 1e-2 and order([1 / count for count in counts], errors) > 1.5, errors
+    assert errors[-1] < 1e-2 and order([1 / count for count in counts[1:]], errors[1:]) > 1.5, errors
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])

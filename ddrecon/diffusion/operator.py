@@ -74,12 +74,9 @@ def accumulate(faces: Tensor, axis: int) -> Tensor:
     return torch.cat([nothing, faces], axis) - torch.cat([faces, nothing], axis)
 
 
-def conductances(diffusion: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
-    """c = harmonic mean of D on the interior faces / h^2 [1/u], along z, y, x (E7); `diffusion`: D [u], `[C, z, y, x]`, > 0."""
-    z, y, x = (
-        2 / (1 / lower(diffusion, axis) + 1 / upper(diffusion, axis)) / step**2 for axis, step in zip(AXES, grid.spacing, strict=True)
-    )
-    return z, y, x
+def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
+    """c = harmonic mean of D on the interior faces along `axis` / h^2 [1/u] (E7); `diffusion`: D [u], `[C, z, y, x]`, > 0."""
+    return 2 / (1 / lower(diffusion, axis) + 1 / upper(diffusion, axis)) / grid.spacing[axis - 1] ** 2
 
 
 def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.errors import FormatError
+from ddrecon.errors import DataWarning, FormatError
 from ddrecon.io.images import read_image
 from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.scene.files import read_referenced
@@ -48,16 +49,15 @@ def _build_light(scene_file: SceneFile, index: int, dtype: torch.dtype, device: 
 
 
 def _read_map(path: Path) -> np.ndarray:
-    """The radiance of an environment map, float32 [h, w, 3]; raises FormatError where it is not one."""
+    """The radiance of an environment map, float32 [h, w, 3]; negative values, which lossy files have around a sun, become 0 with a warning."""
     pixels = read_image(path).pixels
     height, width = pixels.shape[:2]
     if height < 2 or width < 3:
         raise FormatError(path, f"an environment map has at least 3 x 2 pixels, and this is {width} x {height}")
-    negative = pixels.min(axis=2) < 0
-    if negative.any():
-        row, column = np.argwhere(negative)[0]
-        count = np.count_nonzero(negative)
-        raise FormatError(
-            path, f"negative radiance at row {row}, column {column} ({count} such pixels); set it to 0: lossy files have some around a sun"
+    negative = np.count_nonzero(pixels.min(axis=2) < 0)
+    if negative:
+        row, column = np.argwhere(pixels.min(axis=2) < 0)[0]
+        warnings.warn(
+            f"{path}: {negative} pixels with negative radiance are taken as 0, the first at row {row}, column {column}", DataWarning, 4
         )
-    return pixels
+    return pixels.clip(min=0)

@@ -21,7 +21,7 @@ from ddrecon.world import Scene
 
 TOLERANCE = 1e-13
 """Relative residual of the solves."""
-STEPS = (3e-2, 1e-2, 3e-3)
+STEPS = (1e-2, 1e-3, 1e-4)
 """Changes by which finite differences are taken, as parts of the parameter's largest value."""
 SHORT_STEPS = (1e-4, 1e-5, 1e-6)
 """The same for what moves rays or beams, since interpolation has a kink at every cell center and a short step crosses few, and for g, whose

@@ -11,7 +11,7 @@ import pytest
 import torch
 from example_scene import changed
 
-from ddrecon.errors import FormatError, SceneError
+from ddrecon.errors import DataWarning, FormatError, SceneError
 from ddrecon.lights import EnvironmentLight, PointLight
 from ddrecon.scene.build import load_scene
 from ddrecon.scene.dump import dump_scene
@@ -88,12 +88,13 @@ def test_problems_of_all_lights_are_told_together(write: Write):
     assert len(caught.value.problems) == 2
 
 
-def test_negative_radiance_is_refused_by_its_first_pixel(write: Write, tmp_path: Path):
+def test_negative_radiance_is_taken_as_none_with_a_warning(write: Write, tmp_path: Path):
     pixels = save_map(tmp_path, 4, 6, 3)
     pixels[1, 2, 0] = pixels[2, 5, 2] = -1e-3
     np.save(tmp_path / "sky.npy", pixels)
-    with pytest.raises(FormatError, match=r"negative radiance at row 1, column 2 \(2 such pixels\)"):
-        load_scene(write(lit_by({"type": "environment", "file": "sky.npy"})))
+    with pytest.warns(DataWarning, match="2 pixels with negative radiance are taken as 0, the first at row 1, column 2"):
+        (light,) = load_scene(write(lit_by({"type": "environment", "file": "sky.npy"}))).lights
+    assert torch.equal(light.radiance, torch.from_numpy(pixels.clip(min=0)).permute(2, 0, 1).float())
 
 
 @pytest.mark.parametrize("shape", [(1, 6, 3), (4, 2, 3)], ids=str)
