@@ -23,6 +23,8 @@ from ddrecon.nodes import Nodes
 from ddrecon.phase import henyey_greenstein
 from ddrecon.sampling import sample_volume
 
+SMOOTH = 8
+"""Order of the norm by which a ray's way through a cell is found: nearly the largest component, without its kink where two are equal."""
 CHUNK_SAMPLES = 1 << 20
 """Samples taken at a time on the way from the light to the cells."""
 
@@ -62,7 +64,7 @@ def point_beam(medium: Medium, light: PointLight, has_flux: bool) -> tuple[Point
     square = _square(centers - position, least)
     distance = square.sqrt()
     direction = (centers - position) / distance[..., None]
-    speed = (direction.abs() / direction.new_tensor(grid.spacing)).amax(-1)
+    speed = torch.linalg.vector_norm(direction / direction.new_tensor(grid.spacing), ord=SMOOTH, dim=-1)
     step = 1 / torch.maximum(speed, 0.5 / distance)
     entries = centers - 0.5 * step[..., None] * direction
     entered = _mass_to(extinction.field, grid, position, entries.flatten(0, 2), (distance - 0.5 * step).flatten())

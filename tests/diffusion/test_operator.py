@@ -84,8 +84,8 @@ def test_accumulate_is_the_transpose_of_difference(grid: Grid, random):
 def test_the_operator_is_difference_conductance_difference(operator: Operator, random):
     u = random(*operator.loss.shape)
     expected = operator.loss * u
-    for axis, conductance in zip(AXES, operator.conductance, strict=True):
-        expected = expected + accumulate(conductance * difference(u, axis), axis)
+    for axis, faces in zip(AXES, operator.conductances, strict=True):
+        expected = expected + accumulate(faces * difference(u, axis), axis)
     torch.testing.assert_close(operator.apply(u), expected, rtol=1e-12, atol=1e-12)
 
 
