@@ -12,6 +12,7 @@ from ddrecon.march import CHUNK_NODES
 from ddrecon.medium import scaled_medium
 from ddrecon.renderer import has_flux, multiply_scatters
 from ddrecon.sky import count_suns
+from ddrecon.variables import with_values
 from ddrecon.world import Scene, View
 
 
@@ -54,22 +55,30 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' if count > 1 else ''}"
 
 
+GIVEN_BACK = 2**25
+"""Arrays larger than this many bytes leave the process when they are done with; smaller ones stay with its allocator."""
+
+
 def memory_estimate(scene: Scene) -> int:
     """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself.
 
-    A fit, in arrays of one value per cell and in buffers of marched nodes, to peaks measured on grids from 32^3 to 96^3 with 1 to 10 views
-    and 1 or 3 colors: within 15 % of each.
+    A fit, in arrays of one value per cell and in buffers of marched nodes, to peaks measured on grids from 48^3 to 192^3 with 1 to 6 views, 1 or
+    3 colors, constant or as fields, g = 0 or not: within a quarter of each. Memory of arrays above 32 MiB is given back as soon as they are.
     """
-    colors = scaled_medium(scene.volume).extinction.scale.shape[0]
+    medium = scaled_medium(scene.volume)
+    colors, cells = medium.extinction.scale.shape[0], scene.volume.grid.cells
     size = torch.finfo(scene.volume.density.dtype).bits // 8
     arrays, buffers = 25 + 14 * colors, 40
     if scene.optimize is not None:
-        arrays, buffers = int(67 + 101 * colors + (2 + 3.5 * colors) * len(scene.views)), 164
-    return size * (arrays * scene.volume.grid.cells + buffers * CHUNK_NODES)
+        arrays, buffers = 60 + (200 if has_flux(medium) else 110) * colors, 60
+        if size * colors * cells > GIVEN_BACK:
+            arrays = arrays * 2 // 5
+    return size * (arrays * cells + buffers * CHUNK_NODES)
 
 
 def describe(scene: Scene) -> dict[str, Any]:
-    """What `ddrecon check` reports of `scene`: grid, views, physics and memory."""
+    """What `ddrecon check` reports of `scene`: grid, views, physics and memory, where what it optimizes starts."""
+    scene = with_values(scene, scene.starts)
     grid = scene.volume.grid
     low, high = grid.bounds_xyz
     return {
@@ -78,7 +87,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "voxel": list(reversed(grid.spacing)),
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
-        "optimizes": list(scene.optimize.parameters) if scene.optimize else [],
+        "optimizes": {name: scene.starts[name].numel() for name in scene.optimize.parameters} if scene.optimize else {},
         "memory_bytes": memory_estimate(scene),
     }
 
@@ -96,9 +105,13 @@ def lines(report: dict[str, Any]) -> list[str]:
         *views,
         "physics:",
         *(f"  {term}" for term in report["physics"]),
-        f"optimizes: {', '.join(report['optimizes']) or 'nothing'}",
+        f"optimizes: {', '.join(_counted_entries(*item) for item in report['optimizes'].items()) or 'nothing'}",
         f"memory: about {report['memory_bytes'] / 2**20:.0f} MiB at the peak, besides torch itself",
     ]
+
+
+def _counted_entries(name: str, count: int) -> str:
+    return f"{name} ({count:,} number{'s' if count > 1 else ''})"
 
 
 def _by(sizes: list[float]) -> str:

@@ -20,7 +20,7 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
     assert lines[0].startswith("grid: 6 x 5 x 4 cells of 0.1667 x 0.2 x 0.25")
     assert "  front: perspective, 8 x 6 pixels, train, with image" in lines
     assert "  side: perspective, 8 x 6 pixels, test, with image" in lines
-    assert {"views: 2", "physics:", "optimizes: density"} <= set(lines)
+    assert {"views: 2", "physics:", "optimizes: density (120 numbers)"} <= set(lines)
     assert lines[-1].startswith("memory: about ") and "MiB" in lines[-1]
     assert contents(folder) == before
 
@@ -61,7 +61,7 @@ def test_json(succeed: Run) -> None:
         ("front", 8, 6, "train"),
         ("side", 8, 6, "test"),
     ]
-    assert report["optimizes"] == ["density"] and report["memory_bytes"] > 0
+    assert report["optimizes"] == {"density": 120} and report["memory_bytes"] > 0
 
 
 def test_memory_grows_with_cells_and_precision(succeed: Run) -> None:
