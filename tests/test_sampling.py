@@ -81,3 +81,30 @@ def test_volumes_have_both_derivatives(wanted: tuple[bool, bool], random):
     volume, points = random(2, 3, 2, 4), 2.4 * random(2, 3, 3, seed=1) - 1.2
     inputs = [tensor.requires_grad_(is_wanted) for tensor, is_wanted in zip((volume, points), wanted, strict=True)]
     assert torch.autograd.gradcheck(sample_volume, inputs, check_forward_ad=True)
+
+
+# --- kinks -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_slope_at_a_kink_is_the_mean_of_both_sides(random, dtype: torch.dtype):
+    """At cell centers along one axis, between them along the other."""
+    slices = random(1, 1, 5, 7, dtype=dtype)
+    columns, row = torch.arange(1, 6, dtype=dtype), torch.tensor(1.3, dtype=dtype)
+    points = torch.stack([(2 * columns + 1) / 7 - 1, ((2 * row + 1) / 5 - 1).expand(5)], -1)[None].requires_grad_()
+    (bars,) = torch.autograd.grad(sample_slices(slices, points).sum(), points)
+    line = 0.7 * slices[0, 0, 1] + 0.3 * slices[0, 0, 2]
+    torch.testing.assert_close(bars[0, :, 0], 7 / 2 * (line[2:] - line[:-2]) / 2, rtol=1e-3, atol=1e-4)
+    across = slices[0, 0, 2, 1:6] - slices[0, 0, 1, 1:6]
+    torch.testing.assert_close(bars[0, :, 1], 5 / 2 * across, rtol=1e-3, atol=1e-3)
+
+
+def test_both_modes_agree_at_kinks(random):
+    slices, change = random(2, 3, 4, 5), random(2, 6, 2, seed=1)
+    points = torch.stack(torch.broadcast_tensors(torch.tensor([-0.4, 0.0]).double(), torch.tensor([[-0.25], [0.25], [0.1]]).double()), -1)
+    points = points.reshape(1, 6, 2).expand(2, -1, -1).contiguous()
+    _, tangent = torch.func.jvp(lambda moved: sample_slices(slices, moved), (points,), (change,))
+    weight = random(*tangent.shape, seed=2)
+    leaf = points.clone().requires_grad_()
+    (bar,) = torch.autograd.grad((sample_slices(slices, leaf) * weight).sum(), leaf)
+    torch.testing.assert_close((bar * change).sum(), (tangent * weight).sum(), rtol=1e-12, atol=0)
