@@ -75,7 +75,7 @@ def shown_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = lambda message, *_: click.echo(f"warning: {message}", err=True)  # type: ignore[assignment]
+        warnings.showwarning = lambda message, *_: click.echo(f"warning: {message}", err=True)
         yield
 
 

@@ -48,7 +48,7 @@ def render_to_folder(scene: Scene, views: list[View], folder: Path, has_componen
 def render_gradient_to_folder(
     scene: Scene, views: list[View], folder: Path, has_components: bool, parameter: str, progress: Progress
 ) -> dict[str, Any]:
-    """Renders `views` of `scene` and their derivatives with respect to `parameter` (see `require_variation`), as `render_to_folder` does."""
+    """Renders `views` of `scene` and their derivatives with respect to `parameter`, which `require_variation` allows, into `folder`."""
     memory, scales = SolveMemory(), {}
     seconds: dict[str, Any] = {"views": {}}
     files: dict[str, list[str]] = {view.name: [] for view in views}

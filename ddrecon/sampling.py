@@ -1,7 +1,7 @@
 """Linear interpolation in slices and volumes, differentiable in both directions.
 
-torch's `grid_sample` has no forward-mode derivative; these two functions add it. And its slope is that of one side where points lie on
-cells' centers, which rounding picks: here it is the mean of both, as central differences have it. Coordinates are in torch's convention: -1 and
+torch's `grid_sample` has no forward-mode derivative; these two functions add it. And where points lie on cells' centers its slope is that
+of the side rounding picks: here it is the mean of both, as central differences have it. Coordinates are in torch's convention: -1 and
 1 are the outer faces of the first and last cell (`align_corners=False`), the last axis of the array comes first.
 """
 

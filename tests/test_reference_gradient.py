@@ -34,7 +34,9 @@ def test_the_plumes_derivative_is_that_of_a_path_tracer() -> None:
     eye, up = torch.tensor([0.0, 0.3, 3.2]), torch.tensor([0.0, 1.0, 0.0])
     view = View("view", Camera(look_at(eye, torch.zeros(3), up), (64, 64), math.tan(math.radians(28) / 2)))
     light = DirectionalLight(torch.tensor([-2.0, -2.0, -1.0]), torch.tensor([math.pi]))
-    scene = Scene(Volume(grid, density, *optics, torch.tensor(0.0)), [light], [view], RenderSettings(samples_per_pixel=4), DiffusionSettings())
+    scene = Scene(
+        Volume(grid, density, *optics, torch.tensor(0.0)), [light], [view], RenderSettings(samples_per_pixel=4), DiffusionSettings()
+    )
     leaf = density.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(render(with_values(scene, {"density": leaf})).mean(), leaf)
     ours, amount = (torch.nn.functional.avg_pool3d(item[None], 4)[0].numpy() for item in (64 * gradient, density))

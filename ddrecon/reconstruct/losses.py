@@ -13,20 +13,41 @@ ROUNDING = 1e-2
 """Gradients below this, in units of one over the box's shortest side, are penalized quadratically rather than as total variation."""
 
 
-def l2(error: Tensor) -> Tensor:
-    """The square of `error`, entry by entry."""
+HUBER = 0.05
+"""Errors above this part of the targets' root mean square count linearly in the Huber loss."""
+RELATIVE = 0.05
+"""The same part, added to a pixel's target, keeps relative errors finite where targets are black."""
+
+
+def l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The square of `error`, entry by entry; `scale`, the root mean square of the target, plays no part."""
     return error**2
 
 
-LOSSES: dict[str, Callable[[Tensor], Tensor]] = {"l2": l2}
+def l1(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The magnitude of `error` times `scale`, so that it is in units of radiance squared, as all losses are."""
+    return error.abs() * scale
+
+
+def huber(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The square of `error` up to `HUBER` `scale`, and a straight line beyond (Huber 1964, doi:10.1214/aoms/1177703732)."""
+    return 2 * torch.nn.functional.huber_loss(error / scale, torch.zeros_like(error), reduction="none", delta=HUBER) * scale**2
+
+
+def relative_l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The square of `error` over the target, times `scale`: dark pixels count as much as bright ones."""
+    return (error / (target.abs() + RELATIVE * scale)) ** 2 * scale**2
+
+
+LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {"l2": l2, "l1": l1, "huber": huber, "relative_l2": relative_l2}
 
 
 def image_loss(loss: str, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """The mean of `loss` over the pixels and colors of `image` [3, h, w]; pixels where `mask` [h, w] is 0 do not count."""
-    values = LOSSES[loss](image - target)
-    if mask is None:
-        return values.mean()
-    return (values * mask).sum() / (3 * mask.sum()).clamp(min=1)
+    seen = torch.ones_like(image[0]) if mask is None else mask
+    count = (3 * seen.sum()).clamp(min=1)
+    scale = ((target.square() * seen).sum() / count).sqrt().clamp(min=torch.finfo(target.dtype).tiny ** 0.25)
+    return (LOSSES[loss](image - target, target, scale) * seen).sum() / count
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:

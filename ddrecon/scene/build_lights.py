@@ -49,7 +49,7 @@ def _build_light(scene_file: SceneFile, index: int, dtype: torch.dtype, device: 
 
 
 def _read_map(path: Path) -> np.ndarray:
-    """The radiance of an environment map, float32 [h, w, 3]; negative values, which lossy files have around a sun, become 0 with a warning."""
+    """The radiance of an environment map, float32 [h, w, 3]; what is negative, as around a sun in lossy files, becomes 0 with a warning."""
     pixels = read_image(path).pixels
     height, width = pixels.shape[:2]
     if height < 2 or width < 3:

@@ -274,7 +274,7 @@ class OptimizeSettings:
 
     parameters: Mapping[str, ParameterSettings]
     iterations: int = bounded(300, minimum=1)
-    loss: str = one_of("l2", ("l2",))
+    loss: str = one_of("l2", ("l2", "l1", "huber", "relative_l2"))
     optimizer: str = one_of("adam", ("adam",))
     views_per_iteration: int = bounded(0, minimum=0)
     derivatives: str = one_of("all", DERIVATIVES)

@@ -42,7 +42,10 @@ def camera(turn: float, height: float, pixels: int) -> Camera:
 
 
 def scene_of(volume: Volume, views: int, pixels: int) -> Scene:
-    lights = [DirectionalLight(torch.tensor([-1.0, -2.0, -1.0]), torch.tensor([3.0, 2.5, 2.0])), AmbientLight(torch.tensor([0.1, 0.12, 0.15]))]
+    lights = [
+        DirectionalLight(torch.tensor([-1.0, -2.0, -1.0]), torch.tensor([3.0, 2.5, 2.0])),
+        AmbientLight(torch.tensor([0.1, 0.12, 0.15])),
+    ]
     cameras = [camera(2 * math.pi * index / views, 0.5 * (-1) ** index, pixels) for index in range(views)]
     seen = [View(f"view_{index}", item) for index, item in enumerate(cameras)]
     return Scene(volume, lights, seen, diffusion=DiffusionSettings(tolerance=1e-5))

@@ -77,9 +77,15 @@ def test_a_start_from_a_file(load: Callable[[str], Scene], tmp_path: Path, name:
     ("parameters", "problem"),
     [
         ("{densty: {}}", "optimize.parameters.densty: unknown parameter; did you mean 'density'?"),
-        ("{lights.7.irradiance: {}}", "optimize.parameters.lights.7.irradiance: the scene has no such number; did you mean 'lights.0.irradiance'?"),
+        (
+            "{lights.7.irradiance: {}}",
+            "optimize.parameters.lights.7.irradiance: the scene has no such number; did you mean 'lights.0.irradiance'?",
+        ),
         ("{lights.0.radiance: {}}", "optimize.parameters.lights.0.radiance: the scene has no such number"),
-        ("{views.back.camera: {}}", "optimize.parameters.views.back.camera: the scene has no such number; did you mean 'views.front.camera'?"),
+        (
+            "{views.back.camera: {}}",
+            "optimize.parameters.views.back.camera: the scene has no such number; did you mean 'views.front.camera'?",
+        ),
         ("{albedo: {init: 1.5}}", "optimize.parameters.albedo.init: must be at least 0 and at most 1, found 1.5"),
         ("{g: {max: 1}}", "optimize.parameters.g.max: must be at least -0.99 and at most 0.99, found 1"),
         ("{sigma_s: {init: [1, 2]}}", "optimize.parameters.sigma_s.init: expected one number or [r, g, b], found a list of 2"),
@@ -87,7 +93,10 @@ def test_a_start_from_a_file(load: Callable[[str], Scene], tmp_path: Path, name:
         ("{g: {field: true}}", "optimize.parameters.g.field: it is not a field, so it has none"),
         ("{lights.1.radiance: {tv: 1}}", "optimize.parameters.lights.1.radiance.tv: it is not a field, so it has none"),
         ("{albedo: {}, sigma_s: {}}", "optimize.parameters.albedo: cannot be optimized beside sigma_s"),
-        ("{lights.0.irradiance: {init: {file: scene.yaml}}}", "optimize.parameters.lights.0.irradiance.init.file: lights.0.irradiance is not a field"),
+        (
+            "{lights.0.irradiance: {init: {file: scene.yaml}}}",
+            "optimize.parameters.lights.0.irradiance.init.file: lights.0.irradiance is not a field",
+        ),
     ],
 )
 def test_what_is_refused(refused: Callable[[str], list[str]], parameters: str, problem: str) -> None:
