@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from ddrecon.errors import SceneError
 from ddrecon.scene.nodes import Node, found, parse
+from ddrecon.scene.parameter_kinds import KINDS, pattern_of
 from ddrecon.scene.problems import Problems, suggestion
+
+PARAMETERS = "optimize.parameters"
+"""Where keys are the names of variables, dots and all."""
 
 
 def override(root: Node, text: str, problems: Problems) -> None:
     """Puts the value of `text` (`key.path=value`, the value in YAML) into the tree under `root`, making mappings as needed.
 
-    A list is entered by index. Where keys themselves have dots the longest one present is taken. Raises SceneError.
+    A list is entered by index. Where keys themselves have dots, as those of parameters do, the longest one present or legal is taken. Raises
+    SceneError.
     """
     where = f"-D {text}"
     key, separator, value = text.partition("=")
@@ -30,7 +35,8 @@ def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
     parts = path.split(".")
     if isinstance(parent.value, dict):
         for count in range(len(parts), 0, -1):
-            if (name := ".".join(parts[:count])) in parent.value:
+            name = ".".join(parts[:count])
+            if name in parent.value or (parent.key == PARAMETERS and pattern_of(name) in KINDS):
                 return name, ".".join(parts[count:])
     elif isinstance(parent.value, list):
         if not (parts[0].isascii() and parts[0].isdigit() and int(parts[0]) < len(parent.value)):

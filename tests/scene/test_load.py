@@ -256,6 +256,14 @@ def test_overrides_replace_add_and_reach_into_lists(read: Read):
     assert tree.optimize is not None and tree.optimize.parameters["density"].lr == 0.01
 
 
+@pytest.mark.parametrize("name", ["lights.0.irradiance", "views.front.camera", "g"])
+def test_overrides_add_parameters_whose_names_have_dots(read: Read, name: str):
+    text = SCENE + "optimize: {parameters: {density: {}}}\n"
+    optimize = read(text, f"optimize.parameters.{name}.lr=2").tree.optimize
+    assert optimize is not None and optimize.parameters[name].lr == 2
+    assert read(text, f"optimize.parameters.{name}={{}}").tree.optimize.parameters.keys() == {"density", name}
+
+
 def test_overrides_prefer_the_longest_key_there_is(read: Read):
     text = SCENE + "optimize:\n  parameters:\n    density: {}\n    lights.0.irradiance: {lr: 1}\n"
     optimize = read(text, "optimize.parameters.lights.0.irradiance.lr=2").tree.optimize
