@@ -51,9 +51,10 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
 
     Raises KeyError for a name that is none, ValueError for a density of another shape than the grid's.
     """
-    unknown = [name for name in values if name not in variable_names(scene)]
+    known = variable_names(scene)
+    unknown = [name for name in values if name not in known]
     if unknown:
-        raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(variable_names(scene))}")
+        raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(known)}")
     lights = [
         _replaced_light(light, {name: values[key] for name in _tensors(light) if (key := f"lights.{index}.{name}") in values})
         for index, light in enumerate(scene.lights)
@@ -75,9 +76,15 @@ def component_names(name: str, value: Tensor) -> tuple[str, ...]:
 
 def cross_sections(sigma_t: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
     """sigma_a and sigma_s [1/u] of `sigma_t` and `albedo`, each `[C]` or `[C, z, y, x]`."""
-    if sigma_t.ndim != albedo.ndim:
-        sigma_t, albedo = (value if value.ndim == 4 else value.view(-1, 1, 1, 1) for value in (sigma_t, albedo))
+    sigma_t, albedo = _same_axes(sigma_t, albedo)
     return sigma_t * (1 - albedo), sigma_t * albedo
+
+
+def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """Both as [C, z, y, x] if either is; a constant then has one cell."""
+    if one.ndim == other.ndim:
+        return one, other
+    return (one, other.view(-1, 1, 1, 1)) if one.ndim == 4 else (one.view(-1, 1, 1, 1), other)
 
 
 def _tensors(light: Light) -> list[str]:
@@ -88,9 +95,7 @@ def _volume_value(volume: Volume, name: str) -> Tensor:
     if name not in ("sigma_t", "albedo"):
         value: Tensor = getattr(volume, name)
         return value
-    one, other = volume.sigma_a, volume.sigma_s
-    if one.ndim != other.ndim:
-        one, other = (value if value.ndim == 4 else value.view(-1, 1, 1, 1) for value in (one, other))
+    one, other = _same_axes(volume.sigma_a, volume.sigma_s)
     sigma_t = one + other
     return sigma_t if name == "sigma_t" else other / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
 

@@ -20,7 +20,8 @@ from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
 from ddrecon.reconstruct.losses import image_loss, psnr
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.rates import chosen, default_rate, rate_at
+from ddrecon.reconstruct.rates import default_rate, rate_at
+from ddrecon.reconstruct.views import chosen
 from ddrecon.renderer import render_each
 from ddrecon.scene.schema import ParameterSettings
 from ddrecon.variables import value_of, with_values

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from ddrecon.medium import Volume
@@ -49,13 +48,3 @@ def _density_rate(volume: Volume) -> float:
     """HASTE, or a density of THICKEST optical depths across the box's shortest side where that is less."""
     depth = float(volume.sigma_a.mean() + volume.sigma_s.mean()) * min(volume.grid.extent)
     return min(HASTE, THICKEST / depth) if depth > 0 else HASTE
-
-
-def chosen(count: int, wanted: int, iteration: int) -> list[int]:
-    """Which of `count` views `iteration` looks at: `wanted` of them (0: all), every view once before any comes again, in random order."""
-    if not 0 < wanted < count:
-        return list(range(count))
-    seed, places = torch.initial_seed() % 2**32, range(iteration * wanted, (iteration + 1) * wanted)
-    rounds = {place // count for place in places}
-    orders = {turn: torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + turn)).tolist() for turn in rounds}
-    return [orders[place // count][place % count] for place in places]

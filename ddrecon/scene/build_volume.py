@@ -19,6 +19,7 @@ from ddrecon.scene.files import read_referenced
 from ddrecon.scene.load import SceneFile
 from ddrecon.scene.problems import Problems
 from ddrecon.scene.schema import Color, FieldFile
+from ddrecon.variables import cross_sections
 
 QUANTITIES = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo")
 Fields = Mapping[str, Field]
@@ -39,8 +40,7 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     if section.sigma_t is None:
         sigma_a, sigma_s = quantity("sigma_a"), quantity("sigma_s")
     else:
-        sigma_t, albedo = _same_axes(quantity("sigma_t"), quantity("albedo"))
-        sigma_a, sigma_s = sigma_t * (1 - albedo), sigma_t * albedo
+        sigma_a, sigma_s = cross_sections(quantity("sigma_t"), quantity("albedo"))
     sigma_a, sigma_s = _same_colors(sigma_a, sigma_s)
     density = quantity("density")
     density = density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
@@ -115,13 +115,6 @@ def _channels_first(field: Field) -> Tensor:
     """The field as float64 [C, z, y, x], with C = 1 or 3."""
     values = torch.from_numpy(field.values).double()
     return values[None] if values.ndim == 3 else values.permute(3, 0, 1, 2).contiguous()
-
-
-def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """Both as [C, z, y, x] if either is; a constant then has one cell."""
-    if one.ndim == other.ndim:
-        return one, other
-    return (one, other.view(-1, 1, 1, 1)) if one.ndim == 4 else (one.view(-1, 1, 1, 1), other)
 
 
 def _same_colors(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:

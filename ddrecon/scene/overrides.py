@@ -14,8 +14,8 @@ PARAMETERS = "optimize.parameters"
 def override(root: Node, text: str, problems: Problems) -> None:
     """Puts the value of `text` (`key.path=value`, the value in YAML) into the tree under `root`, making mappings as needed.
 
-    A list is entered by index. Where keys themselves have dots, as those of parameters do, the longest one present or legal is taken. Raises
-    SceneError.
+    A list is entered by index. Where keys themselves have dots, as those of parameters do, the longest one present or legal is taken.
+    Raises SceneError.
     """
     where = f"-D {text}"
     key, separator, value = text.partition("=")

@@ -7,7 +7,8 @@ from collections import Counter
 import pytest
 import torch
 
-from ddrecon.reconstruct.rates import chosen, default_rate, rate_at
+from ddrecon.reconstruct.rates import default_rate, rate_at
+from ddrecon.reconstruct.views import chosen
 from ddrecon.variables import value_of, variable_names
 from ddrecon.world import Scene
 
