@@ -21,7 +21,7 @@ from ddrecon.medium import Coefficient
 from ddrecon.nodes import Nodes
 from ddrecon.point_light import PointBeam
 from ddrecon.reduced import Beam
-from ddrecon.sampling import sample_slices, sample_volume
+from ddrecon.sampling import Smooth, sample_slices, sample_volume, subdivided
 
 CHUNK_NODES = 1 << 18
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and memory does not grow with pixels."""
@@ -97,7 +97,8 @@ def cross_box(grid: Grid, rays: Rays) -> Crossing:
 class _Slices:
     """Values where rays cross the planes through the cell centers across `axis`, and the two faces of the box."""
 
-    def __init__(self, fields: Tensor, grid: Grid, axis: int, is_reversed: bool, steps: int):
+    def __init__(self, fields: Tensor, smooth: Smooth | None, grid: Grid, axis: int, is_reversed: bool, steps: int):
+        self.smooth = smooth
         self.axis, self.across = axis, [other for other in range(3) if other != axis]
         self.lower, self.extent = grid.lower, grid.extent
         count = grid.shape[axis]
@@ -107,20 +108,21 @@ class _Slices:
         if is_reversed:
             index, planes = index.flip(0), planes.flip(0)
         slices = fields.permute(1 + axis, 0, *(1 + other for other in self.across)).index_select(0, index)
-        self.slices, self.planes = _subdivided(slices, steps), _subdivided(planes, steps)
+        self.slices, self.planes = subdivided(slices, steps, smooth), subdivided(planes, steps)
         self.nodes = len(self.planes)
 
     def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         distance = (self.planes[:, None] - origin[:, self.axis]) / direction[:, self.axis]
         points = [2 * (origin[:, a] + distance * direction[:, a] - self.lower[a]) / self.extent[a] - 1 for a in self.across]
-        values = sample_slices(self.slices, torch.stack([points[1], points[0]], -1))
+        values = sample_slices(self.slices, torch.stack([points[1], points[0]], -1), smooth=self.smooth)
         return values, torch.minimum(torch.maximum(distance, near), far)
 
 
 class _Equidistant:
     """Values at equal steps along rays, wherever these run."""
 
-    def __init__(self, fields: Tensor, grid: Grid, longest: float, steps: int):
+    def __init__(self, fields: Tensor, smooth: Smooth | None, grid: Grid, longest: float, steps: int):
+        self.smooth = smooth
         self.fields, self.lower, self.extent = fields, fields.new_tensor(grid.lower), fields.new_tensor(grid.extent)
         self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
 
@@ -128,29 +130,23 @@ class _Equidistant:
         part = torch.linspace(0, 1, self.nodes, dtype=near.dtype, device=near.device)[:, None]
         distance = near + part * (far - near)
         points = 2 * (origin + distance[..., None] * direction - self.lower) / self.extent - 1
-        values = sample_volume(self.fields, points.flip(-1))
+        values = sample_volume(self.fields, points.flip(-1), self.smooth)
         return values.transpose(0, 1), distance
 
 
 def _sampler(emission: Emission, rays: Rays, crossing: Crossing, steps: int) -> _Slices | _Equidistant:
     """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps."""
     fields = torch.cat(_fields(emission))
+    first = emission.extinction.field.shape[0] + emission.diffuse.shape[0]
+    last = first + sum(beam.mass.shape[0] for beam in emission.beams)
+    smooth = Smooth(first, last, emission.extinction.mass_bound) if emission.beams else None
     direction = rays.direction[crossing.hit]
     axis = int(direction.abs().mean(0).argmax())
     along = direction[:, axis]
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):
-        return _Slices(fields, emission.grid, axis, bool(along[0] < 0), steps)
-    return _Equidistant(fields, emission.grid, float((crossing.far - crossing.near).max()), steps)
-
-
-def _subdivided(values: Tensor, steps: int) -> Tensor:
-    """`values` along axis 0 with `steps` - 1 linearly interpolated entries between each pair of neighbors."""
-    if steps == 1:
-        return values
-    low, high = values[:-1], values[1:]
-    between = torch.stack([low + (high - low) * (i / steps) for i in range(steps)], 1).flatten(0, 1)
-    return torch.cat([between, values[-1:]])
+        return _Slices(fields, smooth, emission.grid, axis, bool(along[0] < 0), steps)
+    return _Equidistant(fields, smooth, emission.grid, float((crossing.far - crossing.near).max()), steps)
 
 
 def _fields(emission: Emission) -> list[Tensor]:

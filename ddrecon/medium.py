@@ -47,6 +47,11 @@ class Coefficient:
         """The coefficient itself, `[C, z, y, x]`."""
         return self.scale * self.field
 
+    @property
+    def mass_bound(self) -> Tensor:
+        """The inverse of the most that third-order interpolation may change an integral of `field` by: half an optical depth."""
+        return 2 * self.scale.mean()
+
     def mean_transmittance(self, entered: Tensor, step: Tensor) -> Tensor:
         """exp(-depth) averaged over each cell, `[C, z, y, x]`.
 

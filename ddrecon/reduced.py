@@ -22,8 +22,11 @@ from ddrecon.nodes import Nodes
 from ddrecon.phase import henyey_greenstein
 from ddrecon.point_light import PointBeam, point_beam
 from ddrecon.quadrature import sphere_quadrature
-from ddrecon.sampling import sample_slices
+from ddrecon.sampling import Smooth, on_kink, ramp, sample_slices, subdivided
 from ddrecon.sky import Sky, Source
+
+PLANES = 2
+"""Planes a slice at which a slanted beam looks at the field on its way: with one, it would miss what lies between."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,9 @@ def _turned_towards(medium: Medium, travel: Tensor, irradiance: Tensor, towards:
 
 def _seen_from(medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None) -> Moments:
     """`irradiance` ([C] or scalar) and `vector` [3, C], each times the transmittance along `direction`, averaged over cells."""
-    visible = medium.extinction.mean_transmittance(*entered_mass(medium.extinction.field, medium.grid, direction))
+    visible = medium.extinction.mean_transmittance(
+        *entered_mass(medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound)
+    )
     mean = visible * irradiance.view(-1, 1, 1, 1)
     if vector is None:
         return Moments(mean)
@@ -126,18 +131,19 @@ def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam
     """The beam of `light`, and the moments of E tau / (4 pi) averaged over each cell along the beam."""
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
-    entered, step = entered_mass(medium.extinction.field, medium.grid, direction)
+    entered, step = entered_mass(medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound)
     received = irradiance / (4 * math.pi) * medium.extinction.mean_transmittance(entered, step)
     beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
     return beam, beam_moments(received, direction, has_flux)
 
 
-def entered_mass(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
+def entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
     """The integral of `field` from the box to where a beam enters each cell's slice, and its path length within a slice [u].
 
     `field`: [K, z, y, x]; `direction`: [3], unit, array order, the way light travels. Slices are those across the axis along
     which the beam crosses most cells. Outside the box the field falls to zero within half a cell, which keeps the mass of the
-    outer half cells. Returns `[K, z, y, x]` and a scalar.
+    outer half cells. The sum over slices is exact for light along an axis; for slanted light it is refined by planes between them, and
+    carried back to cells to third order, by corrections bounded by 1 / `bound`. Returns `[K, z, y, x]` and a scalar.
     """
     speed = direction / direction.new_tensor(grid.spacing)
     axis = int(speed.detach().abs().argmax())
@@ -148,9 +154,14 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, 
         slices = slices.flip(0)
     slope = torch.stack([speed[other] for other in range(3) if other != axis]) / speed[axis].abs()
     step = grid.spacing[axis] / direction[axis].abs()
-    sheared = _shear(slices, slope)
-    before = (sheared.cumsum(0) - sheared) * step
-    entered = _unshear(before, slope, (slices.shape[2], slices.shape[3]))
+    sheared = _shear(subdivided(slices, PLANES), slope / PLANES)
+    centers = sheared[::PLANES]
+    before = (centers.cumsum(0) - centers) * step
+    segments = torch.cat([PLANES * sheared[:1], sheared[1:] + sheared[:-1]]) * (0.5 * step / PLANES)
+    finer = segments.cumsum(0)[::PLANES] - before - 0.5 * step * centers
+    smooth = Smooth(0, field.shape[0], bound)
+    before = before + smooth.bounded(finer)
+    entered = _unshear(before, slope, (slices.shape[2], slices.shape[3]), smooth)
     if is_reversed:
         entered = entered.flip(0)
     return entered.permute([order.index(dim) for dim in range(4)]), step
@@ -161,13 +172,27 @@ def _shear(slices: Tensor, slope: Tensor) -> Tensor:
     height, width = slices.shape[2:]
     rows, columns = (abs(base) for base in _bases(slices, slope))
     lattice = (height + rows, width + columns)
-    return sample_slices(slices, _lattice_points(slices, lattice, slope, (height, width), 1), "zeros").unflatten(-1, lattice)
+    points = _lattice_points(slices, lattice, slope, (height, width), 1)
+    sheared = sample_slices(slices, points) * _coverage(points, (height, width))[:, None]
+    return sheared.unflatten(-1, lattice)
 
 
-def _unshear(sheared: Tensor, slope: Tensor, size: tuple[int, int]) -> Tensor:
+def _coverage(points: Tensor, size: tuple[int, int]) -> Tensor:
+    """1 inside slices of `size` cells, falling to 0 at one cell beyond their outermost cells' centers, `[N, P]`.
+
+    Beyond a corner it is the lesser of both axes', as along a beam that enters there; elsewhere one of them is 1, and their product has the
+    slopes of both.
+    """
+    sides = points.new_tensor(size[::-1])
+    place = ((points + 1) * sides - 1) / 2
+    one, other = ramp(torch.minimum(place + 1, sides - place), on_kink(points, max(size))).unbind(-1)
+    return torch.where((one == 1) | (other == 1), one * other, torch.minimum(one, other))
+
+
+def _unshear(sheared: Tensor, slope: Tensor, size: tuple[int, int], smooth: Smooth) -> Tensor:
     """The inverse of `_shear`, back on slices of `size` cells."""
     height, width = sheared.shape[2:]
-    return sample_slices(sheared, _lattice_points(sheared, size, slope, (height, width), -1), "border").unflatten(-1, size)
+    return sample_slices(sheared, _lattice_points(sheared, size, slope, (height, width), -1), smooth).unflatten(-1, size)
 
 
 def _bases(slices: Tensor, slope: Tensor) -> list[int]:

@@ -84,7 +84,7 @@ def test_in_a_homogeneous_box_depth_is_path_length(direction: tuple[float, ...],
         from_low = torch.arange(cells[other]).view([-1 if a == other else 1 for a in range(3)])
         from_high = cells[other] - 1 - from_low
         behind, ahead = (from_low, from_high) if direction[other] > 0 else (from_high, from_low)
-        is_inside &= (behind >= drift + 1) & ((ahead >= 1) | (direction[other] == 0))
+        is_inside &= (behind >= drift + 2) & ((ahead >= 2) | (direction[other] == 0))
     assert is_inside.any()
     assert float(error[is_inside].max()) < 1e-14
 
