@@ -178,15 +178,10 @@ def _shear(slices: Tensor, slope: Tensor) -> Tensor:
 
 
 def _coverage(points: Tensor, size: tuple[int, int]) -> Tensor:
-    """1 inside slices of `size` cells, falling to 0 at one cell beyond their outermost cells' centers, `[N, P]`.
-
-    Beyond a corner it is the lesser of both axes', as along a beam that enters there; elsewhere one of them is 1, and their product has the
-    slopes of both.
-    """
+    """1 inside slices of `size` cells, falling to 0 at one cell beyond their outermost cells' centers, along each axis, `[N, P]`."""
     sides = points.new_tensor(size[::-1])
     place = ((points + 1) * sides - 1) / 2
-    one, other = ramp(torch.minimum(place + 1, sides - place), on_kink(points, max(size))).unbind(-1)
-    return torch.where((one == 1) | (other == 1), one * other, torch.minimum(one, other))
+    return ramp(torch.minimum(place + 1, sides - place), on_kink(points, max(size))).prod(-1)
 
 
 def _unshear(sheared: Tensor, slope: Tensor, size: tuple[int, int], smooth: Smooth) -> Tensor:

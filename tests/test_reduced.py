@@ -203,8 +203,9 @@ def test_without_a_medium_ambient_light_is_the_same_everywhere(box):
 
 
 def test_ambient_light_is_symmetric_in_a_symmetric_medium():
-    """A homogeneous cube: the moments have the symmetries of the cube, and light flows inward."""
-    medium = medium_in(Grid((5, 5, 5), (0, 0, 0), (1, 1, 1)), torch.ones(5, 5, 5, dtype=torch.float64))
+    """A homogeneous cube amid empty space: the moments have the symmetries of the cube, and light flows inward."""
+    density = torch.nn.functional.pad(torch.ones(3, 3, 3, dtype=torch.float64), (1,) * 6)
+    medium = medium_in(Grid((5, 5, 5), (0, 0, 0), (1, 1, 1)), density)
     light = unscattered_ambient(medium, torch.ones(1, 1, 1, 1, dtype=torch.float64))
     for axis in (1, 2, 3):
         torch.testing.assert_close(light.mean, light.mean.flip(axis), rtol=0, atol=1e-14)

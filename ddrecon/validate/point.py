@@ -23,7 +23,7 @@ TOLERANCE = 1e-13
 """Relative residual of the solves."""
 STEPS = (1e-2, 1e-3, 1e-4)
 """Changes by which finite differences are taken, as parts of the parameter's largest value."""
-SHORT_STEPS = (1e-4, 1e-5, 1e-6)
+SHORT_STEPS = (1e-4, 1e-6, 1e-7)
 """The same for what moves rays or beams, since interpolation has a kink at every cell center and a short step crosses few, and for g, whose
 delta-Eddington scaling has a second derivative that jumps at 0."""
 SHORT = {"g", "lights.N.direction", "lights.N.position", "lights.N.rotation", "views.NAME.camera"}
