@@ -192,7 +192,7 @@ def _unshear(sheared: Tensor, slope: Tensor, size: tuple[int, int], smooth: Smoo
 
 def _bases(slices: Tensor, slope: Tensor) -> list[int]:
     """Cells by which slices drift in all, along rows and columns, with the sign of `slope`; the first slice does not drift."""
-    return [int(math.copysign(math.ceil(abs(s) * (slices.shape[0] - 1) - 1e-9), s)) for s in slope.tolist()]
+    return [int(math.copysign(math.floor(abs(s) * (slices.shape[0] - 1) + 1e-9) + 1, s)) for s in slope.tolist()]
 
 
 def _lattice_points(slices: Tensor, lattice: tuple[int, int], slope: Tensor, source: tuple[int, int], sign: int) -> Tensor:
