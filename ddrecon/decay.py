@@ -1,8 +1,8 @@
 """Exponential decay integrated in closed form over steps in which the optical depth grows linearly.
 
 With phi(d) = (1 - exp(-d)) / d the mean of exp(-depth) between depths a and b is exp(-min) phi(|b - a|). Its derivatives are
--exp(-min) psi for the smaller depth and exp(-min) (psi - phi) for the larger, psi = phi + phi' = (1 - phi) / d. Both functions here
-are differentiated by hand, in both modes: autograd would keep and revisit a dozen arrays instead of two.
+-exp(-min) psi for the smaller depth and exp(-min) (psi - phi) for the larger, psi = phi + phi' = (1 - phi) / d, and psi' = (phi - 2 psi) / d.
+All functions here are differentiated by hand, in both modes: autograd would keep and revisit a dozen arrays instead of two.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 SERIES_BELOW = 1e-2
-"""Depths below this take psi from its series, since 1 - phi cancels there."""
+"""Depths below this take psi and its slope from their series, since 1 - phi cancels there."""
 
 
 def decay_mean(depth: Tensor) -> Tensor:
@@ -31,6 +31,15 @@ def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Te
     return total
 
 
+def decayed_line(near: Tensor, far: Tensor, depth: Tensor) -> Tensor:
+    """The mean over s in [0, 1] of (near + (far - near) s) exp(-depth s): what reaches the near end of a step from all along it.
+
+    `depth` [N, C, ...] >= 0; `near` and `far` have its shape, or either has one channel where the other has C.
+    """
+    line: Tensor = _DecayedLine.apply(near, far, depth)[0]
+    return line
+
+
 def _phi(depth: Tensor) -> Tensor:
     shifted = depth + torch.finfo(depth.dtype).tiny
     return torch.expm1(-shifted).div_(shifted).neg_()
@@ -39,6 +48,11 @@ def _phi(depth: Tensor) -> Tensor:
 def _psi(depth: Tensor, phi: Tensor) -> Tensor:
     series = 1 / 2 - depth * (1 / 6 - depth * (1 / 24 - depth * (1 / 120 - depth / 720)))
     return torch.where(depth < SERIES_BELOW, series, (1 - phi).div_(depth.clamp(min=SERIES_BELOW)))
+
+
+def _psi_slope(depth: Tensor, phi: Tensor, psi: Tensor) -> Tensor:
+    series = -1 / 6 + depth * (1 / 12 - depth * (1 / 40 - depth * (1 / 180 - depth / 1008)))
+    return torch.where(depth < SERIES_BELOW, series, (phi - 2 * psi).div_(depth.clamp(min=SERIES_BELOW)))
 
 
 class _DecayMean(torch.autograd.Function):
@@ -113,6 +127,47 @@ class _DecayedSum(torch.autograd.Function):
                 d_mean = d_mean + slope * d_scale * value
         d_out = (weight * d_mean).sum(0)
         return d_out if d_weight is None else d_out + (d_weight * decay * phi).sum(0), None, None
+
+
+class _DecayedLine(torch.autograd.Function):
+    """far phi + (near - far) psi, and phi and psi, which are not differentiated themselves."""
+
+    @staticmethod
+    def forward(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        phi = _phi(depth)
+        psi = _psi(depth, phi)
+        return torch.addcmul(far * phi, near - far, psi), phi, psi
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs, *output[1:])
+        ctx.save_for_forward(*inputs, *output[1:])
+
+    @staticmethod
+    def backward(ctx: Any, line_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        if line_bar is None:
+            return None, None, None
+        near, far, depth, phi, psi = ctx.saved_tensors
+        near_bar, slope = line_bar * psi, _line_slope(near, far, depth, phi, psi)
+        far_bar = (line_bar * phi).sub_(near_bar)
+        return _to_fields(near_bar, near), _to_fields(far_bar, far), _to_fields(slope.mul_(line_bar), depth)
+
+    @staticmethod
+    def jvp(ctx: Any, d_near: Tensor | None, d_far: Tensor | None, d_depth: Tensor | None) -> tuple[Tensor, None, None]:
+        near, far, depth, phi, psi = ctx.saved_tensors
+        d_line = torch.zeros_like(far * phi)
+        for change, slope in ((d_near, psi), (d_far, phi - psi)):
+            if change is not None:
+                d_line = d_line + change * slope
+        if d_depth is not None:
+            d_line = d_line + d_depth * _line_slope(near, far, depth, phi, psi)
+        return d_line, None, None
+
+
+def _line_slope(near: Tensor, far: Tensor, depth: Tensor, phi: Tensor, psi: Tensor) -> Tensor:
+    return torch.addcmul(far * (psi - phi), near - far, _psi_slope(depth, phi, psi))
 
 
 def _to_fields(bar: Tensor, field: Tensor) -> Tensor:

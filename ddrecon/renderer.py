@@ -18,6 +18,7 @@ from ddrecon.diffusion import conservative, printed
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.transport import transported
 from ddrecon.environment import environment_radiance
 from ddrecon.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.march import Emission, march
@@ -124,7 +125,9 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
         scattered = source.scaled(scattering, scattering)
         return printed.diffuse_light(medium, closure(medium.transport_extinction), scattered, outside, by_jacobi, has_flux(medium))
     solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
-    return conservative.diffuse_light(medium, closure, source, outside, solve, has_flux(medium))
+    problem = conservative.DiffusionProblem(medium, closure, source, outside, has_flux(medium))
+    light = conservative.diffuse_light(problem, solve)
+    return transported(problem, light, solve, settings.transport_rounds, settings.transport_directions)
 
 
 def view_image(light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all") -> Tensor:

@@ -11,6 +11,7 @@ from typing import Any
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.quadrature import DEGREES
 
 DERIVATIVES = ("all", "single", "diffusion")
 """Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the diffusion (the paper's Fig. 9)."""
@@ -21,8 +22,8 @@ def bounded(default: Any, *, minimum: float | None = None, above: float | None =
     return field(default=default, metadata={"minimum": minimum, "above": above, "maximum": maximum})
 
 
-def one_of(default: str, choices: Collection[str]) -> Any:
-    """A text field whose value is one of `choices`."""
+def one_of(default: Any, choices: Collection[Any]) -> Any:
+    """A field whose value is one of `choices`."""
     return field(default=default, metadata={"choices": tuple(choices)})
 
 
@@ -49,4 +50,5 @@ class DiffusionSettings:
     solver: str = one_of("conjugate_gradient", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
-    transport_rounds: int = bounded(0, minimum=0, maximum=0)
+    transport_rounds: int = bounded(0, minimum=0, maximum=16)
+    transport_directions: int = one_of(50, DEGREES)

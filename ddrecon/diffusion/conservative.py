@@ -6,6 +6,8 @@ What the solve needs is made anew in the backward pass rather than kept, one axi
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 
 from torch import Tensor
 
@@ -13,28 +15,52 @@ from ddrecon.autodiff import recomputed
 from ddrecon.diffusion.implicit import Solve, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductance, face_fluxes
 from ddrecon.medium import Medium
-from ddrecon.moments import Moments
+from ddrecon.moments import Moments, Vector
 
 Closure = Callable[[Tensor], Tensor]
 
 
-def diffuse_light(medium: Medium, closure: Closure, source: Moments, outside: Tensor, solve: Solve, has_flux: bool) -> Moments:
-    """L0 and, where `has_flux`, L1 in `medium`.
+@dataclass(frozen=True)
+class DiffusionProblem:
+    """What diffuse light is asked for: E4 to E6 in `medium`.
 
     `closure` turns transport extinction into D; `source`: Q0 and Q1 of beams; `outside` [C, 1, 1, 1]: radiance that enters through the
     box's faces. L0 and L1 hold all of that, scattered or not, which keeps a white furnace exact (docs/theory.md, section 5).
     """
-    flux_along = dict(zip(AXES, source.flux or (None, None, None), strict=True))
-    z, y, x = (recomputed(_conductance, medium, closure, axis) for axis in AXES)
-    loss, right = recomputed(_loss_and_source, medium, closure, source.mean, outside)
-    for axis, flux in flux_along.items():
-        if flux is not None:
-            right = right - recomputed(_divergence, medium, closure, flux, axis)
-    mean = solve_diffusion(solve, Operator((z, y, x), loss), right)
-    if not has_flux:
-        return Moments(mean)
-    z, y, x = (recomputed(_flux, medium, closure, flux, outside, mean, axis) for axis, flux in flux_along.items())
-    return Moments(mean, (z, y, x))
+
+    medium: Medium
+    closure: Closure
+    source: Moments
+    outside: Tensor
+    has_flux: bool
+
+    @cached_property
+    def system(self) -> tuple[Operator, Tensor]:
+        """A and the right side of E7."""
+        flux_along = self._source_flux()
+        z, y, x = (recomputed(_conductance, self.medium, self.closure, axis) for axis in AXES)
+        loss, right = recomputed(_loss_and_source, self.medium, self.closure, self.source.mean, self.outside)
+        for axis, flux in flux_along.items():
+            if flux is not None:
+                right = right - recomputed(_divergence, self.medium, self.closure, flux, axis)
+        return Operator((z, y, x), loss), right
+
+    def flux(self, mean: Tensor) -> Vector | None:
+        """L1 of L0 = `mean`; None where light's direction does not matter."""
+        if not self.has_flux:
+            return None
+        along = self._source_flux().items()
+        z, y, x = (recomputed(_flux, self.medium, self.closure, flux, self.outside, mean, axis) for axis, flux in along)
+        return z, y, x
+
+    def _source_flux(self) -> dict[int, Tensor | None]:
+        return dict(zip(AXES, self.source.flux or (None, None, None), strict=True))
+
+
+def diffuse_light(problem: DiffusionProblem, solve: Solve[Operator]) -> Moments:
+    """L0 and, where `problem` has flux, L1."""
+    mean = solve_diffusion(solve, *problem.system)
+    return Moments(mean, problem.flux(mean))
 
 
 def _conductance(medium: Medium, closure: Closure, axis: int) -> Tensor:

@@ -34,32 +34,39 @@ class SolveRecord:
 
 @dataclass
 class SolveMemory:
-    """What solves remember between renders: the last solution of each kind, to start from, and a record of every solve.
+    """What solves remember between renders: the last solution of each kind and turn, to start from, and a record of every solve.
 
     With `is_warm` False every solve starts from zero.
     """
 
     is_warm: bool = True
-    last: dict[str, Tensor] = field(default_factory=dict)
+    last: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     records: list[SolveRecord] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Solve(Generic[System]):
-    """How to solve: the solver, its tolerance, and the memory that its solves share."""
+    """How to solve: the solver, its tolerance, and the memory that its solves share.
+
+    A render's solves are told apart by `turn`; forward solves that remember nothing begin at `start`, or at zero.
+    """
 
     solver: Callable[[System, Tensor, Tensor | None, float], Solution]
     tolerance: float
     memory: SolveMemory
+    turn: int = 0
+    start: Tensor | None = None
 
     def __call__(self, kind: str, operator: System, source: Tensor) -> Tensor:
         """u with `operator` u = `source` [C, z, y, x]."""
         start = perf_counter()
-        guess = self.memory.last.get(kind) if self.memory.is_warm and kind != "tangent" else None
+        guess = self.start if kind == "forward" else None
+        if self.memory.is_warm and kind != "tangent":
+            guess = self.memory.last.get((kind, self.turn), guess)
         solution = self.solver(operator, source, guess, self.tolerance)
         self.memory.records.append(SolveRecord(kind, solution.iterations, solution.residual, perf_counter() - start))
         if self.memory.is_warm:
-            self.memory.last[kind] = solution.value
+            self.memory.last[kind, self.turn] = solution.value
         return solution.value
 
 

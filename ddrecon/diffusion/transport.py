@@ -1,0 +1,85 @@
+"""The dial from diffusion to transport: rounds of discrete-ordinates sweeps, each corrected by a diffusion solve (E11, E12).
+
+A sweep sends what L0, L1 and the sources scatter along each direction of a quadrature, through the real geometry, and takes the moments
+of what arrives. What it changes is passed on by diffusion (synthetic acceleration: Alcouffe 1977, doi:10.13182/NSE77-1): few rounds do.
+Directions are gone through one at a time and made again in the backward pass: memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ddrecon.autodiff import is_varied, recomputed
+from ddrecon.diffusion.characteristics import Course, radiance_along
+from ddrecon.diffusion.conservative import DiffusionProblem
+from ddrecon.diffusion.implicit import Solve, solve_diffusion
+from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
+from ddrecon.medium import Medium
+from ddrecon.moments import Moments, Vector
+from ddrecon.quadrature import sphere_quadrature
+
+
+def transported(problem: DiffusionProblem, light: Moments, solve: Solve[Operator], rounds: int, directions: int) -> Moments:
+    """L0 and L1 after `rounds` of sweeps along so many `directions`, begun at `light`, the solution of `problem` (E12)."""
+    if rounds == 0:
+        return light
+    operator, right = problem.system
+    medium, is_lit = problem.medium, is_varied(problem.outside) or bool((problem.outside != 0).any())
+    share = recomputed(_transport_share, medium, directions)
+    for turn in range(1, rounds + 1):
+        scattered = light.scaled(1.0, medium.mean_cosine).plus(problem.source)
+        swept = sweep(medium, scattered, problem.outside if is_lit else None, directions)
+        gain = share * (swept.mean - light.mean)
+        source = medium.remaining_scattering * (swept.mean - light.mean)
+        if turn > 1:
+            source = source - recomputed(_imbalance, operator, right, light.mean)
+        spread = solve_diffusion(replace(solve, turn=turn, start=light.mean.detach()), operator, right + share * source)
+        light = Moments(spread + gain, _corrected(problem.flux(light.mean), problem.flux(spread), swept.flux, share))
+    return light
+
+
+def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int) -> Moments:
+    """Mean and, where `light` has flux, flux of the radiance that `light` scatters and of `inflow` (see `radiance_along`)."""
+    total = torch.zeros_like(light.mean)
+    flux = None if light.flux is None else [torch.zeros_like(total) for _ in range(3)]
+    points, weights = sphere_quadrature(total.new_zeros((), dtype=torch.float64), directions)
+    for direction, weight in zip(points.tolist(), weights.tolist(), strict=True):
+        radiance = recomputed(radiance_along, medium, light, inflow, tuple(direction))
+        total = torch.add(total, radiance, alpha=weight)
+        if flux is not None:
+            flux = [torch.add(part, radiance, alpha=3 * weight * cosine) for part, cosine in zip(flux, direction, strict=True)]
+    if flux is None:
+        return Moments(total)
+    z, y, x = flux
+    return Moments(total, (z, y, x))
+
+
+def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
+    """S - A L0."""
+    imbalance = right - operator.loss * mean
+    for axis, conductance in zip(AXES, operator.conductances, strict=True):
+        imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)
+    return imbalance
+
+
+def _corrected(before: Vector | None, spread: Vector | None, swept: Vector | None, share: Tensor) -> Vector | None:
+    """`spread` + `share` (`swept` - `before`), along each axis."""
+    if before is None or spread is None or swept is None:
+        return None
+    z, y, x = (after + share * (new - old) for old, after, new in zip(before, spread, swept, strict=True))
+    return z, y, x
+
+
+def _transport_share(medium: Medium, directions: int) -> Tensor:
+    """How much of a cell's change by a sweep counts, 1 / (1 + rho^2), the rest being diffusion's (docs/theory.md, section 5).
+
+    rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic whose source is linear over steps of depth d diffuses too much.
+    """
+    points, weights = sphere_quadrature(medium.extinction.scale.new_zeros((), dtype=torch.float64), directions)
+    steps = [Course.of(medium.grid, tuple(point)).step for point in points.tolist()]
+    half = (0.5 * float(weights @ weights.new_tensor(steps)) * medium.extinction.value).clamp(min=1e-3)
+    excess = half / torch.tanh(half) - 1
+    return 1 / (1 + excess**2)
