@@ -1,9 +1,9 @@
 """A half-space that scatters isotropically, whose reflected radiance Chandrasekhar's H-functions give exactly.
 
 I(mu) = w / (4 pi) E mu0 / (mu + mu0) H(mu) H(mu0), with albedo w and irradiance E on a plane facing the light (Chandrasekhar, Radiative
-Transfer, 1950, chapter III). Only optical depth matters, so the half-space is one column of cells, 1e9 times as wide as deep (nothing leaves
-sideways), whose density grows downwards: cells from a fiftieth of an optical depth at the surface to hundreds at the bottom. The closure's
-floor is set to nothing: what is compared is P1 itself, or what transport rounds make of it.
+Transfer, 1950, chapter III). Only optical depth matters, so the half-space is one column of cells, 1e9 times as wide as deep
+(nothing leaves sideways), whose density grows downwards: from a few thousandths of an optical depth a cell at the surface to hundreds at
+the bottom. The closure's floor is set to nothing: what is compared is P1 itself, or what transport rounds make of it.
 """
 
 from __future__ import annotations
