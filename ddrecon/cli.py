@@ -37,6 +37,7 @@ DTYPE = click.option("--dtype", type=click.Choice(["float32", "float64"]), defau
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 SCENE = click.argument("scene", type=click.Path(path_type=Path))
 OUTPUT = click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
+REPORT = click.option("--json", "report", type=click.Path(path_type=Path), metavar="FILE", help="Also write the result to FILE.")
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Write into a folder that is not empty.")
 
 
@@ -67,6 +68,12 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     for option in reversed(COMMON):
         wrapped = option(wrapped)
     return wrapped
+
+
+def require_folder_of(report: Path | None) -> None:
+    """Raises click.UsageError where `report` is to be written into a folder that does not exist."""
+    if report is not None and not report.absolute().parent.is_dir():
+        raise click.UsageError(f"--json {report}: there is no folder {report.absolute().parent}")
 
 
 @contextmanager
@@ -142,20 +149,47 @@ def optimize(
 @SCENE
 @click.option("--parameter", "names", multiple=True, metavar="NAME", help="Check only this parameter; repeatable.")
 @click.option("--samples", type=click.IntRange(min=2), default=8, show_default=True, help="Cells checked one by one.")
-@click.option("--json", "report", type=click.Path(path_type=Path), metavar="FILE", help="Also write the result to FILE.")
+@REPORT
 @in_session
 def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: int, report: Path | None) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
     from ddrecon.io.json_file import write_json
     from ddrecon.validate.gradcheck import check_parameters, describe
 
-    if report is not None and not report.absolute().parent.is_dir():
-        raise click.UsageError(f"--json {report}: there is no folder {report.absolute().parent}")
+    require_folder_of(report)
     checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
     click.echo("\n".join(line for check in checks for line in check.lines()))
     if report is not None:
         write_json(report, describe(checks))
     if not all(check.has_passed for check in checks):
+        sys.exit(1)
+
+
+@main.command()
+@click.option("--hard", "is_hard", is_flag=True, help="Numerical stability on hard cases, in float32 against float64.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for the results: hard.json.")
+@OVERWRITE
+@REPORT
+@in_session
+def bench(session: Session, is_hard: bool, output: Path | None, overwrite: bool, report: Path | None) -> None:
+    """Measure the program on scenes of its own."""
+    if not is_hard:
+        raise click.UsageError("only the hard cases can be run so far: ddrecon bench --hard")
+    if session.overrides:
+        raise click.UsageError("-D changes a scene file, and the hard cases have none")
+    require_folder_of(report)
+    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.json_file import write_json
+    from ddrecon.validate.hard import describe, run_cases, table
+
+    if output is not None:
+        prepare_folder(output, may_exist=overwrite)
+    results = run_cases(session.device, session.progress)
+    click.echo("\n".join(table(results)))
+    for file in (output / "hard.json" if output else None, report):
+        if file is not None:
+            write_json(file, describe(results))
+    if any(result.failures() for result in results):
         sys.exit(1)
 
 

@@ -13,6 +13,8 @@ from torch import Tensor
 
 Vector = tuple[Tensor, Tensor, Tensor]
 """Components along z, y, x."""
+MARGIN = 0.01
+"""Radiance is held above zero by a bend that starts at this part of the sizes of its two terms."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,20 @@ class Moments:
         for component, cosine in zip(self.flux or (), direction, strict=self.flux is not None):
             radiance = torch.addcmul(radiance, component, cosine)
         return radiance
+
+    def positive_along(self, direction: Vector) -> Tensor:
+        """`along` held at zero: r where r >= m = MARGIN (|L0| + |L1.w|), m (1 + r/m)^2 / 4 from there to -m, and 0 below.
+
+        E3 is negative where light is more directed than two terms in angle can say, and where g is not 0 so may L0 be: E4's source
+        then has either sign. Both mean darkness. Without a flux nothing is held: E7's M-matrix keeps L0 >= 0.
+        """
+        radiance = self.along(direction)
+        if self.flux is None:
+            return radiance
+        margin = MARGIN * (self.mean.abs() + (radiance - self.mean).abs())
+        divisor = margin.clamp(min=1e6 * torch.finfo(margin.dtype).tiny)
+        bent = margin * (1 + (radiance / divisor).clamp(-1, 1)) ** 2 / 4
+        return torch.where(radiance >= margin, radiance, bent)
 
 
 def _vector(components: Iterable[Tensor]) -> Vector:

@@ -176,7 +176,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to."""
     medium = light_field.medium
     towards = _towards_camera(medium, bundle)
-    diffuse = light_field.outgoing.along(towards)
+    diffuse = light_field.outgoing.positive_along(towards)
     if light_field.skies:
         diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
     return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)

@@ -93,7 +93,7 @@ def test_image_and_gradient_are_finite(name: str, dtype: torch.dtype, rendered):
 @each_dtype
 @each_case
 def test_radiance_is_not_negative(name: str, dtype: torch.dtype, rendered):
-    """Up to rounding, of sums whose terms are as large as the light; here ambient light outshines what P1 gets wrong (see below)."""
+    """Up to rounding, of sums whose terms are as large as the light."""
     assert float(rendered(name, dtype)[0].min()) > -10 * torch.finfo(dtype).eps
 
 
@@ -114,7 +114,7 @@ def test_gradients_in_single_precision_follow_double(name: str, rendered):
 @pytest.mark.parametrize("density", [half_full, hot_voxel, checkerboard])
 @pytest.mark.parametrize(("sigma_a", "sigma_s"), [(10.0, 2.0), (0.5, 8.0), (0.0, 8.0)])
 def test_isotropic_light_is_never_negative_in_the_dark(density: Callable[..., Tensor], sigma_a: float, sigma_s: float, make_scene):
-    """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either sign, and P1 may dip below zero."""
+    """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either sign, and L0 may dip below zero."""
     scene = make_scene(density(SHAPE), sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
     mean = solve_light(scene, SolveMemory()).outgoing.mean
     assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0

@@ -1,0 +1,70 @@
+"""Source and detector may change places: cell against cell to rounding, light against camera to the order of the discretization."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ddrecon.cameras import Camera, look_at
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.grid import Grid
+from ddrecon.lights import DirectionalLight
+from ddrecon.renderer import solve_light, view_components
+from ddrecon.world import Scene
+
+ONE, OTHER = (-2.0, -2.1, -1.0), (1.2, -0.3, -1.9)
+"""Two directions (x, y, z) that are along no axis of the grid."""
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_two_cells_send_each_other_the_same_light(solver: str, box, random, make_operator):
+    grid = box((5, 4, 6))
+    diffusion, absorption = 10 ** (3 * random(1, *grid.shape) - 2), random(1, *grid.shape, seed=1)
+    operator = make_operator(grid, diffusion, absorption)
+
+    def received(source: tuple[int, ...], detector: tuple[int, ...]) -> float:
+        power = torch.zeros_like(diffusion)
+        power[source] = 1
+        return float(SOLVERS[solver](operator, power, None, 1e-13).value[detector])
+
+    near, far = (0, 0, 1, 1), (0, 4, 3, 4)
+    assert received(near, far) == pytest.approx(received(far, near), rel=1e-9) and received(near, far) > 0
+
+
+def unlike_its_mirror(cells: int) -> torch.Tensor:
+    """A smooth density without symmetry, zero at the faces of the unit box."""
+    grid = Grid((cells,) * 3, (0.0,) * 3, (1.0,) * 3)
+    z, y, x = grid.centers(torch.zeros(1, dtype=torch.float64))
+    hump = (torch.sin(math.pi * z) * torch.sin(math.pi * y) * torch.sin(math.pi * x)) ** 2
+    return hump * (1 + 0.8 * torch.sin(3 * z + 2 * y) * torch.cos(4 * x))
+
+
+def power_seen(scene: Scene, travel: tuple[float, float, float], towards: tuple[float, float, float]) -> tuple[float, float]:
+    """Light of irradiance 1 along `travel` that leaves the volume along `towards`: once scattered, and more often; area integrals."""
+    eye = torch.nn.functional.normalize(torch.tensor(towards, dtype=torch.float64), dim=0) * 3 + 0.5
+    pose = look_at(eye, torch.full_like(eye, 0.5), eye.new_tensor([0.0, 1.0, 0.0]))
+    camera = Camera(pose, (48, 48), 0.9, is_perspective=False)
+    lit = replace(scene, lights=[DirectionalLight(eye.new_tensor(travel), eye.new_tensor([1.0]))])
+    parts = view_components(solve_light(lit, SolveMemory()), lit, camera)
+    return float(parts.single[0].mean()), float(parts.multiple[0].mean())
+
+
+def asymmetry(make_scene: Callable[..., Scene], cells: int, g: float) -> tuple[float, float]:
+    """How much what goes from ONE to OTHER differs from what goes the reverse way, of single and of multiple scattering."""
+    grid = Grid((cells,) * 3, (0.0,) * 3, (1.0,) * 3)
+    scene = make_scene(unlike_its_mirror(cells), grid=grid, sigma_a=(1.0,), sigma_s=(12.0,), g=g)
+    forth = power_seen(scene, ONE, OTHER)
+    back = power_seen(scene, tuple(-c for c in OTHER), tuple(-c for c in ONE))
+    single, multiple = (abs(a - b) / b for a, b in zip(forth, back, strict=True))
+    return single, multiple
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
+def test_light_and_camera_may_change_places(g: float, make_scene):
+    coarse, fine = (asymmetry(make_scene, cells, g) for cells in (12, 24))
+    assert max(fine) < 0.002 and all(after < 0.4 * before for before, after in zip(coarse, fine, strict=True)), (coarse, fine)
