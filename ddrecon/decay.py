@@ -1,7 +1,7 @@
 """Exponential decay integrated in closed form over steps in which the optical depth grows linearly.
 
 With phi(d) = (1 - exp(-d)) / d the mean of exp(-depth) between depths a and b is exp(-min) phi(|b - a|). Its derivatives are
--exp(-min) psi for the smaller depth and exp(-min) (psi - phi) for the larger, psi = phi + phi' = (1 - phi) / d, and psi' = (phi - 2 psi) / d.
+-exp(-min) psi for the smaller depth and exp(-min) (psi - phi) for the larger, psi = phi + phi' = (1 - phi) / d; psi' = (phi - 2 psi) / d.
 All functions here are differentiated by hand, in both modes: autograd would keep and revisit a dozen arrays instead of two.
 """
 

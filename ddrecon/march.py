@@ -1,6 +1,6 @@
 """View rays: the integral of what the medium sends towards the camera (docs/theory.md E1-E3).
 
-Rays are marched slice by slice along the axis the view looks along, with two-dimensional interpolation in each slice; where
+Rays are marched slice by slice along the axis along which they cross most cells, with two-dimensional interpolation in each slice; where
 that is not possible (a camera inside the box, rays nearly along a slice) by three-dimensional interpolation at equal steps.
 Between two nodes of a ray density and optical depth are taken as linear, so emission times transmittance has a closed form.
 """
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ddrecon.autodiff import recomputed
 from ddrecon.cameras import Rays
@@ -28,7 +29,7 @@ CHUNK_NODES = 1 << 18
 CELLS_PER_NODE = 16
 """In large volumes a chunk has a node for so many cells: its backward pass fills an array of all cells, whatever the number of nodes."""
 STEEPEST = 0.2
-"""Smallest direction cosine, against the axis across the slices, of rays that are marched by slices."""
+"""Smallest direction cosine, in units of cells and against the axis across the slices, of rays that are marched by slices."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +141,9 @@ def _sampler(emission: Emission, rays: Rays, crossing: Crossing, steps: int) -> 
     first = emission.extinction.field.shape[0] + emission.diffuse.shape[0]
     last = first + sum(beam.mass.shape[0] for beam in emission.beams)
     smooth = Smooth(first, last, emission.extinction.mass_bound) if emission.beams else None
-    direction = rays.direction[crossing.hit]
-    axis = int(direction.abs().mean(0).argmax())
-    along = direction[:, axis]
+    speed = normalize(rays.direction[crossing.hit] / rays.direction.new_tensor(emission.grid.spacing), dim=1)
+    axis = int(speed.abs().mean(0).argmax())
+    along = speed[:, axis]
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):
         return _Slices(fields, smooth, emission.grid, axis, bool(along[0] < 0), steps)

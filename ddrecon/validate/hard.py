@@ -138,7 +138,7 @@ def _rendered(case: HardCase, dtype: torch.dtype, device: torch.device) -> Rende
     image = render(scene, memory=memory)[0]
     (gradient,) = torch.autograd.grad(image.mean(), density)
     density.requires_grad_(False)
-    balance = balance_of(scene, memory.last["forward"]) if memory.records else Balance(0.0, 0.0, 0.0)
+    balance = balance_of(scene, memory.last["forward", 0]) if memory.records else Balance(0.0, 0.0, 0.0)
     iterations = sum(record.iterations for record in memory.records)
     return Rendered(image.detach(), gradient, iterations, balance)
 

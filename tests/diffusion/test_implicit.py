@@ -91,4 +91,4 @@ def test_what_is_remembered_is_not_what_the_caller_may_change(inputs):
     memory, arguments = SolveMemory(), inputs()
     u = solving(memory)(*arguments)
     u.zero_()
-    assert bool(memory.last["forward"].any())
+    assert bool(memory.last["forward", 0].any())

@@ -69,7 +69,7 @@ def solved(case: HardCase) -> Callable[[float], Balance]:
     """The balance of the solution of `case` in float64, times a factor."""
     scene, memory = case.scene(torch.float64, CPU), SolveMemory()
     render(scene, memory=memory)
-    return lambda factor: balance_of(scene, factor * memory.last["forward"])
+    return lambda factor: balance_of(scene, factor * memory.last["forward", 0])
 
 
 @pytest.mark.parametrize("ambient", [0.0, 0.5])
@@ -86,5 +86,5 @@ def test_what_rounding_makes_of_a_residual_is_attained():
     case = CASES["optical depth 1e-4 a cell"]
     memory = SolveMemory()
     render(case.scene(torch.float64, CPU), memory=memory)
-    balance = balance_of(case.scene(torch.float32, CPU), memory.last["forward"].float())
+    balance = balance_of(case.scene(torch.float32, CPU), memory.last["forward", 0].float())
     assert balance.attainable / 8 < balance.residual < hard.ROUNDINGS * balance.attainable
