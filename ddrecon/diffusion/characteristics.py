@@ -66,7 +66,7 @@ def radiance_along(medium: Medium, light: Moments, inflow: Tensor | None, direct
     that enters the box, None for none.
     """
     course = Course.of(medium.grid, direction)
-    z, y, x = (torch.tensor(component) for component in direction)
+    z, y, x = light.mean.new_tensor(direction)
     here = course.lay(light.along((z, y, x)))
     mass = _crossed(medium.extinction, course)
     scattering = mass if medium.scattering.field is medium.extinction.field else _crossed(medium.scattering, course)

@@ -18,7 +18,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import Solve, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.medium import Medium
-from ddrecon.moments import Moments, Vector
+from ddrecon.moments import Moments
 from ddrecon.quadrature import sphere_quadrature
 
 
@@ -27,34 +27,46 @@ def transported(problem: DiffusionProblem, light: Moments, solve: Solve[Operator
     if rounds == 0:
         return light
     operator, right = problem.system
-    medium, is_lit = problem.medium, is_varied(problem.outside) or bool((problem.outside != 0).any())
+    medium = problem.medium
+    inflow = problem.outside if is_varied(problem.outside) or bool((problem.outside != 0).any()) else None
     share = recomputed(_transport_share, medium, directions)
     for turn in range(1, rounds + 1):
-        scattered = light.scaled(1.0, medium.mean_cosine).plus(problem.source)
-        swept = sweep(medium, scattered, problem.outside if is_lit else None, directions)
-        gain = share * (swept.mean - light.mean)
-        source = medium.remaining_scattering * (swept.mean - light.mean)
+        swept = sweep(medium, light.scaled(1.0, medium.mean_cosine).plus(problem.source), inflow, directions)
+        gain = swept.plus(Moments(light.mean, problem.flux(light.mean)).scaled(-1.0, -1.0)).scaled(share, share)
+        source = medium.remaining_scattering * gain.mean
         if turn > 1:
-            source = source - recomputed(_imbalance, operator, right, light.mean)
-        spread = solve_diffusion(replace(solve, turn=turn, start=light.mean.detach()), operator, right + share * source)
-        light = Moments(spread + gain, _corrected(problem.flux(light.mean), problem.flux(spread), swept.flux, share))
+            source = source - share * recomputed(_imbalance, operator, right, light.mean)
+        spread = solve_diffusion(replace(solve, turn=turn, start=light.mean.detach()), operator, right + source)
+        light = Moments(spread, problem.flux(spread)).plus(gain)
     return light
 
 
 def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int) -> Moments:
     """Mean and, where `light` has flux, flux of the radiance that `light` scatters and of `inflow` (see `radiance_along`)."""
     total = torch.zeros_like(light.mean)
-    flux = None if light.flux is None else [torch.zeros_like(total) for _ in range(3)]
+    flux = None if light.flux is None else (total, total, total)
     points, weights = sphere_quadrature(total.new_zeros((), dtype=torch.float64), directions)
-    for direction, weight in zip(points.tolist(), weights.tolist(), strict=True):
-        radiance = recomputed(radiance_along, medium, light, inflow, tuple(direction))
+    for point, weight in zip(points.tolist(), weights.tolist(), strict=True):
+        radiance = recomputed(radiance_along, medium, light, inflow, tuple(point))
         total = torch.add(total, radiance, alpha=weight)
         if flux is not None:
-            flux = [torch.add(part, radiance, alpha=3 * weight * cosine) for part, cosine in zip(flux, direction, strict=True)]
-    if flux is None:
-        return Moments(total)
-    z, y, x = flux
-    return Moments(total, (z, y, x))
+            z, y, x = (torch.add(along, radiance, alpha=3 * weight * cosine) for along, cosine in zip(flux, point, strict=True))
+            flux = z, y, x
+    return Moments(total, flux)
+
+
+def _transport_share(medium: Medium, directions: int) -> Tensor:
+    """How much of a cell's change by a sweep counts, 1 / (1 + rho^2), the rest being diffusion's (docs/theory.md, section 5).
+
+    rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic whose source is linear over steps of depth d diffuses too much; d is that
+    of the mean step. Along an axis of one cell nothing varies, so that steps along it do not count.
+    """
+    points, weights = sphere_quadrature(medium.extinction.scale.new_zeros((), dtype=torch.float64), directions)
+    courses = [Course.of(medium.grid, tuple(point)) for point in points.tolist()]
+    steps = weights.new_tensor([course.step if medium.grid.shape[course.order[0] - 1] > 1 else 0.0 for course in courses])
+    mean_step = float(weights @ steps / weights[steps > 0].sum().clamp(min=1e-9))
+    half = (0.5 * mean_step * medium.extinction.value).clamp(min=1e-3)
+    return 1 / (1 + (half / torch.tanh(half) - 1) ** 2)
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
@@ -63,23 +75,3 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     for axis, conductance in zip(AXES, operator.conductances, strict=True):
         imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)
     return imbalance
-
-
-def _corrected(before: Vector | None, spread: Vector | None, swept: Vector | None, share: Tensor) -> Vector | None:
-    """`spread` + `share` (`swept` - `before`), along each axis."""
-    if before is None or spread is None or swept is None:
-        return None
-    z, y, x = (after + share * (new - old) for old, after, new in zip(before, spread, swept, strict=True))
-    return z, y, x
-
-
-def _transport_share(medium: Medium, directions: int) -> Tensor:
-    """How much of a cell's change by a sweep counts, 1 / (1 + rho^2), the rest being diffusion's (docs/theory.md, section 5).
-
-    rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic whose source is linear over steps of depth d diffuses too much.
-    """
-    points, weights = sphere_quadrature(medium.extinction.scale.new_zeros((), dtype=torch.float64), directions)
-    steps = [Course.of(medium.grid, tuple(point)).step for point in points.tolist()]
-    half = (0.5 * float(weights @ weights.new_tensor(steps)) * medium.extinction.value).clamp(min=1e-3)
-    excess = half / torch.tanh(half) - 1
-    return 1 / (1 + excess**2)
