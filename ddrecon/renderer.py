@@ -15,7 +15,7 @@ from torch import Tensor
 from ddrecon.autodiff import is_varied
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
 from ddrecon.diffusion import conservative, printed
-from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.closures import CLOSURES, smooth
 from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.environment import environment_radiance
@@ -120,9 +120,10 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
 
     if settings.scheme == "printed":
         by_jacobi = Solve(printed.jacobi, settings.tolerance, memory)
+        diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
-        return printed.diffuse_light(medium, closure(medium.transport_extinction), scattered, outside, by_jacobi, has_flux(medium))
+        return printed.diffuse_light(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
     solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
     return conservative.diffuse_light(medium, closure, source, outside, solve, has_flux(medium))
 

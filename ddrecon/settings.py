@@ -39,12 +39,13 @@ class RenderSettings:
 class DiffusionSettings:
     """How multiply scattered light is found; `tolerance` is the relative residual of each linear solve.
 
-    The scheme `printed` is the paper's own, always solved by Jacobi iteration: `solver` is for `conservative`.
+    The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi iteration: `closure` and `solver` are
+    for `conservative`. `floor` is that of the smooth closure.
     """
 
     model: str = one_of("p1", ("none", "p1"))
     scheme: str = one_of("conservative", ("conservative", "printed"))
-    closure: str = one_of("smooth", CLOSURES)
+    closure: str = one_of("geometric", CLOSURES)
     floor: float = bounded(FLOOR, above=0, maximum=1e3)
     solver: str = one_of("conjugate_gradient", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
