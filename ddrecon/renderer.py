@@ -14,9 +14,10 @@ from torch import Tensor
 
 from ddrecon.autodiff import is_varied
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
-from ddrecon.diffusion import conservative, printed
+from ddrecon.diffusion import conservative, flux_limited, printed
 from ddrecon.diffusion.closures import CLOSURES, smooth
 from ddrecon.diffusion.implicit import Solve, SolveMemory
+from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.environment import environment_radiance
 from ddrecon.lights import AmbientLight, EnvironmentLight, Light
@@ -125,6 +126,8 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
         scattered = source.scaled(scattering, scattering)
         return printed.diffuse_light(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
     solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
+    if settings.model == "flux_limited":
+        return flux_limited.diffuse_light(medium, LIMITERS[settings.limiter], source, outside, solve, has_flux(medium))
     return conservative.diffuse_light(medium, closure, source, outside, solve, has_flux(medium))
 
 

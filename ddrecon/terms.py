@@ -36,6 +36,8 @@ def needed_terms(scene: Scene) -> list[str]:
 def _how(settings: DiffusionSettings) -> str:
     if settings.scheme == "printed":
         return "smooth closure, printed scheme by Jacobi iteration"
+    if settings.model == "flux_limited":
+        return f"{settings.limiter} limiter, damped Picard iteration with {settings.solver}"
     return f"{settings.closure} closure, {settings.solver}"
 
 

@@ -20,7 +20,7 @@ FLOOR = 3.3
 BACKGROUND = 0.01
 """Optical thickness, across a side of the box, of a haze that gives an empty box distances too; accuracy is flat from 0.001 to 0.1."""
 COARSE_CELLS = 32
-"""Cells, at most, along the longest side in which distances, which are smooth, are found; 16, 32 and 64 give the same images within 0.1 %."""
+"""Cells, at most, along the longest side in which distances, which are smooth, are found; 16, 32 and 64 render alike."""
 
 
 def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:

@@ -33,7 +33,7 @@ def diffuse_light(medium: Medium, closure: Closure, source: Moments, outside: Te
     mean = solve_diffusion(solve, Operator((z, y, x), loss), right)
     if not has_flux:
         return Moments(mean)
-    z, y, x = (recomputed(_flux, medium, closure, flux, outside, mean, axis) for axis, flux in flux_along.items())
+    z, y, x = (recomputed(axis_flux, medium, closure, flux, outside, mean, axis) for axis, flux in flux_along.items())
     return Moments(mean, (z, y, x))
 
 
@@ -54,7 +54,7 @@ def _divergence(medium: Medium, closure: Closure, source_flux: Tensor, axis: int
     return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
 
 
-def _flux(medium: Medium, closure: Closure, source_flux: Tensor | None, outside: Tensor, mean: Tensor, axis: int) -> Tensor:
+def axis_flux(medium: Medium, closure: Closure, source_flux: Tensor | None, outside: Tensor, mean: Tensor, axis: int) -> Tensor:
     """L1 along `axis`, averaged over each cell's two faces."""
     source = None if source_flux is None else medium.remaining_scattering * source_flux
     return 3 * cell_average(face_fluxes(mean, source, closure(medium.transport_extinction), medium.grid, axis, outside), axis)

@@ -78,4 +78,4 @@ def test_distances_on_a_fine_grid_are_interpolated():
     grid = Grid((48, 48, 48), (-0.5,) * 3, (0.5,) * 3)
     distance, kappa = sphere(grid, 0.3)
     outside = distance > 0.35
-    torch.testing.assert_close(1 / inverse_distance(kappa, grid)[outside], distance[outside], rtol=0.02, atol=0)
+    torch.testing.assert_close(1 / inverse_distance(kappa, grid)[outside], distance[outside], rtol=0.03, atol=0)
