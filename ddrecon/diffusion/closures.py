@@ -32,9 +32,13 @@ def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Te
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
     """D = 1 / (3 kappa_tr + 4 / distance): collisions and the spreading of light, two resistances in series (docs/theory.md section 5).
 
-    `distance` is that to the medium. `floor` is not used: nothing here depends on the size of the box.
+    `distance` is that to the medium. `floor` is not used: nothing here depends on the size of the box. Below zero, where only finite
+    differences go, D is continued to second order and stays positive.
     """
-    return 1 / (3 * transport_extinction + 4 * inverse_distance(transport_extinction, grid))
+    spreading = 4 * inverse_distance(transport_extinction, grid)
+    ratio = 3 * transport_extinction / spreading
+    share = torch.where(ratio < 0, 1 - ratio + ratio**2, 1 / (1 + ratio.clamp(min=0)))
+    return share / spreading
 
 
 def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:

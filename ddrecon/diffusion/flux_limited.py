@@ -31,7 +31,7 @@ MAX_ITERATIONS = 1000
 INNER_TOLERANCE = 0.05
 """How closely each iteration's linear system is solved; the fixed point does not depend on it."""
 VACUUM = 0.1
-"""Optical thickness, across the box's shortest side, added to the medium: it keeps D finite where light is even and space empty."""
+"""Optical thickness, across the shortest side, of the least medium there is: D stays finite where light is even and space empty."""
 DARKNESS = 1e-6
 """Light below this part of its mean is taken as even, so that steepness is finite where there is none."""
 
@@ -48,7 +48,8 @@ class Balance:
 
     def diffusion(self, u: Tensor, transport_extinction: Tensor) -> Tensor:
         """D [u] in the light `u`."""
-        return self.limiter(transport_extinction + VACUUM / min(self.grid.extent), steepness_square(u, self.grid))
+        least = VACUUM / min(self.grid.extent)
+        return self.limiter(torch.sqrt(transport_extinction**2 + least**2), steepness_square(u, self.grid))
 
     def system(self, u: Tensor, *coefficients: Tensor) -> tuple[Operator, Tensor]:
         """A and S with the D of the light `u`."""

@@ -79,3 +79,13 @@ def test_distances_on_a_fine_grid_are_interpolated():
     distance, kappa = sphere(grid, 0.3)
     outside = distance > 0.35
     torch.testing.assert_close(1 / inverse_distance(kappa, grid)[outside], distance[outside], rtol=0.03, atol=0)
+
+
+def test_finite_differences_may_step_below_zero(box, random):
+    """D stays positive there, and its slope at zero is the same from both sides."""
+    kappa: Tensor = random(1, 3, 4, 2) * (random(1, 3, 4, 2, seed=1) > 0.5)
+    below, above = (geometric(kappa + change, box((3, 4, 2))) for change in (-1e-5, 1e-5))
+    here = kappa.clone().requires_grad_()
+    _, slope = torch.autograd.functional.jvp(lambda k: geometric(k, box((3, 4, 2))), here, torch.ones_like(kappa))
+    torch.testing.assert_close((above - below) / 2e-5, slope, rtol=1e-7, atol=0)
+    assert bool((geometric(kappa - 0.4, box((3, 4, 2))) > 0).all())
