@@ -14,9 +14,10 @@ from torch import Tensor
 
 from ddrecon.autodiff import is_varied
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
-from ddrecon.diffusion import conservative, printed
-from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion import conservative, flux_limited, printed
+from ddrecon.diffusion.closures import CLOSURES, smooth
 from ddrecon.diffusion.implicit import Solve, SolveMemory
+from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.diffusion.transport import transported
 from ddrecon.environment import environment_radiance
@@ -121,10 +122,13 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
 
     if settings.scheme == "printed":
         by_jacobi = Solve(printed.jacobi, settings.tolerance, memory)
+        diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
-        return printed.diffuse_light(medium, closure(medium.transport_extinction), scattered, outside, by_jacobi, has_flux(medium))
+        return printed.diffuse_light(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
     solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
+    if settings.model == "flux_limited":
+        return flux_limited.diffuse_light(medium, LIMITERS[settings.limiter], source, outside, solve, has_flux(medium))
     problem = conservative.DiffusionProblem(medium, closure, source, outside, has_flux(medium))
     light = conservative.diffuse_light(problem, solve)
     return transported(problem, light, solve, settings.transport_rounds, settings.transport_directions)

@@ -5,11 +5,12 @@ Each field's metadata is what the scene loader checks: `minimum`, `above`, `maxi
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
+from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.quadrature import DEGREES
 
@@ -40,15 +41,25 @@ class RenderSettings:
 class DiffusionSettings:
     """How multiply scattered light is found; `tolerance` is the relative residual of each linear solve.
 
-    The scheme `printed` is the paper's own, always solved by Jacobi iteration: `solver` is for `conservative`.
+    The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi iteration: `closure` and `solver` are
+    for `conservative`. `floor` is that of the smooth closure. The model `flux_limited` has a `limiter` in place of a closure.
+    `transport_rounds` sweeps along `transport_directions` directions take P1 towards transport (docs/theory.md, section 5).
     """
 
-    model: str = one_of("p1", ("none", "p1"))
+    model: str = one_of("p1", ("none", "p1", "flux_limited"))
     scheme: str = one_of("conservative", ("conservative", "printed"))
-    closure: str = one_of("smooth", CLOSURES)
+    closure: str = one_of("geometric", CLOSURES)
     floor: float = bounded(FLOOR, above=0, maximum=1e3)
+    limiter: str = one_of("marshak", LIMITERS)
     solver: str = one_of("conjugate_gradient", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
     transport_rounds: int = bounded(0, minimum=0, maximum=16)
     transport_directions: int = one_of(50, DEGREES)
+
+    def problems(self) -> Iterator[tuple[str, str]]:
+        """Settings that exclude each other, as key and what is wrong with it."""
+        if self.model == "flux_limited" and self.scheme == "printed":
+            yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
+        if self.transport_rounds > 0 and (self.model, self.scheme) != ("p1", "conservative"):
+            yield "transport_rounds", "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these"

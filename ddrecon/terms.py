@@ -11,6 +11,7 @@ from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Lig
 from ddrecon.march import CHUNK_NODES
 from ddrecon.medium import scaled_medium
 from ddrecon.renderer import has_flux, multiply_scatters
+from ddrecon.settings import DiffusionSettings
 from ddrecon.sky import count_suns
 from ddrecon.variables import with_values
 from ddrecon.world import Scene, View
@@ -25,12 +26,22 @@ def needed_terms(scene: Scene) -> list[str]:
     if multiply_scatters(medium, scene.diffusion) and bool(medium.g > 0):
         terms.append("delta-Eddington scaling of the forward peak (g > 0)")
     if multiply_scatters(medium, scene.diffusion):
-        how = scene.diffusion.solver if scene.diffusion.scheme == "conservative" else f"{scene.diffusion.scheme} scheme by Jacobi iteration"
-        terms.append(f"multiple scattering by {scene.diffusion.model} diffusion, {scene.diffusion.closure} closure, {how}")
+        terms.append(f"multiple scattering by {scene.diffusion.model} diffusion, {_how(scene.diffusion)}")
+        if scene.diffusion.transport_rounds:
+            rounds = _counted(scene.diffusion.transport_rounds, "transport round")
+            terms.append(f"{rounds} of sweeps along {scene.diffusion.transport_directions} directions, each with a diffusion solve")
         terms.append("fluxes Q1 and L1 (g is not 0)" if has_flux(medium) else "no fluxes Q1 and L1 (g = 0)")
     else:
         terms.append("no multiple scattering: no diffusion solve")
     return terms
+
+
+def _how(settings: DiffusionSettings) -> str:
+    if settings.scheme == "printed":
+        return "smooth closure, printed scheme by Jacobi iteration"
+    if settings.model == "flux_limited":
+        return f"{settings.limiter} limiter, damped Picard iteration with {settings.solver}"
+    return f"{settings.closure} closure, {settings.solver}"
 
 
 def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:

@@ -50,7 +50,7 @@ class DiffusionProblem:
         if not self.has_flux:
             return None
         along = self._source_flux().items()
-        z, y, x = (recomputed(_flux, self.medium, self.closure, flux, self.outside, mean, axis) for axis, flux in along)
+        z, y, x = (recomputed(axis_flux, self.medium, self.closure, flux, self.outside, mean, axis) for axis, flux in along)
         return z, y, x
 
     def _source_flux(self) -> dict[int, Tensor | None]:
@@ -80,7 +80,7 @@ def _divergence(medium: Medium, closure: Closure, source_flux: Tensor, axis: int
     return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
 
 
-def _flux(medium: Medium, closure: Closure, source_flux: Tensor | None, outside: Tensor, mean: Tensor, axis: int) -> Tensor:
+def axis_flux(medium: Medium, closure: Closure, source_flux: Tensor | None, outside: Tensor, mean: Tensor, axis: int) -> Tensor:
     """L1 along `axis`, averaged over each cell's two faces."""
     source = None if source_flux is None else medium.remaining_scattering * source_flux
     return 3 * cell_average(face_fluxes(mean, source, closure(medium.transport_extinction), medium.grid, axis, outside), axis)

@@ -73,6 +73,9 @@ def read_whole(node: Node, rule: Rule) -> int:
     if isinstance(node.value, bool) or not isinstance(node.value, int):
         raise node.refused(f"expected a whole number, found {found(node)}")
     _check_limits(node, node.value, rule.limits)
+    choices = rule.limits.get("choices", (node.value,))
+    if node.value not in choices:
+        raise node.refused(f"expected one of {', '.join(map(str, choices))}, found {node.value}")
     return node.value
 
 

@@ -32,6 +32,11 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
         ("volume.g=0", "no fluxes Q1 and L1 (g = 0)", "delta-Eddington"),
         ("diffusion.scheme=printed", "printed scheme by Jacobi", "conjugate_gradient"),
         ("diffusion.scheme=conservative", "conjugate_gradient", "printed"),
+        (
+            "diffusion.model=flux_limited",
+            "flux_limited diffusion, marshak limiter, damped Picard iteration with conjugate_gradient",
+            "closure",
+        ),
         ("diffusion.model=none", "no multiple scattering", "p1 diffusion"),
         ("volume.sigma_s=0", "no multiple scattering", "p1 diffusion"),
         ("lights=[{type: ambient, radiance: 1}]", "ambient light", "directional"),

@@ -170,7 +170,11 @@ ONE_FAULT = [
     ("render.samples_per_pixel=true", "render.samples_per_pixel: expected a whole number, found true"),
     ("render.background=yes", "render.background: expected true or false, found 'yes'"),
     ("render.background=1", "render.background: expected true or false, found 1"),
-    ("diffusion.model=p2", "diffusion.model: expected one of none, p1, found 'p2'"),
+    ("diffusion.model=p2", "diffusion.model: expected one of none, p1, flux_limited, found 'p2'"),
+    (
+        "diffusion={model: flux_limited, scheme: printed}",
+        "diffusion.scheme: 'printed' is for diffusion.model p1; flux_limited needs 'conservative'",
+    ),
     ("diffusion.tolerance=0.6", "diffusion.tolerance: must be at most 0.5"),
     ("difusion.model=p1", "difusion: unknown key; did you mean 'diffusion'?"),
     ("optimize.iterations=10", "optimize: missing key 'parameters'"),
