@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.autodiff import keep
+
 SERIES_BELOW = 1e-2
 """Depths below this take psi and its slope from their series, since 1 - phi cancels there."""
 
@@ -62,8 +64,7 @@ class _DecayMean(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(inputs[0], output)
-        ctx.save_for_forward(inputs[0], output)
+        keep(ctx, inputs[0], output)
 
     @staticmethod
     def backward(ctx: Any, phi_bar: Tensor) -> Tensor:
@@ -89,8 +90,7 @@ class _DecayedSum(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*inputs, *output[1:])
-        ctx.save_for_forward(*inputs, *output[1:])
+        keep(ctx, *inputs, *output[1:])
 
     @staticmethod
     def backward(ctx: Any, out_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
@@ -142,8 +142,7 @@ class _DecayedLine(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*inputs, *output[1:])
-        ctx.save_for_forward(*inputs, *output[1:])
+        keep(ctx, *inputs, *output[1:])
 
     @staticmethod
     def backward(ctx: Any, line_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:

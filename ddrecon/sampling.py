@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from ddrecon.autodiff import keep
+
 _BACKWARD = {4: torch.ops.aten.grid_sampler_2d_backward, 5: torch.ops.aten.grid_sampler_3d_backward}
 _BORDER = 1
 """How those two call the padding that repeats the outermost cells."""
@@ -50,8 +52,7 @@ class _Sample(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
         values, points = inputs
-        ctx.save_for_backward(values, points)
-        ctx.save_for_forward(values, points)
+        keep(ctx, values, points)
 
     @staticmethod
     def backward(ctx: Any, output_bar: Tensor) -> tuple[Tensor | None, Tensor | None]:

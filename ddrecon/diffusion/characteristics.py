@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.autodiff import keep
 from ddrecon.decay import decayed_line
 from ddrecon.grid import Grid
 from ddrecon.medium import Coefficient, Medium
@@ -21,6 +22,8 @@ from ddrecon.moments import Moments
 
 SLICES, ROWS, COLUMNS = 0, 2, 3
 """Dimensions of arrays laid out for a course: [slices, C, rows, columns]."""
+Direction = tuple[float, float, float]
+"""A unit vector in array order, the way light travels."""
 NEARLY = 1e-9
 """Drifts this near to none or to a whole cell are taken as that: no interpolation is needed then."""
 
@@ -35,7 +38,7 @@ class Course:
     step: float
 
     @staticmethod
-    def of(grid: Grid, direction: tuple[float, float, float]) -> Course:
+    def of(grid: Grid, direction: Direction) -> Course:
         """The course of unit `direction` (array order) through `grid`."""
         speed = [component / spacing for component, spacing in zip(direction, grid.spacing, strict=True)]
         axis = max(range(3), key=lambda a: abs(speed[a]))
@@ -59,7 +62,7 @@ class Course:
         return _moved(_moved(values, ROWS, self.drift[0], is_repeated), SLICES, self.forward, is_repeated)
 
 
-def radiance_along(medium: Medium, light: Moments, inflow: Tensor | None, direction: tuple[float, float, float]) -> Tensor:
+def radiance_along(medium: Medium, light: Moments, inflow: Tensor | None, direction: Direction) -> Tensor:
     """I [C, z, y, x] at cell centers along unit `direction` of travel (array order), of what `light` scatters into it (E11).
 
     `light`: the moments q and q1 of all light that scatters, to which `medium` gives (1 - f) kappa_s; `inflow` [C, 1, 1, 1]: the radiance
@@ -117,8 +120,7 @@ class _Follow(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         passed, _, ctx.course = inputs
-        ctx.save_for_backward(passed, output)
-        ctx.save_for_forward(passed, output)
+        keep(ctx, passed, output)
 
     @staticmethod
     def backward(ctx: Any, out_bar: Tensor) -> tuple[Tensor, Tensor, None]:

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.autodiff import keep
 from ddrecon.diffusion.conservative import axis_flux
 from ddrecon.diffusion.implicit import Solve, SolveRecord
 from ddrecon.diffusion.limiters import Limiter
@@ -111,8 +112,7 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.solve, ctx.balance, *coefficients = inputs
-        ctx.save_for_backward(output, *coefficients)
-        ctx.save_for_forward(output, *coefficients)
+        keep(ctx, output, *coefficients)
 
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:

@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
+from ddrecon.autodiff import keep
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.solvers.scaled import Solution
 
@@ -78,8 +79,7 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.solve, _, *coefficients = inputs
-        ctx.save_for_backward(output, *coefficients)
-        ctx.save_for_forward(output, *coefficients)
+        keep(ctx, output, *coefficients)
 
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:

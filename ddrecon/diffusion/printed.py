@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.autodiff import keep
 from ddrecon.diffusion.implicit import Solve
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.diffusion.stencils import Stencils, convolve, convolve_transposed, divergence, extend, fold, outward
@@ -135,8 +136,7 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.solve, ctx.stencils, _, *parts = inputs
-        ctx.save_for_backward(output, *parts)
-        ctx.save_for_forward(output, *parts)
+        keep(ctx, output, *parts)
 
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:

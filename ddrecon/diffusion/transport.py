@@ -2,7 +2,6 @@
 
 A sweep sends what L0, L1 and the sources scatter along each direction of a quadrature, through the real geometry, and takes the moments
 of what arrives. What it changes is passed on by diffusion (synthetic acceleration: Alcouffe 1977, doi:10.13182/NSE77-1): few rounds do.
-Directions are gone through one at a time and made again in the backward pass: memory does not grow with their number.
 """
 
 from __future__ import annotations
@@ -13,10 +12,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.autodiff import is_varied, recomputed
-from ddrecon.diffusion.characteristics import Course, radiance_along
+from ddrecon.diffusion.characteristics import Course
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import Solve, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
+from ddrecon.diffusion.sweep import sweep
 from ddrecon.medium import Medium
 from ddrecon.moments import Moments
 from ddrecon.quadrature import sphere_quadrature
@@ -41,18 +41,12 @@ def transported(problem: DiffusionProblem, light: Moments, solve: Solve[Operator
     return light
 
 
-def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int) -> Moments:
-    """Mean and, where `light` has flux, flux of the radiance that `light` scatters and of `inflow` (see `radiance_along`)."""
-    total = torch.zeros_like(light.mean)
-    flux = None if light.flux is None else (total, total, total)
-    points, weights = sphere_quadrature(total.new_zeros((), dtype=torch.float64), directions)
-    for point, weight in zip(points.tolist(), weights.tolist(), strict=True):
-        radiance = recomputed(radiance_along, medium, light, inflow, tuple(point))
-        total = torch.add(total, radiance, alpha=weight)
-        if flux is not None:
-            z, y, x = (torch.add(along, radiance, alpha=3 * weight * cosine) for along, cosine in zip(flux, point, strict=True))
-            flux = z, y, x
-    return Moments(total, flux)
+def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
+    """S - A L0."""
+    imbalance = right - operator.loss * mean
+    for axis, conductance in zip(AXES, operator.conductances, strict=True):
+        imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)
+    return imbalance
 
 
 def _transport_share(medium: Medium, directions: int) -> Tensor:
@@ -67,11 +61,3 @@ def _transport_share(medium: Medium, directions: int) -> Tensor:
     mean_step = float(weights @ steps / weights[steps > 0].sum().clamp(min=1e-9))
     half = (0.5 * mean_step * medium.extinction.value).clamp(min=1e-3)
     return 1 / (1 + (half / torch.tanh(half) - 1) ** 2)
-
-
-def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
-    """S - A L0."""
-    imbalance = right - operator.loss * mean
-    for axis, conductance in zip(AXES, operator.conductances, strict=True):
-        imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)
-    return imbalance

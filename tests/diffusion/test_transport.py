@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from weakref import WeakSet
 
 import pytest
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.transport import sweep
+from ddrecon.diffusion.sweep import sweep
 from ddrecon.medium import scaled_medium
 from ddrecon.moments import Moments
 from ddrecon.quadrature import DEGREES
@@ -41,7 +43,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
     source = reduced_light(medium, scene.lights, False).source
     last = light_after(scene, 12)
     swept = sweep(medium, Moments(last).plus(source), None, 26).mean
-    torch.testing.assert_close(swept, last, rtol=0, atol=1e-5 * float(last.max()))
+    torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
     left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
 
@@ -100,15 +102,34 @@ def test_directions_agree_the_better_the_more_there_are(make_scene):
     assert float((some - many).norm()) < 0.6 * float((few - many).norm()) < 0.02 * float(many.norm())
 
 
-def test_kept_memory_does_not_grow_with_directions(make_scene):
-    def kept(directions: int) -> int:
-        scene = make_scene(ball(10).requires_grad_(), directional=(3.0,), transport_rounds=2, transport_directions=directions)
-        sizes: dict[int, int] = {}
-        with torch.autograd.graph.saved_tensors_hooks(lambda t: sizes.setdefault(t.data_ptr(), t.numel()) and t, lambda t: t):
-            solve_light(scene, SolveMemory())
-        return sum(sizes.values())
+def test_memory_does_not_grow_with_directions(make_scene):
+    """What is alive at once, of arrays of cells, while a sweep and its backward pass are made."""
 
-    assert kept(86) < 1.1 * kept(26)
+    def peak(directions: int) -> int:
+        scene = make_scene(ball(10).requires_grad_(), directional=(3.0,))
+        medium, light = scaled_medium(scene.volume), Moments(torch.ones(3, 10, 10, 10, dtype=torch.float64))
+        with ArrayCount(1000) as count:
+            sweep(medium, light, None, directions).mean.sum().backward()
+        return count.most
+
+    assert peak(86) == peak(26)
+
+
+class ArrayCount(TorchDispatchMode):
+    """The most arrays of at least `size` entries, made by operations, that have been alive at once."""
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.size, self.most = size, 0
+        self.alive: WeakSet[object] = WeakSet()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for made in out if isinstance(out, tuple | list) else (out,):
+            if isinstance(made, Tensor) and made.numel() >= self.size:
+                self.alive.add(made.untyped_storage())
+        self.most = max(self.most, len(self.alive))
+        return out
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4])
