@@ -29,7 +29,7 @@ from ddrecon.grid import Grid
 from ddrecon.lights import AmbientLight, DirectionalLight, Light, PointLight
 from ddrecon.medium import Volume
 from ddrecon.phase import henyey_greenstein
-from ddrecon.renderer import Components, render, solve_light, view_components, view_image
+from ddrecon.renderer import render, solve_light, view_components, view_image
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.world import Scene, View
 
@@ -88,6 +88,13 @@ def sun(travel: Vector) -> Light:
     return DirectionalLight(torch.tensor(travel), torch.tensor([math.pi]))
 
 
+def from_far(degrees: float) -> Vector:
+    """The way light travels that `FAR` sees so many degrees beside the middle of the box."""
+    x, y, z = (part / math.hypot(*FAR) for part in FAR)
+    ahead, aside = math.cos(math.radians(degrees)), math.sin(math.radians(degrees)) * math.sqrt(0.5)
+    return ahead * x + aside, ahead * y, ahead * z - aside
+
+
 def ambient(radiance: float) -> Light:
     return AmbientLight(torch.tensor([radiance]))
 
@@ -124,6 +131,7 @@ ANISOTROPIES = (-0.8, -0.4, 0.0, 0.4, 0.8, 0.9)
 CASES = (
     *(Case(f"lit from the side, g {g}", CLOUD, 25.0, g=g) for g in ANISOTROPIES),
     *(Case(f"seen against the light, g {g}", CLOUD, 25.0, g=g, lights=[sun((-2.0, -0.4, -2.2))], eye=FAR) for g in ANISOTROPIES),
+    *(Case(f"{angle} degrees from the light, g 0.8", CLOUD, 25.0, g=0.8, lights=[sun(from_far(angle))], eye=FAR) for angle in (45, 70)),
     *(Case(f"lit from the eye, g {g}", CLOUD, 25.0, g=g, lights=[sun((2.0, -1.2, 2.2))], eye=FAR) for g in (-0.8, -0.4, 0.0, 0.4)),
     *(Case(f"ball, depth {depth}", BALL, depth / DEPTH_OF_BALL, 0.99) for depth in (5, 20, 60)),
     *(Case(f"ball, depth 20, albedo {albedo}", BALL, 20 / DEPTH_OF_BALL, albedo) for albedo in (0.5, 1.0)),
@@ -146,14 +154,19 @@ def gray(image: Tensor) -> np.ndarray:
     return image.mean(0).double().numpy()
 
 
-def images(scene: Scene) -> tuple[Components, float]:
-    """The parts of the image of `scene`, and the seconds that the image alone takes."""
+def image(scene: Scene) -> tuple[np.ndarray, float]:
+    """The image of `scene` and the seconds it takes."""
     with torch.no_grad():
         start = time.perf_counter()
-        light, camera = solve_light(scene, SolveMemory()), scene.views[0].camera
-        view_image(light, scene, camera)
-        seconds = time.perf_counter() - start
-        return view_components(light, scene, camera), seconds
+        found = view_image(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
+        return gray(found), time.perf_counter() - start
+
+
+def scattered_once(scene: Scene) -> np.ndarray:
+    """The image of `scene` by light that is seen unscattered or scattered once."""
+    with torch.no_grad():
+        parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
+    return gray(parts.single + parts.reduced)
 
 
 def row(cells: Iterable[object]) -> None:
@@ -169,31 +182,33 @@ def measure_cases(references: Path, only: str, pictures: Path | None, directions
             continue
         whole = traced(case.scene(), references, noise=case.noise)
         once = traced(case.scene(), references, depth=2, noise=0.02)
-        found = {n: images(case.scene(transport_rounds=n, transport_directions=directions)) for n in ROUNDS}
-        parts, first = found[0]
-        errors = [whole.error(_whole(components)) for components, _ in found.values()]
-        ratios = [f"{seconds / first:.1f}" for _, seconds in list(found.values())[1:]]
-        row([case.name, whole.noise, once.error(gray(parts.single + parts.reduced)), *errors, *ratios])
+        found = {n: image(case.scene(transport_rounds=n, transport_directions=directions)) for n in ROUNDS}
+        single = once.error(scattered_once(case.scene()))
+        errors = [_visible(whole.error(picture), whole.noise) for picture, _ in found.values()]
+        ratios = [f"{found[n][1] / found[0][1]:.1f}" for n in ROUNDS[1:]]
+        row([case.name, whole.noise, _visible(single, once.noise), *errors, *ratios])
         if pictures is not None:
-            draw(pictures / f"{'_'.join(case.name.replace(',', '').split())}.png", whole, [_whole(found[n][0]) for n in (0, 2)])
+            draw(pictures / f"{'_'.join(case.name.replace(',', '').split())}.png", whole, [found[n][0] for n in (0, 2)])
 
 
-def _whole(components: Components) -> np.ndarray:
-    return gray(components.reduced + components.single + components.multiple)
+def _visible(error: float, noise: float) -> str:
+    """`error`, or that it is below what can be told from such noise."""
+    return f"{error:.3f}" if error > noise / 3 else f"< {noise / 3:.3f}"
 
 
 def measure_convergence(references: Path) -> None:
     """Prints errors by cells, directions and rounds, against the path-traced image of the finest grid."""
     rounds = (0, 1, 2, 4, 8)
-    row(["case", "cells", "directions", *(f"n = {n}" for n in rounds)])
-    row(["---"] * (3 + len(rounds)))
+    row(["case", "noise", "cells", "directions", *(f"n = {n}" for n in rounds)])
+    row(["---"] * (4 + len(rounds)))
     for case in CONVERGING:
-        whole = traced(case.scene(96), references, noise=case.noise, passes=128)
-        for cells in (24, 48, 96):
-            diffusion = whole.error(_whole(images(case.scene(cells))[0]))
-            for directions in (26, 50, 86):
+        whole = traced(case.scene(96), references, noise=case.noise, passes=96)
+        for cells, counts in {24: (26, 50, 86), 48: (26, 50, 86), 96: (50,)}.items():
+            diffusion = image(case.scene(cells))[0]
+            for directions in counts:
                 scenes = (case.scene(cells, transport_rounds=n, transport_directions=directions) for n in rounds[1:])
-                row([case.name, cells, directions, diffusion, *(whole.error(_whole(images(scene)[0])) for scene in scenes)])
+                found = [diffusion, *(image(scene)[0] for scene in scenes)]
+                row([case.name, whole.noise, cells, directions, *(_visible(whole.error(item), whole.noise) for item in found)])
 
 
 WIDTH, PEAK, SIGMA_A, SIGMA_S, TILT = 0.1, 12.0, 0.5, 2.0, -0.3
@@ -260,24 +275,27 @@ def mass_before(point: Tensor, direction: Tensor) -> Tensor:
 
 
 def draw(path: Path, target: Traced, renders: list[np.ndarray]) -> None:
-    """Writes target, render and signed difference, a row for n = 0 and one for n = 2."""
+    """Writes target, render and signed difference, a row for n = 0 and one for n = 2, where there is anything to see."""
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    top = float(np.quantile(target.image, 0.995))
-    figure, axes = plt.subplots(len(renders), 3, figsize=(7.2, 4.9), layout="constrained")
-    for line, image, rounds in zip(axes, renders, (0, 2), strict=True):
-        for axis, picture in zip(line, (target.image, image), strict=False):
-            shown = axis.imshow(picture, cmap="gray", vmin=0, vmax=top)
-        change = line[2].imshow(image - target.image, cmap="RdBu_r", vmin=-0.25 * top, vmax=0.25 * top)
-        line[0].set_title("path traced", fontsize=9)
-        line[1].set_title(f"ddrecon, n = {rounds}", fontsize=9)
-        line[2].set_title(f"difference, error {target.error(image):.3f}", fontsize=9)
-        figure.colorbar(shown, ax=line[1], shrink=0.85)
-        figure.colorbar(change, ax=line[2], shrink=0.85)
+    top = float(target.image.max())
+    seen = [np.flatnonzero(target.image.max(axis) > 0.01 * top) for axis in (1, 0)]
+    crop = tuple(slice(max(0, lines[0] - 1), lines[-1] + 2) for lines in seen)
+    most = max(float(np.abs(render - target.image).max()) for render in renders)
+    figure, axes = plt.subplots(2, 3, figsize=(7.6, 4.9), layout="constrained")
+    for line, picture, rounds in zip(axes, renders, (0, 2), strict=True):
+        error = f"difference, relative RMS {target.error(picture):.3f}"
+        for axis, shown, title in zip(line, (target.image, picture), ("path traced", f"ddrecon, n = {rounds}"), strict=False):
+            radiance = axis.imshow(shown[crop], cmap="gray", vmin=0, vmax=top)
+            axis.set_title(title, fontsize=9)
+        change = line[2].imshow((picture - target.image)[crop], cmap="RdBu_r", vmin=-most, vmax=most)
+        line[2].set_title(error, fontsize=9)
     for axis in axes.flat:
         axis.set_xticks([])
         axis.set_yticks([])
+    figure.colorbar(radiance, ax=axes[:, 1], shrink=0.6, label="radiance")
+    figure.colorbar(change, ax=axes[:, 2], shrink=0.6)
     figure.savefig(path, dpi=90)
     plt.close(figure)
 

@@ -20,8 +20,12 @@ from ddrecon.lights import AmbientLight, DirectionalLight, Light
 from ddrecon.medium import Volume
 from ddrecon.world import Scene
 
-SAMPLES, LEAST = 128, 4
-"""Paths a pixel in each pass, and the fewest passes."""
+SAMPLES, LEAST, LONGEST = 128, 4, 1024
+"""Paths a pixel in each pass, the fewest passes, and the segments of the longest path.
+
+There is no Russian roulette: Mitsuba ends a twentieth of all paths at each scattering, whatever they carry, and what is left over of the
+long paths in dense media weighs so much that noise was ten times higher.
+"""
 
 
 @dataclass(frozen=True)
@@ -82,7 +86,7 @@ def _written(value: object) -> object:
 def mitsuba_scene(scene: Scene, depth: int) -> dict[str, Any]:
     """What Mitsuba's `load_dict` makes of `scene` and its first view."""
     lights = {f"light_{index}": _light(light) for index, light in enumerate(scene.lights)}
-    integrator = {"type": "volpath", "max_depth": depth, "rr_depth": 16}
+    integrator = {"type": "volpath", "max_depth": depth if depth > 0 else LONGEST, "rr_depth": 2 * LONGEST}
     return {"type": "scene", "integrator": integrator, "sensor": _sensor(scene.views[0].camera), "box": _box(scene.volume), **lights}
 
 

@@ -214,7 +214,7 @@ def test_more_steps_and_samples_keep_a_homogeneous_transmittance(make_scene, box
 
 
 def test_the_transmittance_of_a_blob_converges_at_second_order(make_scene, make_camera, order):
-    """Of a Gaussian ball that absorbs, seen against light of 1: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) at distance b of its middle."""
+    """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at distance b from its middle."""
     camera, counts, errors = make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1), [12, 24, 48], []
     bundle = rays(camera)
     closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
