@@ -211,3 +211,19 @@ def test_more_steps_and_samples_keep_a_homogeneous_transmittance(make_scene, box
     for color, sigma in enumerate(scene.volume.sigma_a):
         expected = sum(torch.exp(-sigma * chords(box((3, 5, 4)), bundle)) for bundle in bundles) / 4
         torch.testing.assert_close(image[color].flatten(), expected, rtol=1e-12, atol=0)
+
+
+def test_the_transmittance_of_a_blob_converges_at_second_order(make_scene, make_camera, order):
+    """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at distance b from its middle."""
+    camera, counts, errors = make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1), [12, 24, 48], []
+    bundle = rays(camera)
+    closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
+    depth = SIGMA_A * DENSITY * WIDTH * math.sqrt(2 * math.pi) * torch.exp(-(closest**2) / (2 * WIDTH**2))
+    expected = torch.exp(-depth).view(camera.size)
+    for n in counts:
+        grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
+        density = DENSITY * torch.exp(-sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2))
+        absorbing = {"sigma_a": (SIGMA_A,), "sigma_s": (0.0,), "directional": None, "ambient": (1.0,)}
+        scene = make_scene(density, grid=grid, camera=camera, **absorbing)
+        errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
+    assert errors[-1] < 2e-3 and order([1 / n for n in counts], errors) >= 1.8, errors
