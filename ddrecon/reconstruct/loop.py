@@ -6,6 +6,7 @@ whoever drives it may log, preview, stop or save between any two.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError, SolveError
-from ddrecon.reconstruct.gradients import differentiate
+from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
 from ddrecon.reconstruct.losses import image_loss, psnr
 from ddrecon.reconstruct.parameters import Parameter
@@ -109,7 +110,7 @@ class Reconstruction:
             self._enter_stage(stage)
         self.memory.records.clear()
         seen = self._seen()
-        found = differentiate(self.train_level, [view.name for view in seen], self._values(), self._loss_of(seen), self.memory)
+        found = self._differentiated(seen)
         loss, gradients = self._penalized(found.loss, found.gradients)
         self._require_finite(loss, gradients)
         solves = {kind: sum(r.iterations for r in self.memory.records if r.kind == kind) for kind in ("forward", "adjoint")}
@@ -202,14 +203,22 @@ class Reconstruction:
             level = with_values(self.test_level, self._values())
             return _mean_psnr(render_each(level, level.views, self.memory), level.views)
 
+    def _differentiated(self, seen: list[View]) -> Differentiated:
+        try:
+            return differentiate(self.train_level, [view.name for view in seen], self._values(), self._loss_of(seen), self.memory)
+        except SolveError as error:
+            if math.isfinite(error.residual):
+                raise
+            raise self._diverged("the light", error.residual) from error
+
     def _require_finite(self, loss: Tensor, gradients: dict[str, Tensor]) -> None:
         for name, gradient in gradients.items():
             if not bool(torch.isfinite(gradient).all()):
-                raise self._diverged(f"the derivative of the loss with respect to {name}", loss)
+                raise self._diverged(f"the derivative of the loss with respect to {name}", float(loss.detach()))
 
-    def _diverged(self, what: str, loss: Tensor) -> SolveError:
+    def _diverged(self, what: str, loss: float) -> SolveError:
         rates = " and ".join(f"optimize.parameters.{parameter.name}.lr" for parameter in self.parameters)
-        return SolveError(f"{what} is not finite", self.iteration, float(loss.detach()), f"lower {rates}")
+        return SolveError(f"{what} is not finite", self.iteration, loss, f"lower {rates}")
 
 
 def _parameter(scene: Scene, name: str, settings: ParameterSettings) -> Parameter:

@@ -83,7 +83,7 @@ def test_a_second_solve_starts_from_the_first(is_warm: bool, inputs):
     Solve(solve.solver, 1e-9, memory)("forward", operator, arguments[0])
     assert memory.records[0].iterations > 0
     assert (memory.records[1].iterations == 0) == is_warm
-    assert (memory.last.get("forward") is not None) == is_warm
+    assert (memory.last.get(("forward", 0)) is not None) == is_warm
     assert first.shape == arguments[0].shape
 
 

@@ -55,6 +55,7 @@ def half_space(make_scene: Callable[..., Scene], albedo: float, sun: float, cell
         sigma_s=(albedo,),
         directional=(IRRADIANCE,),
         travel=(math.sqrt(1 - sun**2), 0.0, sun),
+        closure="smooth",
         floor=1e-6,
         transport_rounds=rounds,
     )

