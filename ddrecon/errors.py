@@ -42,5 +42,9 @@ class SolveError(DdreconError):
         super().__init__(f"{what} after {iterations} iterations (residual {residual:.2e}); {advice}")
 
 
+class DivergenceError(SolveError):
+    """An optimization whose numbers are no longer finite."""
+
+
 class DataWarning(UserWarning):
     """Data that was used, but not as it stands."""

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import SceneError, SolveError
+from ddrecon.errors import DivergenceError, SceneError, SolveError
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
 from ddrecon.reconstruct.losses import image_loss, psnr
@@ -181,7 +181,7 @@ class Reconstruction:
             ((_, target, mask),) = _compared([image], [view])
             loss = view.weight / total * image_loss(self.settings.loss, image, target, mask)
             if not bool(torch.isfinite(loss)):
-                raise self._diverged(f"the loss of view {view.name}", loss)
+                raise self._diverged(f"the loss of view {view.name}", float(loss.detach()))
             return loss
 
         return loss_of
@@ -207,7 +207,7 @@ class Reconstruction:
         try:
             return differentiate(self.train_level, [view.name for view in seen], self._values(), self._loss_of(seen), self.memory)
         except SolveError as error:
-            if math.isfinite(error.residual):
+            if isinstance(error, DivergenceError) or math.isfinite(error.residual):
                 raise
             raise self._diverged("the light", error.residual) from error
 
@@ -216,9 +216,9 @@ class Reconstruction:
             if not bool(torch.isfinite(gradient).all()):
                 raise self._diverged(f"the derivative of the loss with respect to {name}", float(loss.detach()))
 
-    def _diverged(self, what: str, loss: float) -> SolveError:
+    def _diverged(self, what: str, loss: float) -> DivergenceError:
         rates = " and ".join(f"optimize.parameters.{parameter.name}.lr" for parameter in self.parameters)
-        return SolveError(f"{what} is not finite", self.iteration, loss, f"lower {rates}")
+        return DivergenceError(f"{what} is not finite", self.iteration, loss, f"lower {rates}")
 
 
 def _parameter(scene: Scene, name: str, settings: ParameterSettings) -> Parameter:
