@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -37,7 +38,8 @@ class Emission:
     """What a volume sends towards one camera: its `extinction`, `scattering`, light `beams`, and `diffuse` [C, z, y, x].
 
     `diffuse` is the radiance that scatters into the camera's rays from all other light, so that emission per unit length is
-    kappa_s (diffuse + sum over beams of p E tau / (4 pi)); `g` is the mean cosine of p. Point lights have E = I / r^2.
+    kappa_s (diffuse + sum over beams of p E tau / (4 pi)); `g` is the mean cosine of p. Point lights have E = I / r^2. `peak` is the
+    medium's: what its forward peak does to p.
     """
 
     grid: Grid
@@ -46,6 +48,7 @@ class Emission:
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Tensor
     g: Tensor
+    peak: Tensor | None
 
     @property
     def colors(self) -> int:
@@ -155,21 +158,30 @@ def _fields(emission: Emission) -> list[Tensor]:
     fields = [emission.extinction.field, emission.diffuse, *(beam.mass for beam in emission.beams)]
     if emission.scattering.field is not emission.extinction.field:
         fields.append(emission.scattering.field)
+    if _is_field(emission.peak):
+        fields.append(emission.peak)
     return fields
+
+
+def _is_field(peak: Tensor | None) -> TypeGuard[Tensor]:
+    """Whether the medium's `peak` differs from cell to cell."""
+    return peak is not None and peak.shape[1:].numel() > 1
 
 
 def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> tuple[Tensor, Tensor]:
     """Scattered radiance and transmittance, each [C, R], from `values` [N, channels, R] at the `nodes`."""
     sizes = [field.shape[0] for field in _fields(emission)]
     extinction, diffuse, *others = values.split(sizes, 1)
+    peak = others.pop() if _is_field(emission.peak) else emission.peak.view(-1, 1) if emission.peak is not None else None
     masses, scattering = others[: len(emission.beams)], (others[len(emission.beams) :] or [extinction])[0]
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     mass = nodes.integral(extinction)
     end = mass.cumsum(0)
     begin = end - mass
     scattered = decayed_sum(nodes.integral(scattering * diffuse), begin, end, scale)
+    passed = torch.cat([torch.zeros_like(end[:1]), end])
     for beam, beam_mass in zip(emission.beams, masses, strict=True):
-        weight, phase = beam.scattered(scattering, nodes, emission.g)
+        weight, phase = beam.scattered(scattering, nodes, emission.g, None if peak is None else peak * (passed + beam_mass))
         arriving = decayed_sum(weight, begin + beam_mass[:-1], end + beam_mass[1:], scale)
         scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
     return scattered * emission.scattering.scale.view(-1, 1), torch.exp(-scale * end[-1])

@@ -65,7 +65,8 @@ class Medium:
     """Coefficients of one medium, seen with the part `forward_fraction` f of its scattering taken as not scattered.
 
     `scattering` is kappa_s itself, which beams scatter by with the exact phase function of mean cosine `g`; `extinction` is
-    kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that remains.
+    kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that remains. `peak` times the integral of the extinction's
+    field is the depth f kappa_s of the forward peak: `[C, 1, 1, 1]`, `[C, z, y, x]` where cross sections vary, None without a peak.
     """
 
     grid: Grid
@@ -75,6 +76,7 @@ class Medium:
     g: Tensor
     mean_cosine: Tensor
     forward_fraction: Tensor
+    peak: Tensor | None
 
     @property
     def remaining_scattering(self) -> Tensor:
@@ -106,15 +108,25 @@ def _medium(volume: Volume, fraction: Tensor, mean_cosine: Tensor) -> Medium:
             return Coefficient(sigma, density)
         return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * density)
 
+    extinction = sigma_a + (1 - fraction) * sigma_s
     return Medium(
         volume.grid,
-        extinction=coefficient(sigma_a + (1 - fraction) * sigma_s),
+        extinction=coefficient(extinction),
         scattering=coefficient(sigma_s),
         absorption=coefficient(sigma_a),
         g=volume.g,
         mean_cosine=mean_cosine,
         forward_fraction=fraction,
+        peak=_peak(extinction, fraction * sigma_s) if bool(fraction > 0) else None,
     )
+
+
+def _peak(extinction: Tensor, forward: Tensor) -> Tensor:
+    """`forward` scattering per unit of what is summed as mass: density, or `extinction` where that varies (0 where there is none)."""
+    extinction, forward = torch.broadcast_tensors(extinction, forward)
+    if extinction.shape[1:].numel() == 1:
+        return forward
+    return torch.where(extinction > 0, forward / torch.where(extinction > 0, extinction, 1), 0)
 
 
 def _broadcast(sigma: Tensor) -> Tensor:

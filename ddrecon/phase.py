@@ -5,7 +5,10 @@ Phase functions are normalized to 4 pi over the sphere, as in docs/theory.md E2.
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
+
+from ddrecon.decay import decay_mean
 
 
 def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
@@ -29,3 +32,28 @@ def forward_fraction(g: Tensor) -> Tensor:
 def scaled_mean_cosine(g: Tensor) -> Tensor:
     """The mean cosine g' = (g - f) / (1 - f) of what remains: g / (1 + g) for g > 0, else g."""
     return g / (1 + g.clamp(min=0))
+
+
+def peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
+    """What turns a beam into a view ray: scattered once, or only by the forward peak on a way of peak `depth` (docs/theory.md E13), >= 0.
+
+    `depth` >= 0: f times the optical depth of scattering from where the light enters to where the view ray leaves; at 0 this is
+    `henyey_greenstein`. `cosine`: as there, broadcast against `depth`; `g` >= 0, scalar. Where it would be negative, since scattering
+    without its peak has only two moments, it is 0.
+    """
+    fraction = forward_fraction(g)
+    some = decay_mean(depth)
+    spread = g * torch.exp((g - 1) * depth) * decay_mean(g * depth) / some
+    rest = (1 - fraction) * (1 + 3 * scaled_mean_cosine(g) * cosine)
+    return (rest + fraction * some * _peak(spread, cosine)).clamp(min=0)
+
+
+def _peak(spread: Tensor, cosine: Tensor) -> Tensor:
+    """The forward peak, whose moments are 1, 1, 1, h, h^2, ... with h = `spread`.
+
+    It is (p_h - 1 - 3 h cosine) / h^2 + 1 + 3 cosine of the Henyey-Greenstein function p_h, written so that nothing cancels at small h.
+    """
+    away = spread - 2 * cosine
+    root = (1 + spread * away).sqrt()
+    curved = (1 + root * (2 + root * (3 + 1.5 * root))) / (root**3 * (root + 1) ** 2)
+    return 3 * cosine - 1.5 + 1.5 * spread * away + (1 - spread * spread) * away * away * curved

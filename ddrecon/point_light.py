@@ -20,7 +20,7 @@ from ddrecon.lights import PointLight
 from ddrecon.medium import Medium
 from ddrecon.moments import Moments, beam_moments
 from ddrecon.nodes import Nodes
-from ddrecon.phase import henyey_greenstein
+from ddrecon.phase import henyey_greenstein, peaked_phase
 from ddrecon.sampling import sample_volume
 
 SMOOTH = 8
@@ -41,19 +41,21 @@ class PointBeam:
     irradiance: Tensor
     least: float
 
-    def scattered(self, scattering: Tensor, nodes: Nodes, g: Tensor) -> tuple[Tensor, Tensor | float]:
-        """The integral over each segment of `scattering` [N, K, R] times p / r^2, `[N - 1, K, R]`, and a factor of 1.
+    def scattered(self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None) -> tuple[Tensor, Tensor | float]:
+        """The integral over each segment of `scattering` [N, K, R] times p / r^2, `[N - 1, K or C, R]`, and a factor of 1.
 
-        Scattering times p is linear between nodes; 1 / r^2 over a segment is exactly the angle it subtends over the ray's distance.
+        `peak`: as of `Beam.scattered`. Scattering times p is linear between nodes; 1 / r^2 over a segment is exactly the angle it
+        subtends over the ray's distance.
         """
         offset = nodes.origin - self.position
         foot = (offset * nodes.direction).sum(-1)
         across = _square(offset - foot[:, None] * nodes.direction, self.least)
         along = foot + nodes.distance
-        phase = henyey_greenstein(-along / (across + along * along).sqrt(), g)
+        cosine = (-along / (across + along * along).sqrt())[:, None]
+        phase = henyey_greenstein(cosine, g) if peak is None else peaked_phase(peak, cosine, g)
         apart = across.sqrt()
         angle = torch.atan2(apart * nodes.lengths, across + along[1:] * along[:-1])
-        return nodes.integral(scattering * phase[:, None], angle / apart), 1.0
+        return nodes.integral(scattering * phase, angle / apart), 1.0
 
 
 def point_beam(medium: Medium, light: PointLight, has_flux: bool) -> tuple[PointBeam, Moments]:

@@ -19,7 +19,7 @@ from ddrecon.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.medium import Medium
 from ddrecon.moments import Moments, Vector, beam_moments
 from ddrecon.nodes import Nodes
-from ddrecon.phase import henyey_greenstein
+from ddrecon.phase import henyey_greenstein, peaked_phase
 from ddrecon.point_light import PointBeam, point_beam
 from ddrecon.quadrature import sphere_quadrature
 from ddrecon.sampling import Smooth, on_kink, ramp, sample_slices, subdivided
@@ -40,9 +40,15 @@ class Beam:
     direction: Tensor
     irradiance: Tensor
 
-    def scattered(self, scattering: Tensor, nodes: Nodes, g: Tensor) -> tuple[Tensor, Tensor | float]:
-        """The integral over each segment of `scattering` [N, K, R], `[N - 1, K, R]`, and the phase function p, the same all along a ray."""
-        return nodes.integral(scattering), henyey_greenstein(-(nodes.direction @ self.direction), g)
+    def scattered(self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None) -> tuple[Tensor, Tensor | float]:
+        """The integral over each segment of `scattering` [N, K, R], and the phase function p, the same all along a ray.
+
+        With a forward peak of depth `peak` [N, C, R] at the nodes p changes on the way: the integral holds it, and the factor is 1.
+        """
+        cosine = -(nodes.direction @ self.direction)
+        if peak is None:
+            return nodes.integral(scattering), henyey_greenstein(cosine, g)
+        return nodes.integral(scattering * peaked_phase(peak, cosine, g)), 1.0
 
 
 @dataclass(frozen=True)

@@ -183,7 +183,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     diffuse = light_field.outgoing.positive_along(towards)
     if light_field.skies:
         diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
-    return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g)
+    return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g, medium.peak)
 
 
 def _radiance(emission: Emission, scene: Scene, bundle: Rays) -> Tensor:

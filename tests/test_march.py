@@ -36,7 +36,7 @@ def emission_of(grid: Grid, density: Tensor, sigma_a: float = 0.5, sigma_s: tupl
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
     medium = scaled_medium(Volume(grid, density, density.new_tensor([sigma_a]), density.new_tensor(sigma_s), density.new_tensor(g)))
     diffuse = (1 + grid.centers(density)[2]).expand(len(sigma_s), *grid.shape)
-    return Emission(grid, medium.extinction, medium.scattering, reduced_light(medium, [light], False).beams, diffuse, medium.g)
+    return Emission(grid, medium.extinction, medium.scattering, reduced_light(medium, [light], False).beams, diffuse, medium.g, medium.peak)
 
 
 def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
@@ -113,11 +113,12 @@ def test_radiance_and_transmittance_have_both_derivatives(view: dict, box, make_
     assert torch.autograd.gradcheck(lambda d: march(emission_of(grid, d), bundle, 1), density, atol=1e-8, check_forward_ad=True)
 
 
+@pytest.mark.parametrize("g", [0.0, 0.6])
 @pytest.mark.parametrize("has_fields", ["absorption", "scattering"])
-def test_a_cross_section_may_be_a_field(has_fields: str, box, make_camera, random):
+def test_a_cross_section_may_be_a_field(has_fields: str, g: float, box, make_camera, random):
     """The same numbers in every cell give the same image, but for bounds of third-order corrections, which colors share or do not."""
     grid, density, camera = box((3, 5, 4)), random(3, 5, 4), make_camera()
-    constant = Volume(grid, density, random(3, seed=1), random(3, seed=2), density.new_tensor(0.0))
+    constant = Volume(grid, density, random(3, seed=1), random(3, seed=2), density.new_tensor(g))
     field = {"absorption": "sigma_a", "scattering": "sigma_s"}[has_fields]
     varying = replace(constant, **{field: getattr(constant, field).view(3, 1, 1, 1).expand(3, *grid.shape)})
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
@@ -125,7 +126,7 @@ def test_a_cross_section_may_be_a_field(has_fields: str, box, make_camera, rando
     for volume in (constant, varying):
         medium = scaled_medium(volume)
         beams = reduced_light(medium, [light], False).beams
-        emission = Emission(grid, medium.extinction, medium.scattering, beams, random(3, *grid.shape, seed=4), medium.g)
+        emission = Emission(grid, medium.extinction, medium.scattering, beams, random(3, *grid.shape, seed=4), medium.g, medium.peak)
         results.append(torch.cat(march(emission, rays(camera), 1)))
     torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=0)
 

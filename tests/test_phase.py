@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
 from ddrecon.medium import Volume, scaled_medium, unscaled_medium
-from ddrecon.phase import forward_fraction, henyey_greenstein, scaled_mean_cosine
+from ddrecon.phase import forward_fraction, henyey_greenstein, peaked_phase, scaled_mean_cosine
 
 MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(100)
@@ -17,16 +19,51 @@ def scalar(value: float) -> torch.Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def legendre_moment(g: float, degree: int) -> float:
-    """The average of P_degree(cosine) over the sphere, weighted by the phase function: g^degree."""
+def legendre_moment(phase: torch.Tensor, degree: int) -> float:
+    """The average of P_degree(cosine) over the sphere, weighted by a phase function given at the `NODES`."""
     polynomial = np.polynomial.legendre.Legendre.basis(degree)(NODES)
-    return float((henyey_greenstein(torch.tensor(NODES), scalar(g)).numpy() * polynomial * WEIGHTS).sum() / 2)
+    return float((phase.numpy() * polynomial * WEIGHTS).sum() / 2)
 
 
 @pytest.mark.parametrize("g", MEAN_COSINES)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_moments_are_powers_of_the_mean_cosine(g: float, degree: int):
-    assert legendre_moment(g, degree) == pytest.approx(g**degree, abs=1e-12)
+    phase = henyey_greenstein(torch.tensor(NODES), scalar(g))
+    assert legendre_moment(phase, degree) == pytest.approx(g**degree, abs=1e-12)
+
+
+def peak_moment(g: float, depth: float, degree: int) -> float:
+    """The moment of light that the forward peak alone has scattered, once at a given place on its way of `depth` scatterings.
+
+    n of them fall on the way with Poisson's probability, each is the one in question with 1 / n, and n in a row have the moments of one
+    to the power of n: 1 up to the second, g for the third.
+    """
+    counts = range(1, 80)
+    chances = [math.exp(-depth) * depth ** (n - 1) / math.factorial(n) for n in counts]
+    return g**2 * sum(chance * g ** (n * max(0, degree - 2)) for chance, n in zip(chances, counts, strict=True))
+
+
+@pytest.mark.parametrize("g", [0.05, 0.2, 0.4])
+@pytest.mark.parametrize("depth", [1e-9, 0.3, 2.0, 9.0])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_peak_spreads_light_by_the_moments_of_its_scatterings(g: float, depth: float, degree: int):
+    phase = peaked_phase(scalar(depth), torch.tensor(NODES), scalar(g))
+    rest = {0: 1 - g**2, 1: (1 - g**2) * g / (1 + g)}.get(degree, 0.0)
+    assert legendre_moment(phase, degree) == pytest.approx(rest + peak_moment(g, depth, degree), rel=1e-9)
+
+
+@pytest.mark.parametrize("g", [0.0, 1e-4, 0.3, 0.8, 0.95])
+def test_a_peak_that_nothing_lies_behind_is_the_exact_phase_function(g: float):
+    cosine = torch.linspace(-1, 1, 101, dtype=torch.float64)
+    torch.testing.assert_close(peaked_phase(scalar(0.0), cosine, scalar(g)), henyey_greenstein(cosine, scalar(g)), rtol=1e-9, atol=1e-12)
+
+
+def test_a_spread_peak_is_finite_and_not_negative_at_any_depth():
+    depth, cosine = torch.logspace(-30, 10, 61)[:, None].requires_grad_(), torch.linspace(-1, 1, 21)
+    for g in (0.0, 0.5, 0.99):
+        phase = peaked_phase(depth, cosine, torch.tensor(g))
+        slope = torch.autograd.grad(phase.sum(), depth)[0]
+        assert phase.isfinite().all() and (phase >= 0).all() and slope.isfinite().all()
 
 
 def test_isotropic_scattering_is_one_everywhere():
