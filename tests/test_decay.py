@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.decay import SERIES_BELOW, decay_mean, decayed_sum
+from ddrecon.decay import SERIES_BELOW, decay_mean, decayed_line, decayed_sum
 
 DEPTHS = (0.0, 1e-6, SERIES_BELOW - 1e-3, SERIES_BELOW + 1e-3, 0.3, 5.0, 50.0, 1e4)
 
@@ -100,3 +100,20 @@ def test_single_precision_follows_double(depth: float):
     epsilon = torch.finfo(torch.float32).eps
     assert means[0].item() == pytest.approx(means[1].item(), rel=4 * epsilon)
     assert slopes[0] == pytest.approx(slopes[1], rel=8 * epsilon * max(1 / SERIES_BELOW, depth))
+
+
+@pytest.mark.parametrize("depth", DEPTHS[:-1])
+def test_a_decayed_line_against_quadrature(depth: float):
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    part = (nodes + 1) / 2
+    expected = float(((0.7 + (2.5 - 0.7) * part) * np.exp(-depth * part) * weights).sum() / 2)
+    near, far, depths = (torch.full((1, 1, 1), value, dtype=torch.float64) for value in (0.7, 2.5, depth))
+    assert decayed_line(near, far, depths).item() == pytest.approx(expected, rel=1e-11)
+
+
+@pytest.mark.parametrize(("near", "far"), [(1, 1), (3, 1), (1, 3), (3, 3)])
+def test_decayed_lines_have_both_derivatives(near: int, far: int, random):
+    depth = torch.tensor(DEPTHS[1:6], dtype=torch.float64).view(-1, 1, 1).expand(-1, 3, 2) * (1 + 0.1 * random(5, 3, 2))
+    inputs = [random(5, near, 2, seed=1), random(5, far, 2, seed=2), depth]
+    inputs = [tensor.clone().requires_grad_() for tensor in inputs]
+    assert torch.autograd.gradcheck(decayed_line, inputs, eps=1e-7, atol=1e-7, rtol=1e-6, check_forward_ad=True)
