@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,12 +153,9 @@ def gray(image: Tensor) -> np.ndarray:
     return image.mean(0).double().numpy()
 
 
-def image(scene: Scene) -> tuple[np.ndarray, float]:
-    """The image of `scene` and the seconds it takes."""
+def image(scene: Scene) -> np.ndarray:
     with torch.no_grad():
-        start = time.perf_counter()
-        found = view_image(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
-        return gray(found), time.perf_counter() - start
+        return gray(view_image(solve_light(scene, SolveMemory()), scene, scene.views[0].camera))
 
 
 def scattered_once(scene: Scene) -> np.ndarray:
@@ -174,9 +170,9 @@ def row(cells: Iterable[object]) -> None:
 
 
 def measure_cases(references: Path, only: str, pictures: Path | None, directions: int) -> None:
-    """Prints, for every case, the errors by number of rounds and the time they take."""
-    row(["case", "noise", "single", *(f"n = {n}" for n in ROUNDS), *(f"time, n = {n}" for n in ROUNDS[1:])])
-    row(["---"] * (2 * len(ROUNDS) + 2))
+    """Prints, for every case, the errors by number of rounds."""
+    row(["case", "noise", "single", *(f"n = {n}" for n in ROUNDS)])
+    row(["---"] * (len(ROUNDS) + 3))
     for case in CASES:
         if only not in case.name:
             continue
@@ -184,11 +180,10 @@ def measure_cases(references: Path, only: str, pictures: Path | None, directions
         once = traced(case.scene(), references, depth=2, noise=0.02)
         found = {n: image(case.scene(transport_rounds=n, transport_directions=directions)) for n in ROUNDS}
         single = once.error(scattered_once(case.scene()))
-        errors = [_visible(whole.error(picture), whole.noise) for picture, _ in found.values()]
-        ratios = [f"{found[n][1] / found[0][1]:.1f}" for n in ROUNDS[1:]]
-        row([case.name, whole.noise, _visible(single, once.noise), *errors, *ratios])
+        errors = [_visible(whole.error(picture), whole.noise) for picture in found.values()]
+        row([case.name, whole.noise, _visible(single, once.noise), *errors])
         if pictures is not None:
-            draw(pictures / f"{'_'.join(case.name.replace(',', '').split())}.png", whole, [found[n][0] for n in (0, 2)])
+            draw(pictures / f"{'_'.join(case.name.replace(',', '').split())}.png", whole, [found[n] for n in (0, 2)])
 
 
 def _visible(error: float, noise: float) -> str:
@@ -204,10 +199,10 @@ def measure_convergence(references: Path) -> None:
     for case in CONVERGING:
         whole = traced(case.scene(96), references, noise=case.noise, passes=96)
         for cells, counts in {24: (26, 50, 86), 48: (26, 50, 86), 96: (50,)}.items():
-            diffusion = image(case.scene(cells))[0]
+            diffusion = image(case.scene(cells))
             for directions in counts:
                 scenes = (case.scene(cells, transport_rounds=n, transport_directions=directions) for n in rounds[1:])
-                found = [diffusion, *(image(scene)[0] for scene in scenes)]
+                found = [diffusion, *(image(scene) for scene in scenes)]
                 row([case.name, whole.noise, cells, directions, *(_visible(whole.error(item), whole.noise) for item in found)])
 
 
