@@ -21,6 +21,7 @@ from ddrecon.medium import Coefficient
 from ddrecon.nodes import Nodes
 from ddrecon.point_light import PointBeam
 from ddrecon.reduced import Beam
+from ddrecon.running import running_sum
 from ddrecon.sampling import Smooth
 from ddrecon.settings import RenderSettings
 from ddrecon.view_rays import Crossing, Equidistant, Slices, cross_box, sampler_for, through_box
@@ -154,7 +155,7 @@ def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> Tensor:
     masses, scattering = others[: len(emission.beams)], (others[len(emission.beams) :] or [extinction])[0]
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     mass = nodes.integral(extinction)
-    end = mass.cumsum(0)
+    end = running_sum(mass)
     begin = end - mass
     scattered = decayed_sum(nodes.integral(scattering * diffuse), begin, end, scale)
     for beam, beam_mass in zip(emission.beams, masses, strict=True):

@@ -8,12 +8,13 @@ from torch import Tensor
 from ddrecon.sampling import Smooth, bend, excess, less, on_kink, ramp
 
 
-def sample_lattice(slices: Tensor, rows: Tensor, columns: Tensor, smooth: Smooth | None = None) -> Tensor:
+def sample_lattice(slices: Tensor, rows: Tensor, columns: Tensor, smooth: Smooth | None = None, fades: bool = False) -> Tensor:
     """Values `[N, K, r c]` of `slices` [N, K, H, W] at every pair of `rows` [N, r] and `columns` [N, c], in [-1, 1].
 
-    The same, with the same derivatives, as `sample_slices` at all those points.
+    The same, with the same derivatives, as `sample_slices` at all those points; or where it `fades`, falling to zero along each axis within
+    one cell beyond the outermost cells' centers.
     """
-    across, along = _weights(rows, slices.shape[2]), _weights(columns, slices.shape[3])
+    across, along = _weights(rows, slices.shape[2], fades), _weights(columns, slices.shape[3], fades)
     half = _rows_applied(across, slices)
     plain = _columns_applied(half, along)
     if smooth is None:
@@ -36,16 +37,18 @@ def _columns_applied(values: Tensor, matrix: Tensor) -> Tensor:
     return torch.bmm(values.flatten(1, 2), matrix.transpose(1, 2)).unflatten(1, (channels, rows)).flatten(2)
 
 
-def _weights(coordinate: Tensor, size: int) -> Tensor:
+def _weights(coordinate: Tensor, size: int, fades: bool) -> Tensor:
     """What each of `size` cells counts for in the linear interpolation at `coordinate` [N, R]: `[N, R, size]`.
 
-    Beyond the outermost cells' centers these count alone; on a cell's center the slope is the mean of both sides'.
+    Beyond the outermost cells' centers these count alone, or ever less; on a cell's center the slope is the mean of both sides'.
     """
     place = ((coordinate + 1) * size - 1) / 2
-    index = torch.arange(size - 1, dtype=place.dtype, device=place.device)
-    passed = ramp(place[..., None] - index, on_kink(place, size))
-    ends = torch.ones_like(place)[..., None]
-    return -torch.cat([ends, passed, 0 * ends], -1).diff(dim=-1)
+    index = torch.arange(-1, size, dtype=place.dtype, device=place.device)
+    passed = ramp(place[..., None] - (index if fades else index[1:-1]), on_kink(place, size))
+    if not fades:
+        ends = torch.ones_like(place)[..., None]
+        passed = torch.cat([ends, passed, 0 * ends], -1)
+    return passed[..., :-1] - passed[..., 1:]
 
 
 def _bent(weights: Tensor, coordinate: Tensor) -> Tensor:
