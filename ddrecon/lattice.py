@@ -49,9 +49,9 @@ class Lattice:
         """How many rows and columns."""
         return len(self.rows), len(self.columns)
 
-    def rays(self, rows: slice, extent: float) -> Rays:
-        """The rays of some `rows`, row by row; parallel ones begin `extent` before the plane."""
-        places = torch.meshgrid(self.rows[rows], self.columns, indexing="ij")
+    def rays(self, rows: Tensor, extent: float) -> Rays:
+        """The rays of some `rows` [u], row by row; parallel ones begin `extent` before the plane."""
+        places = torch.meshgrid(rows, self.columns, indexing="ij")
         point = [torch.full_like(places[0], self.middle)] * 3
         for axis, place in zip(self.across, places, strict=True):
             point[axis] = place
@@ -68,18 +68,12 @@ class Lattice:
             lines.append((bundle.origin[:, axis] + distance * bundle.direction[:, axis] - line[0]) / (line[1] - line[0]))
         return torch.stack(lines, -1)
 
-    def crossings(self, planes: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
-        """Where in `planes` [N] across `axis` the rays of some `rows` and all columns run, [N, r] and [N, c] [u]."""
-        row_axis, column_axis = self.across
-        apart = planes[:, None] - self.middle
+    def crossings(self, planes: Tensor, which: int, line: Tensor) -> Tensor:
+        """Where in `planes` [N] across `axis` rays through `line` [R] run, some rows (`which` = 0) or columns (1): `[N, R]` [u]."""
+        apart, axis = planes[:, None] - self.middle, self.across[which]
         if self.eye is None:
-            slope = self.direction / self.direction[self.axis]
-            return self.rows[rows] + apart * slope[row_axis], self.columns + apart * slope[column_axis]
-        part = apart / (self.middle - self.eye[self.axis])
-        return (
-            self.rows[rows] + part * (self.rows[rows] - self.eye[row_axis]),
-            self.columns + part * (self.columns - self.eye[column_axis]),
-        )
+            return line + apart * (self.direction[axis] / self.direction[self.axis])
+        return line + apart / (self.middle - self.eye[self.axis]) * (line - self.eye[axis])
 
 
 def lattice_for(grid: Grid, axis: int, bundles: Sequence[Rays], hits: Sequence[Tensor]) -> Lattice | None:

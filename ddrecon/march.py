@@ -114,17 +114,17 @@ def _march_rays(emission: Emission, sampler: Slices | Equidistant, rays: Rays, c
 
 def _march_lattice(emission: Emission, slices: Slices, lattice: Lattice) -> Tensor:
     """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
-    grid, (row_count, column_count) = emission.grid, lattice.shape
+    grid, columns = emission.grid, slices.lattice_columns(lattice)
 
-    def run(rows: slice) -> Tensor:
+    def run(rows: Tensor) -> Tensor:
         rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
         near, far = through_box(grid, rays)
-        values, distance = slices.sample_rows(lattice, rows, rays, near, torch.maximum(near, far))
-        return _integrate(emission, values, Nodes(rays.origin, rays.direction, distance))
+        values, distance = slices.sample_rows(lattice, rows, columns, rays)
+        inside = torch.minimum(torch.maximum(distance, near), torch.maximum(near, far))
+        return _integrate(emission, values, Nodes(rays.origin, rays.direction, inside))
 
-    count = max(1, _chunk(grid, slices.nodes) // column_count)
-    chunks = [slice(first, first + count) for first in range(0, row_count, count)]
-    return torch.cat([recomputed(run, chunk) for chunk in chunks], 1).unflatten(1, lattice.shape)
+    count = max(1, _chunk(grid, slices.nodes) // len(lattice.columns))
+    return torch.cat([recomputed(run, rows) for rows in lattice.rows.split(count)], 1).unflatten(1, lattice.shape)
 
 
 def _chunk(grid: Grid, nodes: int) -> int:

@@ -24,7 +24,7 @@ from ddrecon.point_light import PointBeam, point_beam
 from ddrecon.quadrature import sphere_quadrature
 from ddrecon.running import running_sum
 from ddrecon.sampling import Smooth
-from ddrecon.separable import sample_lattice
+from ddrecon.separable import Weights, sample_lattice
 from ddrecon.sky import Sky, Source
 
 
@@ -183,12 +183,14 @@ class _Shear:
 
     def there(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], numbered from `shift`, on the lattice; they fall to zero one cell beyond their outermost centers."""
-        rows, columns = self._places(slices, shift, self.lattice, self.size, 1)
-        return sample_lattice(slices, rows, columns, fades=True).unflatten(-1, self.lattice)
+        places = self._places(slices, shift, self.lattice, self.size, 1)
+        rows, columns = (Weights.at(place, size, fades=True) for place, size in zip(places, self.size, strict=True))
+        return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
 
     def back(self, sheared: Tensor, smooth: Smooth) -> Tensor:
         """Slices of values `sheared` on the lattice, in cells again."""
-        rows, columns = self._places(sheared, 0.0, self.size, self.lattice, -1)
+        places = self._places(sheared, 0.0, self.size, self.lattice, -1)
+        rows, columns = (Weights.at(place, size, is_smooth=True) for place, size in zip(places, self.lattice, strict=True))
         return sample_lattice(sheared, rows, columns, smooth).unflatten(-1, self.size)
 
     def _places(self, like: Tensor, shift: float, points: tuple[int, int], cells: tuple[int, int], sign: int) -> list[Tensor]:

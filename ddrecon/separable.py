@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from ddrecon.sampling import Smooth, bend, excess, less, on_kink, ramp
 
 
-def sample_lattice(slices: Tensor, rows: Tensor, columns: Tensor, smooth: Smooth | None = None, fades: bool = False) -> Tensor:
-    """Values `[N, K, r c]` of `slices` [N, K, H, W] at every pair of `rows` [N, r] and `columns` [N, c], in [-1, 1].
+@dataclass(frozen=True)
+class Weights:
+    """What each cell of a line counts for at R places, `[N, R, size]`: for `linear` values, and for their `excess` over third order."""
 
-    The same, with the same derivatives, as `sample_slices` at all those points; or where it `fades`, falling to zero along each axis within
-    one cell beyond the outermost cells' centers.
+    linear: Tensor
+    excess: Tensor | None = None
+
+    @staticmethod
+    def at(coordinate: Tensor, size: int, *, is_smooth: bool = False, fades: bool = False) -> Weights:
+        """Those at `coordinate` [N, R], in [-1, 1], of a line of `size` cells; the excess only where `is_smooth`.
+
+        Beyond the outermost cells' centers these count alone, or where it `fades` less and less, to nothing one cell further.
+        """
+        linear = _linear(coordinate, size, fades)
+        return Weights(linear, excess(coordinate, size)[..., None] * bend(linear, 2) if is_smooth else None)
+
+
+def sample_lattice(slices: Tensor, rows: Weights, columns: Weights, smooth: Smooth | None = None) -> Tensor:
+    """Values `[N, K, r c]` of `slices` [N, K, H, W] at every pair of `rows` [N, r, H] and `columns` [N, c, W].
+
+    The same, with the same derivatives, as `sample_slices` at all those points; channels in `smooth` need weights of both kinds.
     """
-    across, along = _weights(rows, slices.shape[2], fades), _weights(columns, slices.shape[3], fades)
-    half = _rows_applied(across, slices)
-    plain = _columns_applied(half, along)
-    if smooth is None:
-        return plain
-    bent = _rows_applied(_bent(across, rows), slices[:, smooth.channels])
-    both = torch.cat([bent, half[:, smooth.channels]], -1), torch.cat([along, _bent(along, columns)], -1)
-    return less(plain, _columns_applied(*both), smooth)
+    half = _rows_applied(rows.linear, slices)
+    linear = _columns_applied(half, columns.linear)
+    if smooth is None or rows.excess is None or columns.excess is None:
+        return linear
+    bent = _rows_applied(rows.excess, slices[:, smooth.channels])
+    both = torch.cat([bent, half[:, smooth.channels]], -1), torch.cat([columns.linear, columns.excess], -1)
+    return less(linear, _columns_applied(*both), smooth)
 
 
 def _rows_applied(matrix: Tensor, values: Tensor) -> Tensor:
@@ -37,11 +54,8 @@ def _columns_applied(values: Tensor, matrix: Tensor) -> Tensor:
     return torch.bmm(values.flatten(1, 2), matrix.transpose(1, 2)).unflatten(1, (channels, rows)).flatten(2)
 
 
-def _weights(coordinate: Tensor, size: int, fades: bool) -> Tensor:
-    """What each of `size` cells counts for in the linear interpolation at `coordinate` [N, R]: `[N, R, size]`.
-
-    Beyond the outermost cells' centers these count alone, or ever less; on a cell's center the slope is the mean of both sides'.
-    """
+def _linear(coordinate: Tensor, size: int, fades: bool) -> Tensor:
+    """Weights of linear interpolation; on a cell's center the slope is the mean of both sides'."""
     place = ((coordinate + 1) * size - 1) / 2
     index = torch.arange(-1, size, dtype=place.dtype, device=place.device)
     passed = ramp(place[..., None] - (index if fades else index[1:-1]), on_kink(place, size))
@@ -49,8 +63,3 @@ def _weights(coordinate: Tensor, size: int, fades: bool) -> Tensor:
         ends = torch.ones_like(place)[..., None]
         passed = torch.cat([ends, passed, 0 * ends], -1)
     return passed[..., :-1] - passed[..., 1:]
-
-
-def _bent(weights: Tensor, coordinate: Tensor) -> Tensor:
-    """The weights by which linear interpolation exceeds that of third order, from its own `weights` [N, R, size]."""
-    return excess(coordinate, weights.shape[2])[..., None] * bend(weights, 2)

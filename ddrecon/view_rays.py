@@ -17,7 +17,7 @@ from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.lattice import Lattice
 from ddrecon.sampling import Smooth, sample_slices, sample_volume, subdivided
-from ddrecon.separable import sample_lattice
+from ddrecon.separable import Weights, sample_lattice
 
 STEEPEST = 0.2
 """Smallest direction cosine, in units of cells and against the axis across the slices, of rays that are marched by slices."""
@@ -65,7 +65,8 @@ class Slices:
         index = (place - 0.5).clamp(0, count - 1).long()
         if is_reversed:
             index, planes = index.flip(0), planes.flip(0)
-        slices = fields.permute(1 + axis, 0, *(1 + other for other in self.across)).index_select(0, index)
+        row, column = self.across
+        slices = fields.permute(1 + axis, 1 + row, 0, 1 + column).index_select(0, index).transpose(1, 2)
         self.slices, self.planes = subdivided(slices, steps, smooth), subdivided(planes, steps)
         self.nodes = len(self.planes)
 
@@ -76,11 +77,17 @@ class Slices:
         values = sample_slices(self.slices, torch.stack([columns, rows], -1), self.smooth)
         return values, torch.minimum(torch.maximum(distance, near), far)
 
-    def sample_rows(self, lattice: Lattice, chosen: slice, rays: Rays, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        """The same for `rays`, those of the `chosen` rows of `lattice`."""
-        rows, columns = (self._scaled(line, a) for line, a in zip(lattice.crossings(self.planes, chosen), self.across, strict=True))
-        values = sample_lattice(self.slices, rows, columns, self.smooth)
-        return values, torch.minimum(torch.maximum(self._distance(rays.origin, rays.direction), near), far)
+    def lattice_columns(self, lattice: Lattice) -> Weights:
+        """What cells count for in the columns of `lattice`."""
+        return self._weights(lattice.crossings(self.planes, 1, lattice.columns), 1)
+
+    def sample_rows(self, lattice: Lattice, rows: Tensor, columns: Weights, rays: Rays) -> tuple[Tensor, Tensor]:
+        """Values [N, channels, R] where `rays`, those of some `rows` and all columns of `lattice`, meet the planes; distances [N, R]."""
+        down = self._weights(lattice.crossings(self.planes, 0, rows), 0)
+        return sample_lattice(self.slices, down, columns, self.smooth), self._distance(rays.origin, rays.direction)
+
+    def _weights(self, places: Tensor, which: int) -> Weights:
+        return Weights.at(self._scaled(places, self.across[which]), self.slices.shape[2 + which], is_smooth=self.smooth is not None)
 
     def _distance(self, origin: Tensor, direction: Tensor) -> Tensor:
         return (self.planes[:, None] - origin[:, self.axis]) / direction[:, self.axis]

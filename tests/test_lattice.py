@@ -62,11 +62,11 @@ def images(scene: Scene) -> tuple[Tensor, Tensor]:
 @each_camera
 def test_places_and_crossings_are_those_of_the_rays(view: dict, scene_of):
     lattice, slices = lattice_of(scene_of(view))
-    chosen = slice(2, 5)
+    chosen = lattice.rows[2:5]
     bundle = lattice.rays(chosen, 3.0)
     rows, columns = torch.meshgrid(torch.arange(2, 5).double(), torch.arange(len(lattice.columns)).double(), indexing="ij")
     torch.testing.assert_close(lattice.places(bundle), torch.stack([rows, columns], -1).flatten(0, 1), rtol=0, atol=1e-11)
-    down, along = lattice.crossings(slices.planes, chosen)
+    down, along = lattice.crossings(slices.planes, 0, chosen), lattice.crossings(slices.planes, 1, lattice.columns)
     distance = (slices.planes[:, None] - bundle.origin[:, lattice.axis]) / bundle.direction[:, lattice.axis]
     points = (bundle.origin + distance[..., None] * bundle.direction).unflatten(1, rows.shape)
     torch.testing.assert_close(points[..., lattice.across[0]], down[:, :, None].expand(-1, -1, rows.shape[1]))
@@ -78,7 +78,7 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     """The pixels of the lattice's own rays need no interpolation: they are what marching those rays gives."""
     scene = scene_of(view)
     lattice, _ = lattice_of(scene)
-    bundle = lattice.rays(slice(0, lattice.shape[0]), 3.0)
+    bundle = lattice.rays(lattice.rows, 3.0)
     emission = _emission(solve_light(scene, SolveMemory()), bundle)
     monkeypatch.setattr(march_module, "lattice_for", lambda *_: lattice)
     (interpolated,) = march_each(emission, [bundle], INTERPOLATED, 1.0)
