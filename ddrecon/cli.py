@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 COMMON = (
     click.option("-D", "overrides", multiple=True, metavar="KEY.PATH=VALUE", help="Override a value of the scene file; repeatable."),
     click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True),
-    click.option("--threads", type=click.IntRange(min=1), help="Processor threads; all cores unless given."),
+    click.option("--threads", type=click.IntRange(min=1), help="Processor threads; OMP_NUM_THREADS or all cores unless given."),
     click.option("--seed", type=int, default=0, show_default=True),
     click.option("-q", "--quiet", is_flag=True, help="No progress line."),
     click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),

@@ -137,7 +137,7 @@ def open_session(
     if device == "cuda" and not torch.cuda.is_available():
         raise SceneError("--device cuda: torch sees no CUDA device here; leave --device out, or install a CUDA build of torch")
     place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-    threads = threads or os.cpu_count() or 1
+    threads = threads or (torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else os.cpu_count() or 1)
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     return Session(overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json)

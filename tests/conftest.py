@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +19,8 @@ from ddrecon.medium import Volume
 from ddrecon.settings import DiffusionSettings, RenderSettings
 from ddrecon.world import Scene, View
 
-torch.set_num_threads(2)
+os.environ["OMP_NUM_THREADS"] = "1"
+torch.set_num_threads(1)  # tests run side by side, one a core
 
 LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 """A box, in array order, whose cells are not cubes."""

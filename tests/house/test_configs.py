@@ -32,7 +32,6 @@ def test_there_are_configs() -> None:
 def test_a_config_runs_small(config: Path) -> None:
     if ".exr" in config.read_text() and importlib.util.find_spec("OpenEXR") is None:
         pytest.skip("its images need OpenEXR")
-    torch.set_num_threads(2)
     scene = load_scene(config, overrides=small(config))
     scene.views = [scene.views[0], scene.views[-1]]
     result = optimize(scene)

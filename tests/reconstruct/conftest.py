@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-import torch
 
 from ddrecon.scene.build import load_scene
 from ddrecon.world import Scene
@@ -13,5 +12,4 @@ BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
 
 @pytest.fixture
 def ball_scene() -> Scene:
-    torch.set_num_threads(2)
     return load_scene(BALL, overrides=["optimize.iterations=8"])
