@@ -45,11 +45,11 @@ class Moments:
         """`along` held at zero: r where r >= m = MARGIN (|L0| + |L1.w|), m (1 + r/m)^2 / 4 from there to -m, and 0 below.
 
         E3 is negative where light is more directed than two terms in angle can say, and where g is not 0 so may L0 be: E4's source
-        then has either sign. Both mean darkness. Without a flux nothing is held: E7's M-matrix keeps L0 >= 0.
+        then has either sign. Both mean darkness. Without a flux E7's M-matrix keeps L0 >= 0, and what a solve leaves below it is cut off.
         """
         radiance = self.along(direction)
         if self.flux is None:
-            return radiance
+            return radiance.clamp(min=0)
         margin = MARGIN * (self.mean.abs() + (radiance - self.mean).abs())
         divisor = margin.clamp(min=1e6 * torch.finfo(margin.dtype).tiny)
         bent = margin * (1 + (radiance / divisor).clamp(-1, 1)) ** 2 / 4

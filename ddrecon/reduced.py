@@ -162,7 +162,7 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | f
     shear = _Shear.of(slices, slope)
     centers, middles = shear.there(slices, 0.0), shear.there(0.5 * (slices[1:] + slices[:-1]), 0.5)
     bends = middles - 0.5 * (centers[1:] + centers[:-1])
-    finer = running_sum(torch.cat([torch.zeros_like(bends[:1]), bends])) * (0.5 * step)
+    finer = running_sum(torch.cat([torch.zeros_like(centers[:1]), bends])) * (0.5 * step)
     smooth = Smooth(0, field.shape[0], bound)
     entered = shear.back((running_sum(centers) - centers) * step + smooth.bounded(finer), smooth)
     if is_reversed:

@@ -31,10 +31,12 @@ def test_radiance_far_below_zero_is_zero():
     assert not along_z(fluxes(1.0, -1.0, -1.0), fluxes(-1.1, -1.0, 0.9)).any()
 
 
-def test_without_a_flux_nothing_is_held():
-    mean = fluxes(-1.0, 2.0)
-    one = torch.ones(())
-    assert Moments(mean).positive_along((one, one, one)) is mean
+def test_without_a_flux_only_what_is_below_zero_is_changed():
+    """At zero itself, as in empty space, derivatives pass."""
+    mean = fluxes(-1.0, 0.0, 2.0).requires_grad_()
+    held = Moments(mean).positive_along((torch.ones(()),) * 3)
+    assert held.flatten().tolist() == [0.0, 0.0, 2.0]
+    assert torch.autograd.grad(held.sum(), mean)[0].flatten().tolist() == [0.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
