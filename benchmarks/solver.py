@@ -4,7 +4,8 @@
 
 `--cells`: edges of cubes, measured beside 64 x 96 x 64; three colors, float32. The plume is `data/plume/density.npz` under its light;
 `--densities FILE...` adds other volumes. Solvers run in turns, as often as `--repeats` says, and the median of the turns' ratios counts.
-Multigrid's time includes making its grids; an adjoint solve finds them made.
+Multigrid's time includes making its grids; an adjoint solve finds them made. On a CPU, time is that of the processor, which others on
+the machine disturb less.
 """
 
 from __future__ import annotations
@@ -53,11 +54,12 @@ def resampled(density: Tensor, shape: tuple[int, int, int]) -> Tensor:
 
 
 def seconds(solver: str, operator: Operator, source: Tensor, tolerance: float) -> tuple[float, int]:
-    """Wall time of a solve with nothing prepared, and its iterations."""
+    """Time of a solve with nothing prepared, and its iterations."""
     fresh = Operator(operator.conductances, operator.loss)
-    start = time.perf_counter()
+    clock = time.perf_counter if source.is_cuda else time.process_time
+    start = clock()
     iterations = SOLVERS[solver](fresh, source, None, tolerance).iterations
-    return time.perf_counter() - start, iterations
+    return clock() - start, iterations
 
 
 def row(name: str, operator: Operator, source: Tensor, tolerance: float, solvers: list[str], repeats: int) -> str:
@@ -84,7 +86,8 @@ def main() -> None:
     solvers = ["multigrid", "conjugate_gradient", *(["jacobi"] if arguments.jacobi else [])]
     heads = [f"{solver}: iterations" for solver in solvers] + [f"time of {solver} / multigrid" for solver in solvers[1:]]
     print(f"| medium, cells, tolerance | {' | '.join(heads)} |\n|{'---|' * (len(heads) + 1)}")
-    media = {path.stem: torch.from_numpy(read_field(path, "density").values) for path in [PLUME, *arguments.densities]}
+    files = {"plume": PLUME} | {path.stem: path for path in arguments.densities}
+    media = {name: torch.from_numpy(read_field(path, "density").values) for name, path in files.items()}
     shapes = [(n, n, n) for n in arguments.cells] + [(64, 96, 64)]
     for shape in shapes:
         fields = {name: (resampled(values, shape), 40.0) for name, values in media.items()} | {

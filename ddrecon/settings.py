@@ -44,7 +44,9 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class DiffusionSettings:
-    """How multiply scattered light is found; `tolerance` is the relative residual of each linear solve.
+    """How multiply scattered light is found.
+
+    `tolerance` is the relative residual of each linear solve; a reconstruction solves no closer than its gradient needs.
 
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi iteration: `closure` and `solver` are
     for `conservative`. `floor` is that of the smooth closure. The model `flux_limited` has a `limiter` in place of a closure.

@@ -145,17 +145,18 @@ class _Solve(torch.autograd.Function):
 def iterate(solve: Solve[Operator], kind: str, start: Tensor, correction: Callable[[Tensor], Tensor]) -> Tensor:
     """The u [C, z, y, x] whose `correction` vanishes, by damped steps from the last solution of this `kind`, or from `start`.
 
-    Stops when a step's norm is below `solve.tolerance` times that of u, for every color, and records the steps and the last such change.
+    Stops when a step's norm is below the tolerance of `solve` times that of u, for every color, and records the steps and the last such
+    change.
     """
-    began, memory = perf_counter(), solve.memory
+    began, memory, tolerance = perf_counter(), solve.memory, solve.tolerance_of(kind)
     guess = memory.last.get((kind, solve.turn)) if memory.is_warm and kind != "tangent" else None
     u = start if guess is None or guess.shape != start.shape else guess
     iteration, change = 0, float("inf")
-    while change > solve.tolerance and iteration < MAX_ITERATIONS:
+    while change > tolerance and iteration < MAX_ITERATIONS:
         step = DAMPING * correction(u)
         u, iteration = u + step, iteration + 1
         change = float((norm(step) / norm(u).clamp(min=torch.finfo(u.dtype).tiny)).max())
-    if not change <= solve.tolerance:
+    if not change <= tolerance:
         advice = "raise diffusion.tolerance, use --dtype float64, diffusion.limiter=marshak or diffusion.model=p1"
         raise SolveError(f"flux-limited diffusion ({kind}) did not reach its tolerance", iteration, change, advice)
     memory.records.append(SolveRecord(kind, iteration, change, perf_counter() - began))

@@ -38,12 +38,14 @@ class SolveRecord:
 class SolveMemory:
     """What solves remember between renders: the last solution of each kind and turn, to start from, and a record of every solve.
 
-    With `is_warm` False every solve starts from zero.
+    With `is_warm` False every solve starts from zero. `enough`: by kind, the tolerance up to which a solve is of use; it is solved no
+    more exactly than that, whatever it is asked for.
     """
 
     is_warm: bool = True
     last: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     records: list[SolveRecord] = field(default_factory=list)
+    enough: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -65,11 +67,15 @@ class Solve(Generic[System]):
         guess = self.start if kind == "forward" else None
         if self.memory.is_warm and kind != "tangent":
             guess = self.memory.last.get((kind, self.turn), guess)
-        solution = self.solver(operator, source, guess, self.tolerance)
+        solution = self.solver(operator, source, guess, self.tolerance_of(kind))
         self.memory.records.append(SolveRecord(kind, solution.iterations, solution.residual, perf_counter() - start))
         if self.memory.is_warm:
             self.memory.last[kind, self.turn] = solution.value
         return solution.value
+
+    def tolerance_of(self, kind: str) -> float:
+        """How exactly to solve."""
+        return max(self.tolerance, self.memory.enough.get(kind, 0.0))
 
 
 class _Solve(torch.autograd.Function):

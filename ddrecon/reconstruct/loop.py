@@ -22,6 +22,7 @@ from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
 from ddrecon.reconstruct.losses import image_loss, psnr
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate, rate_at
+from ddrecon.reconstruct.tolerance import enough
 from ddrecon.reconstruct.views import chosen
 from ddrecon.renderer import render_each
 from ddrecon.scene.schema import ParameterSettings
@@ -89,6 +90,7 @@ class Reconstruction:
         self.parameters = [_parameter(scene, name, settings) for name, settings in self.settings.parameters.items()]
         self.rows: list[Row] = []
         self.elapsed = 0.0
+        self.misfit = 1.0
         self.memory = SolveMemory(scene.diffusion.warm_start)
         self._enter_stage(0)
 
@@ -113,6 +115,7 @@ class Reconstruction:
         found = self._differentiated(seen)
         loss, gradients = self._penalized(found.loss, found.gradients)
         self._require_finite(loss, gradients)
+        self.misfit = math.sqrt(float(found.loss) / self.power) if self.power else 1.0
         solves = {kind: sum(r.iterations for r in self.memory.records if r.kind == kind) for kind in ("forward", "adjoint")}
         for parameter in self.parameters:
             parameter.step(gradients[parameter.name], rate_at(self.iteration, self.settings.iterations))
@@ -146,6 +149,7 @@ class Reconstruction:
             "rows": rows,
             "elapsed": self.elapsed,
             "solutions": dict(self.memory.last),
+            "misfit": self.misfit,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -153,7 +157,7 @@ class Reconstruction:
         for parameter in self.parameters:
             parameter.restore(state["parameters"][parameter.name])
         self.rows = [Row(*row) for row in state["rows"]]
-        self.elapsed = state["elapsed"]
+        self.elapsed, self.misfit = state["elapsed"], state["misfit"]
         self._enter_stage(state["stage"])
         self.memory.last = {kind: field.to(self.full.volume.density) for kind, field in state["solutions"].items()}
 
@@ -204,12 +208,15 @@ class Reconstruction:
             return _mean_psnr(render_each(level, level.views, self.memory), level.views)
 
     def _differentiated(self, seen: list[View]) -> Differentiated:
+        self.memory.enough = enough(self.misfit)
         try:
             return differentiate(self.train_level, [view.name for view in seen], self._values(), self._loss_of(seen), self.memory)
         except SolveError as error:
             if isinstance(error, DivergenceError) or math.isfinite(error.residual):
                 raise
             raise self._diverged("the light", error.residual) from error
+        finally:
+            self.memory.enough = {}
 
     def _require_finite(self, loss: Tensor, gradients: dict[str, Tensor]) -> None:
         for name, gradient in gradients.items():
