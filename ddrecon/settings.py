@@ -51,7 +51,7 @@ class DiffusionSettings:
     closure: str = one_of("geometric", CLOSURES)
     floor: float = bounded(FLOOR, above=0, maximum=1e3)
     limiter: str = one_of("marshak", LIMITERS)
-    solver: str = one_of("conjugate_gradient", SOLVERS)
+    solver: str = one_of("multigrid", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
     transport_rounds: int = bounded(0, minimum=0, maximum=16)

@@ -19,6 +19,7 @@ from ddrecon.autodiff import keep
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.solvers.scaled import Solution
 
+Made = dict[Callable[[Operator], Any], Any]
 System = TypeVar("System")
 """What a solver solves: an operator."""
 
@@ -73,23 +74,26 @@ class Solve(Generic[System]):
 
 class _Solve(torch.autograd.Function):
     @staticmethod
-    def forward(solve: Solve[Operator], source: Tensor, loss: Tensor, c_z: Tensor, c_y: Tensor, c_x: Tensor) -> Tensor:
-        return solve("forward", Operator((c_z, c_y, c_x), loss), source).clone()
+    def forward(solve: Solve[Operator], made: Made, source: Tensor, loss: Tensor, c_z: Tensor, c_y: Tensor, c_x: Tensor) -> Tensor:
+        return solve("forward", Operator((c_z, c_y, c_x), loss, made), source).clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.solve, _, *coefficients = inputs
+        ctx.solve, ctx.made, _, *coefficients = inputs
         keep(ctx, output, *coefficients)
 
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, loss, *conductances = ctx.saved_tensors
-        adjoint = ctx.solve("adjoint", Operator(tuple(conductances), loss), u_bar)
-        conductance_bars = [-difference(adjoint, axis) * difference(u, axis) for axis in AXES]
-        return None, adjoint.clone(), -adjoint * u, *conductance_bars
+        adjoint = ctx.solve("adjoint", Operator(tuple(conductances), loss, ctx.made), u_bar)
+        conductance_bars = [
+            (-difference(adjoint, axis) * difference(u, axis)).sum_to_size(conductance.shape)
+            for axis, conductance in zip(AXES, conductances, strict=True)
+        ]
+        return None, None, adjoint.clone(), (-adjoint * u).sum_to_size(loss.shape), *conductance_bars
 
     @staticmethod
-    def jvp(ctx: Any, _: None, d_source: Tensor | None, d_loss: Tensor | None, *d_conductances: Tensor | None) -> Tensor:
+    def jvp(ctx: Any, _solve: None, _made: None, d_source: Tensor | None, d_loss: Tensor | None, *d_conductances: Tensor | None) -> Tensor:
         u, loss, *conductances = ctx.saved_tensors
         right = torch.zeros_like(u) if d_source is None else d_source.clone()
         if d_loss is not None:
@@ -97,13 +101,12 @@ class _Solve(torch.autograd.Function):
         for axis, d_conductance in zip(AXES, d_conductances, strict=True):
             if d_conductance is not None:
                 right -= accumulate(d_conductance * difference(u, axis), axis)
-        return ctx.solve("tangent", Operator(tuple(conductances), loss), right).clone()
+        return ctx.solve("tangent", Operator(tuple(conductances), loss, ctx.made), right).clone()
 
 
 def solve_diffusion(solve: Solve[Operator], operator: Operator, source: Tensor) -> Tensor:
     """u with `operator` u = `source` [C, z, y, x], differentiable in both modes with respect to `source` and the operator.
 
-    An operator of one color serves a source of several.
+    An operator of one color serves a source of several. What solvers make of the operator, in plain numbers, serves all its solves.
     """
-    coefficients = (c.expand(source.shape[0], -1, -1, -1) for c in (operator.loss, *operator.conductances))
-    return _Solve.apply(solve, source, *coefficients)
+    return _Solve.apply(solve, operator.made, source, operator.loss, *operator.conductances)

@@ -8,14 +8,17 @@ Neighbors are combined by slicing: conv3d with fixed difference kernels gives th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
 
+Made = TypeVar("Made")
 AXES = (1, 2, 3)
 """Array axes of z, y, x in a `[C, z, y, x]` tensor."""
 
@@ -25,11 +28,13 @@ class Operator:
     """A symmetric positive definite M-matrix per color.
 
     `conductances`: c [1/u] on the interior faces along z, y, x, each one entry shorter than a cell array along its axis; `loss`
-    [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0.
+    [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0. Conductances that all colors share may be given once. `made`: what solvers have made
+    of these numbers; to be handed on with them only.
     """
 
     conductances: tuple[Tensor, Tensor, Tensor]
     loss: Tensor
+    made: dict[Callable[[Operator], Any], Any] = field(default_factory=dict, repr=False, compare=False)
 
     @cached_property
     def diagonal(self) -> Tensor:
@@ -43,6 +48,12 @@ class Operator:
     def apply(self, u: Tensor) -> Tensor:
         """A u, `[C, z, y, x]`."""
         return subtract_neighbors(self.diagonal * u, u, self.conductances)
+
+    def once(self, make: Callable[[Operator], Made]) -> Made:
+        """What `make` makes of this operator, made when first asked for and kept: forward and adjoint solves share it."""
+        if make not in self.made:
+            self.made[make] = make(self)
+        return self.made[make]
 
 
 def lower(u: Tensor, axis: int) -> Tensor:
@@ -60,11 +71,11 @@ def difference(u: Tensor, axis: int) -> Tensor:
     return upper(u, axis) - lower(u, axis)
 
 
-def subtract_neighbors(result: Tensor, u: Tensor, conductances: tuple[Tensor, ...]) -> Tensor:
-    """`result` minus conductance times neighbor, over all interior faces; `result` is changed in place and returned."""
+def subtract_neighbors(result: Tensor, u: Tensor, conductances: tuple[Tensor, ...], times: float = 1.0) -> Tensor:
+    """`result` minus `times` conductance times neighbor, over all interior faces; `result` is changed in place and returned."""
     for axis, conductance in zip(AXES, conductances, strict=True):
-        lower(result, axis).addcmul_(conductance, upper(u, axis), value=-1)
-        upper(result, axis).addcmul_(conductance, lower(u, axis), value=-1)
+        lower(result, axis).addcmul_(conductance, upper(u, axis), value=-times)
+        upper(result, axis).addcmul_(conductance, lower(u, axis), value=-times)
     return result
 
 

@@ -30,11 +30,11 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
     [
         ("volume.g=0.3", "fluxes Q1 and L1 (g is not 0)", "no fluxes"),
         ("volume.g=0", "no fluxes Q1 and L1 (g = 0)", "delta-Eddington"),
-        ("diffusion.scheme=printed", "printed scheme by Jacobi", "conjugate_gradient"),
-        ("diffusion.scheme=conservative", "conjugate_gradient", "printed"),
+        ("diffusion.scheme=printed", "printed scheme by Jacobi", "multigrid"),
+        ("diffusion.scheme=conservative", "multigrid", "printed"),
         (
             "diffusion.model=flux_limited",
-            "flux_limited diffusion, marshak limiter, damped Picard iteration with conjugate_gradient",
+            "flux_limited diffusion, marshak limiter, damped Picard iteration with multigrid",
             "closure",
         ),
         ("diffusion.model=none", "no multiple scattering", "p1 diffusion"),

@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.diffusion.solvers import SOLVERS, hierarchy
 
 CASES = [("conjugate_gradient", shape) for shape in [(2, 3, 2), (1, 2, 4), (1, 1, 1)]] + [(solver, (2, 1, 2)) for solver in SOLVERS]
 
@@ -61,6 +61,22 @@ def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
         duals = [forward_ad.make_dual(tensor, d) for tensor, d in zip(arguments, directions, strict=True)]
         tangent = forward_ad.unpack_dual(solving()(*duals)).tangent
     assert float(((u_bar * tangent).sum() - along).abs()) < 1e-10 * float((u_bar * tangent).abs().sum())
+
+
+def test_the_adjoint_takes_what_the_forward_solve_made_of_the_operator(inputs, monkeypatch: pytest.MonkeyPatch):
+    source, loss, *conductances = (tensor.requires_grad_() for tensor in inputs())
+    operator = Operator(tuple(conductances), loss)
+    solve = Solve(SOLVERS["multigrid"], 1e-12, SolveMemory())
+    u = solve_diffusion(solve, operator, source)
+    assert operator.made
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("made again")
+
+    monkeypatch.setattr(hierarchy, "coarsened", refuse)
+    monkeypatch.setattr(hierarchy.Coarsest, "of", refuse)
+    solve_diffusion(solve, operator, 2 * source)
+    torch.autograd.grad(u.sum(), loss)
 
 
 def test_every_solve_is_recorded(inputs):

@@ -59,7 +59,7 @@ def test_radiance_that_is_not_held_at_zero_is_told(monkeypatch: pytest.MonkeyPat
 
 def test_a_solve_that_gives_up_is_told(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(TOLERANCE, torch.float32, 1e-30)
-    monkeypatch.setattr(import_module("ddrecon.diffusion.solvers.conjugate_gradient"), "MAX_ITERATIONS", 8)
+    monkeypatch.setattr(import_module("ddrecon.diffusion.solvers.multigrid"), "MAX_ITERATIONS", 8)
     result = run_case("small", SMALL, CPU)
     assert isinstance(result, Unsolved) and "did not reach its tolerance" in result.failures()[0]
     assert describe([result])["passed"] is False and "did not reach" in table([result])[2]

@@ -7,5 +7,6 @@ its right side, for every color. To add one: write its file, enter it here.
 
 from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.diffusion.solvers.jacobi import jacobi
+from ddrecon.diffusion.solvers.multigrid import multigrid
 
-SOLVERS = {"conjugate_gradient": conjugate_gradient, "jacobi": jacobi}
+SOLVERS = {"multigrid": multigrid, "conjugate_gradient": conjugate_gradient, "jacobi": jacobi}

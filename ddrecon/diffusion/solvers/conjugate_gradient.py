@@ -22,7 +22,7 @@ def conjugate_gradient(operator: Operator, source: Tensor, guess: Tensor | None,
     for iteration in range(MAX_ITERATIONS + 1):
         if iteration % CHECK_EVERY == 0 and not (relative := system.relative(residual)) > tolerance:
             break
-        product = system.apply(direction)
+        product = system.matrix.apply(direction)
         step = square / inner(direction, product).clamp(min=tiny)
         y.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
@@ -30,4 +30,4 @@ def conjugate_gradient(operator: Operator, source: Tensor, guess: Tensor | None,
         direction.mul_(square / previous.clamp(min=tiny)).add_(residual)
     if not relative <= tolerance:
         raise system.give_up("conjugate_gradient", iteration, relative)
-    return Solution(system.scale * y, iteration, relative)
+    return system.solution(y, iteration, relative)

@@ -19,7 +19,7 @@ def jacobi(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: 
         if iteration % CHECK_EVERY == 0 and not (relative := system.relative(residual)) > tolerance:
             break
         y += residual
-        residual = system.source - system.apply(y)
+        residual = system.matrix.residual(y, system.source)
     if not relative <= tolerance:
         raise system.give_up("jacobi", iteration, relative)
-    return Solution(system.scale * y, iteration, relative)
+    return system.solution(y, iteration, relative)

@@ -21,38 +21,64 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class ScaledSystem:
-    """S A S y = S b with unit diagonal, and u = S y; `scale` is S, `conductances` those of S A S."""
+class ScaledMatrix:
+    """S A S, whose diagonal is 1; `scale` is S, `conductances` those of S A S."""
 
     scale: Tensor
     conductances: tuple[Tensor, ...]
+
+    @staticmethod
+    def of(operator: Operator) -> ScaledMatrix:
+        """The scaled form of `operator`."""
+        scale = operator.diagonal.rsqrt()
+        scaled = tuple(c * lower(scale, axis) * upper(scale, axis) for axis, c in zip(AXES, operator.conductances, strict=True))
+        return ScaledMatrix(scale, scaled)
+
+    def apply(self, y: Tensor) -> Tensor:
+        """S A S y."""
+        return subtract_neighbors(y.clone(), y, self.conductances)
+
+    def residual(self, y: Tensor, source: Tensor) -> Tensor:
+        """`source` - S A S y."""
+        return subtract_neighbors(source - y, y, self.conductances, times=-1.0)
+
+    def relaxed(self, y: Tensor, source: Tensor, step: float) -> Tensor:
+        """y + `step` (`source` - S A S y)."""
+        return subtract_neighbors(torch.lerp(y, source, step), y, self.conductances, times=-step)
+
+
+@dataclass(frozen=True)
+class ScaledSystem:
+    """S A S y = S b, and u = S y."""
+
+    matrix: ScaledMatrix
     source: Tensor
     source_norm: Tensor
 
     @staticmethod
     def of(operator: Operator, source: Tensor) -> ScaledSystem:
         """The scaled form of `operator` u = `source`."""
-        scale = operator.diagonal.rsqrt()
-        scaled = tuple(c * lower(scale, axis) * upper(scale, axis) for axis, c in zip(AXES, operator.conductances, strict=True))
-        return ScaledSystem(scale, scaled, scale * source, norm(scale * source))
-
-    def apply(self, y: Tensor) -> Tensor:
-        """S A S y."""
-        return subtract_neighbors(y.clone(), y, self.conductances)
+        matrix = operator.once(ScaledMatrix.of)
+        scaled = matrix.scale * source
+        return ScaledSystem(matrix, scaled, norm(scaled))
 
     def start(self, guess: Tensor | None) -> tuple[Tensor, Tensor]:
         """The first iterate, from a guess of u, and its residual; where the guess is worse than zero, zero."""
         nothing = torch.zeros_like(self.source)
         if guess is None or guess.shape != self.source.shape:
             return nothing, self.source.clone()
-        y = guess / self.scale
-        residual = self.source - self.apply(y)
+        y = guess / self.matrix.scale
+        residual = self.matrix.residual(y, self.source)
         helps = norm(residual) < self.source_norm
         return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
 
     def relative(self, residual: Tensor) -> float:
         """The norm of `residual` over that of the right side, largest over the colors; 0 for a color without source."""
         return float((norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)).max())
+
+    def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
+        """The solution that y is."""
+        return Solution(self.matrix.scale * y, iterations, residual)
 
     def give_up(self, name: str, iterations: int, residual: float) -> SolveError:
         """The error of a solve that did not converge."""

@@ -1,0 +1,101 @@
+"""The V-cycle of multigrid: relaxation on each grid, and a correction from a coarser one, down to a few cells that are solved directly.
+
+A cycle is a symmetric positive definite matrix, as a preconditioner of conjugate gradients must be: relaxation after the correction is
+the transpose of that before it, restriction that of interpolation, and each relaxation makes every error smaller.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import AXES, Operator, lower, upper
+from ddrecon.diffusion.solvers.coarsening import Coarsening, coarsened
+from ddrecon.diffusion.solvers.scaled import ScaledMatrix
+
+FEW_CELLS = 128
+"""So many cells are solved directly."""
+STRONG = 0.5
+"""Axes whose conductances are weaker than this part of the strongest are not coarsened yet: relaxation is slow along them."""
+SMOOTHEST = 1 / 3
+"""The least eigenvalue that relaxation has to take care of: that of an error that alternates along one axis of cubic cells."""
+CENTER, REACH = (2 + SMOOTHEST) / 2, (2 - SMOOTHEST) / 2 * math.cos(math.pi / 4)
+STEPS = (1 / (CENTER - REACH), 1 / (CENTER + REACH))
+"""The two relaxations of Chebyshev's polynomial on [`SMOOTHEST`, 2]; no eigenvalue of a scaled M-matrix is above 2."""
+
+
+@dataclass(frozen=True)
+class Coarsest:
+    """A few cells; `inverse` [C, n, n] of their matrix."""
+
+    inverse: Tensor
+
+    @staticmethod
+    def of(operator: Operator) -> Coarsest:
+        """The direct solve of `operator`, made in double precision, in which differences of its entries are exact enough."""
+        shape = operator.loss.shape[1:]
+        number = torch.arange(math.prod(shape), device=operator.loss.device).view(1, *shape)
+        matrix = torch.diag_embed(Operator(_double(operator.conductances), operator.loss.double()).diagonal.flatten(1))
+        for axis, conductance in zip(AXES, operator.conductances, strict=True):
+            low, high = lower(number, axis).flatten(), upper(number, axis).flatten()
+            matrix[:, low, high] = matrix[:, high, low] = -conductance.flatten(1).double()
+        return Coarsest(torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L).to(operator.loss.dtype))
+
+    def correction(self, residual: Tensor) -> Tensor:
+        """A^-1 `residual`."""
+        return (self.inverse @ residual.flatten(1).unsqueeze(-1)).view_as(residual)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A grid: its matrix, and the way to the next coarser one, axis by axis."""
+
+    matrix: ScaledMatrix
+    ways: tuple[Coarsening, ...]
+    coarser: Level | Coarsest
+
+    @staticmethod
+    def of(operator: Operator) -> Level:
+        """The grid of `operator` and all coarser ones."""
+        matrix, ways = operator.once(ScaledMatrix.of), []
+        for axis in _strong_axes(matrix):
+            way, operator = coarsened(operator, axis)
+            ways.append(way)
+        has_few = operator.loss[0].numel() <= FEW_CELLS
+        return Level(matrix, tuple(ways), Coarsest.of(operator) if has_few else Level.of(operator))
+
+    def cycle(self, source: Tensor) -> Tensor:
+        """Roughly y with S A S y = `source` [C, z, y, x]: linear in `source`, symmetric and positive definite."""
+        y = STEPS[0] * source
+        for step in STEPS[1:]:
+            y = self.matrix.relaxed(y, source, step)
+        coarse = self.matrix.residual(y, source).div_(self.matrix.scale)
+        for way in self.ways:
+            coarse = way.restrict(coarse)
+        coarse = self.coarser.correction(coarse)
+        for way in reversed(self.ways):
+            coarse = way.prolong(coarse)
+        y.addcdiv_(coarse, self.matrix.scale)
+        for step in reversed(STEPS):
+            y = self.matrix.relaxed(y, source, step)
+        return y
+
+    def correction(self, residual: Tensor) -> Tensor:
+        """Roughly A^-1 `residual`, by one cycle."""
+        return self.cycle(self.matrix.scale * residual).mul_(self.matrix.scale)
+
+
+def _strong_axes(matrix: ScaledMatrix) -> list[int]:
+    """The axes to coarsen, all that have more than one cell and are not weak."""
+    sizes = matrix.scale.shape
+    axes = [axis for axis in AXES if sizes[axis] > 1]
+    strengths = torch.stack([matrix.conductances[axis - 1].mean() for axis in axes]).tolist() if axes else []
+    return [axis for axis, strength in zip(axes, strengths, strict=True) if not strength < STRONG * max(strengths)]
+
+
+def _double(conductances: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    z, y, x = conductances
+    return z.double(), y.double(), x.double()
