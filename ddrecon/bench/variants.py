@@ -19,7 +19,7 @@ ROUNDS = ((0, 26), (1, 26), (2, 26), (1, 50), (2, 50), (4, 50))
 STEPS = (1, 2)
 COARSER = (2, 4)
 """Factors by which the grid is made coarser; targets and cameras keep their pixels."""
-EXACT: dict[str, Any] = {"solver": "conjugate_gradient", "tolerance": 1e-10, "warm_start": False}
+EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-10, "warm_start": False}
 EXACT_STEPS = 4
 
 
