@@ -6,7 +6,8 @@ The numerical error is against the same model solved exactly, in double precisio
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -65,16 +66,13 @@ def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
     return Shot(image.detach(), _block_sums(gradient, blocks), middle - start, end - middle, iterations)
 
 
-def measure(variants: Sequence[Variant], scene: Scene, turns: int, progress: Progress) -> dict[str, Timing]:
-    """By name, the timings of all `variants` that can be solved, each once in every turn, so that what else runs slows all alike."""
-    blocks = blocks_of(scene)
-    timings = {variant.name: Timing() for variant in variants}
-    for turn, variant in progress([(turn, variant) for turn in range(turns) for variant in variants], "bench"):
-        if turn == len(timings[variant.name].shots):
-            try:
-                timings[variant.name].shots.append(shoot(variant.change(scene), blocks))
-            except SolveError:
-                continue
+def measure(contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress) -> dict[str, Timing]:
+    """By name, the timings of all `contestants` that can be solved, each once in every turn, so that what else runs slows all alike."""
+    timings = {name: Timing() for name in contestants}
+    for turn, name in progress([(turn, name) for turn in range(turns) for name in contestants], "bench"):
+        if turn == len(timings[name].shots):
+            with suppress(SolveError):
+                timings[name].shots.append(contestants[name]())
     return {name: timing for name, timing in timings.items() if timing.shots}
 
 
