@@ -15,7 +15,7 @@ from ddrecon.bench.measure import Progress, blocks_of, exact_shots, measure, sho
 from ddrecon.bench.plot import draw
 from ddrecon.bench.plume import plume_scene
 from ddrecon.bench.report import Row, rows_of, table
-from ddrecon.bench.variants import variants_of
+from ddrecon.bench.variants import QUICK, Sweep, variants_of
 from ddrecon.io.json_file import write_json
 from ddrecon.reconstruct.levels import at_level
 from ddrecon.session import Session
@@ -69,7 +69,7 @@ def quick(scene: Scene) -> Scene:
 def run_bench(scene: Scene, double: Scene, is_quick: bool, progress: Progress) -> list[Row]:
     """A row for every variant of `scene` (its first view); `double` is the same scene in double precision."""
     scene, double = (replace(item, views=item.views[:1]) for item in (scene, double))
-    variants = variants_of(scene)
+    variants = variants_of(scene, QUICK if is_quick else Sweep())
     exact = exact_shots(variants, double, progress)
     ours = {variant.name: functools.partial(shoot, variant.change(scene), blocks_of(scene)) for variant in variants}
     timings = measure(ours, 1 if is_quick else TURNS, progress)

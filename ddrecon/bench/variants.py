@@ -13,13 +13,20 @@ from ddrecon.reconstruct.levels import at_level
 from ddrecon.settings import DiffusionSettings
 from ddrecon.world import Scene
 
-TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
-ROUNDS = ((0, 26), (1, 26), (2, 26), (1, 50), (2, 50), (4, 50))
-"""Transport rounds and directions."""
-STEPS = (1, 2)
-COARSER = (2, 4)
-"""Factors by which the grid is made coarser; targets and cameras keep their pixels."""
-EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-10, "warm_start": False}
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is tried: tolerances, models, transport rounds with directions, steps a voxel, and factors by which the grid is made coarser."""
+
+    tolerances: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
+    models: tuple[str, ...] = ("p1", "flux_limited")
+    rounds: tuple[tuple[int, int], ...] = ((0, 26), (1, 26), (2, 26), (1, 50), (2, 50), (4, 50))
+    steps: tuple[int, ...] = (1, 2)
+    coarser: tuple[int, ...] = (2, 4)
+
+
+QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (2,))
+EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
 EXACT_STEPS = 4
 
 
@@ -37,9 +44,9 @@ class Variant:
         return f"{self.factor} {self.value}".strip()
 
 
-def variants_of(scene: Scene) -> list[Variant]:
-    """The base, and every variant that differs from it."""
-    return [Variant("base", "", lambda scene: scene), *(item for item in _all() if not _is_same(item.change(scene), scene))]
+def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
+    """The base, and every variant of `sweep` that differs from it."""
+    return [Variant("base", "", lambda scene: scene), *(item for item in _all(sweep) if not _is_same(item.change(scene), scene))]
 
 
 def exactly(scene: Scene) -> Scene:
@@ -53,19 +60,20 @@ def model_of(scene: Scene) -> tuple[object, ...]:
     return scene.volume.grid.shape, _effective(replace(scene.diffusion, **EXACT))
 
 
-def _all() -> Iterator[Variant]:
+def _all(sweep: Sweep) -> Iterator[Variant]:
     for solver in SOLVERS:
         yield _diffusing("solver", solver, solver=solver)
-    for tolerance in TOLERANCES:
+    for tolerance in sweep.tolerances:
         yield _diffusing("tolerance", tolerance, tolerance=tolerance)
     for closure in CLOSURES:
         yield _diffusing("closure", closure, closure=closure)
-    yield _diffusing("model", "flux_limited", model="flux_limited")
-    for rounds, directions in ROUNDS:
+    for model in sweep.models:
+        yield _diffusing("model", model, model=model)
+    for rounds, directions in sweep.rounds:
         yield _diffusing("rounds", f"{rounds}, {directions} directions", transport_rounds=rounds, transport_directions=directions)
-    for steps in STEPS:
+    for steps in sweep.steps:
         yield _marching("steps", steps, steps_per_voxel=steps)
-    for factor in COARSER:
+    for factor in sweep.coarser:
         yield Variant("grid", f"{factor} times coarser", functools.partial(_coarser, factor))
 
 
