@@ -74,6 +74,10 @@ class Rays:
     direction: Tensor
     eye: Tensor | None
 
+    def chosen(self, index: Tensor) -> Rays:
+        """The rays at `index`."""
+        return Rays(self.origin[index], self.direction[index], self.eye)
+
 
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world matrix `[3, 4]` of a camera at `origin` looking at `target`; all three are `[3]` (x, y, z).

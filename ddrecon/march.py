@@ -1,36 +1,36 @@
 """View rays: the integral of what the medium sends towards the camera (docs/theory.md E1-E3).
 
-Rays are marched slice by slice along the axis along which they cross most cells, with two-dimensional interpolation in each slice; where
-that is not possible (a camera inside the box, rays nearly along a slice) by three-dimensional interpolation at equal steps.
 Between two nodes of a ray density and optical depth are taken as linear, so emission times transmittance has a closed form.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeGuard
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from ddrecon.autodiff import recomputed
 from ddrecon.cameras import Rays
 from ddrecon.decay import decayed_sum
 from ddrecon.grid import Grid
+from ddrecon.lattice import Lattice, is_rough, lattice_for, seen_between
 from ddrecon.medium import Coefficient
 from ddrecon.nodes import Nodes
 from ddrecon.point_light import PointBeam
 from ddrecon.reduced import Beam
-from ddrecon.sampling import Smooth, sample_slices, sample_volume, subdivided
+from ddrecon.running import running_sum
+from ddrecon.sampling import Smooth
+from ddrecon.settings import RenderSettings
+from ddrecon.view_rays import Crossing, Equidistant, Slices, cross_box, sampler_for, through_box
 
 CHUNK_NODES = 1 << 18
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and memory does not grow with pixels."""
 CELLS_PER_NODE = 16
 """In large volumes a chunk has a node for so many cells: its backward pass fills an array of all cells, whatever the number of nodes."""
-STEEPEST = 0.2
-"""Smallest direction cosine, in units of cells and against the axis across the slices, of rays that are marched by slices."""
 
 
 @dataclass(frozen=True)
@@ -56,101 +56,91 @@ class Emission:
         return max(self.diffuse.shape[0], self.extinction.scale.shape[0], *(beam.irradiance.shape[0] for beam in self.beams), 1)
 
 
-@dataclass(frozen=True)
-class Crossing:
-    """The part of each ray inside the box: where rays `hit` it (indices), and distances [u] to `near` and `far` there."""
-
-    hit: Tensor
-    near: Tensor
-    far: Tensor
-
-
 def march(emission: Emission, rays: Rays, steps_per_voxel: int) -> tuple[Tensor, Tensor]:
     """Radiance [C, R] scattered towards the camera along `rays`, and transmittance [C, R] of the whole volume along them."""
     crossing = cross_box(emission.grid, rays)
-    blank = emission.diffuse.new_zeros(emission.colors, rays.direction.shape[0])
     if crossing.hit.numel() == 0:
-        return blank, blank + 1
-    sampler = _sampler(emission, rays, crossing, steps_per_voxel)
-
-    def run(chunk: Tensor) -> tuple[Tensor, Tensor]:
-        chosen = crossing.hit[chunk]
-        origin, direction = rays.origin[chosen], rays.direction[chosen]
-        values, distance = sampler.sample(origin, direction, crossing.near[chunk], crossing.far[chunk])
-        return _integrate(emission, values, Nodes(origin, direction, distance))
-
-    nodes = max(CHUNK_NODES, emission.grid.cells // CELLS_PER_NODE)
-    chunks = torch.arange(crossing.hit.numel(), device=blank.device).split(max(1, nodes // sampler.nodes))
-    parts = [recomputed(run, chunk) for chunk in chunks]
-    scattered, transmittance = (torch.cat(part, 1) for part in zip(*parts, strict=True))
-    return blank.index_copy(1, crossing.hit, scattered), (blank + 1).index_copy(1, crossing.hit, transmittance)
+        return _seen(emission, rays, [])
+    sampler = sampler_for(*_packed(emission), emission.grid, rays, crossing, steps_per_voxel)
+    return _seen(emission, rays, [(crossing.hit, _march_rays(emission, sampler, rays, crossing))])
 
 
-def cross_box(grid: Grid, rays: Rays) -> Crossing:
-    """Where `rays` run inside the box of `grid`, in front of the camera."""
-    low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
-    tiny = torch.finfo(rays.direction.dtype).tiny
-    safe = torch.where(rays.direction.abs() < tiny, torch.full_like(rays.direction, tiny), rays.direction)
-    one, other = (low - rays.origin) / safe, (high - rays.origin) / safe
-    near = torch.minimum(one, other).amax(-1).clamp(min=0)
-    far = torch.maximum(one, other).amin(-1)
-    hit = (far > near).nonzero()[:, 0]
-    return Crossing(hit, near[hit], far[hit])
+def march_each(emission: Emission, bundles: Sequence[Rays], settings: RenderSettings, behind: float) -> list[tuple[Tensor, Tensor]]:
+    """What `march` returns, for each of the `bundles` of one camera, with light no brighter than `behind` seen through the volume.
+
+    Where it is less work rays are those of a lattice, and pixels are interpolated to third order, but for those that this might change
+    by more than `settings.tolerance` of the image's root mean square: they have their own rays.
+    """
+    crossings = [cross_box(emission.grid, bundle) for bundle in bundles]
+    hits = [crossing.hit for crossing in crossings]
+    if settings.tolerance == 0 or not all(map(len, hits)):
+        return [march(emission, bundle, settings.steps_per_voxel) for bundle in bundles]
+    sampler = sampler_for(*_packed(emission), emission.grid, bundles[0], crossings[0], settings.steps_per_voxel)
+    lattice = lattice_for(emission.grid, sampler.axis, bundles, hits) if isinstance(sampler, Slices) else None
+    if lattice is None or not isinstance(sampler, Slices):
+        return [march(emission, bundle, settings.steps_per_voxel) for bundle in bundles]
+    values = _march_lattice(emission, sampler, lattice)
+    scattered, opacity = values.detach().split(emission.colors)
+    most = settings.tolerance * float((scattered + behind * (1 - opacity)).square().mean().sqrt())
+    visible = torch.cat([scattered, behind * opacity])
+    images = []
+    for bundle, crossing in zip(bundles, crossings, strict=True):
+        places = lattice.places(bundle.chosen(crossing.hit))
+        parts = [(crossing.hit, seen_between(values, places))]
+        own = crossing.chosen(is_rough(visible, most, places))
+        if len(own.hit):
+            parts.append((own.hit, _march_rays(emission, sampler, bundle, own)))
+        images.append(_seen(emission, bundle, parts))
+    return images
 
 
-class _Slices:
-    """Values where rays cross the planes through the cell centers across `axis`, and the two faces of the box."""
-
-    def __init__(self, fields: Tensor, smooth: Smooth | None, grid: Grid, axis: int, is_reversed: bool, steps: int):
-        self.smooth = smooth
-        self.axis, self.across = axis, [other for other in range(3) if other != axis]
-        self.lower, self.extent = grid.lower, grid.extent
-        count = grid.shape[axis]
-        place = torch.arange(count + 2, dtype=fields.dtype, device=fields.device) - 0.5
-        planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
-        index = (place - 0.5).clamp(0, count - 1).long()
-        if is_reversed:
-            index, planes = index.flip(0), planes.flip(0)
-        slices = fields.permute(1 + axis, 0, *(1 + other for other in self.across)).index_select(0, index)
-        self.slices, self.planes = subdivided(slices, steps, smooth), subdivided(planes, steps)
-        self.nodes = len(self.planes)
-
-    def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        distance = (self.planes[:, None] - origin[:, self.axis]) / direction[:, self.axis]
-        points = [2 * (origin[:, a] + distance * direction[:, a] - self.lower[a]) / self.extent[a] - 1 for a in self.across]
-        values = sample_slices(self.slices, torch.stack([points[1], points[0]], -1), smooth=self.smooth)
-        return values, torch.minimum(torch.maximum(distance, near), far)
+def _seen(emission: Emission, rays: Rays, parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Radiance and transmittance [C, R] along `rays`: `parts` in turn: indices, radiance and opacity [2 C, P] there."""
+    values = emission.diffuse.new_zeros(2 * emission.colors, len(rays.direction))
+    for index, found in parts:
+        values = values.index_copy(1, index, found)
+    scattered, opacity = values.split(emission.colors)
+    return scattered, 1 - opacity
 
 
-class _Equidistant:
-    """Values at equal steps along rays, wherever these run."""
+def _march_rays(emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing) -> Tensor:
+    """Radiance and opacity [2 C, P] along those of `rays` that are in `crossing`."""
 
-    def __init__(self, fields: Tensor, smooth: Smooth | None, grid: Grid, longest: float, steps: int):
-        self.smooth = smooth
-        self.fields, self.lower, self.extent = fields, fields.new_tensor(grid.lower), fields.new_tensor(grid.extent)
-        self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
+    def run(chunk: Tensor) -> Tensor:
+        chosen = rays.chosen(crossing.hit[chunk])
+        values, distance = sampler.sample(chosen.origin, chosen.direction, crossing.near[chunk], crossing.far[chunk])
+        return _integrate(emission, values, Nodes(chosen.origin, chosen.direction, distance))
 
-    def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-        part = torch.linspace(0, 1, self.nodes, dtype=near.dtype, device=near.device)[:, None]
-        distance = near + part * (far - near)
-        points = 2 * (origin + distance[..., None] * direction - self.lower) / self.extent - 1
-        values = sample_volume(self.fields, points.flip(-1), self.smooth)
-        return values.transpose(0, 1), distance
+    chunks = torch.arange(len(crossing.hit), device=crossing.hit.device).split(_chunk(emission.grid, sampler.nodes))
+    return torch.cat([recomputed(run, chunk) for chunk in chunks], 1)
 
 
-def _sampler(emission: Emission, rays: Rays, crossing: Crossing, steps: int) -> _Slices | _Equidistant:
-    """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps."""
-    fields = torch.cat(_fields(emission))
+def _march_lattice(emission: Emission, slices: Slices, lattice: Lattice) -> Tensor:
+    """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
+    grid, columns = emission.grid, slices.lattice_columns(lattice)
+
+    def run(rows: Tensor) -> Tensor:
+        rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
+        near, far = through_box(grid, rays)
+        values, distance = slices.sample_rows(lattice, rows, columns, rays)
+        inside = torch.minimum(torch.maximum(distance, near), torch.maximum(near, far))
+        return _integrate(emission, values, Nodes(rays.origin, rays.direction, inside))
+
+    count = max(1, _chunk(grid, slices.nodes) // len(lattice.columns))
+    return torch.cat([recomputed(run, rows) for rows in lattice.rows.split(count)], 1).unflatten(1, lattice.shape)
+
+
+def _chunk(grid: Grid, nodes: int) -> int:
+    """How many rays of so many `nodes` are marched at a time."""
+    return max(1, max(CHUNK_NODES, grid.cells // CELLS_PER_NODE) // nodes)
+
+
+def _packed(emission: Emission) -> tuple[Tensor, Smooth | None]:
+    """All fields to interpolate [channels, z, y, x], and which of them to third order."""
     first = emission.extinction.field.shape[0] + emission.diffuse.shape[0]
     last = first + sum(beam.mass.shape[0] for beam in emission.beams)
     smooth = Smooth(first, last, emission.extinction.mass_bound) if emission.beams else None
-    speed = normalize(rays.direction[crossing.hit] / rays.direction.new_tensor(emission.grid.spacing), dim=1)
-    axis = int(speed.abs().mean(0).argmax())
-    along = speed[:, axis]
-    is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
-    if is_steep and bool((crossing.near > 0).all()):
-        return _Slices(fields, smooth, emission.grid, axis, bool(along[0] < 0), steps)
-    return _Equidistant(fields, smooth, emission.grid, float((crossing.far - crossing.near).max()), steps)
+    return torch.cat(_fields(emission)), smooth
 
 
 def _fields(emission: Emission) -> list[Tensor]:
@@ -168,15 +158,15 @@ def _is_field(peak: Tensor | None) -> TypeGuard[Tensor]:
     return peak is not None and peak.shape[1:].numel() > 1
 
 
-def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> tuple[Tensor, Tensor]:
-    """Scattered radiance and transmittance, each [C, R], from `values` [N, channels, R] at the `nodes`."""
+def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> Tensor:
+    """Scattered radiance and opacity [2 C, R] from `values` [N, channels, R] at the `nodes`."""
     sizes = [field.shape[0] for field in _fields(emission)]
     extinction, diffuse, *others = values.split(sizes, 1)
     peak = others.pop() if _is_field(emission.peak) else emission.peak.view(-1, 1) if emission.peak is not None else None
     masses, scattering = others[: len(emission.beams)], (others[len(emission.beams) :] or [extinction])[0]
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     mass = nodes.integral(extinction)
-    end = mass.cumsum(0)
+    end = running_sum(mass)
     begin = end - mass
     scattered = decayed_sum(nodes.integral(scattering * diffuse), begin, end, scale)
     passed = torch.cat([torch.zeros_like(end[:1]), end])
@@ -184,4 +174,4 @@ def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> tuple[Tensor
         weight, phase = beam.scattered(scattering, nodes, emission.g, None if peak is None else peak * (passed + beam_mass))
         arriving = decayed_sum(weight, begin + beam_mass[:-1], end + beam_mass[1:], scale)
         scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
-    return scattered * emission.scattering.scale.view(-1, 1), torch.exp(-scale * end[-1])
+    return torch.cat([scattered * emission.scattering.scale.view(-1, 1), -torch.expm1(-scale * end[-1])])

@@ -22,11 +22,10 @@ from ddrecon.nodes import Nodes
 from ddrecon.phase import henyey_greenstein, peaked_phase
 from ddrecon.point_light import PointBeam, point_beam
 from ddrecon.quadrature import sphere_quadrature
-from ddrecon.sampling import Smooth, on_kink, ramp, sample_slices, subdivided
+from ddrecon.running import running_sum
+from ddrecon.sampling import Smooth
+from ddrecon.separable import Weights, sample_lattice
 from ddrecon.sky import Sky, Source
-
-PLANES = 2
-"""Planes a slice at which a slanted beam looks at the field on its way: with one, it would miss what lies between."""
 
 
 @dataclass(frozen=True)
@@ -160,54 +159,52 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | f
         slices = slices.flip(0)
     slope = torch.stack([speed[other] for other in range(3) if other != axis]) / speed[axis].abs()
     step = grid.spacing[axis] / direction[axis].abs()
-    sheared = _shear(subdivided(slices, PLANES), slope / PLANES)
-    centers = sheared[::PLANES]
-    before = (centers.cumsum(0) - centers) * step
-    segments = torch.cat([PLANES * sheared[:1], sheared[1:] + sheared[:-1]]) * (0.5 * step / PLANES)
-    finer = segments.cumsum(0)[::PLANES] - before - 0.5 * step * centers
+    shear = _Shear.of(slices, slope)
+    centers, middles = shear.there(slices, 0.0), shear.there(0.5 * (slices[1:] + slices[:-1]), 0.5)
+    bends = middles - 0.5 * (centers[1:] + centers[:-1])
+    finer = running_sum(torch.cat([torch.zeros_like(bends[:1]), bends])) * (0.5 * step)
     smooth = Smooth(0, field.shape[0], bound)
-    before = before + smooth.bounded(finer)
-    entered = _unshear(before, slope, (slices.shape[2], slices.shape[3]), smooth)
+    entered = shear.back((running_sum(centers) - centers) * step + smooth.bounded(finer), smooth)
     if is_reversed:
         entered = entered.flip(0)
     return entered.permute([order.index(dim) for dim in range(4)]), step
 
 
-def _shear(slices: Tensor, slope: Tensor) -> Tensor:
-    """Slice k of `slices` [N, K, H, W] shifted by -k `slope` cells, on a lattice wide enough to hold every slice."""
-    height, width = slices.shape[2:]
-    rows, columns = (abs(base) for base in _bases(slices, slope))
-    lattice = (height + rows, width + columns)
-    points = _lattice_points(slices, lattice, slope, (height, width), 1)
-    sheared = sample_slices(slices, points) * _coverage(points, (height, width))[:, None]
-    return sheared.unflatten(-1, lattice)
+@dataclass(frozen=True)
+class _Shear:
+    """Slices of `size` cells on a `lattice` that holds all of them, slice k shifted by -k `slope` cells, slice 0 beginning at `first`."""
 
+    slope: Tensor
+    size: tuple[int, int]
+    lattice: tuple[int, int]
+    first: tuple[int, int]
 
-def _coverage(points: Tensor, size: tuple[int, int]) -> Tensor:
-    """1 inside slices of `size` cells, falling to 0 at one cell beyond their outermost cells' centers, along each axis, `[N, P]`."""
-    sides = points.new_tensor(size[::-1])
-    place = ((points + 1) * sides - 1) / 2
-    return ramp(torch.minimum(place + 1, sides - place), on_kink(points, max(size))).prod(-1)
+    @staticmethod
+    def of(slices: Tensor, slope: Tensor) -> _Shear:
+        """That of `slices` [N, K, H, W]."""
+        height, width = slices.shape[2:]
+        rows, columns = (math.floor(abs(s) * (slices.shape[0] - 1) + 1e-9) + 1 for s in slope.tolist())
+        is_on = [s > 0 for s in slope.tolist()]
+        return _Shear(slope, (height, width), (height + rows, width + columns), (rows * is_on[0], columns * is_on[1]))
 
+    def there(self, slices: Tensor, shift: float) -> Tensor:
+        """`slices` [N, K, H, W], numbered from `shift`, on the lattice; they fall to zero one cell beyond their outermost centers."""
+        places = self._places(slices, shift, self.lattice, self.size, 1)
+        rows, columns = (Weights.at(place, size, fades=True) for place, size in zip(places, self.size, strict=True))
+        return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
 
-def _unshear(sheared: Tensor, slope: Tensor, size: tuple[int, int], smooth: Smooth) -> Tensor:
-    """The inverse of `_shear`, back on slices of `size` cells."""
-    height, width = sheared.shape[2:]
-    return sample_slices(sheared, _lattice_points(sheared, size, slope, (height, width), -1), smooth).unflatten(-1, size)
+    def back(self, sheared: Tensor, smooth: Smooth) -> Tensor:
+        """Slices of values `sheared` on the lattice, in cells again."""
+        places = self._places(sheared, 0.0, self.size, self.lattice, -1)
+        rows, columns = (Weights.at(place, size, is_smooth=True) for place, size in zip(places, self.lattice, strict=True))
+        return sample_lattice(sheared, rows, columns, smooth).unflatten(-1, self.size)
 
-
-def _bases(slices: Tensor, slope: Tensor) -> list[int]:
-    """Cells by which slices drift in all, along rows and columns, with the sign of `slope`; the first slice does not drift."""
-    return [int(math.copysign(math.floor(abs(s) * (slices.shape[0] - 1) + 1e-9) + 1, s)) for s in slope.tolist()]
-
-
-def _lattice_points(slices: Tensor, lattice: tuple[int, int], slope: Tensor, source: tuple[int, int], sign: int) -> Tensor:
-    """Where the points of `lattice` fall, slice by slice, in slices of `source` cells: shifted by `sign` k `slope`, in [-1, 1]."""
-    index = torch.arange(slices.shape[0], dtype=slices.dtype, device=slices.device)
-    lines = []
-    for cells, shift, base, size in zip(lattice, slope, _bases(slices, slope), source, strict=True):
-        drift = sign * (index * shift - max(base, 0))
-        position = drift[:, None] + torch.arange(cells, dtype=slices.dtype, device=slices.device)
-        lines.append((2 * position + 1) / size - 1)
-    rows, columns = lines
-    return torch.stack(torch.broadcast_tensors(columns[:, None, :], rows[:, :, None]), -1).flatten(1, 2)
+    def _places(self, like: Tensor, shift: float, points: tuple[int, int], cells: tuple[int, int], sign: int) -> list[Tensor]:
+        """Where rows and columns of `points` fall among those of `cells`, slice by slice, in [-1, 1]."""
+        index = torch.arange(like.shape[0], dtype=like.dtype, device=like.device) + shift
+        lines = []
+        for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True):
+            drift = sign * (index * slope - first)
+            position = drift[:, None] + torch.arange(count, dtype=like.dtype, device=like.device)
+            lines.append((2 * position + 1) / size - 1)
+        return lines

@@ -6,7 +6,7 @@ directions but where unscattered ambient light is asked for by itself, no fluxes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,12 +22,12 @@ from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.diffusion.transport import transported
 from ddrecon.environment import environment_radiance
 from ddrecon.lights import AmbientLight, EnvironmentLight, Light
-from ddrecon.march import Emission, march
+from ddrecon.march import Emission, march_each
 from ddrecon.medium import Medium, scaled_medium, unscaled_medium
 from ddrecon.moments import Moments, Vector
 from ddrecon.point_light import PointBeam
 from ddrecon.reduced import Beam, ambient_radiance, ambient_sky, reduced_light, scattered_sky, unscattered_sky
-from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.settings import DiffusionSettings
 from ddrecon.sky import Sky, sources
 from ddrecon.world import Scene, View
 
@@ -142,7 +142,7 @@ def view_image(light_field: LightField, scene: Scene, camera: Camera, derivative
     """
     if derivatives == "all":
         emission = _emission(light_field, rays(camera))
-        return _average(camera, scene.render, lambda bundle: _radiance(emission, scene, bundle))
+        return _image(emission, scene, camera)
     nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
     once, often = replace(light_field, outgoing=nothing), replace(light_field, beams=(), skies=())
     parts = {"single": (once, scene), "diffusion": (often, _without_background(scene))}
@@ -170,10 +170,15 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     return Components(reduced, single, image - reduced - single)
 
 
-def _average(camera: Camera, settings: RenderSettings, radiance: Callable[[Rays], Tensor]) -> Tensor:
-    offsets = subpixel_offsets(settings.samples_per_pixel)
-    total = torch.stack([radiance(rays(camera, offset)) for offset in offsets]).mean(0)
-    return total.unflatten(-1, camera.size)
+def _image(emission: Emission, scene: Scene, camera: Camera) -> Tensor:
+    """Radiance [3, h, w]: E1, averaged over the rays of each pixel."""
+    bundles = [rays(camera, offset) for offset in subpixel_offsets(scene.render.samples_per_pixel)]
+    lights = scene.lights if scene.render.background else []
+    behind = [_background(lights, bundle) for bundle in bundles]
+    brightest = max(float(radiance.detach().max()) for radiance in behind)
+    marched = march_each(emission, bundles, scene.render, brightest)
+    radiance = [scattered + clear * light for (scattered, clear), light in zip(marched, behind, strict=True)]
+    return torch.stack(radiance).mean(0).expand(3, -1).unflatten(-1, camera.size)
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
@@ -184,14 +189,6 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     if light_field.skies:
         diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
     return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g, medium.peak)
-
-
-def _radiance(emission: Emission, scene: Scene, bundle: Rays) -> Tensor:
-    """Radiance [3, R] along `bundle`: E1."""
-    scattered, transmittance = march(emission, bundle, scene.render.steps_per_voxel)
-    if scene.render.background:
-        scattered = scattered + transmittance * _background(scene.lights, bundle)
-    return scattered.expand(3, -1)
 
 
 def _background(lights: Sequence[Light], bundle: Rays) -> Tensor:

@@ -121,10 +121,10 @@ def subdivided(values: Tensor, steps: int, smooth: Smooth | None = None) -> Tens
     low, high = values[:-1], values[1:]
     parts = [low + (high - low) * (i / steps) for i in range(steps)]
     if smooth is not None:
-        bend = _bend(values[:, smooth.channels], 0)
+        bent = bend(values[:, smooth.channels], 0)
         for i in range(1, steps):
             share = i / steps
-            parts[i] = _less(parts[i], 0.5 * share * (1 - share) * (bend[:-1] * (1 - share) + bend[1:] * share), smooth)
+            parts[i] = less(parts[i], 0.5 * share * (1 - share) * (bent[:-1] * (1 - share) + bent[1:] * share), smooth)
     return torch.cat([torch.stack(parts, 1).flatten(0, 1), values[-1:]])
 
 
@@ -137,15 +137,15 @@ def _interpolated(values: Tensor, points: Tensor, smooth: Smooth | None) -> Tens
         return _sampled(values, points)
     axes = range(2, values.ndim)
     chosen = values[:, smooth.channels]
-    found = _sampled(torch.cat([values, *(_bend(chosen, axis) for axis in axes)], 1), points)
+    found = _sampled(torch.cat([values, *(bend(chosen, axis) for axis in axes)], 1), points)
     plain, *bends = found.split([values.shape[1]] + [chosen.shape[1]] * len(axes), 1)
-    excess = [_excess(points[..., 1 - axis], values.shape[axis])[:, None] * bend for axis, bend in zip(axes, bends, strict=True)]
-    return _less(plain, torch.stack(excess).sum(0), smooth)
+    excesses = [excess(points[..., 1 - axis], values.shape[axis])[:, None] * bent for axis, bent in zip(axes, bends, strict=True)]
+    return less(plain, torch.stack(excesses).sum(0), smooth)
 
 
-def _less(values: Tensor, excess: Tensor, smooth: Smooth) -> Tensor:
-    """`values` with `excess`, bounded, taken from the channels that are `smooth`."""
-    changed = values[:, smooth.channels] - smooth.bounded(excess)
+def less(values: Tensor, amount: Tensor, smooth: Smooth) -> Tensor:
+    """`values` with `amount`, bounded, taken from the channels that are `smooth`."""
+    changed = values[:, smooth.channels] - smooth.bounded(amount)
     return torch.cat([values[:, : smooth.first], changed, values[:, smooth.last :]], 1)
 
 
@@ -154,7 +154,7 @@ def _sampled(values: Tensor, points: Tensor) -> Tensor:
     return found
 
 
-def _bend(values: Tensor, axis: int) -> Tensor:
+def bend(values: Tensor, axis: int) -> Tensor:
     """Second differences along `axis`, those at its ends with the end repeated."""
     count = values.shape[axis]
     longer = torch.cat([values.narrow(axis, 0, 1), values, values.narrow(axis, count - 1, 1)], axis)
@@ -163,8 +163,33 @@ def _bend(values: Tensor, axis: int) -> Tensor:
 
 def ramp(place: Tensor, tolerance: float) -> Tensor:
     """`place` held within 0 and 1; within `tolerance` of a kink its slope is the mean of both sides', 1/2."""
-    is_on_kink = (place.abs() < tolerance) | ((place - 1).abs() < tolerance)
-    return torch.where(is_on_kink, place.detach().round() + 0.5 * (place - place.detach()), place.clamp(0, 1))
+    held: Tensor = _Ramp.apply(place, tolerance)
+    return held
+
+
+class _Ramp(torch.autograd.Function):
+    @staticmethod
+    def forward(place: Tensor, tolerance: float) -> Tensor:
+        return place.clamp(0, 1)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, float], output: Tensor) -> None:
+        place, ctx.tolerance = inputs
+        keep(ctx, place)
+
+    @staticmethod
+    def backward(ctx: Any, held_bar: Tensor) -> tuple[Tensor, None]:
+        return held_bar * _ramp_slope(ctx.saved_tensors[0], ctx.tolerance), None
+
+    @staticmethod
+    def jvp(ctx: Any, d_place: Tensor, _: None) -> Tensor:
+        return d_place * _ramp_slope(ctx.saved_tensors[0], ctx.tolerance)
+
+
+def _ramp_slope(place: Tensor, tolerance: float) -> Tensor:
+    outer = (place > -tolerance) & (place < 1 + tolerance)
+    inner = (place > tolerance) & (place < 1 - tolerance)
+    return 0.5 * (outer.to(place.dtype) + inner.to(place.dtype))
 
 
 def on_kink(place: Tensor, size: int) -> float:
@@ -172,7 +197,7 @@ def on_kink(place: Tensor, size: int) -> float:
     return float(KINK * torch.finfo(place.dtype).eps * size)
 
 
-def _excess(coordinate: Tensor, size: int) -> Tensor:
+def excess(coordinate: Tensor, size: int) -> Tensor:
     """a (1 - a) / 2: 0 at cell centers, 1/8 midway, 0 beyond the outermost; on a kink its slope is the mean of both sides'."""
     place = ((coordinate + 1) * size - 1) / 2
     apart = place - place.round()

@@ -30,10 +30,15 @@ def one_of(default: Any, choices: Collection[Any]) -> Any:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How view rays are sampled. `background`: ambient light is also seen directly."""
+    """How view rays are sampled. `background`: ambient light is also seen directly.
+
+    `tolerance`: pixels closer together than half a voxel are interpolated between rays that far apart, but for those which that may change
+    by more than this part of the image's root mean square; 0: every pixel has its own rays.
+    """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
     steps_per_voxel: int = bounded(1, minimum=1, maximum=8)
+    tolerance: float = bounded(0.05, minimum=0, maximum=1)
     background: bool = True
 
 

@@ -51,9 +51,15 @@ class Coarsest:
 
 @dataclass(frozen=True)
 class Level:
-    """A grid: its matrix, and the way to the next coarser one, axis by axis."""
+    """A grid: its matrix, and the way to the next coarser one, axis by axis.
+
+    `taken` [C, z, y, x]: S times what a cell exchanges with its neighbors, the sum of its conductances. Corrections from the coarser grid
+    are multiplied by it: by 1/S where nothing is lost, by nearly nothing where light is absorbed before it gets to the next cell. Else they
+    would carry errors of bright cells into dark ones, where light then falls below zero.
+    """
 
     matrix: ScaledMatrix
+    taken: Tensor
     ways: tuple[Coarsening, ...]
     coarser: Level | Coarsest
 
@@ -61,24 +67,25 @@ class Level:
     def of(operator: Operator) -> Level:
         """The grid of `operator` and all coarser ones."""
         matrix, ways = operator.once(ScaledMatrix.of), []
+        taken = matrix.scale * (operator.diagonal - operator.loss)
         for axis in _strong_axes(matrix):
             way, operator = coarsened(operator, axis)
             ways.append(way)
         has_few = operator.loss[0].numel() <= FEW_CELLS
-        return Level(matrix, tuple(ways), Coarsest.of(operator) if has_few else Level.of(operator))
+        return Level(matrix, taken, tuple(ways), Coarsest.of(operator) if has_few else Level.of(operator))
 
     def cycle(self, source: Tensor) -> Tensor:
         """Roughly y with S A S y = `source` [C, z, y, x]: linear in `source`, symmetric and positive definite."""
         y = STEPS[0] * source
         for step in STEPS[1:]:
             y = self.matrix.relaxed(y, source, step)
-        coarse = self.matrix.residual(y, source).div_(self.matrix.scale)
+        coarse = self.matrix.residual(y, source).mul_(self.taken)
         for way in self.ways:
             coarse = way.restrict(coarse)
         coarse = self.coarser.correction(coarse)
         for way in reversed(self.ways):
             coarse = way.prolong(coarse)
-        y.addcdiv_(coarse, self.matrix.scale)
+        y.addcmul_(coarse, self.taken)
         for step in reversed(STEPS):
             y = self.matrix.relaxed(y, source, step)
         return y
