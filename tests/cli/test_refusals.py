@@ -20,6 +20,7 @@ COMMANDS = {
     "render": ["render", "scene.yaml", "-o", "out"],
     "optimize": ["optimize", "scene.yaml", "-o", "out"],
     "gradcheck": ["gradcheck", "scene.yaml"],
+    "reference": ["reference", "scene.yaml", "-o", "out"],
     "check": ["check", "scene.yaml"],
 }
 AN_OUTPUT = ["render", "optimize"]
