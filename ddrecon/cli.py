@@ -223,6 +223,21 @@ def reference(
 
 @main.command()
 @SCENE
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FILE.xml", help="Where the scene goes.")
+@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@in_session
+def export(session: Session, scene: Path, output: Path, overwrite: bool) -> None:
+    """Write SCENE for Mitsuba 3: FILE.xml, and its volumes beside it."""
+    if output.suffix.lower() != ".xml":
+        raise click.UsageError(f"-o {output}: a scene for Mitsuba is an .xml file")
+    from ddrecon.reference.export import export_scene
+
+    written = export_scene(session.load(scene), output, may_exist=overwrite)
+    click.echo(f"written: {', '.join(map(str, written))}")
+
+
+@main.command()
+@SCENE
 @DTYPE
 @AS_JSON
 @in_session

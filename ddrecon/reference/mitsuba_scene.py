@@ -28,6 +28,8 @@ from ddrecon.world import Scene, View
 LONGEST = 1024
 """Segments of the longest path. There is no Russian roulette: Mitsuba ends a twentieth of all paths at each scattering, whatever they
 carry, and what is left over of the long paths in dense media weighs so much that noise was ten times higher."""
+SAMPLES = 256
+"""Paths a pixel where nobody says otherwise."""
 GRAY = 1e-5
 """Colors whose extinctions differ by less, relatively, are of one extinction: red, green and blue then share their paths."""
 FINER, MANY = 3, 2**20
@@ -64,7 +66,7 @@ def sensor_id(index: int) -> str:
 
 def is_gray(volume: Volume) -> bool:
     """Whether red, green and blue are extinguished alike, everywhere."""
-    sigma_t = volume.sigma_a + volume.sigma_s
+    sigma_t = _fields(volume.sigma_a) + _fields(volume.sigma_s)
     return bool((sigma_t - sigma_t.mean(0)).abs().max() <= GRAY * sigma_t.max())
 
 
@@ -76,7 +78,7 @@ def _medium(volume: Volume) -> dict[str, Any]:
     if sigma_t.numel() == 1:
         field, scale = volume.density[None], sigma_t.item()
     else:
-        field, scale = _fields(sigma_t) * volume.density, 1.0
+        field, scale = sigma_t * volume.density, 1.0
     return {
         "type": "heterogeneous",
         "sigma_t": _grid_volume(field, volume.grid),
@@ -87,9 +89,9 @@ def _medium(volume: Volume) -> dict[str, Any]:
 
 
 def _plain(volume: Volume) -> Volume:
-    """`volume` in double precision on the CPU, without derivatives."""
-    values = (volume.density, volume.sigma_a, volume.sigma_s, volume.g)
-    return Volume(volume.grid, *(value.detach().cpu().double() for value in values))
+    """`volume` in double precision on the CPU, without derivatives; cross sections [C, z, y, x] or [C, 1, 1, 1]."""
+    density, sigma_a, sigma_s, g = (value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s, volume.g))
+    return Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), g)
 
 
 def _fields(sigma: Tensor) -> Tensor:
@@ -98,16 +100,16 @@ def _fields(sigma: Tensor) -> Tensor:
 
 def _albedo(volume: Volume) -> Any:
     """The part of extinction that scatters: a number, a color or a volume; 0 where nothing is extinguished."""
-    absorbing, scattering = volume.sigma_a, volume.sigma_s
-    if absorbing.ndim == 4 or scattering.ndim == 4:
-        fields = (_fields(sigma) * volume.density for sigma in (absorbing, scattering))
+    absorbing, scattering = torch.broadcast_tensors(volume.sigma_a, volume.sigma_s)
+    if absorbing[0].numel() > 1:
         times = FINER if volume.grid.cells <= MANY else 1
+        fields = (sigma * volume.density for sigma in (absorbing, scattering))
         absorbing, scattering = (interpolate(field[None], scale_factor=times, mode="trilinear")[0] for field in fields)
     extinction = absorbing + scattering
     albedo = torch.where(extinction > 0, scattering / torch.where(extinction > 0, extinction, 1), 0).clamp(max=1)
-    if albedo.ndim == 4:
+    if albedo[0].numel() > 1:
         return _grid_volume(albedo, volume.grid)
-    return albedo.item() if albedo.numel() == 1 else tuple(albedo.tolist())
+    return albedo.item() if albedo.numel() == 1 else tuple(albedo.flatten().tolist())
 
 
 def _grid_volume(values: Tensor, grid: Grid) -> dict[str, Any]:
@@ -139,7 +141,7 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     diagonal = math.hypot(*grid.extent)
     sensor: dict[str, Any] = {
         "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32", "rfilter": {"type": "box"}},
-        "sampler": {"type": "independent"},
+        "sampler": {"type": "independent", "sample_count": SAMPLES},
         "near_clip": NEAR * diagonal,
         "far_clip": 2 * (diagonal + math.dist(origin, grid.center_xyz)),
     }

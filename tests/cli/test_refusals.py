@@ -21,6 +21,7 @@ COMMANDS = {
     "optimize": ["optimize", "scene.yaml", "-o", "out"],
     "gradcheck": ["gradcheck", "scene.yaml"],
     "reference": ["reference", "scene.yaml", "-o", "out"],
+    "export": ["export", "scene.yaml", "-o", "out.xml"],
     "check": ["check", "scene.yaml"],
 }
 AN_OUTPUT = ["render", "optimize"]

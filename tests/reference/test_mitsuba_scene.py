@@ -69,10 +69,13 @@ def test_constant_cross_sections(make_scene, random, sigma: tuple[float, ...]) -
     np.testing.assert_allclose(np.array(medium["albedo"]), (volume.sigma_s / (volume.sigma_a + volume.sigma_s)).squeeze(), rtol=1e-12)
 
 
-def test_cross_sections_per_cell(make_scene, random) -> None:
-    absorbing, scattering = random(3, *SHAPE, seed=1), random(3, *SHAPE, seed=2)
-    scene = make_scene(random(*SHAPE), sigma_a=absorbing, sigma_s=scattering)
+@pytest.mark.parametrize("absorbing", [(3, *SHAPE), (1, *SHAPE), (3, 1, 1, 1), (1, 1, 1, 1)])
+def test_cross_sections_per_cell(make_scene, random, absorbing: tuple[int, ...]) -> None:
+    sigma_a, scattering = random(*absorbing, seed=1), random(3, *SHAPE, seed=2)
+    constant = sigma_a.flatten() if absorbing[1:] == (1, 1, 1) else sigma_a
+    scene = make_scene(random(*SHAPE), sigma_a=constant, sigma_s=scattering)
     medium = described(scene)["medium"]
+    np.testing.assert_allclose(extinction(medium), ((sigma_a + scattering) * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-6)
     found = extinction(medium) * medium["albedo"]["grid"][(slice(FINER // 2, None, FINER),) * 3]
     np.testing.assert_allclose(found, (scattering * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-5)
 
