@@ -194,6 +194,49 @@ def bench(
 
 @main.command()
 @SCENE
+@OUTPUT
+@OVERWRITE
+@click.option("--view", "names", multiple=True, metavar="NAME", help="Trace only this view; repeatable.")
+@click.option("--spp", "samples", type=click.IntRange(min=4), default=256, show_default=True, metavar="N", help="Paths a pixel.")
+@click.option("--views", "is_only_traced", is_flag=True, help="Write the path-traced images alone, as NAME.*: targets for experiments.")
+@DTYPE
+@AS_JSON
+@in_session
+def reference(
+    session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], samples: int, is_only_traced: bool
+) -> None:
+    """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
+    from ddrecon.io.folders import prepare_folder
+    from ddrecon.reference.compare import compare_to_folder, trace_to_folder, write_report
+    from ddrecon.reference.trace import open_tracer
+
+    loaded = session.load(scene)
+    views = session.chosen_views(loaded, names)
+    tracer = open_tracer(loaded, views, threads=session.threads)
+    prepare_folder(output, may_exist=overwrite)
+    settings = output, samples, session.seed, session.progress
+    found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
+    report = write_report(output, found, session.environment())
+    session.show(report, session.reference_lines(report, output))
+
+
+@main.command()
+@SCENE
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FILE.xml", help="Where the scene goes.")
+@click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@in_session
+def export(session: Session, scene: Path, output: Path, overwrite: bool) -> None:
+    """Write SCENE for Mitsuba 3: FILE.xml, and its volumes beside it."""
+    if output.suffix.lower() != ".xml":
+        raise click.UsageError(f"-o {output}: a scene for Mitsuba is an .xml file")
+    from ddrecon.reference.export import export_scene
+
+    written = export_scene(session.load(scene), output, may_exist=overwrite)
+    click.echo(f"written: {', '.join(map(str, written))}")
+
+
+@main.command()
+@SCENE
 @DTYPE
 @AS_JSON
 @in_session

@@ -32,6 +32,12 @@ class FormatError(DdreconError):
         super().__init__(f"{path}: {reason}")
 
 
+class MissingExtraError(DdreconError):
+    """An optional package that a command cannot do without, and that is not installed."""
+
+    exit_code = 3
+
+
 class SolveError(DdreconError):
     """A linear solve or an optimization that did not converge; the last good state is kept."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError
-from ddrecon.io.images import write_linear, write_preview
+from ddrecon.io.images import write_picture
 from ddrecon.io.json_file import write_json
 from ddrecon.reconstruct.losses import psnr
 from ddrecon.reconstruct.previews import diverging, pixels
@@ -37,7 +37,7 @@ def render_to_folder(scene: Scene, views: list[View], folder: Path, has_componen
             start = perf_counter()
             images = _images(light_field, scene, view, has_components)
             seconds[view.name] = perf_counter() - start
-            files[view.name] = [path.name for name, image in images.items() for path in _write(folder / name, image)]
+            files[view.name] = [path.name for name, image in images.items() for path in write_picture(folder / name, pixels(image))]
             if view.image is not None:
                 quality[view.name] = psnr(images[view.name], view.image, view.mask)
     report = _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {"psnr": quality}
@@ -68,8 +68,7 @@ def render_gradient_to_folder(
     for (view, name), (image, derivative) in rendered.items():
         derived = f"{view}.{GRADIENT}{name.removeprefix(view)}"
         picture, scales[derived] = diverging(derivative)
-        written = [*_write(folder / name, image), *write_linear(folder / derived, pixels(derivative)), folder / f"{derived}.png"]
-        write_preview(written[-1], picture)
+        written = write_picture(folder / name, pixels(image)) + write_picture(folder / derived, pixels(derivative), picture)
         files[view] += [path.name for path in written]
     report = _report(scene, memory, seconds, files) | {"psnr": {}, "gradient": {"parameter": parameter, "full_scale": scales}}
     write_json(folder / "render.json", report)
@@ -95,10 +94,3 @@ def _images(light_field: LightField, scene: Scene, view: View, has_components: b
     parts = view_components(light_field, scene, view.camera)
     named = {f"{view.name}.{name}": getattr(parts, name) for name in ("reduced", "single", "multiple")}
     return {view.name: parts.reduced + parts.single + parts.multiple, **named}
-
-
-def _write(stem: Path, image: Tensor) -> list[Path]:
-    array = pixels(image)
-    preview = stem.with_name(stem.name + ".png")
-    write_preview(preview, array)
-    return [*write_linear(stem, array), preview]

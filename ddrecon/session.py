@@ -33,6 +33,7 @@ class Session:
     overrides: tuple[str, ...]
     device: torch.device
     dtype: torch.dtype
+    threads: int
     seed: int
     is_quiet: bool
     is_verbose: bool
@@ -83,6 +84,27 @@ class Session:
         return [*lines, f"written to {folder}"]
 
     @staticmethod
+    def reference_lines(report: dict[str, Any], folder: Path) -> list[str]:
+        """What `reference` prints: how far our view is from theirs, and how long both took."""
+        lines = []
+        for name, view in report["views"].items():
+            notes = [f"noise {view['noise']:.3f}"]
+            if "error" in view:
+                least = view["noise"] / 3
+                error = f"{view['error']:.3f}" if view["error"] >= least else f"< {least:.3f}"
+                notes = [f"relative RMS error {error} (with the reference's noise, {view['noise']:.3f}: {view['distance']:.3f})"]
+                notes += [f"PSNR {view['psnr']:.1f} dB"]
+                notes += [f"brightness {view['brightness']:.3f} of the reference's"] if view["brightness"] is not None else []
+            times = ", ".join(f"{who} {seconds:.2f} s" for who, seconds in view["seconds"].items())
+            lines.append(f"{name}: {', '.join(notes)} ({times})")
+        settings = report["settings"]
+        return [
+            *lines,
+            f"{settings['samples_per_pixel']} paths a pixel, Mitsuba {report['environment']['mitsuba']}",
+            f"written to {folder}",
+        ]
+
+    @staticmethod
     def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         """What `optimize` prints when it is done."""
         test = f", test PSNR {summary['test_psnr']:.2f} dB" if summary["test_psnr"] is not None else ""
@@ -115,6 +137,7 @@ def open_session(
     if device == "cuda" and not torch.cuda.is_available():
         raise SceneError("--device cuda: torch sees no CUDA device here; leave --device out, or install a CUDA build of torch")
     place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-    torch.set_num_threads(threads or os.cpu_count() or 1)
+    threads = threads or os.cpu_count() or 1
+    torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    return Session(overrides, place, DTYPES[dtype], seed, is_quiet, is_verbose, as_json)
+    return Session(overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json)

@@ -70,6 +70,13 @@ def write_preview(path: Path, pixels: np.ndarray) -> None:
         iio.imwrite(temporary, np.round(255 * encoded).astype(np.uint8), plugin="pillow", extension=".png")
 
 
+def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
+    """Writes `pixels` [h, w, 3] as `write_linear` does, and `preview` [h, w, 3] (None: `pixels` again) to `stem`.png; returns all paths."""
+    path = stem.with_name(stem.name + ".png")
+    write_preview(path, pixels if preview is None else preview)
+    return [*write_linear(stem, pixels), path]
+
+
 def _read_values(path: Path) -> np.ndarray:
     reader = READERS.get(path.suffix.lower())
     if reader is None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.field import Field
+from ddrecon.io.mitsuba import read_vol, write_vol
 from ddrecon.io.npz import read_npz, write_npz
 
 
@@ -21,7 +22,7 @@ class VolumeFormat:
     write: Callable[[Path, str, np.ndarray, np.ndarray], None]
 
 
-FORMATS: dict[str, VolumeFormat] = {".npz": VolumeFormat(read_npz, write_npz)}
+FORMATS: dict[str, VolumeFormat] = {".npz": VolumeFormat(read_npz, write_npz), ".vol": VolumeFormat(read_vol, write_vol)}
 
 
 def read_field(path: Path, name: str) -> Field:

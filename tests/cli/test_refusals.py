@@ -20,6 +20,8 @@ COMMANDS = {
     "render": ["render", "scene.yaml", "-o", "out"],
     "optimize": ["optimize", "scene.yaml", "-o", "out"],
     "gradcheck": ["gradcheck", "scene.yaml"],
+    "reference": ["reference", "scene.yaml", "-o", "out"],
+    "export": ["export", "scene.yaml", "-o", "out.xml"],
     "check": ["check", "scene.yaml"],
 }
 AN_OUTPUT = ["render", "optimize"]

@@ -1,0 +1,119 @@
+"""Our images beside path-traced ones as files, and how far apart they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.io.images import write_picture, write_preview
+from ddrecon.io.json_file import write_json
+from ddrecon.reconstruct.losses import psnr
+from ddrecon.reconstruct.previews import comparison, diverging, pixels
+from ddrecon.reference.mitsuba_scene import LONGEST
+from ddrecon.reference.trace import Traced, Tracer
+from ddrecon.renderer import solve_light, view_image
+from ddrecon.world import Scene, View
+
+PASSES = 8
+"""Passes an image is traced in, by whose scatter its noise is told; fewer where there are fewer paths a pixel than that."""
+SEEDS = 2**30
+Progress = Callable[[Sequence[int], str], Iterable[int]]
+
+
+def trace_to_folder(tracer: Tracer, views: Sequence[View], folder: Path, samples: int, seed: int, progress: Progress) -> dict[str, Any]:
+    """Writes the images of `views`, traced with `samples` paths a pixel, as NAME.* into `folder`, and returns a report.
+
+    `tracer` must be of these views, `samples` at least 2; `progress` is told of the passes of each view.
+    """
+    report: dict[str, Any] = {"settings": _settings(tracer, samples, seed), "views": {}, "files": {}}
+    for index, view in enumerate(views):
+        traced, seconds = _trace(tracer, index, view.name, samples, seed, progress)
+        report["views"][view.name] = {"noise": traced.noise, "seconds": {"reference": seconds}}
+        report["files"][view.name] = [path.name for path in write_picture(folder / view.name, traced.image)]
+    return report
+
+
+def compare_to_folder(
+    tracer: Tracer, scene: Scene, views: Sequence[View], folder: Path, samples: int, seed: int, progress: Progress
+) -> dict[str, Any]:
+    """Writes NAME.reference.*, NAME.ours.*, NAME.difference.* (ours less the reference) and NAME.comparison.png for `views` of `scene`.
+
+    Arguments and result are those of `trace_to_folder`, the report with our errors in it.
+    """
+    report: dict[str, Any] = {"settings": _settings(tracer, samples, seed), "views": {}, "files": {}}
+    start = perf_counter()
+    with torch.no_grad():
+        light_field = solve_light(scene, SolveMemory())
+    report["seconds"] = {"light": perf_counter() - start}
+    for index, view in enumerate(views):
+        traced, seconds = _trace(tracer, index, view.name, samples, seed, progress)
+        start = perf_counter()
+        with torch.no_grad():
+            ours = view_image(light_field, scene, view.camera).cpu()
+        times = {"reference": seconds, "ours": perf_counter() - start}
+        theirs = torch.from_numpy(traced.image).permute(2, 0, 1).to(ours)
+        report["views"][view.name] = _figures(traced, ours, theirs) | {"seconds": times}
+        report["files"][view.name] = [path.name for path in _write(folder / view.name, ours, theirs)]
+    return report
+
+
+def write_report(folder: Path, report: dict[str, Any], environment: dict[str, Any]) -> dict[str, Any]:
+    """Writes `report` and the `environment` it was made in to `reference.json` in `folder`, and returns both together."""
+    import mitsuba
+
+    whole = report | {"environment": environment | {"mitsuba": mitsuba.__version__}}
+    write_json(folder / "reference.json", whole)
+    return whole
+
+
+def _settings(tracer: Tracer, samples: int, seed: int) -> dict[str, Any]:
+    passes = min(PASSES, samples)
+    return {
+        "samples_per_pixel": passes * -(-samples // passes),
+        "passes": passes,
+        "seed": seed,
+        "variant": tracer.module.variant(),
+        "integrator": "volpath",
+        "longest_path": LONGEST,
+        "russian_roulette": False,
+        "colors_traced_apart": len(tracer.scenes) > 1,
+    }
+
+
+def _trace(tracer: Tracer, index: int, name: str, samples: int, seed: int, progress: Progress) -> tuple[Traced, float]:
+    """The traced image of view number `index`, and the seconds it took."""
+    passes, start = min(PASSES, samples), perf_counter()
+    share, first = -(-samples // passes), seed * passes
+    images = [tracer.trace(index, (first + number) % SEEDS, share) for number in progress(range(passes), name)]
+    return Traced.of(images), perf_counter() - start
+
+
+def _figures(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:
+    image, mean = pixels(ours).astype(np.float64), float(traced.image.mean())
+    return {
+        "error": traced.error(image),
+        "distance": traced.distance(image),
+        "noise": traced.noise,
+        "psnr": psnr(ours, theirs, None),
+        "brightness": float(image.mean()) / mean if mean > 0 else None,
+    }
+
+
+def _write(stem: Path, ours: Tensor, theirs: Tensor) -> list[Path]:
+    difference = ours - theirs
+    pictures: dict[str, tuple[np.ndarray, np.ndarray | None]] = {
+        "reference": (pixels(theirs), None),
+        "ours": (pixels(ours), None),
+        "difference": (pixels(difference), diverging(difference)[0]),
+    }
+    beside = stem.with_name(f"{stem.name}.comparison.png")
+    write_preview(beside, comparison(theirs, ours))
+    written = [path for kind, (array, preview) in pictures.items() for path in write_picture(Path(f"{stem}.{kind}"), array, preview)]
+    return [*written, beside]

@@ -1,0 +1,164 @@
+"""A scene in Mitsuba's words: nested dictionaries as its `load_dict` takes them, but of plain values, so that Mitsuba is not needed here.
+
+The one convention: arrays are told apart by their axes. [4, 4] is a transform, [h, w, 3] a picture, [z, y, x, C] a volume, all float32
+but the transform; a tuple is a color and a list a vector.
+
+Where albedo differs from cell to cell, Mitsuba interpolates it where we interpolate the scattering coefficient, so it is handed over on
+`FINER` times finer cells (in grids of at most `MANY`), between whose centers little is left of that difference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from ddrecon.cameras import Camera, rays
+from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
+from ddrecon.medium import Volume
+from ddrecon.reference.mitsuba_lights import mitsuba_lights
+from ddrecon.world import Scene, View
+
+LONGEST = 1024
+"""Segments of the longest path. There is no Russian roulette: Mitsuba ends a twentieth of all paths at each scattering, whatever they
+carry, and what is left over of the long paths in dense media weighs so much that noise was ten times higher."""
+SAMPLES = 256
+"""Paths a pixel where nobody says otherwise."""
+GRAY = 1e-5
+"""Colors whose extinctions differ by less, relatively, are of one extinction: red, green and blue then share their paths."""
+FINER, MANY = 3, 2**20
+NEAR = 1e-4
+"""How far from the eye Mitsuba's rays start, in diagonals of the box; it wants more than 0."""
+MEDIUM = "medium"
+
+
+def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[str, Any]:
+    """`scene` seen by the cameras of `views`, by paths of at most `depth` segments (2: scattered once; -1: up to `LONGEST`).
+
+    The cameras are `sensor_0`, `sensor_1`, ... Raises SceneError for what Mitsuba cannot show: several environment maps, and views of
+    whose rays only some start inside the volume.
+    """
+    return {
+        "type": "scene",
+        "integrator": {
+            "type": "volpath" if is_gray(scene.volume) else "volpathmis",
+            "max_depth": depth if depth > 0 else LONGEST,
+            "rr_depth": 2 * LONGEST,
+            "hide_emitters": not scene.render.background,
+        },
+        MEDIUM: _medium(scene.volume),
+        **{sensor_id(index): _sensor(view, scene.volume.grid) for index, view in enumerate(views)},
+        "box": _box(scene.volume.grid),
+        **mitsuba_lights(scene.lights),
+    }
+
+
+def sensor_id(index: int) -> str:
+    """What the camera of view number `index` is called."""
+    return f"sensor_{index}"
+
+
+def is_gray(volume: Volume) -> bool:
+    """Whether red, green and blue are extinguished alike, everywhere."""
+    sigma_t = _fields(volume.sigma_a) + _fields(volume.sigma_s)
+    return bool((sigma_t - sigma_t.mean(0)).abs().max() <= GRAY * sigma_t.max())
+
+
+def _medium(volume: Volume) -> dict[str, Any]:
+    volume = _plain(volume)
+    sigma_t = volume.sigma_a + volume.sigma_s
+    if is_gray(volume):
+        sigma_t = sigma_t.mean(0, keepdim=True)
+    if sigma_t.numel() == 1:
+        field, scale = volume.density[None], sigma_t.item()
+    else:
+        field, scale = sigma_t * volume.density, 1.0
+    return {
+        "type": "heterogeneous",
+        "sigma_t": _grid_volume(field, volume.grid),
+        "scale": scale,
+        "albedo": _albedo(volume),
+        "phase": {"type": "hg", "g": volume.g.item()},
+    }
+
+
+def _plain(volume: Volume) -> Volume:
+    """`volume` in double precision on the CPU, without derivatives; cross sections [C, z, y, x] or [C, 1, 1, 1]."""
+    density, sigma_a, sigma_s, g = (value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s, volume.g))
+    return Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), g)
+
+
+def _fields(sigma: Tensor) -> Tensor:
+    return sigma if sigma.ndim == 4 else sigma.view(-1, 1, 1, 1)
+
+
+def _albedo(volume: Volume) -> Any:
+    """The part of extinction that scatters: a number, a color or a volume; 0 where nothing is extinguished."""
+    absorbing, scattering = torch.broadcast_tensors(volume.sigma_a, volume.sigma_s)
+    if absorbing[0].numel() > 1:
+        times = FINER if volume.grid.cells <= MANY else 1
+        fields = (sigma * volume.density for sigma in (absorbing, scattering))
+        absorbing, scattering = (interpolate(field[None], scale_factor=times, mode="trilinear")[0] for field in fields)
+    extinction = absorbing + scattering
+    albedo = torch.where(extinction > 0, scattering / torch.where(extinction > 0, extinction, 1), 0).clamp(max=1)
+    if albedo[0].numel() > 1:
+        return _grid_volume(albedo, volume.grid)
+    return albedo.item() if albedo.numel() == 1 else tuple(albedo.flatten().tolist())
+
+
+def _grid_volume(values: Tensor, grid: Grid) -> dict[str, Any]:
+    """`values` [C, z, y, x] on the box of `grid`."""
+    array = np.ascontiguousarray(values.permute(1, 2, 3, 0).float().numpy())
+    lower, upper = (np.array(corner) for corner in grid.bounds_xyz)
+    return {"type": "gridvolume", "grid": array, "raw": True, "to_world": _placed(lower, upper - lower)}
+
+
+def _box(grid: Grid) -> dict[str, Any]:
+    """The box, whose faces do nothing but hold the medium; Mitsuba's cube runs from -1 to 1."""
+    place = _placed(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2)
+    return {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": {"type": "ref", "id": MEDIUM}}
+
+
+def _placed(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    matrix = np.diag([*scale, 1.0])
+    matrix[:3, 3] = origin
+    return matrix
+
+
+def _sensor(view: View, grid: Grid) -> dict[str, Any]:
+    """The camera: Mitsuba's looks along +z with +x to the left, and its film keeps the mean of each pixel."""
+    camera = view.camera
+    height, width = camera.size
+    right, up, backward, origin = camera.pose.detach().cpu().double().numpy().T
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([-right, up, -backward, origin], axis=1)
+    diagonal = math.hypot(*grid.extent)
+    sensor: dict[str, Any] = {
+        "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32", "rfilter": {"type": "box"}},
+        "sampler": {"type": "independent", "sample_count": SAMPLES},
+        "near_clip": NEAR * diagonal,
+        "far_clip": 2 * (diagonal + math.dist(origin, grid.center_xyz)),
+    }
+    if _starts_inside(view.name, camera, grid):
+        sensor[MEDIUM] = {"type": "ref", "id": MEDIUM}
+    if camera.is_perspective:
+        fov = 2 * math.degrees(math.atan(camera.half_width))
+        return {"type": "perspective", "fov": fov, "fov_axis": "x", "to_world": matrix, **sensor}
+    scale = np.diag([camera.half_width, camera.half_width, 1.0, 1.0])
+    return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
+
+
+def _starts_inside(name: str, camera: Camera, grid: Grid) -> bool:
+    """Whether view rays start inside the box of `grid`; Mitsuba is told so once for all of them."""
+    start = rays(camera).origin.detach()
+    lower, upper = (start.new_tensor(corner) for corner in (grid.lower, grid.upper))
+    is_inside = ((start > lower) & (start < upper)).all(1)
+    if bool(is_inside.any()) and not bool(is_inside.all()):
+        raise SceneError(f"view {name!r}: Mitsuba cannot show rays of which only some start inside the volume; move the camera back")
+    return bool(is_inside.any())

@@ -1,0 +1,106 @@
+"""Path-traced images (Mitsuba 3, extra `reference`): passes with seeds of their own, whose scatter tells how noisy their mean is."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ddrecon.errors import MissingExtraError
+from ddrecon.reference.colors import of_color
+from ddrecon.reference.mitsuba_scene import is_gray, mitsuba_scene, sensor_id
+from ddrecon.world import Scene, View
+
+
+@dataclass(frozen=True, eq=False)
+class Tracer:
+    """Mitsuba, and its `scenes`: one that all colors share, or one for each of red, green and blue."""
+
+    module: ModuleType
+    scenes: tuple[Any, ...]
+
+    def trace(self, view: int, seed: int, samples: int) -> np.ndarray:
+        """The image [h, w, 3], float64, of view number `view` by `samples` paths a pixel; each `seed` >= 0 has paths of its own."""
+        images = [self._render(scene, view, len(self.scenes) * seed + index, samples) for index, scene in enumerate(self.scenes)]
+        return images[0] if len(images) == 1 else np.stack([image.mean(-1) for image in images], -1)
+
+    def _render(self, scene: Any, view: int, seed: int, samples: int) -> np.ndarray:
+        (sensor,) = (sensor for sensor in scene.sensors() if sensor.id() == sensor_id(view))
+        return np.array(self.module.render(scene, sensor=sensor, seed=seed, spp=samples), np.float64)
+
+
+def open_tracer(scene: Scene, views: Sequence[View], depth: int = -1, threads: int | None = None) -> Tracer:
+    """What traces `views` of `scene` on `threads` threads (None: all), by paths of at most `depth` segments (-1: practically any number).
+
+    Colors whose extinctions differ are traced one by one. Raises MissingExtraError without Mitsuba, SceneError for what it cannot show.
+    """
+    module = load_mitsuba(threads)
+    scenes = [scene] if is_gray(scene.volume) else [of_color(scene, color) for color in range(3)]
+    return Tracer(module, tuple(module.load_dict(_translated(module, mitsuba_scene(one, views, depth))) for one in scenes))
+
+
+def load_mitsuba(threads: int | None = None) -> ModuleType:
+    """Mitsuba, set to the variant `llvm_ad_rgb` where DRJIT_LIBLLVM_PATH names an LLVM for it, else to `scalar_rgb`.
+
+    Raises MissingExtraError where it is not installed.
+    """
+    try:
+        import drjit
+        import mitsuba
+    except ImportError:
+        raise MissingExtraError("the reference renderer needs: pip install ddrecon[reference]") from None
+    mitsuba.set_variant("llvm_ad_rgb" if os.environ.get("DRJIT_LIBLLVM_PATH") else "scalar_rgb")
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)
+    if threads is not None:
+        drjit.set_thread_count(threads)
+    module: ModuleType = mitsuba
+    return module
+
+
+def _translated(module: ModuleType, value: Any) -> Any:
+    """A description by `mitsuba_scene` with Mitsuba's own objects in it."""
+    if isinstance(value, dict):
+        return {key: _translated(module, entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return {"type": "rgb", "value": list(value)}
+    if isinstance(value, np.ndarray):
+        return {2: module.ScalarTransform4f, 3: module.Bitmap, 4: module.VolumeGrid}[value.ndim](value)
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """The mean `image` [h, w] or [h, w, 3] of several passes, and its `noise`.
+
+    That is the standard error of its pixels (root mean square), relative to the root mean square of the image; 0 for a black image.
+    """
+
+    image: np.ndarray
+    noise: float
+
+    @staticmethod
+    def of(passes: Sequence[np.ndarray]) -> Traced:
+        """What at least two `passes` say together."""
+        image = np.mean(passes, 0)
+        variance = (np.var(passes, axis=0, ddof=1) / len(passes)).mean()
+        return Traced(image, math.sqrt(variance / _power(image)))
+
+    def distance(self, image: np.ndarray) -> float:
+        """The root mean square of the difference to `image`, relative to this one's."""
+        return math.sqrt(self._square(image))
+
+    def error(self, image: np.ndarray) -> float:
+        """The `distance` of `image` less the noise, in quadrature: what would be left were this one free of noise; at least 0."""
+        return math.sqrt(max(0.0, self._square(image) - self.noise**2))
+
+    def _square(self, image: np.ndarray) -> float:
+        return float(((image - self.image) ** 2).mean() / _power(self.image))
+
+
+def _power(image: np.ndarray) -> float:
+    return max(float((image**2).mean()), float(np.finfo(np.float64).tiny))

@@ -1,0 +1,93 @@
+"""Exported scenes are those that Mitsuba is given directly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from ddrecon.errors import SceneError
+from ddrecon.io.volumes import read_field
+from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.reference.export import export_scene
+from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
+from ddrecon.world import Scene, View
+
+NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
+COLOR = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
+NEAR: list[Light] = [DirectionalLight(-COLOR, COLOR), PointLight(COLOR, 2 * COLOR), AmbientLight(COLOR)]
+
+
+def opened(path: Path, **options: Any) -> np.ndarray:
+    mitsuba = load_mitsuba()
+    return np.array(mitsuba.render(mitsuba.load_file(str(path)), **options), np.float64)
+
+
+def sky() -> EnvironmentLight:
+    radiance = COLOR.view(3, 1, 1) * torch.arange(18, dtype=torch.float64).view(1, 3, 6)
+    return EnvironmentLight(radiance, COLOR[2], 25 * COLOR[2])
+
+
+def with_an_orthographic_view(scene: Scene, make_camera) -> Scene:
+    return replace(scene, views=[*scene.views, View("other", make_camera(eye=(2.0, 0.5, 0.1), is_perspective=False, half_width=0.6))])
+
+
+def test_volumes_and_the_box_are_those_of_the_scene(make_scene, random, tmp_path: Path) -> None:
+    scene = make_scene(random(3, 4, 5), sigma_a=random(3, 3, 4, 5, seed=1))
+    written = export_scene(scene, tmp_path / "scene.xml", may_exist=False)
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in written)
+    field = read_field(tmp_path / "scene.sigma_t.vol", "sigma_t")
+    expected = (scene.volume.sigma_a + scene.volume.sigma_s.view(3, 1, 1, 1)) * scene.volume.density
+    np.testing.assert_allclose(field.values, expected.permute(1, 2, 3, 0), rtol=1e-6)
+    np.testing.assert_allclose(field.bounds, scene.volume.grid.bounds_xyz, rtol=1e-6)
+    assert {
+        Path(node.attrib["value"]) for node in ElementTree.parse(tmp_path / "scene.xml").iter("string") if "vol" in node.attrib["value"]
+    }
+
+
+@pytest.mark.parametrize("with_sky", [False, True])
+def test_a_gray_scene_opened_is_the_scene_traced(make_scene, make_camera, random, tmp_path: Path, with_sky: bool) -> None:
+    pytest.importorskip("mitsuba", reason=NEEDED)
+    lights = NEAR
+    if with_sky:
+        pytest.importorskip("OpenEXR")
+        lights = [*NEAR, sky()]
+    scene = with_an_orthographic_view(make_scene(random(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4), make_camera)
+    scene = replace(scene, lights=lights)
+    export_scene(scene, tmp_path / "scene.xml", may_exist=False)
+    tracer = open_tracer(scene, scene.views)
+    for index in range(2):
+        np.testing.assert_allclose(opened(tmp_path / "scene.xml", sensor=index, seed=5, spp=16), tracer.trace(index, 5, 16), rtol=1e-4)
+
+
+def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(make_scene, random, tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason=NEEDED)
+    scene = make_scene(0.3 * random(3, 4, 5))
+    export_scene(scene, tmp_path / "scene.xml", may_exist=False)
+    tracer = open_tracer(scene, scene.views)
+    theirs, ours = (
+        Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=128) for seed in range(8)]),
+        Traced.of([tracer.trace(0, seed, 128) for seed in range(8)]),
+    )
+    assert max(theirs.noise, ours.noise) < 0.1
+    assert ours.distance(theirs.image) < 1.5 * np.hypot(theirs.noise, ours.noise)
+
+
+def test_what_is_there_stays(make_scene, random, tmp_path: Path) -> None:
+    scene, path = make_scene(random(3, 4, 5)), tmp_path / "scene.xml"
+    (tmp_path / "scene.sigma_t.vol").write_text("mine")
+    with pytest.raises(SceneError, match=r"scene.sigma_t.vol: already there"):
+        export_scene(scene, path, may_exist=False)
+    assert (tmp_path / "scene.sigma_t.vol").read_text() == "mine" and not path.exists()
+    export_scene(scene, path, may_exist=True)
+    assert read_field(tmp_path / "scene.sigma_t.vol", "sigma_t").resolution == (5, 4, 3)
+
+
+def test_no_folder(make_scene, random, tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="there is no folder"):
+        export_scene(make_scene(random(3, 4, 5)), tmp_path / "none" / "scene.xml", may_exist=False)

@@ -1,0 +1,129 @@
+"""Mitsuba's images of our scenes: closed forms, places, and our own images of light scattered once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import Camera, look_at
+from ddrecon.grid import Grid
+from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.reference.trace import Traced, open_tracer
+from ddrecon.renderer import render
+from ddrecon.settings import RenderSettings
+from ddrecon.world import Scene
+
+pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)")
+
+LOWER, UPPER = (-0.2, -0.8, -0.3), (0.8, 0.4, 0.5)
+"""A box around (0.3, -0.2, 0.1), whose sides differ."""
+CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+ONES, COLORS = torch.ones(3, dtype=torch.float64), torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
+SIDES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def passes(scene: Scene, count: int, samples: int, depth: int = -1) -> list[np.ndarray]:
+    tracer = open_tracer(scene, scene.views, depth)
+    return [tracer.trace(0, seed, samples) for seed in range(count)]
+
+
+def seen_from(side: tuple[float, float, float], half_width: float, size: int, is_perspective: bool = False, away: float = 2.0) -> Camera:
+    towards = CENTER.new_tensor(side)
+    up = towards.roll(1) if 1.0 in side else CENTER.new_tensor((0.0, 1.0, 0.0))
+    return Camera(look_at(CENTER + away * towards, CENTER, up), (size, size), half_width, is_perspective)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(make_scene, side: str) -> None:
+    density, sigma = torch.full((2, 3, 2), 1.5, dtype=torch.float64), np.array([0.5, 1.0, 2.0])
+    grid = Grid.from_xyz((2, 3, 2), LOWER, UPPER)
+    camera = seen_from(SIDES[side], 0.2, 4)
+    scene = make_scene(density, grid=grid, sigma_a=tuple(sigma), sigma_s=(0.0,), directional=None, ambient=(1.0, 0.5, 0.2), camera=camera)
+    length = dict(zip("xyz", np.subtract(UPPER, LOWER), strict=True))[side]
+    means = np.array([image.mean((0, 1)) for image in passes(scene, 8, 256)])
+    error = np.abs(means.mean(0) - [1.0, 0.5, 0.2] * np.exp(-1.5 * sigma * length))
+    assert (error < 5 * means.std(0, ddof=1) / math.sqrt(len(means))).all()
+    assert not passes(replace(scene, render=RenderSettings(background=False)), 1, 16)[0].any()
+
+
+@pytest.mark.parametrize("corner", [(0, 0, 0), (2, 0, 4), (2, 3, 0)])
+@pytest.mark.parametrize("side", SIDES)
+def test_a_voxel_darkens_the_place_it_has(make_scene, side: str, corner: tuple[int, int, int]) -> None:
+    density = torch.zeros(3, 4, 5, dtype=torch.float64)
+    density[corner] = 8.0
+    grid = Grid.from_xyz((5, 4, 3), LOWER, UPPER)
+    camera = seen_from(SIDES[side], 0.65, 26)
+    scene = make_scene(density, grid=grid, sigma_a=(1.0,), sigma_s=(0.0,), directional=None, ambient=(1.0,), camera=camera)
+    z, y, x = (axis.flatten()[index] for axis, index in zip(grid.centers(density), corner, strict=True))
+    right, up, _ = camera.pose[:, :3].T @ (torch.stack([x, y, z]) - camera.pose[:, 3])
+    darkness = 1 - passes(scene, 1, 64)[0].mean(-1)
+    line = (np.arange(26) + 0.5 - 13) / 13 * 0.65
+    place = (darkness.sum(0) @ line / darkness.sum(), -darkness.sum(1) @ line / darkness.sum())
+    np.testing.assert_allclose(place, (right, up), atol=0.3 * min(grid.spacing))
+
+
+def soft_ball(cells: int) -> tuple[Grid, Tensor]:
+    """A ball that is denser towards +x, on cells that are no cubes."""
+    grid = Grid.from_xyz((cells, cells, cells), LOWER, UPPER)
+    z, y, x = grid.centers(CENTER)
+    radius = ((x - CENTER[0]) ** 2 + (y - CENTER[1]) ** 2 + (z - CENTER[2]) ** 2).sqrt()
+    return grid, torch.sigmoid((0.28 - radius) / 0.05) * (1 + x)
+
+
+def sky() -> Tensor:
+    """A map [3, 8, 16] without symmetry, one pixel of it bright."""
+    radiance = COLORS.view(3, 1, 1) * torch.linspace(1, 0.1, 8, dtype=torch.float64).view(1, 8, 1).repeat(1, 1, 16)
+    radiance[:, 2, 5] += 40
+    return radiance
+
+
+LIGHTS: dict[str, Callable[[], list[Light]]] = {
+    "directional": lambda: [DirectionalLight(-torch.tensor([2.0, 2.0, 1.0]).double(), COLORS)],
+    "ambient": lambda: [AmbientLight(COLORS)],
+    "environment": lambda: [EnvironmentLight(sky(), ONES[0], 40 * ONES[0])],
+    "environment and ambient": lambda: [EnvironmentLight(sky(), 0.5 * ONES[0], -70 * ONES[0]), AmbientLight(COLORS)],
+    "point": lambda: [PointLight(CENTER + torch.tensor([1.0, 1.5, 0.5]), COLORS)],
+}
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+@pytest.mark.parametrize("light", LIGHTS)
+def test_light_scattered_once_is_ours_to_4_percent(make_scene, light: str, is_perspective: bool) -> None:
+    grid, density = soft_ball(12)
+    half_width = 0.25 if is_perspective else 0.5
+    camera = seen_from((0.5, 0.3, 0.8), half_width, 16, is_perspective)
+    scene = make_scene(density, grid=grid, sigma_a=(0.5, 1.0, 2.0), sigma_s=(3.0, 2.0, 1.0), g=0.3, camera=camera, model="none")
+    settings = RenderSettings(samples_per_pixel=16, steps_per_voxel=2, background=False)
+    scene = replace(scene, lights=LIGHTS[light](), render=settings)
+    traced = Traced.of(passes(scene, 8, 128, depth=2))
+    ours = render(scene)[0].permute(1, 2, 0).numpy()
+    assert traced.noise < 0.05
+    assert traced.error(ours) < 0.04
+    assert ours.mean() == pytest.approx(traced.image.mean(), rel=0.03)
+
+
+def test_the_background_is_seen_where_we_see_it(make_scene) -> None:
+    grid, density = soft_ball(8)
+    camera = seen_from((0.5, 0.3, 0.8), 1.2, 16, True)
+    scene = make_scene(density, grid=grid, sigma_a=(20.0,), sigma_s=(0.0,), camera=camera, model="none")
+    scene = replace(scene, lights=LIGHTS["environment"](), render=RenderSettings(samples_per_pixel=64))
+    traced = Traced.of(passes(scene, 8, 64))
+    assert traced.error(render(scene)[0].permute(1, 2, 0).numpy()) < 0.02
+
+
+def test_seeds(make_scene, random) -> None:
+    scene = make_scene(random(3, 4, 5))
+    first, second = passes(scene, 2, 4)
+    assert np.array_equal(first, passes(scene, 1, 4)[0]) and not np.array_equal(first, second)
+
+
+def test_nothing_and_nothing_that_shines(make_scene) -> None:
+    empty = make_scene(torch.zeros(2, 2, 2, dtype=torch.float64), ambient=(0.5,))
+    np.testing.assert_allclose(passes(empty, 1, 4)[0], 0.5, rtol=1e-6)
+    assert not passes(replace(empty, lights=[]), 1, 4)[0].any()
