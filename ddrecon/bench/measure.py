@@ -29,10 +29,15 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 @dataclass(frozen=True)
 class Shot:
-    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density, summed over blocks [z, y, x]."""
+    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density, summed over blocks [z, y, x].
+
+    `by_amount` is the gradient times density, summed likewise: what changes as all density there grows by a factor. Empty cells, which path
+    tracers do not see, have no part in it.
+    """
 
     image: Tensor
     gradient: Tensor
+    by_amount: Tensor
     image_seconds: float
     gradient_seconds: float
     iterations: int
@@ -63,7 +68,8 @@ def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
     end = _now(density)
     scene.volume.density = density
     iterations = memory.records[0].iterations if memory.records else 0
-    return Shot(image.detach(), _block_sums(gradient, blocks), middle - start, end - middle, iterations)
+    sums = block_sums(gradient, blocks), block_sums(gradient * density.detach(), blocks)
+    return Shot(image.detach(), *sums, middle - start, end - middle, iterations)
 
 
 def measure(contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress) -> dict[str, Timing]:
@@ -102,7 +108,7 @@ def correlation(one: Tensor, other: Tensor) -> float:
     return float(torch.corrcoef(torch.stack([one.flatten().double(), other.flatten().double()]))[0, 1])
 
 
-def _block_sums(gradient: Tensor, blocks: tuple[int, int, int]) -> Tensor:
+def block_sums(gradient: Tensor, blocks: tuple[int, int, int]) -> Tensor:
     """`gradient` [z, y, x] summed over `blocks`, whatever its own grid: the effect of scaling density there."""
     mean = adaptive_avg_pool3d(gradient[None], blocks)[0]
     return mean * (gradient.numel() / mean.numel())

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ddrecon.bench.report import Row, error_of
+
+FLOOR = 1e-8
+"""Errors below this are drawn here."""
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
@@ -18,36 +22,33 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    has_truth = any(row.image_error is not None for row in rows)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 5.5), layout="constrained")
-    factors = list(dict.fromkeys(_factor(row) for row in rows))
-    for factor in factors:
-        chosen = [row for row in rows if _factor(row) == factor]
-        color = f"C{factors.index(factor) % 10}"
-        for axis, seconds, error in (
-            (left, [row.image_seconds for row in chosen], [error_of(row) for row in chosen]),
-            (right, [row.both_seconds for row in chosen], [row.gradient_numerical for row in chosen]),
-        ):
-            axis.scatter(seconds, [max(value, FLOOR) for value in error], color=color, label=factor, s=36, zorder=3)
-    for row in rows:
-        left.annotate(row.name.partition(" ")[2] or row.name, (row.image_seconds, max(error_of(row), FLOOR)), **NOTE)
-        right.annotate(row.name.partition(" ")[2] or row.name, (row.both_seconds, max(row.gradient_numerical, FLOOR)), **NOTE)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 6), layout="constrained")
+    truth = "path tracing" if any(row.image_error is not None for row in rows) else "the same model solved exactly"
+    _scatter(left, [(row, row.image_seconds, error_of(row)) for row in rows])
+    _scatter(right, [(row, row.both_seconds, row.gradient_numerical) for row in rows if row.gradient_numerical is not None])
     front = sorted((row.image_seconds, max(error_of(row), FLOOR)) for row in rows if row.is_best)
     left.step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
-    left.set(xlabel="seconds of an image", ylabel="relative RMS error, " + ("path tracing" if has_truth else "exact solution"))
-    right.set(xlabel="seconds of an image and its gradient", ylabel="relative RMS error of the gradient, same model solved exactly")
-    for axis in (left, right):
-        axis.set(xscale="log", yscale="log")
-        axis.grid(which="major", alpha=0.3)
+    left.set(xlabel="seconds of an image", ylabel=f"relative RMS error of the image, against {truth}")
+    right.set(
+        xlabel="seconds of an image and its gradient", ylabel="relative RMS error of the gradient, against the same model solved exactly"
+    )
     left.legend(fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-FLOOR = 1e-8
-"""Errors below this are drawn here."""
-NOTE = {"fontsize": 7, "xytext": (4, 3), "textcoords": "offset points"}
+def _scatter(axis: Any, points: Sequence[tuple[Row, float, float]]) -> None:
+    """Draws rows at (seconds, error), a color for each kind of variant; notes are staggered where points are close."""
+    kinds = list(dict.fromkeys(_kind(row) for row, _, _ in points))
+    for index, kind in enumerate(kinds):
+        seconds, errors = zip(*((x, max(y, FLOOR)) for row, x, y in points if _kind(row) == kind), strict=True)
+        axis.scatter(seconds, errors, color=f"C{index % 10}", label=kind, s=36, zorder=3)
+    for index, (row, x, y) in enumerate(sorted(points, key=lambda point: point[1])):
+        place = {"xytext": (4, (4, -11, 14, -21)[index % 4]), "textcoords": "offset points"}
+        axis.annotate(row.name.partition(" ")[2] or row.name, (x, max(y, FLOOR)), fontsize=7, **place)
+    axis.set(xscale="log", yscale="log")
+    axis.grid(which="major", alpha=0.3)
 
 
-def _factor(row: Row) -> str:
+def _kind(row: Row) -> str:
     return row.name.split(" ")[0]

@@ -2,50 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from ddrecon.bench.measure import Shot, Timing, correlation, relative_error
-from ddrecon.bench.variants import Variant
+from ddrecon.bench.path_tracing import Truth
 
 
 @dataclass(frozen=True)
 class Row:
-    """One variant. Seconds are medians, `both_seconds` of image and gradient; errors are relative RMS; None where there is no path tracing.
+    """One variant, or path tracing. Seconds are medians, `both_seconds` of image and gradient; errors are relative RMS.
 
     `image_numerical` and `gradient_numerical` are against the same model solved exactly; `image_error` is against path tracing, its noise
-    subtracted in quadrature, `gradient_correlation` with path replay's gradient. `is_best`: no other row is faster and closer to the truth.
+    subtracted in quadrature, `gradient_correlation` with path replay's gradient times density. None where there is nothing to compare with.
+    `iterations` are the first solve's, or samples a pixel. `is_best`: no other row is faster and closer to the truth.
     """
 
     name: str
     image_seconds: float
     both_seconds: float
     iterations: int
-    image_numerical: float
-    gradient_numerical: float
+    image_numerical: float | None = None
+    gradient_numerical: float | None = None
     image_error: float | None = None
     gradient_correlation: float | None = None
     is_best: bool = False
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Path tracing: `image` [3, h, w] with its relative `noise`, and `gradient` over blocks, None where it was not made."""
-
-    image: Any
-    noise: float
-    gradient: Any = None
-
-    def error(self, image: Any) -> float:
-        """The relative RMS error of `image`, less the truth's own noise in quadrature."""
-        return max(0.0, relative_error(image, self.image) ** 2 - self.noise**2) ** 0.5
-
-
-def rows_of(variants: Sequence[Variant], timings: dict[str, Timing], exact: dict[str, Shot], truth: Truth | None) -> list[Row]:
-    """A row for every variant that was measured, in their order."""
-    rows = [_row(variant.name, timings[variant.name], exact[variant.name], truth) for variant in variants if variant.name in timings]
-    return with_best(rows)
+def rows_of(timings: Mapping[str, Timing], exact: Mapping[str, Shot], truth: Truth | None) -> list[Row]:
+    """A row for every contestant that was measured; `exact` are the exact solutions of those that have one."""
+    return with_best([_row(name, timing, exact.get(name), truth) for name, timing in timings.items()])
 
 
 def with_best(rows: Sequence[Row]) -> list[Row]:
@@ -54,20 +41,25 @@ def with_best(rows: Sequence[Row]) -> list[Row]:
     def is_beaten(row: Row) -> bool:
         return any(other.image_seconds < row.image_seconds and error_of(other) < error_of(row) for other in rows)
 
-    return [Row(**{**asdict(row), "is_best": not is_beaten(row)}) for row in rows]
+    return [replace(row, is_best=not is_beaten(row)) for row in rows]
 
 
 def error_of(row: Row) -> float:
-    """Against path tracing, or where there is none against the exact solution."""
-    return row.image_numerical if row.image_error is None else row.image_error
+    """Against path tracing, or where there is none against the exact solution; infinite without either."""
+    return next((error for error in (row.image_error, row.image_numerical) if error is not None), math.inf)
 
 
-def _row(name: str, timing: Timing, exact: Shot, truth: Truth | None) -> Row:
-    shot, (image_seconds, both_seconds) = timing.shots[0], timing.seconds
-    numerical = relative_error(shot.image, exact.image), relative_error(shot.gradient, exact.gradient)
-    error = truth.error(shot.image) if truth is not None else None
-    agreement = correlation(shot.gradient, truth.gradient) if truth is not None and truth.gradient is not None else None
-    return Row(name, image_seconds, both_seconds, shot.iterations, *numerical, error, agreement)
+def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> Row:
+    shot = timing.shots[0]
+    row = Row(name, *timing.seconds, shot.iterations)
+    if exact is not None:
+        errors = relative_error(shot.image, exact.image), relative_error(shot.gradient, exact.gradient)
+        row = replace(row, image_numerical=errors[0], gradient_numerical=errors[1])
+    if truth is not None:
+        row = replace(row, image_error=truth.error(shot.image))
+        if truth.by_amount is not None:
+            row = replace(row, gradient_correlation=correlation(shot.by_amount, truth.by_amount))
+    return row
 
 
 def table(rows: Sequence[Row]) -> list[str]:
@@ -92,7 +84,7 @@ def table(rows: Sequence[Row]) -> list[str]:
             f"{row.both_seconds / rows[0].both_seconds:.2f}",
             str(row.iterations),
         ]
-        shown += [f"{row.image_numerical:.1e}", f"{row.gradient_numerical:.1e}"]
+        shown += ["" if value is None else f"{value:.1e}" for value in (row.image_numerical, row.gradient_numerical)]
         shown += ["" if value is None else f"{value:.3f}" for value in (row.image_error, row.gradient_correlation)]
         lines.append(_line([row.name, *shown, "best" if row.is_best else ""]))
     return lines
