@@ -166,30 +166,29 @@ def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: in
 
 
 @main.command()
-@click.option("--hard", "is_hard", is_flag=True, help="Numerical stability on hard cases, in float32 against float64.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for the results: hard.json.")
+@click.argument("scene", required=False, type=click.Path(path_type=Path))
+@click.option("--quick", "is_quick", is_flag=True, help="A small scene, or SCENE made coarser, measured once.")
+@click.option("--hard", "is_hard", is_flag=True, help="Instead: numerical stability on hard cases, in float32 against float64.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for the results: bench.json and bench.png, or hard.json.")
 @OVERWRITE
 @REPORT
 @in_session
-def bench(session: Session, is_hard: bool, output: Path | None, overwrite: bool, report: Path | None) -> None:
-    """Measure the program on scenes of its own."""
-    if not is_hard:
-        raise click.UsageError("only the hard cases can be run so far: ddrecon bench --hard")
-    if session.overrides:
-        raise click.UsageError("-D changes a scene file, and the hard cases have none")
+def bench(
+    session: Session, scene: Path | None, is_quick: bool, is_hard: bool, output: Path | None, overwrite: bool, report: Path | None
+) -> None:
+    """Measure speed against error on SCENE, or on a plume of ddrecon's own."""
+    if session.overrides and scene is None:
+        raise click.UsageError("-D changes a scene file; name one")
+    if is_hard and (scene is not None or is_quick):
+        raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     require_folder_of(report)
+    from ddrecon.bench.run import bench_hard, bench_speed
     from ddrecon.io.folders import prepare_folder
-    from ddrecon.io.json_file import write_json
-    from ddrecon.validate.hard import describe, run_cases, table
 
     if output is not None:
         prepare_folder(output, may_exist=overwrite)
-    results = run_cases(session.device, session.progress)
-    click.echo("\n".join(table(results)))
-    for file in (output / "hard.json" if output else None, report):
-        if file is not None:
-            write_json(file, describe(results))
-    if any(result.failures() for result in results):
+    has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
+    if not has_passed:
         sys.exit(1)
 
 

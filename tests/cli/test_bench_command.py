@@ -1,4 +1,4 @@
-"""`ddrecon bench --hard` prints and writes its table, and fails where a case does."""
+"""`ddrecon bench` prints and writes its tables; `--hard` fails where a case does."""
 
 from __future__ import annotations
 
@@ -45,11 +45,38 @@ def test_a_broken_bound_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["bench"], "ddrecon bench --hard"),
-        ([*BENCH, "-D", "volume.g=0"], "the hard cases have none"),
+        ([*BENCH, "-D", "volume.g=0"], "-D changes a scene file; name one"),
+        ([*BENCH, "scene.yaml"], "--hard has cases of its own"),
+        (["bench", "gone.yaml"], "gone.yaml"),
         ([*BENCH, "--json", "gone/report.json"], "there is no folder"),
         ([*BENCH, "-o", "scene.yaml"], "is a file"),
     ],
 )
 def test_what_cannot_be_done_is_refused(refuse: Callable[..., list[str]], arguments: list[str], told: str) -> None:
     assert told in refuse(2, *arguments)[-1]
+
+
+def test_a_scene_is_measured_by_every_variant(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ddrecon.bench.run._tracer", lambda scene, has_gradient: None)
+    result = run("bench", "scene.yaml", "--quick", "-q", "-o", "out", "--json", "report.json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    report = json.loads(Path("report.json").read_text())
+    assert report == json.loads(Path("out/bench.json").read_text())
+    rows = {row["name"]: row for row in report["rows"]}
+    assert [line.split("|")[1].strip() for line in result.stdout.splitlines()[2 : 2 + len(rows)]] == list(rows)
+    assert rows["tolerance 1e-06"]["iterations"] > rows["tolerance 0.01"]["iterations"]
+    assert rows["solver jacobi"]["iterations"] > rows["solver conjugate_gradient"]["iterations"] > rows["base"]["iterations"]
+    assert rows["steps 2"]["image_numerical"] < rows["base"]["image_numerical"]
+    assert report["truth_noise"] is None and report["environment"]["threads"] >= 1
+
+
+def test_path_tracing_takes_part_where_mitsuba_is_installed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba", reason="Mitsuba 3 is not installed (extra `reference`)")
+    monkeypatch.setattr("ddrecon.bench.run.QUICK_PATHS", (4, 64))
+    result = run("bench", "scene.yaml", "--quick", "-q", "--json", "report.json")
+    assert result.exit_code == 0, result.stderr
+    report = json.loads(Path("report.json").read_text())
+    rows = {row["name"]: row for row in report["rows"]}
+    few, many = (rows[f"Mitsuba {paths} paths a pixel"]["image_error"] for paths in (4, 64))
+    assert many < few / 2 and report["truth_noise"]["image"] < many
+    assert "Mitsuba reaches base's image error" in result.stdout

@@ -1,0 +1,94 @@
+"""The table and the record of a bench: one row per variant, errors beside the time they take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from ddrecon.bench.measure import Shot, Timing, correlation, relative_error
+from ddrecon.bench.path_tracing import Truth
+
+
+@dataclass(frozen=True)
+class Row:
+    """One variant, or path tracing. Seconds are medians, `both_seconds` of image and gradient; errors are relative RMS.
+
+    `image_numerical` and `gradient_numerical` are against the same model solved exactly; `image_error` is against path tracing, its noise
+    subtracted in quadrature, `gradient_correlation` with path replay's gradient times density. None where there is nothing to compare with.
+    `iterations` are the first solve's, or samples a pixel. `is_best`: no other row is faster and closer to the truth.
+    """
+
+    name: str
+    image_seconds: float
+    both_seconds: float
+    iterations: int
+    image_numerical: float | None = None
+    gradient_numerical: float | None = None
+    image_error: float | None = None
+    gradient_correlation: float | None = None
+    is_best: bool = False
+
+
+def rows_of(timings: Mapping[str, Timing], exact: Mapping[str, Shot], truth: Truth | None) -> list[Row]:
+    """A row for every contestant that was measured; `exact` are the exact solutions of those that have one."""
+    return with_best([_row(name, timing, exact.get(name), truth) for name, timing in timings.items()])
+
+
+def with_best(rows: Sequence[Row]) -> list[Row]:
+    """The same rows, those marked that no other beats in both time of an image and error."""
+
+    def is_beaten(row: Row) -> bool:
+        return any(other.image_seconds < row.image_seconds and error_of(other) < error_of(row) for other in rows)
+
+    return [replace(row, is_best=not is_beaten(row)) for row in rows]
+
+
+def error_of(row: Row) -> float:
+    """Against path tracing, or where there is none against the exact solution; infinite without either."""
+    return next((error for error in (row.image_error, row.image_numerical) if error is not None), math.inf)
+
+
+def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> Row:
+    shot = timing.shots[0]
+    row = Row(name, *timing.seconds, shot.iterations)
+    if exact is not None:
+        errors = relative_error(shot.image, exact.image), relative_error(shot.gradient, exact.gradient)
+        row = replace(row, image_numerical=errors[0], gradient_numerical=errors[1])
+    if truth is not None:
+        row = replace(row, image_error=truth.error(shot.image))
+        if truth.by_amount is not None:
+            row = replace(row, gradient_correlation=correlation(shot.by_amount, truth.by_amount))
+    return row
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """The rows as a Markdown table; times also as multiples of the first row's."""
+    head = [
+        "variant",
+        "image s",
+        "+ gradient s",
+        "times base",
+        "iterations",
+        "image num. error",
+        "gradient num. error",
+        "image error",
+        "gradient corr.",
+        "",
+    ]
+    lines = [_line(head), _line(["---"] * len(head))]
+    for row in rows:
+        shown = [
+            f"{row.image_seconds:.3f}",
+            f"{row.both_seconds:.3f}",
+            f"{row.both_seconds / rows[0].both_seconds:.2f}",
+            str(row.iterations),
+        ]
+        shown += ["" if value is None else f"{value:.1e}" for value in (row.image_numerical, row.gradient_numerical)]
+        shown += ["" if value is None else f"{value:.3f}" for value in (row.image_error, row.gradient_correlation)]
+        lines.append(_line([row.name, *shown, "best" if row.is_best else ""]))
+    return lines
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,99 @@
+"""What is varied: one setting at a time, from what the scene says."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.reconstruct.levels import at_level
+from ddrecon.settings import DiffusionSettings
+from ddrecon.world import Scene
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is tried: tolerances, models, transport rounds with directions, steps a voxel, and factors by which the grid is made coarser."""
+
+    tolerances: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
+    models: tuple[str, ...] = ("p1", "flux_limited")
+    rounds: tuple[tuple[int, int], ...] = ((0, 26), (1, 26), (2, 26), (1, 50), (2, 50), (4, 50))
+    steps: tuple[int, ...] = (1, 2)
+    coarser: tuple[int, ...] = (2, 4)
+
+
+QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (2,))
+EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
+EXACT_STEPS = 4
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One `factor` of a scene changed to `value`; the base, a scene as it is, has no factor."""
+
+    factor: str
+    value: str
+    change: Callable[[Scene], Scene]
+
+    @property
+    def name(self) -> str:
+        """As in tables: 'tolerance 0.01'."""
+        return f"{self.factor} {self.value}".strip()
+
+
+def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
+    """The base, and every variant of `sweep` that differs from it."""
+    return [Variant("base", "", lambda scene: scene), *(item for item in _all(sweep) if not _is_same(item.change(scene), scene))]
+
+
+def exactly(scene: Scene) -> Scene:
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows and marched in finer steps, ray by ray."""
+    render = replace(scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel))
+    return replace(scene, render=render, diffusion=replace(scene.diffusion, **EXACT))
+
+
+def model_of(scene: Scene) -> tuple[object, ...]:
+    """What `exactly` keeps of a scene: scenes for which this is the same have the same exact image."""
+    return scene.volume.grid.shape, _effective(replace(scene.diffusion, **EXACT))
+
+
+def _all(sweep: Sweep) -> Iterator[Variant]:
+    for solver in SOLVERS:
+        yield _diffusing("solver", solver, solver=solver)
+    for tolerance in sweep.tolerances:
+        yield _diffusing("tolerance", tolerance, tolerance=tolerance)
+    for closure in CLOSURES:
+        yield _diffusing("closure", closure, closure=closure)
+    for model in sweep.models:
+        yield _diffusing("model", model, model=model)
+    for rounds, directions in sweep.rounds:
+        yield _diffusing("rounds", f"{rounds}, {directions} directions", transport_rounds=rounds, transport_directions=directions)
+    for steps in sweep.steps:
+        yield _marching("steps", steps, steps_per_voxel=steps)
+    for factor in sweep.coarser:
+        yield Variant("grid", f"{factor} times coarser", functools.partial(_coarser, factor))
+
+
+def _diffusing(factor: str, value: object, **changes: Any) -> Variant:
+    return Variant(factor, str(value), lambda scene: replace(scene, diffusion=replace(scene.diffusion, **changes)))
+
+
+def _marching(factor: str, value: object, **changes: Any) -> Variant:
+    return Variant(factor, str(value), lambda scene: replace(scene, render=replace(scene.render, **changes)))
+
+
+def _coarser(factor: int, scene: Scene) -> Scene:
+    return replace(at_level(scene, factor), views=scene.views)
+
+
+def _is_same(changed: Scene, scene: Scene) -> bool:
+    is_same_grid = changed.volume.grid.shape == scene.volume.grid.shape
+    return is_same_grid and changed.render == scene.render and _effective(changed.diffusion) == _effective(scene.diffusion)
+
+
+def _effective(diffusion: DiffusionSettings) -> DiffusionSettings:
+    """Without the number of directions where there are no rounds that it could matter to."""
+    return diffusion if diffusion.transport_rounds else replace(diffusion, transport_directions=DiffusionSettings.transport_directions)
