@@ -16,16 +16,18 @@ from ddrecon.world import Scene
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is tried: tolerances, models, transport rounds with directions, steps a voxel, and factors by which the grid is made coarser."""
+    """What is tried: tolerances of solves, models, transport rounds with directions, steps a voxel, tolerances of interpolated pixels, and
+    factors by which the grid is made coarser."""
 
     tolerances: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
     models: tuple[str, ...] = ("p1", "flux_limited")
     rounds: tuple[tuple[int, int], ...] = ((0, 26), (1, 26), (2, 26), (1, 50), (2, 50), (4, 50))
     steps: tuple[int, ...] = (1, 2)
+    pixels: tuple[float, ...] = (0, 0.01, 0.05, 1)
     coarser: tuple[int, ...] = (2, 4)
 
 
-QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (2,))
+QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (0, 0.05), (2,))
 EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
 EXACT_STEPS = 4
 
@@ -51,7 +53,7 @@ def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
 
 def exactly(scene: Scene) -> Scene:
     """`scene` by the same model on the same grid, solved as exactly as its precision allows and marched in finer steps, ray by ray."""
-    render = replace(scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel))
+    render = replace(scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel), tolerance=0.0)
     return replace(scene, render=render, diffusion=replace(scene.diffusion, **EXACT))
 
 
@@ -73,6 +75,8 @@ def _all(sweep: Sweep) -> Iterator[Variant]:
         yield _diffusing("rounds", f"{rounds}, {directions} directions", transport_rounds=rounds, transport_directions=directions)
     for steps in sweep.steps:
         yield _marching("steps", steps, steps_per_voxel=steps)
+    for tolerance in sweep.pixels:
+        yield _marching("pixels", tolerance, tolerance=tolerance)
     for factor in sweep.coarser:
         yield Variant("grid", f"{factor} times coarser", functools.partial(_coarser, factor))
 
