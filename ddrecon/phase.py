@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.decay import decay_mean
+from ddrecon.polynomial import fitted, positive_part
 
 
 def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
@@ -41,11 +42,23 @@ def peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
     `henyey_greenstein`. `cosine`: as there, broadcast against `depth`; `g` >= 0, scalar. Where it would be negative, since scattering
     without its peak has only two moments, it is 0.
     """
+    return _peaked(depth, cosine, g).clamp(min=0)
+
+
+def peaked_phase_along(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
+    """`peaked_phase` where only `depth` [N, C, R] changes along rays, each with its own `cosine` [R], by a polynomial of each ray.
+
+    Exact at no depth, elsewhere off by no more than 0.007 up to g = 0.95, relative to the function's value or to 1 where that is less.
+    """
+    return positive_part(fitted(lambda depths: _peaked(depths, cosine, g), depth), depth)
+
+
+def _peaked(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
     fraction = forward_fraction(g)
     some = decay_mean(depth)
     spread = g * torch.exp((g - 1) * depth) * decay_mean(g * depth) / some
     rest = (1 - fraction) * (1 + 3 * scaled_mean_cosine(g) * cosine)
-    return (rest + fraction * some * _peak(spread, cosine)).clamp(min=0)
+    return rest + fraction * some * _peak(spread, cosine)
 
 
 def _peak(spread: Tensor, cosine: Tensor) -> Tensor:

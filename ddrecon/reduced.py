@@ -19,7 +19,7 @@ from ddrecon.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.medium import Medium
 from ddrecon.moments import Moments, Vector, beam_moments
 from ddrecon.nodes import Nodes
-from ddrecon.phase import henyey_greenstein, peaked_phase
+from ddrecon.phase import henyey_greenstein, peaked_phase_along
 from ddrecon.point_light import PointBeam, point_beam
 from ddrecon.quadrature import sphere_quadrature
 from ddrecon.running import running_sum
@@ -47,7 +47,7 @@ class Beam:
         cosine = -(nodes.direction @ self.direction)
         if peak is None:
             return nodes.integral(scattering), henyey_greenstein(cosine, g)
-        return nodes.integral(scattering * peaked_phase(peak, cosine, g)), 1.0
+        return nodes.integral(scattering * peaked_phase_along(peak, cosine, g)), 1.0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ddrecon.medium import Volume, scaled_medium, unscaled_medium
-from ddrecon.phase import forward_fraction, henyey_greenstein, peaked_phase, scaled_mean_cosine
+from ddrecon.phase import forward_fraction, henyey_greenstein, peaked_phase, peaked_phase_along, scaled_mean_cosine
 
 MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(100)
@@ -115,3 +115,20 @@ def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of, r
 def test_a_density_of_another_shape_is_refused(random, box):
     with pytest.raises(ValueError, match=r"\(2, 3, 5\).*\(2, 3, 4\)"):
         Volume(box((2, 3, 4)), random(2, 3, 5), random(1), random(1), scalar(0.0))
+
+
+@pytest.mark.parametrize("g", [0.1, 0.5, 0.85, 0.95])
+def test_along_rays_a_spread_peak_is_nearly_the_same(g: float):
+    """And the same where nothing lies behind it."""
+    cosine = torch.linspace(-1, 1, 41, dtype=torch.float64)
+    depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 400)]).double()[:, None]
+    along, exact = peaked_phase_along(depth[:, None].expand(-1, 1, 41), cosine, scalar(g))[:, 0], peaked_phase(depth, cosine, scalar(g))
+    torch.testing.assert_close(along[0], exact[0], rtol=1e-9, atol=1e-12)
+    assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
+
+
+def test_along_rays_both_derivatives_agree_with_differences():
+    depth = torch.rand(3, 2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
+    cosine = torch.tensor([-0.9, -0.2, 0.4, 0.95], dtype=torch.float64).requires_grad_()
+    arguments = (depth, cosine, scalar(0.6).requires_grad_())
+    assert torch.autograd.gradcheck(peaked_phase_along, arguments, check_forward_ad=True)

@@ -35,14 +35,19 @@ class DiffusionProblem:
     has_flux: bool
 
     @cached_property
+    def diffusion(self) -> Tensor:
+        """D [u], `[C, z, y, x]`."""
+        return recomputed(_diffusion, self.medium, self.closure)
+
+    @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E7."""
         flux_along = self._source_flux()
-        z, y, x = (recomputed(_conductance, self.medium, self.closure, axis) for axis in AXES)
-        loss, right = recomputed(_loss_and_source, self.medium, self.closure, self.source.mean, self.outside)
+        z, y, x = (recomputed(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
+        loss, right = recomputed(_loss_and_source, self.medium, self.diffusion, self.source.mean, self.outside)
         for axis, flux in flux_along.items():
             if flux is not None:
-                right = right - recomputed(_divergence, self.medium, self.closure, flux, axis)
+                right = right - recomputed(_divergence, self.medium, self.diffusion, flux, axis)
         return Operator((z, y, x), loss), right
 
     def flux(self, mean: Tensor) -> Vector | None:
@@ -50,7 +55,7 @@ class DiffusionProblem:
         if not self.has_flux:
             return None
         along = self._source_flux().items()
-        z, y, x = (recomputed(axis_flux, self.medium, self.closure, flux, self.outside, mean, axis) for axis, flux in along)
+        z, y, x = (recomputed(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis) for axis, flux in along)
         return z, y, x
 
     def _source_flux(self) -> dict[int, Tensor | None]:
@@ -63,24 +68,23 @@ def diffuse_light(problem: DiffusionProblem, solve: Solve[Operator]) -> Moments:
     return Moments(mean, problem.flux(mean))
 
 
-def _conductance(medium: Medium, closure: Closure, axis: int) -> Tensor:
-    """c on the interior faces along `axis`."""
-    return conductance(closure(medium.transport_extinction), medium.grid, axis)
+def _diffusion(medium: Medium, closure: Closure) -> Tensor:
+    return closure(medium.transport_extinction)
 
 
-def _loss_and_source(medium: Medium, closure: Closure, source_mean: Tensor, outside: Tensor) -> tuple[Tensor, Tensor]:
+def _loss_and_source(medium: Medium, diffusion: Tensor, source_mean: Tensor, outside: Tensor) -> tuple[Tensor, Tensor]:
     """What cells lose to absorption and through the box's faces, and what they gain from Q0 and from outside."""
-    escape = boundary_loss(closure(medium.transport_extinction), medium.grid)
+    escape = boundary_loss(diffusion, medium.grid)
     return medium.absorption.value + escape, medium.remaining_scattering * source_mean + escape * outside
 
 
-def _divergence(medium: Medium, closure: Closure, source_flux: Tensor, axis: int) -> Tensor:
+def _divergence(medium: Medium, diffusion: Tensor, source_flux: Tensor, axis: int) -> Tensor:
     """The part along `axis` of div (D kappa_s Q1)."""
-    faces = face_fluxes(None, medium.remaining_scattering * source_flux, closure(medium.transport_extinction), medium.grid, axis)
+    faces = face_fluxes(None, medium.remaining_scattering * source_flux, diffusion, medium.grid, axis)
     return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
 
 
-def axis_flux(medium: Medium, closure: Closure, source_flux: Tensor | None, outside: Tensor, mean: Tensor, axis: int) -> Tensor:
+def axis_flux(medium: Medium, diffusion: Tensor, source_flux: Tensor | None, outside: Tensor, mean: Tensor, axis: int) -> Tensor:
     """L1 along `axis`, averaged over each cell's two faces."""
     source = None if source_flux is None else medium.remaining_scattering * source_flux
-    return 3 * cell_average(face_fluxes(mean, source, closure(medium.transport_extinction), medium.grid, axis, outside), axis)
+    return 3 * cell_average(face_fluxes(mean, source, diffusion, medium.grid, axis, outside), axis)

@@ -96,7 +96,7 @@ def diffuse_light(medium: Medium, limiter: Limiter, source: Moments, outside: Te
         return Moments(mean)
     diffusion = balance.diffusion(mean, transport_extinction)
     components = source.flux or (None, None, None)
-    z, y, x = (axis_flux(medium, lambda _: diffusion, part, outside, mean, axis) for axis, part in zip(AXES, components, strict=True))
+    z, y, x = (axis_flux(medium, diffusion, part, outside, mean, axis) for axis, part in zip(AXES, components, strict=True))
     return Moments(mean, (z, y, x))
 
 

@@ -276,9 +276,9 @@ class OptimizeSettings:
     iterations: int = bounded(300, minimum=1)
     loss: str = one_of("l2", ("l2", "l1", "huber", "relative_l2"))
     optimizer: str = one_of("adam", ("adam",))
-    views_per_iteration: int = bounded(0, minimum=0)
+    views_per_iteration: int = bounded(3, minimum=0)
     derivatives: str = one_of("all", DERIVATIVES)
-    refine_at: tuple[float, ...] = field(default=(0.3, 0.6), metadata={"above": 0, "below": 1})
+    refine_at: tuple[float, ...] = field(default=(0.4, 0.8), metadata={"above": 0, "below": 1})
 
     def problems(self) -> Iterator[Problem]:
         if any(later <= earlier for earlier, later in zip(self.refine_at, self.refine_at[1:], strict=False)):

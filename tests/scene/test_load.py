@@ -64,7 +64,7 @@ def test_the_example_of_the_contract(read: Read, tmp_path: Path):
     assert tree.views[0].image == tmp_path / "targets/front.exr" and tree.views[0].split == "train"
     assert tree.diffusion.tolerance == 1e-4 and tree.render == RenderSettings()
     assert (
-        tree.optimize == OptimizeSettings({"density": ParameterSettings(init=0.0, lr=0.05, min=0.0, tv=1e-4)})
+        tree.optimize == OptimizeSettings({"density": ParameterSettings(init=0.0, lr=0.05, min=0.0, tv=1e-4)}, refine_at=(0.3, 0.6))
         and tree.optimize.parameters["density"].tv == 1e-4
     )
 
@@ -74,7 +74,7 @@ def test_defaults(read: Read):
     assert tree.render == RenderSettings() and tree.diffusion == DiffusionSettings() and tree.optimize is None
     assert tree.views[0].camera.up == (0, 1, 0) and tree.views[0].split == "train" and tree.views[0].image is None
     settings = read(SCENE + "optimize: {parameters: {density: {}}}\n").tree.optimize
-    assert settings == OptimizeSettings({"density": ParameterSettings()}, 300, "l2", "adam", 0, "all", (0.3, 0.6))
+    assert settings == OptimizeSettings({"density": ParameterSettings()}, 300, "l2", "adam", 3, "all", (0.4, 0.8))
     assert read(changed(volume={"density": 1, "sigma_a": 0, "sigma_s": 1})).tree.volume.g == 0
 
 
