@@ -33,13 +33,14 @@ def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Te
     return total
 
 
-def decayed_line(near: Tensor, far: Tensor, depth: Tensor) -> Tensor:
+def decayed_line(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
     """The mean over s in [0, 1] of (near + (far - near) s) exp(-depth s): what reaches the near end of a step from all along it.
 
-    `depth` [N, C, ...] >= 0; `near` and `far` have its shape, or either has one channel where the other has C.
+    And 1 - exp(-depth), the part of what enters at its far end that is lost on it. `depth` [N, C, ...] >= 0; `near` and `far` have its
+    shape, or either has one channel where the other has C.
     """
-    line: Tensor = _DecayedLine.apply(near, far, depth)[0]
-    return line
+    line, lost, *_ = _DecayedLine.apply(near, far, depth)
+    return line, lost
 
 
 def _phi(depth: Tensor) -> Tensor:
@@ -130,39 +131,41 @@ class _DecayedSum(torch.autograd.Function):
 
 
 class _DecayedLine(torch.autograd.Function):
-    """far phi + (near - far) psi, and phi and psi, which are not differentiated themselves."""
+    """far phi + (near - far) psi and depth phi; and phi and psi, which are not differentiated themselves."""
 
     @staticmethod
-    def forward(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         phi = _phi(depth)
         psi = _psi(depth, phi)
-        return torch.addcmul(far * phi, near - far, psi), phi, psi
+        return torch.addcmul(far * phi, near - far, psi), depth * phi, phi, psi
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
-        ctx.mark_non_differentiable(*output[1:])
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output[2:])
         ctx.set_materialize_grads(False)
         keep(ctx, *inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, line_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, line_bar: Tensor | None, lost_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+        near, far, depth, lost, phi, psi = ctx.saved_tensors
+        depth_bar = None if lost_bar is None else lost_bar * (1 - lost)
         if line_bar is None:
-            return None, None, None
-        near, far, depth, phi, psi = ctx.saved_tensors
+            return None, None, depth_bar
         near_bar, slope = line_bar * psi, _line_slope(near, far, depth, phi, psi)
         far_bar = (line_bar * phi).sub_(near_bar)
-        return _to_fields(near_bar, near), _to_fields(far_bar, far), _to_fields(slope.mul_(line_bar), depth)
+        through = _to_fields(slope.mul_(line_bar), depth)
+        return _to_fields(near_bar, near), _to_fields(far_bar, far), through if depth_bar is None else depth_bar.add_(through)
 
     @staticmethod
-    def jvp(ctx: Any, d_near: Tensor | None, d_far: Tensor | None, d_depth: Tensor | None) -> tuple[Tensor, None, None]:
-        near, far, depth, phi, psi = ctx.saved_tensors
-        d_line = torch.zeros_like(far * phi)
+    def jvp(ctx: Any, d_near: Tensor | None, d_far: Tensor | None, d_depth: Tensor | None) -> tuple[Tensor, Tensor, None, None]:
+        near, far, depth, lost, phi, psi = ctx.saved_tensors
+        d_line, d_lost = torch.zeros_like(far * phi), torch.zeros_like(lost)
         for change, slope in ((d_near, psi), (d_far, phi - psi)):
             if change is not None:
                 d_line = d_line + change * slope
         if d_depth is not None:
-            d_line = d_line + d_depth * _line_slope(near, far, depth, phi, psi)
-        return d_line, None, None
+            d_line, d_lost = d_line + d_depth * _line_slope(near, far, depth, phi, psi), d_depth * (1 - lost)
+        return d_line, d_lost, None, None
 
 
 def _line_slope(near: Tensor, far: Tensor, depth: Tensor, phi: Tensor, psi: Tensor) -> Tensor:

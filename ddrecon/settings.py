@@ -62,7 +62,7 @@ class DiffusionSettings:
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
     transport_rounds: int = bounded(0, minimum=0, maximum=16)
-    transport_directions: int = one_of(50, DEGREES)
+    transport_directions: int = one_of(26, DEGREES)
 
     def problems(self) -> Iterator[tuple[str, str]]:
         """Settings that exclude each other, as key and what is wrong with it."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -108,7 +110,8 @@ def test_a_decayed_line_against_quadrature(depth: float):
     part = (nodes + 1) / 2
     expected = float(((0.7 + (2.5 - 0.7) * part) * np.exp(-depth * part) * weights).sum() / 2)
     near, far, depths = (torch.full((1, 1, 1), value, dtype=torch.float64) for value in (0.7, 2.5, depth))
-    assert decayed_line(near, far, depths).item() == pytest.approx(expected, rel=1e-11)
+    line, lost = decayed_line(near, far, depths)
+    assert line.item() == pytest.approx(expected, rel=1e-11) and lost.item() == pytest.approx(-math.expm1(-depth), rel=1e-14)
 
 
 @pytest.mark.parametrize(("near", "far"), [(1, 1), (3, 1), (1, 3), (3, 3)])

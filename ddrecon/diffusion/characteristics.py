@@ -74,8 +74,8 @@ def radiance_along(medium: Medium, light: Moments, inflow: Tensor | None, direct
     mass = _crossed(medium.extinction, course)
     scattering = mass if medium.scattering.field is medium.extinction.field else _crossed(medium.scattering, course)
     depth = mass * _scale(medium.extinction)
-    scattered = decayed_line(here, course.before(here, is_repeated=True), depth) * (scattering * _scale(medium.scattering))
-    source, lost = scattered * (1 - medium.forward_fraction), -torch.expm1(-depth)
+    line, lost = decayed_line(here, course.before(here, is_repeated=True), depth)
+    source = line * (scattering * ((1 - medium.forward_fraction) * _scale(medium.scattering)))
     if inflow is None:
         return course.lift(follow(1 - lost, source, course))
     return course.lift(follow(1 - lost, source - inflow.view(1, -1, 1, 1) * lost, course)) + inflow
