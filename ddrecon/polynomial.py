@@ -25,11 +25,11 @@ DEEPEST = 1e6
 def fitted(function: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """Coefficients `[COEFFICIENTS, R]` of the polynomial that equals `function` at Chebyshev's extrema, depth 0 and infinity among them.
 
-    `function` takes depths [COEFFICIENTS, 1] and returns `[COEFFICIENTS, R]`. Differentiable through its values.
+    `function` takes depths [COEFFICIENTS, 1] and returns `[COEFFICIENTS, R]`, in double precision. Differentiable through its values.
     """
     places, inverse = _interpolation()
     depths = (SCALE * (1 + places) / (1 - places)).clamp(max=DEEPEST)
-    found: Tensor = inverse.to(like.device) @ function(depths.to(like)[:, None]).double()
+    found: Tensor = inverse.to(like.device) @ function(depths.to(like.device)[:, None])
     return found.to(like.dtype)
 
 
