@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,31 +23,44 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(13, 6), layout="constrained")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
     truth = "path tracing" if any(row.image_error is not None for row in rows) else "the same model solved exactly"
-    _scatter(left, [(row, row.image_seconds, error_of(row)) for row in rows])
-    _scatter(right, [(row, row.both_seconds, row.gradient_numerical) for row in rows if row.gradient_numerical is not None])
+    kinds = list(dict.fromkeys(_kind(row) for row in rows))
+    dots = [Dot(index + 1, row.name, f"C{kinds.index(_kind(row)) % 10}") for index, row in enumerate(rows)]
+    _scatter(left, [(dot, row.image_seconds, error_of(row)) for dot, row in zip(dots, rows, strict=True)])
+    gradients = [(dot, row.both_seconds, row.gradient_numerical) for dot, row in zip(dots, rows, strict=True)]
+    _scatter(right, [(dot, seconds, error) for dot, seconds, error in gradients if error is not None])
     front = sorted((row.image_seconds, max(error_of(row), FLOOR)) for row in rows if row.is_best)
     left.step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
     left.set(xlabel="seconds of an image", ylabel=f"relative RMS error of the image, against {truth}")
     right.set(
         xlabel="seconds of an image and its gradient", ylabel="relative RMS error of the gradient, against the same model solved exactly"
     )
-    left.legend(fontsize=8)
+    names = [f"{dot.number}  {dot.name}" for dot in dots]
+    handles = [plt.Line2D([], [], color=dot.color, marker="o", linestyle="") for dot in dots]
+    figure.legend(handles, names, loc="outside right center", fontsize=8, frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def _scatter(axis: Any, points: Sequence[tuple[Row, float, float]]) -> None:
-    """Draws rows at (seconds, error), a color for each kind of variant; notes are staggered where points are close."""
-    kinds = list(dict.fromkeys(_kind(row) for row, _, _ in points))
-    for index, kind in enumerate(kinds):
-        seconds, errors = zip(*((x, max(y, FLOOR)) for row, x, y in points if _kind(row) == kind), strict=True)
-        axis.scatter(seconds, errors, color=f"C{index % 10}", label=kind, s=36, zorder=3)
-    for index, (row, x, y) in enumerate(sorted(points, key=lambda point: point[1])):
-        place = {"xytext": (4, (4, -11, 14, -21)[index % 4]), "textcoords": "offset points"}
-        axis.annotate(row.name.partition(" ")[2] or row.name, (x, max(y, FLOOR)), fontsize=7, **place)
+@dataclass(frozen=True)
+class Dot:
+    """How a row is drawn: a numbered dot; the `number` stands beside its name in the legend."""
+
+    number: int
+    name: str
+    color: str
+
+
+def _scatter(axis: Any, points: Sequence[tuple[Dot, float, float]]) -> None:
+    """Draws dots at (seconds, error); numbers go around them in turn, so that those of close dots stay apart."""
+    for index, (dot, x, y) in enumerate(sorted(points, key=lambda point: point[1])):
+        height = max(y, FLOOR)
+        axis.scatter([x], [height], color=dot.color, s=36, zorder=3)
+        place = ((0, 9), (0, -9), (0, 18), (0, -18))[index % 4]
+        axis.annotate(str(dot.number), (x, height), xytext=place, textcoords="offset points", fontsize=8, ha="center", va="center")
     axis.set(xscale="log", yscale="log")
+    axis.margins(0.08)
     axis.grid(which="major", alpha=0.3)
 
 
