@@ -24,10 +24,10 @@ from ddrecon.session import Session
 from ddrecon.validate import hard
 from ddrecon.world import Scene
 
-TURNS = 3
+TURNS = 2
 PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
 """Paths a pixel that Mitsuba is tried with; the truth is the mean of `TRUTH_PASSES` of the most, by other paths."""
-TRUTH_PASSES = 8
+TRUTH_PASSES = 4
 QUICK_CELLS = 60_000
 """A quick bench is of a scene made coarser until it has no more cells than this."""
 

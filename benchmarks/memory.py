@@ -1,0 +1,106 @@
+"""Peak memory against what `ddrecon check` predicts, and bytes per cell and color of a forward and adjoint solve.
+
+    python benchmarks/memory.py
+
+Every figure is the highest resident size of a process of its own, less that of the same work on 16^3 cells.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+SMALL = 16
+SCENE = {
+    "volume": {"bounds": {"min": [-0.5] * 3, "max": [0.5] * 3}, "density": 1, "sigma_t": 20, "g": 0.0},
+    "lights": [{"type": "directional", "direction": [-2, -2, -1], "irradiance": 3.14159}],
+}
+CAMERA = {"type": "perspective", "target": [0, 0, 0], "up": [0, 1, 0], "fov": 28}
+CASES = {
+    "gray": {},
+    "RGB": {"albedo": [0.95, 0.9, 0.8]},
+    "RGB, g 0.3": {"albedo": [0.95, 0.9, 0.8], "g": 0.3},
+    "RGB, g 0.3, one round": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1},
+    "RGB, flux-limited": {"albedo": [0.95, 0.9, 0.8], "model": "flux_limited"},
+    "RGB fields": {"albedo": [0.95, 0.9, 0.8], "fields": True},
+}
+SOLVE = """
+import sys, torch
+from pathlib import Path
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.renderer import solve_light
+from ddrecon.scene.build import load_scene
+scene = load_scene(Path(sys.argv[1]))
+density = scene.volume.density.requires_grad_()
+torch.autograd.grad(solve_light(scene, SolveMemory()).outgoing.mean.sum(), density)
+"""
+
+
+def scene_of(cells: int, pixels: int, case: dict[str, object], is_optimized: bool) -> dict[str, object]:
+    """A scene file's contents: one view."""
+    volume = {**SCENE["volume"], "resolution": [cells] * 3, "albedo": case.get("albedo", 0.9), "g": case.get("g", 0.0)}  # type: ignore[dict-item]
+    views = [{"name": "view", "camera": {**CAMERA, "origin": [0, 0.3, 3.2], "resolution": [pixels] * 2}}]
+    scene = {**SCENE, "volume": volume, "views": views}
+    scene["diffusion"] = {"transport_rounds": case.get("rounds", 0), "model": case.get("model", "p1"), "tolerance": 1e-2}
+    if is_optimized:
+        scene["views"] = [{**views[0], "image": "view.npy", "split": "train"}]
+        parameters: dict[str, object] = {"density": {"init": 1}}
+        if case.get("fields"):
+            parameters["albedo"] = {"init": 0.9, "field": True}
+        scene["optimize"] = {"iterations": 1, "refine_at": [], "parameters": parameters}
+    return scene
+
+
+def peak(command: list[str]) -> int:
+    """The highest resident size [bytes] of `command`."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise RuntimeError(process.stderr.read().decode())  # type: ignore[union-attr]
+    return usage.ru_maxrss * 1024
+
+
+def measured(folder: Path, verb: str, cells: int, pixels: int, case: dict[str, object]) -> tuple[int, int]:
+    """The peak of `verb` and what `ddrecon check` says of the scene [bytes]."""
+    import numpy as np
+
+    np.save(folder / "view.npy", np.full((pixels, pixels, 3), 0.1, np.float32))
+    path = folder / "scene.yaml"
+    path.write_text(json.dumps(scene_of(cells, pixels, case, verb == "optimize")))
+    program = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
+    found = subprocess.run([*program, "check", str(path), "--json"], capture_output=True, text=True, check=True)
+    if verb == "solve":
+        command = [sys.executable, "-c", SOLVE, str(path)]
+    else:
+        command = [*program, verb, str(path), "-o", str(folder / "out"), "--overwrite", "-q"]
+    return peak(command), int(json.loads(found.stdout)["memory_bytes"])
+
+
+def main() -> None:
+    """Prints two tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--cells", type=int, nargs="*", default=[64, 96])
+    parser.add_argument("--pixels", type=int, default=256)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        print("| scene | cells | solve, there and back [bytes per cell and color] | command | peak [MiB] | predicted / peak |")
+        print(f"|{'---|' * 6}")
+        for title, case in CASES.items():
+            bases = {verb: measured(folder, verb, SMALL, 16, case)[0] for verb in ("solve", "render", "optimize")}
+            for cells in arguments.cells:
+                solve = measured(folder, "solve", cells, 16, case)[0] - bases["solve"]
+                each = solve / (cells**3 - SMALL**3) / (3 if "albedo" in case else 1)
+                for verb in ("render", "optimize"):
+                    found, predicted = measured(folder, verb, cells, arguments.pixels, case)
+                    used = found - bases[verb]
+                    print(f"| {title} | {cells}^3 | {each:.0f} | {verb} | {used / 2**20:.0f} | {predicted / used:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
