@@ -60,7 +60,7 @@ def bench_hard(session: Session, output: Path | None, report: Path | None) -> bo
 
 def _scene(session: Session, path: Path | None, dtype: torch.dtype, is_quick: bool) -> Scene:
     if path is None:
-        return plume_scene(*((32, 128) if is_quick else (64, 512)), dtype, session.device)
+        return plume_scene(*((32, 128) if is_quick else (64, 256)), dtype, session.device)
     scene = replace(session, dtype=dtype).load(path)
     return quick(scene) if is_quick else scene
 
