@@ -22,7 +22,8 @@ from ddrecon.world import Scene
 AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6
 NEGLIGIBLE = 1e-6
-"""Errors are relative to the derivative they are of, or to this part of the parameter's largest where that is more."""
+"""Errors are relative to the derivative they are of, or to this part of the parameter's largest where that is more; those that the last
+digits of the loss could make pass."""
 TOGETHER = "all at once"
 
 Loss = Callable[[Mapping[str, Tensor]], Tensor]
@@ -156,18 +157,23 @@ def _check_way(
     steps: tuple[float, ...],
     floor: float,
 ) -> EntryCheck:
-    differences = tuple(_difference(loss, values, direction, step) for step in steps)
+    differences, roundings = zip(*(_difference(loss, values, direction, step) for step in steps), strict=True)
     tiny = torch.finfo(torch.float64).tiny
-    errors = [abs(difference - adjoint) / max(abs(difference), abs(adjoint), floor, tiny) for difference in differences]
+    errors = [
+        abs(difference - adjoint) / max(abs(difference), abs(adjoint), floor, rounding / AGREE_DIFFERENCES, tiny)
+        for difference, rounding in zip(differences, roundings, strict=True)
+    ]
     best = min(range(len(steps)), key=lambda i: errors[i])
     return EntryCheck(entry, value, adjoint, differences[best], steps[best], errors[best], steps, differences)
 
 
-def _difference(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, Tensor], step: float) -> float:
-    """The central difference of fourth order along `direction`."""
+def _difference(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, Tensor], step: float) -> tuple[float, float]:
+    """The central difference of fourth order along `direction`, and what the last digits of the loss make of it."""
 
     def shifted(steps: int) -> float:
         with torch.no_grad():
             return float(loss({name: value + steps * step * direction[name] for name, value in values.items() if name in direction}))
 
-    return (8 * (shifted(1) - shifted(-1)) - (shifted(2) - shifted(-2))) / (12 * step)
+    near, far = (shifted(1), shifted(-1)), (shifted(2), shifted(-2))
+    rounding = 18 * torch.finfo(torch.float64).eps * max(map(abs, (*near, *far)))
+    return (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * step), rounding / (12 * step)

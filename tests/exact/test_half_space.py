@@ -58,6 +58,7 @@ def half_space(make_scene: Callable[..., Scene], albedo: float, sun: float, cell
         closure="smooth",
         floor=1e-6,
         transport_rounds=rounds,
+        transport_directions=50,
     )
     return replace(scene, views=[View(f"mu {cosine}", looking_down(cosine)) for cosine in VIEWS])
 

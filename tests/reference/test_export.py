@@ -25,7 +25,7 @@ NEAR: list[Light] = [DirectionalLight(-COLOR, COLOR), PointLight(COLOR, 2 * COLO
 
 def opened(path: Path, **options: Any) -> np.ndarray:
     mitsuba = load_mitsuba()
-    return np.array(mitsuba.render(mitsuba.load_file(str(path)), **options), np.float64)
+    return np.array(mitsuba.render(mitsuba.load_file(str(path), parallel=False), **options), np.float64)
 
 
 def sky() -> EnvironmentLight:
