@@ -73,8 +73,8 @@ GIVEN_BACK = 2**25
 def memory_estimate(scene: Scene) -> int:
     """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself.
 
-    A fit, in arrays of one value per cell and in buffers of marched nodes, to peaks measured on grids from 48^3 to 192^3 with 1 to 6 views,
-    1 or 3 colors, constant or as fields, g = 0 or not: within a quarter of each.
+    A fit, in arrays of one value per cell and in buffers of marched nodes, to peaks measured before solves were by multigrid; between 0.7
+    and 1.7 times the peaks that `benchmarks/memory.py` finds now.
     """
     medium = scaled_medium(scene.volume)
     colors, cells = medium.extinction.scale.shape[0], scene.volume.grid.cells
