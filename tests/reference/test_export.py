@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from ddrecon.errors import SceneError
 from ddrecon.io.volumes import read_field
 from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.export import export_scene
-from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
+from ddrecon.reference.trace import Traced, open_tracer
 from ddrecon.world import Scene, View
 
 NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
@@ -23,9 +26,20 @@ COLOR = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
 NEAR: list[Light] = [DirectionalLight(-COLOR, COLOR), PointLight(COLOR, 2 * COLOR), AmbientLight(COLOR)]
 
 
+OPEN = """
+import json, sys
+import numpy as np
+from ddrecon.reference.trace import load_mitsuba
+mitsuba = load_mitsuba()
+path, options = sys.argv[1:]
+np.save(path + ".npy", np.array(mitsuba.render(mitsuba.load_file(path), **json.loads(options)), np.float64))
+"""
+
+
 def opened(path: Path, **options: Any) -> np.ndarray:
-    mitsuba = load_mitsuba()
-    return np.array(mitsuba.render(mitsuba.load_file(str(path), parallel=False), **options), np.float64)
+    """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes its EXR reader has hung."""
+    subprocess.run([sys.executable, "-c", OPEN, str(path), json.dumps(options)], check=True, timeout=120)
+    return np.load(f"{path}.npy")
 
 
 def sky() -> EnvironmentLight:
