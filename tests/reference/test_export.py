@@ -18,7 +18,7 @@ from ddrecon.errors import SceneError
 from ddrecon.io.volumes import read_field
 from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.export import export_scene
-from ddrecon.reference.trace import Traced, open_tracer
+from ddrecon.reference.trace import Traced, Tracer, open_tracer
 from ddrecon.world import Scene, View
 
 NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
@@ -30,16 +30,23 @@ OPEN = """
 import json, sys
 import numpy as np
 from ddrecon.reference.trace import load_mitsuba
-mitsuba = load_mitsuba()
+mitsuba = load_mitsuba(threads=2)
 path, options = sys.argv[1:]
 np.save(path + ".npy", np.array(mitsuba.render(mitsuba.load_file(path), **json.loads(options)), np.float64))
 """
 
 
 def opened(path: Path, **options: Any) -> np.ndarray:
-    """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes its EXR reader has hung."""
+    """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes its EXR reader has hung.
+
+    On two threads, as `tracer_of` traces: the random numbers of the variant `scalar_rgb` depend on how many there are.
+    """
     subprocess.run([sys.executable, "-c", OPEN, str(path), json.dumps(options)], check=True, timeout=120)
     return np.load(f"{path}.npy")
+
+
+def tracer_of(scene: Scene) -> Tracer:
+    return open_tracer(scene, scene.views, threads=2)
 
 
 def sky() -> EnvironmentLight:
@@ -74,7 +81,7 @@ def test_a_gray_scene_opened_is_the_scene_traced(make_scene, make_camera, random
     scene = with_an_orthographic_view(make_scene(random(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4), make_camera)
     scene = replace(scene, lights=lights)
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
-    tracer = open_tracer(scene, scene.views)
+    tracer = tracer_of(scene)
     for index in range(2):
         np.testing.assert_allclose(opened(tmp_path / "scene.xml", sensor=index, seed=5, spp=16), tracer.trace(index, 5, 16), rtol=1e-4)
 
@@ -83,7 +90,7 @@ def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(make_scene, random
     pytest.importorskip("mitsuba", reason=NEEDED)
     scene = make_scene(0.3 * random(3, 4, 5))
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
-    tracer = open_tracer(scene, scene.views)
+    tracer = tracer_of(scene)
     theirs, ours = (
         Traced.of([opened(tmp_path / "scene.xml", seed=seed, spp=128) for seed in range(8)]),
         Traced.of([tracer.trace(0, seed, 128) for seed in range(8)]),
