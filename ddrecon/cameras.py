@@ -7,6 +7,7 @@ vectors here are (x, y, z); `rays` hands them on in array order.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -77,6 +78,11 @@ class Rays:
     def chosen(self, index: Tensor) -> Rays:
         """The rays at `index`."""
         return Rays(self.origin[index], self.direction[index], self.eye)
+
+    @staticmethod
+    def joined(bundles: Sequence[Rays]) -> Rays:
+        """All rays of some `bundles` of one camera, bundle by bundle."""
+        return Rays(torch.cat([b.origin for b in bundles]), torch.cat([b.direction for b in bundles]), bundles[0].eye)
 
 
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:

@@ -76,12 +76,12 @@ class Lattice:
         return line + apart / (self.middle - self.eye[self.axis]) * (line - self.eye[axis])
 
 
-def lattice_for(grid: Grid, axis: int, bundles: Sequence[Rays], hits: Sequence[Tensor]) -> Lattice | None:
-    """The lattice across `axis` for what `bundles` of one camera see of the box, in those of their rays that `hit` it.
+def lattice_for(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
+    """The lattice across `axis` in place of rays of one camera, all `hitting` the box.
 
-    None where a ray for every pixel is no more work, or the camera is not beyond the slices along `axis`.
+    None where these are no more work themselves, or the camera is not beyond the slices along `axis`.
     """
-    eye, direction = bundles[0].eye, bundles[0].direction[0]
+    eye, direction = hitting.eye, hitting.direction[0]
     if eye is not None and grid.lower[axis] - grid.spacing[axis] < float(eye[axis].detach()) < grid.upper[axis] + grid.spacing[axis]:
         return None
     row, column = (other for other in range(3) if other != axis)
@@ -96,17 +96,11 @@ def lattice_for(grid: Grid, axis: int, bundles: Sequence[Rays], hits: Sequence[T
         )
         return Lattice(axis, (row, column), middle, eye, direction, rows, columns)
 
-    unit = lattice((0, 0), (1, 1))
-    ranges = torch.cat([_range(unit.places(bundle.chosen(hit))) for bundle, hit in zip(bundles, hits, strict=True) if len(hit)])
-    first = [math.floor(low) - MARGIN for low in ranges.amin(0).tolist()]
-    last = [math.ceil(high) + MARGIN for high in ranges.amax(0).tolist()]
+    places = lattice((0, 0), (1, 1)).places(hitting).detach()
+    first = [math.floor(low) - MARGIN for low in places.amin(0).tolist()]
+    last = [math.ceil(high) + MARGIN for high in places.amax(0).tolist()]
     count = math.prod(b - a + 1 for a, b in zip(first, last, strict=True))
-    return lattice(first, last) if FEWER * count <= sum(map(len, hits)) else None
-
-
-def _range(places: Tensor) -> Tensor:
-    places = places.detach()
-    return torch.stack([places.amin(0), places.amax(0)])
+    return lattice(first, last) if FEWER * count <= len(places) else None
 
 
 def seen_between(values: Tensor, places: Tensor) -> Tensor:

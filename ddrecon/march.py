@@ -56,42 +56,35 @@ class Emission:
         return max(self.diffuse.shape[0], self.extinction.scale.shape[0], *(beam.irradiance.shape[0] for beam in self.beams), 1)
 
 
-def march(emission: Emission, rays: Rays, steps_per_voxel: int) -> tuple[Tensor, Tensor]:
-    """Radiance [C, R] scattered towards the camera along `rays`, and transmittance [C, R] of the whole volume along them."""
-    crossing = cross_box(emission.grid, rays)
+def march(emission: Emission, rays: Rays, settings: RenderSettings, behind: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Radiance [C, R] scattered towards the camera along `rays`, and transmittance [C, R] of the whole volume along them.
+
+    Where it is less work the rays that are marched are those of a lattice, and `rays` are interpolated to third order, but for those that
+    this might change by more than `settings.tolerance` of the image's root mean square, with light no brighter than `behind` seen through
+    the volume: they are marched themselves.
+    """
+    grid, crossing = emission.grid, cross_box(emission.grid, rays)
     if crossing.hit.numel() == 0:
         return _seen(emission, rays, [])
-    sampler = sampler_for(*_packed(emission), emission.grid, rays, crossing, steps_per_voxel)
+    sampler = sampler_for(*_packed(emission), grid, rays, crossing, settings.steps_per_voxel)
+    if settings.tolerance > 0 and isinstance(sampler, Slices):
+        lattice = lattice_for(grid, sampler.axis, rays.chosen(crossing.hit))
+        if lattice is not None:
+            return _seen(emission, rays, _interpolated(emission, sampler, lattice, rays, crossing, settings.tolerance, behind))
     return _seen(emission, rays, [(crossing.hit, _march_rays(emission, sampler, rays, crossing))])
 
 
-def march_each(emission: Emission, bundles: Sequence[Rays], settings: RenderSettings, behind: float) -> list[tuple[Tensor, Tensor]]:
-    """What `march` returns, for each of the `bundles` of one camera, with light no brighter than `behind` seen through the volume.
-
-    Where it is less work rays are those of a lattice, and pixels are interpolated to third order, but for those that this might change
-    by more than `settings.tolerance` of the image's root mean square: they have their own rays.
-    """
-    crossings = [cross_box(emission.grid, bundle) for bundle in bundles]
-    hits = [crossing.hit for crossing in crossings]
-    if settings.tolerance == 0 or not all(map(len, hits)):
-        return [march(emission, bundle, settings.steps_per_voxel) for bundle in bundles]
-    sampler = sampler_for(*_packed(emission), emission.grid, bundles[0], crossings[0], settings.steps_per_voxel)
-    lattice = lattice_for(emission.grid, sampler.axis, bundles, hits) if isinstance(sampler, Slices) else None
-    if lattice is None or not isinstance(sampler, Slices):
-        return [march(emission, bundle, settings.steps_per_voxel) for bundle in bundles]
-    values = _march_lattice(emission, sampler, lattice)
+def _interpolated(
+    emission: Emission, slices: Slices, lattice: Lattice, rays: Rays, crossing: Crossing, tolerance: float, behind: float
+) -> list[tuple[Tensor, Tensor]]:
+    """All `rays` in `crossing` interpolated between those of `lattice`, then those that are marched themselves: parts as of `_seen`."""
+    values = _march_lattice(emission, slices, lattice)
     scattered, opacity = values.detach().split(emission.colors)
-    most = settings.tolerance * float((scattered + behind * (1 - opacity)).square().mean().sqrt())
-    visible = torch.cat([scattered, behind * opacity])
-    images = []
-    for bundle, crossing in zip(bundles, crossings, strict=True):
-        places = lattice.places(bundle.chosen(crossing.hit))
-        parts = [(crossing.hit, seen_between(values, places))]
-        own = crossing.chosen(is_rough(visible, most, places))
-        if len(own.hit):
-            parts.append((own.hit, _march_rays(emission, sampler, bundle, own)))
-        images.append(_seen(emission, bundle, parts))
-    return images
+    most = tolerance * float((scattered + behind * (1 - opacity)).square().mean().sqrt())
+    places = lattice.places(rays.chosen(crossing.hit))
+    own = crossing.chosen(is_rough(torch.cat([scattered, behind * opacity]), most, places))
+    parts = [(crossing.hit, seen_between(values, places))]
+    return [*parts, (own.hit, _march_rays(emission, slices, rays, own))] if len(own.hit) else parts
 
 
 def _seen(emission: Emission, rays: Rays, parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.diffusion.transport import transported
 from ddrecon.environment import environment_radiance
 from ddrecon.lights import AmbientLight, EnvironmentLight, Light
-from ddrecon.march import Emission, march_each
+from ddrecon.march import Emission, march
 from ddrecon.medium import Medium, scaled_medium, unscaled_medium
 from ddrecon.moments import Moments, Vector
 from ddrecon.point_light import PointBeam
@@ -172,13 +172,12 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
 
 def _image(emission: Emission, scene: Scene, camera: Camera) -> Tensor:
     """Radiance [3, h, w]: E1, averaged over the rays of each pixel."""
-    bundles = [rays(camera, offset) for offset in subpixel_offsets(scene.render.samples_per_pixel)]
-    lights = scene.lights if scene.render.background else []
-    behind = [_background(lights, bundle) for bundle in bundles]
-    brightest = max(float(radiance.detach().max()) for radiance in behind)
-    marched = march_each(emission, bundles, scene.render, brightest)
-    radiance = [scattered + clear * light for (scattered, clear), light in zip(marched, behind, strict=True)]
-    return torch.stack(radiance).mean(0).expand(3, -1).unflatten(-1, camera.size)
+    offsets = subpixel_offsets(scene.render.samples_per_pixel)
+    bundle = Rays.joined([rays(camera, offset) for offset in offsets])
+    behind = _background(scene.lights if scene.render.background else [], bundle)
+    scattered, clear = march(emission, bundle, scene.render, float(behind.detach().max()))
+    radiance = (scattered + clear * behind).unflatten(-1, (len(offsets), -1)).mean(-2)
+    return radiance.expand(3, -1).unflatten(-1, camera.size)
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:

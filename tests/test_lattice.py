@@ -13,7 +13,7 @@ from ddrecon.cameras import rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.lattice import Lattice, lattice_for
-from ddrecon.march import march_each
+from ddrecon.march import march
 from ddrecon.renderer import _emission, render, solve_light
 from ddrecon.settings import RenderSettings
 from ddrecon.tangents import render_tangent
@@ -51,7 +51,7 @@ def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
     bundle, grid = rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
     slices = sampler_for(scene.volume.density[None], None, grid, bundle, crossing, 1)
-    return lattice_for(grid, slices.axis, [bundle], [crossing.hit]), slices
+    return lattice_for(grid, slices.axis, bundle.chosen(crossing.hit)), slices
 
 
 def images(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -81,8 +81,7 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     bundle = lattice.rays(lattice.rows, 3.0)
     emission = _emission(solve_light(scene, SolveMemory()), bundle)
     monkeypatch.setattr(march_module, "lattice_for", lambda *_: lattice)
-    (interpolated,) = march_each(emission, [bundle], INTERPOLATED, 1.0)
-    (own,) = march_each(emission, [bundle], OWN, 1.0)
+    interpolated, own = march(emission, bundle, INTERPOLATED, 1.0), march(emission, bundle, OWN)
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
 

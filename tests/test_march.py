@@ -40,6 +40,11 @@ def emission_of(grid: Grid, density: Tensor, sigma_a: float = 0.5, sigma_s: tupl
     return Emission(grid, medium.extinction, medium.scattering, reduced_light(medium, [light], False).beams, diffuse, medium.g, medium.peak)
 
 
+def every_ray(steps: int) -> RenderSettings:
+    """Settings by which all rays are marched themselves."""
+    return RenderSettings(steps_per_voxel=steps, tolerance=0.0)
+
+
 def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
     """The length of one ray inside the box, in front of its origin, face by face."""
     near, far = 0.0, math.inf
@@ -61,7 +66,7 @@ def chords(grid: Grid, bundle: Rays) -> Tensor:
 def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int, box, make_camera):
     grid, bundle = box((3, 5, 4)), rays(make_camera(size=(7, 6), **view))
     emission = emission_of(grid, torch.full(grid.shape, 0.7, dtype=torch.float64))
-    transmittance = march(emission, bundle, steps)[1]
+    transmittance = march(emission, bundle, every_ray(steps))[1]
     lengths = chords(grid, bundle)
     assert bool((lengths > 0).any())
     extinction = emission.extinction.value[:, 0, 0, 0]
@@ -72,7 +77,7 @@ def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int, box, 
 def test_rays_that_miss_the_box_see_nothing(view: dict, box, make_camera, random):
     grid = box((3, 5, 4))
     bundle = rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
-    scattered, transmittance = march(emission_of(grid, random(*grid.shape)), bundle, 1)
+    scattered, transmittance = march(emission_of(grid, random(*grid.shape)), bundle, every_ray(1))
     is_miss = chords(grid, bundle) == 0
     assert bool(is_miss.any()) or view is CAMERAS["inside"]
     assert not scattered[:, is_miss].any() and bool((transmittance[:, is_miss] == 1).all())
@@ -82,16 +87,16 @@ def test_rays_that_miss_the_box_see_nothing(view: dict, box, make_camera, random
 def test_a_box_behind_the_camera_is_not_seen(box, make_camera, random):
     grid, bundle = box((3, 5, 4)), rays(make_camera())
     away = Rays(bundle.origin, -bundle.direction, bundle.eye)
-    scattered, transmittance = march(emission_of(grid, random(*grid.shape)), away, 1)
+    scattered, transmittance = march(emission_of(grid, random(*grid.shape)), away, every_ray(1))
     assert not scattered.any() and bool((transmittance == 1).all())
 
 
 @each_camera
 def test_chunks_do_not_matter(view: dict, box, make_camera, random, monkeypatch):
     emission, bundle = emission_of(box((3, 5, 4)), random(3, 5, 4)), rays(make_camera(size=(7, 6), **view))
-    whole = march(emission, bundle, 2)
+    whole = march(emission, bundle, every_ray(2))
     monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
-    for one, other in zip(whole, march(emission, bundle, 2), strict=True):
+    for one, other in zip(whole, march(emission, bundle, every_ray(2)), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-15)
 
 
@@ -99,9 +104,9 @@ def test_chunks_do_not_matter(view: dict, box, make_camera, random, monkeypatch)
 def test_slices_and_equal_steps_agree_in_the_limit(view: str, box, make_camera, random, monkeypatch):
     """Both interpolate the same fields, along other nodes: their difference vanishes as steps grow."""
     emission, bundle = emission_of(box((3, 5, 4)), random(3, 5, 4)), rays(make_camera(size=(7, 6), **CAMERAS[view]))
-    sliced = [march(emission, bundle, steps) for steps in (1, 16)]
+    sliced = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
     monkeypatch.setattr(view_rays, "STEEPEST", 1.0)
-    equal = [march(emission, bundle, steps) for steps in (1, 16)]
+    equal = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
     for field in (0, 1):
         coarse, fine = (float((a[field] - b[field]).norm() / a[field].norm()) for a, b in zip(sliced, equal, strict=True))
         assert 0 < fine < 2e-3 and fine < coarse / 8, (coarse, fine)
@@ -111,7 +116,7 @@ def test_slices_and_equal_steps_agree_in_the_limit(view: str, box, make_camera, 
 def test_radiance_and_transmittance_have_both_derivatives(view: dict, box, make_camera, half_empty):
     grid, bundle = box((2, 3, 2)), rays(make_camera(size=(2, 2), **view))
     density = half_empty(*grid.shape, seed=3).requires_grad_()
-    assert torch.autograd.gradcheck(lambda d: march(emission_of(grid, d), bundle, 1), density, atol=1e-8, check_forward_ad=True)
+    assert torch.autograd.gradcheck(lambda d: march(emission_of(grid, d), bundle, every_ray(1)), density, atol=1e-8, check_forward_ad=True)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6])
@@ -128,7 +133,7 @@ def test_a_cross_section_may_be_a_field(has_fields: str, g: float, box, make_cam
         medium = scaled_medium(volume)
         beams = reduced_light(medium, [light], False).beams
         emission = Emission(grid, medium.extinction, medium.scattering, beams, random(3, *grid.shape, seed=4), medium.g, medium.peak)
-        results.append(torch.cat(march(emission, rays(camera), 1)))
+        results.append(torch.cat(march(emission, rays(camera), every_ray(1))))
     torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=0)
 
 

@@ -17,6 +17,7 @@ from ddrecon.medium import Medium, Volume, scaled_medium
 from ddrecon.point_light import point_beam
 from ddrecon.reduced import reduced_light
 from ddrecon.renderer import render
+from ddrecon.settings import RenderSettings
 from ddrecon.world import Scene
 
 SHAPE = (5, 4, 6)
@@ -96,7 +97,8 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form(make_ca
     bundle = rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
     beams = reduced_light(medium, [light_at(position)], False).beams
     dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
-    radiance = march(Emission(grid, medium.extinction, medium.scattering, beams, dark, medium.g, medium.peak), bundle, 1)[0][0]
+    emission = Emission(grid, medium.extinction, medium.scattering, beams, dark, medium.g, medium.peak)
+    radiance = march(emission, bundle, RenderSettings())[0][0]
     light = array_order(torch.tensor(position, dtype=torch.float64))
     low, high = (light.new_tensor(corner) for corner in (grid.lower, grid.upper))
     one, other = ((corner - bundle.origin) / bundle.direction for corner in (low, high))
