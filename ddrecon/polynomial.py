@@ -1,6 +1,7 @@
 """Functions of a depth from 0 to infinity, as polynomials in x = (depth - s) / (depth + s): a few products where a closed form takes many.
 
-They are differentiated by hand, in both modes.
+By interpolation at Chebyshev's extrema (Trefethen 2019, Approximation Theory and Approximation Practice, chapter 2,
+doi:10.1137/1.9781611975949). They are differentiated by hand, in both modes.
 """
 
 from __future__ import annotations

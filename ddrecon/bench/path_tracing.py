@@ -6,16 +6,15 @@ Gradients are those of path replay backpropagation (Vicini, Speierer and Jakob 2
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.bench.measure import Shot, block_sums, blocks_of, relative_error
+from ddrecon.bench.measure import Shot, block_sums, blocks_of
 from ddrecon.reference.mitsuba_scene import LONGEST
 from ddrecon.reference.trace import Traced, Tracer, open_tracer
 from ddrecon.world import Scene
@@ -28,19 +27,10 @@ TRUTH_SEED = 1000
 
 @dataclass(frozen=True)
 class Truth:
-    """Path tracing: `image` [3, h, w] and `by_amount` [z, y, x] as of a `Shot`, each with its noise, relative to its root mean square.
+    """Path tracing: `image` [3, h, w] and `by_amount` [z, y, x] as of a `Shot`; None where there is no path replay."""
 
-    `by_amount` is None where there is no path replay.
-    """
-
-    image: Tensor
-    noise: float
-    by_amount: Tensor | None = None
-    by_amount_noise: float = 0.0
-
-    def error(self, image: Tensor) -> float:
-        """The relative RMS error of `image`, less the truth's own noise in quadrature."""
-        return math.sqrt(max(0.0, relative_error(image, self.image) ** 2 - self.noise**2))
+    image: Traced
+    by_amount: Traced | None = None
 
 
 class PathTracer:
@@ -68,11 +58,9 @@ class PathTracer:
         """The mean of several passes."""
         shots = [self.shoot(samples, TRUTH_SEED + index) for index in range(passes)]
         image = Traced.of([shot.image.numpy() for shot in shots])
-        found = Truth(torch.from_numpy(image.image), image.noise)
         if self.replay is None:
-            return found
-        gradient = Traced.of([shot.by_amount.double().numpy() for shot in shots])
-        return replace(found, by_amount=torch.from_numpy(gradient.image), by_amount_noise=gradient.noise)
+            return Truth(image)
+        return Truth(image, Traced.of([shot.by_amount.double().numpy() for shot in shots]))
 
 
 def _has_replay(tracer: Tracer, scene: Scene) -> bool:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import torch
+
 from ddrecon.bench.measure import Shot, Timing, correlation, relative_error
 from ddrecon.bench.path_tracing import Truth
 
@@ -56,9 +58,9 @@ def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> 
         errors = relative_error(shot.image, exact.image), relative_error(shot.gradient, exact.gradient)
         row = replace(row, image_numerical=errors[0], gradient_numerical=errors[1])
     if truth is not None:
-        row = replace(row, image_error=truth.error(shot.image))
+        row = replace(row, image_error=truth.image.error(shot.image.numpy()))
         if truth.by_amount is not None:
-            row = replace(row, gradient_correlation=correlation(shot.by_amount, truth.by_amount))
+            row = replace(row, gradient_correlation=correlation(shot.by_amount, torch.from_numpy(truth.by_amount.image)))
     return row
 
 

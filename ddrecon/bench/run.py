@@ -116,7 +116,9 @@ def describe(rows: Sequence[Row], truth: Truth | None, scene: Scene, environment
     """The bench as plain values."""
     height, width = scene.views[0].camera.size
     size = {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]}
-    noise = {"image": truth.noise, "gradient": truth.by_amount_noise} if truth is not None else None
+    noise = None
+    if truth is not None:
+        noise = {"image": truth.image.noise, "gradient": truth.by_amount.noise if truth.by_amount is not None else None}
     return {"scene": size, "truth_noise": noise, "environment": environment, "rows": [asdict(row) for row in rows]}
 
 

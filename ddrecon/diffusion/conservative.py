@@ -1,6 +1,7 @@
 """Diffuse light by the conservative scheme: the P1 balance E4 with the Marshak boundary E6 on the operator of E7, and the flux E5.
 
-What the solve needs is made anew in the backward pass rather than kept, one axis at a time: memory is what limits the size of a volume.
+D is kept for the backward pass, which makes conductances and right sides from it anew, one axis at a time: memory is what limits the size
+of a volume.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
-        return recomputed(_diffusion, self.medium, self.closure)
+        return recomputed(lambda medium: self.closure(medium.transport_extinction), self.medium)
 
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
@@ -66,10 +67,6 @@ def diffuse_light(problem: DiffusionProblem, solve: Solve[Operator]) -> Moments:
     """L0 and, where `problem` has flux, L1."""
     mean = solve_diffusion(solve, *problem.system)
     return Moments(mean, problem.flux(mean))
-
-
-def _diffusion(medium: Medium, closure: Closure) -> Tensor:
-    return closure(medium.transport_extinction)
 
 
 def _loss_and_source(medium: Medium, diffusion: Tensor, source_mean: Tensor, outside: Tensor) -> tuple[Tensor, Tensor]:
