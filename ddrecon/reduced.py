@@ -136,8 +136,8 @@ def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam
     """The beam of `light`, and the moments of E tau / (4 pi) averaged over each cell along the beam."""
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
-    entered, step = entered_mass(medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound)
-    received = irradiance / (4 * math.pi) * medium.extinction.mean_transmittance(entered, step)
+    entered, step = recomputed(entered_mass, medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound)
+    received = irradiance / (4 * math.pi) * recomputed(medium.extinction.mean_transmittance, entered, step)
     beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
     return beam, beam_moments(received, direction, has_flux)
 
@@ -150,6 +150,14 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | f
     outer half cells. The sum over slices is exact for light along an axis; for slanted light it is refined by planes between them, and
     carried back to cells to third order, by corrections bounded by 1 / `bound`. Returns `[K, z, y, x]` and a scalar.
     """
+    if field.shape[0] == 1:
+        return _entered_mass(field, grid, direction, bound)
+    each = [recomputed(_entered_mass, one, grid, direction, bound) for one in field.split(1)]
+    return torch.cat([entered for entered, _ in each]), each[0][1]
+
+
+def _entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float) -> tuple[Tensor, Tensor]:
+    """What `entered_mass` returns, of one field [1, z, y, x]."""
     speed = direction / direction.new_tensor(grid.spacing)
     axis = int(speed.detach().abs().argmax())
     order = [axis + 1, 0] + [1 + other for other in range(3) if other != axis]
@@ -163,7 +171,7 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | f
     centers, middles = shear.there(slices, 0.0), shear.there(0.5 * (slices[1:] + slices[:-1]), 0.5)
     bends = middles - 0.5 * (centers[1:] + centers[:-1])
     finer = running_sum(torch.cat([torch.zeros_like(centers[:1]), bends])) * (0.5 * step)
-    smooth = Smooth(0, field.shape[0], bound)
+    smooth = Smooth(0, 1, bound)
     entered = shear.back((running_sum(centers) - centers) * step + smooth.bounded(finer), smooth)
     if is_reversed:
         entered = entered.flip(0)

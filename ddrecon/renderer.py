@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import is_varied
+from ddrecon.autodiff import is_varied, recomputed
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
 from ddrecon.diffusion import conservative, flux_limited, printed
 from ddrecon.diffusion.closures import CLOSURES, smooth
@@ -184,7 +184,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to."""
     medium = light_field.medium
     towards = _towards_camera(medium, bundle)
-    diffuse = light_field.outgoing.positive_along(towards)
+    diffuse = recomputed(light_field.outgoing.positive_along, towards)
     if light_field.skies:
         diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
     return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g, medium.peak)

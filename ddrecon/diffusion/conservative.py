@@ -38,7 +38,7 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
-        return recomputed(lambda medium: self.closure(medium.transport_extinction), self.medium)
+        return recomputed(_diffusion, self.medium, self.closure)
 
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
@@ -67,6 +67,10 @@ def diffuse_light(problem: DiffusionProblem, solve: Solve[Operator]) -> Moments:
     """L0 and, where `problem` has flux, L1."""
     mean = solve_diffusion(solve, *problem.system)
     return Moments(mean, problem.flux(mean))
+
+
+def _diffusion(medium: Medium, closure: Closure) -> Tensor:
+    return closure(medium.transport_extinction)
 
 
 def _loss_and_source(medium: Medium, diffusion: Tensor, source_mean: Tensor, outside: Tensor) -> tuple[Tensor, Tensor]:

@@ -91,7 +91,9 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, loss, *conductances = ctx.saved_tensors
-        adjoint = ctx.solve("adjoint", Operator(tuple(conductances), loss, ctx.made), u_bar)
+        made, ctx.made = ctx.made, {}  # after the last of the solves that share it the memory is wanted for what follows
+        adjoint = ctx.solve("adjoint", Operator(tuple(conductances), loss, made), u_bar)
+        del made
         conductance_bars = [
             (-difference(adjoint, axis) * difference(u, axis)).sum_to_size(conductance.shape)
             for axis, conductance in zip(AXES, conductances, strict=True)

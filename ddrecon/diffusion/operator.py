@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from ddrecon.autodiff import keep
 from ddrecon.grid import Grid
 
 Made = TypeVar("Made")
@@ -87,15 +88,49 @@ def accumulate(faces: Tensor, axis: int) -> Tensor:
 
 def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
     """c = harmonic mean of D on the interior faces along `axis` / h^2 [1/u] (E7); `diffusion`: D [u], `[C, z, y, x]`, > 0."""
-    return 2 / (1 / lower(diffusion, axis) + 1 / upper(diffusion, axis)) / grid.spacing[axis - 1] ** 2
+    return harmonic_mean(diffusion, axis) / grid.spacing[axis - 1] ** 2
+
+
+def harmonic_mean(u: Tensor, axis: int) -> Tensor:
+    """The harmonic mean of the cells on both sides of every interior face along `axis`; `u`: `[C, z, y, x]`, > 0."""
+    mean: Tensor = _HarmonicMean.apply(u, axis)
+    return mean
+
+
+class _HarmonicMean(torch.autograd.Function):
+    """Differentiated by hand, d mean = mean^2 / 2 (da / a^2 + db / b^2): keeps one array beside `u`, autograd five."""
+
+    @staticmethod
+    def forward(u: Tensor, axis: int) -> Tensor:
+        return lower(u, axis).reciprocal().add_(upper(u, axis).reciprocal()).reciprocal_().mul_(2)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
+        u, ctx.axis = inputs
+        keep(ctx, u, output)
+
+    @staticmethod
+    def backward(ctx: Any, mean_bar: Tensor) -> tuple[Tensor, None]:
+        u, mean = ctx.saved_tensors
+        half = 0.5 * mean_bar * mean * mean
+        u_bar = torch.zeros_like(u)
+        for side in (lower, upper):
+            side(u_bar, ctx.axis).addcdiv_(half, side(u, ctx.axis) ** 2)
+        return u_bar, None
+
+    @staticmethod
+    def jvp(ctx: Any, d_u: Tensor, _: None) -> Tensor:
+        u, mean = ctx.saved_tensors
+        change = sum(side(d_u, ctx.axis) / side(u, ctx.axis) ** 2 for side in (lower, upper))
+        return 0.5 * mean * mean * change
 
 
 def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
     """What a cell loses through the faces of the box per unit L0 [1/u]: 1 / (h (2 + h / (2 D))) for each such face (Marshak, E6)."""
     loss = torch.zeros_like(diffusion)
     for axis, step in zip(AXES, grid.spacing, strict=True):
-        escape = 1 / (step * (2 + step / (2 * diffusion)))
-        loss = loss + escape * _on_box(diffusion, axis)
+        for end in (_first, _last):
+            end(loss, axis).add_(_escape(end(diffusion, axis), step) / step)
     return loss
 
 
@@ -109,20 +144,16 @@ def face_fluxes(
     `axis`, positive towards higher indices.
     """
     step = grid.spacing[axis - 1]
-    interior = 2 / (1 / lower(diffusion, axis) + 1 / upper(diffusion, axis))
-    escape = 1 / (2 + step / (2 * diffusion))
-    inside, low, high = torch.zeros_like(interior), torch.zeros_like(_first(escape, axis)), torch.zeros_like(_last(escape, axis))
+    low = inside = high = diffusion.new_zeros(())
     if radiance is not None:
-        inside = inside - interior * difference(radiance, axis) / step
-        low = low - _first(escape * radiance, axis)
-        high = high + _last(escape * radiance, axis)
+        low, inside, high = -_first(radiance, axis), difference(radiance, axis) / -step, _last(radiance, axis)
     if source_flux is not None:
-        inside = inside + interior * 0.5 * (lower(source_flux, axis) + upper(source_flux, axis))
-        outflow = escape * (step / 2) * source_flux
-        low, high = low + _first(outflow, axis), high + _last(outflow, axis)
+        low, high = (side + step / 2 * end(source_flux, axis) for side, end in ((low, _first), (high, _last)))
+        inside = inside + 0.5 * (lower(source_flux, axis) + upper(source_flux, axis))
     if outside is not None:
-        low, high = low + outside * _first(escape, axis), high - outside * _last(escape, axis)
-    return torch.cat([low, inside, high], axis)
+        low, high = low + outside, high - outside
+    into, out = (_escape(end(diffusion, axis), step) for end in (_first, _last))
+    return torch.cat([into * low, harmonic_mean(diffusion, axis) * inside, out * high], axis)
 
 
 def cell_average(faces: Tensor, axis: int) -> Tensor:
@@ -130,12 +161,9 @@ def cell_average(faces: Tensor, axis: int) -> Tensor:
     return 0.5 * (lower(faces, axis) + upper(faces, axis))
 
 
-def _on_box(u: Tensor, axis: int) -> Tensor:
-    """How many of a cell's two faces along `axis` lie on the box: 0, 1 or 2, shaped to broadcast."""
-    counts = torch.zeros(u.shape[axis], dtype=u.dtype, device=u.device)
-    counts[0] += 1
-    counts[-1] += 1
-    return counts.view(_with([1, 1, 1, 1], axis, -1))
+def _escape(diffusion: Tensor, step: float) -> Tensor:
+    """What leaves a cell through a face on the box per unit L0 (Marshak, E6): 1 / (2 + h / (2 D))."""
+    return 1 / (2 + step / (2 * diffusion))
 
 
 def _first(u: Tensor, axis: int) -> Tensor:
