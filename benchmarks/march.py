@@ -61,8 +61,9 @@ class Case:
             distance = (sampler.planes[:, None] - chosen.origin[:, sampler.axis]) / chosen.direction[:, sampler.axis]
             places = chosen.origin + distance[..., None] * chosen.direction
             points = 2 * (places - places.new_tensor(grid.lower)) / places.new_tensor(grid.extent) - 1
-            slices = sampler.slices.detach().requires_grad_()
-            sample_slices(slices, points[..., list(reversed(sampler.across))].contiguous()).sum().backward()
+            slices = torch.cat(sampler.bands, 2).requires_grad_()
+            across = [axis for axis in (2, 1, 0) if axis != sampler.axis]
+            sample_slices(slices, points[..., across].contiguous()).sum().backward()
 
 
 def case(sigma_t: float, eye: tuple[float, float, float], pixels: int) -> Case:

@@ -29,8 +29,6 @@ from ddrecon.view_rays import Crossing, Equidistant, Slices, cross_box, sampler_
 
 CHUNK_NODES = 1 << 18
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and memory does not grow with pixels."""
-CELLS_PER_NODE = 16
-"""In large volumes a chunk has a node for so many cells: its backward pass fills an array of all cells, whatever the number of nodes."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ def march(emission: Emission, rays: Rays, settings: RenderSettings, behind: floa
         lattice = lattice_for(grid, sampler.axis, rays.chosen(crossing.hit))
         if lattice is not None:
             return _seen(emission, rays, _interpolated(emission, sampler, lattice, rays, crossing, settings.tolerance, behind))
-    return _seen(emission, rays, [(crossing.hit, _march_rays(emission, sampler, rays, crossing))])
+    return _seen(emission, rays, [_march_rays(emission, sampler, rays, crossing)])
 
 
 def _interpolated(
@@ -84,7 +82,7 @@ def _interpolated(
     places = lattice.places(rays.chosen(crossing.hit))
     own = crossing.chosen(is_rough(torch.cat([scattered, behind * opacity]), most, places))
     parts = [(crossing.hit, seen_between(values, places))]
-    return [*parts, (own.hit, _march_rays(emission, slices, rays, own))] if len(own.hit) else parts
+    return [*parts, _march_rays(emission, slices, rays, own)] if len(own.hit) else parts
 
 
 def _seen(emission: Emission, rays: Rays, parts: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
@@ -96,36 +94,33 @@ def _seen(emission: Emission, rays: Rays, parts: Sequence[tuple[Tensor, Tensor]]
     return scattered, 1 - opacity
 
 
-def _march_rays(emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing) -> Tensor:
-    """Radiance and opacity [2 C, P] along those of `rays` that are in `crossing`."""
+def _march_rays(emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
+    """Those of `rays` that are in `crossing`, in some order, and radiance and opacity [2 C, P] along them."""
+    hitting = rays.chosen(crossing.hit)
 
-    def run(chunk: Tensor) -> Tensor:
-        chosen = rays.chosen(crossing.hit[chunk])
-        values, distance = sampler.sample(chosen.origin, chosen.direction, crossing.near[chunk], crossing.far[chunk])
+    def run(chunk: Tensor, part: Slices | Equidistant) -> Tensor:
+        chosen = hitting.chosen(chunk)
+        values, distance = part.sample(chosen.origin, chosen.direction, crossing.near[chunk], crossing.far[chunk])
         return _integrate(emission, values, Nodes(chosen.origin, chosen.direction, distance))
 
-    chunks = torch.arange(len(crossing.hit), device=crossing.hit.device).split(_chunk(emission.grid, sampler.nodes))
-    return torch.cat([recomputed(run, chunk) for chunk in chunks], 1)
+    parts = sampler.parts(hitting, max(1, CHUNK_NODES // sampler.nodes))
+    values = torch.cat([recomputed(run, *part) for part in parts], 1)
+    return crossing.hit[torch.cat([chunk for chunk, _ in parts])], values
 
 
 def _march_lattice(emission: Emission, slices: Slices, lattice: Lattice) -> Tensor:
     """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
     grid, columns = emission.grid, slices.lattice_columns(lattice)
 
-    def run(rows: Tensor) -> Tensor:
+    def run(rows: Tensor, part: Slices) -> Tensor:
         rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
         near, far = through_box(grid, rays)
-        values, distance = slices.sample_rows(lattice, rows, columns, rays)
+        values, distance = part.sample_rows(lattice, rows, columns, rays)
         inside = torch.minimum(torch.maximum(distance, near), torch.maximum(near, far))
         return _integrate(emission, values, Nodes(rays.origin, rays.direction, inside))
 
-    count = max(1, _chunk(grid, slices.nodes) // len(lattice.columns))
-    return torch.cat([recomputed(run, rows) for rows in lattice.rows.split(count)], 1).unflatten(1, lattice.shape)
-
-
-def _chunk(grid: Grid, nodes: int) -> int:
-    """How many rays of so many `nodes` are marched at a time."""
-    return max(1, max(CHUNK_NODES, grid.cells // CELLS_PER_NODE) // nodes)
+    count = max(1, CHUNK_NODES // (slices.nodes * len(lattice.columns)))
+    return torch.cat([recomputed(run, *part) for part in slices.lattice_parts(lattice, count)], 1).unflatten(1, lattice.shape)
 
 
 def _packed(emission: Emission) -> tuple[Tensor, Smooth | None]:

@@ -7,7 +7,7 @@ that is not possible (a camera inside the box, rays nearly along a slice) by thr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +21,13 @@ from ddrecon.separable import Weights, sample_lattice
 
 STEEPEST = 0.2
 """Smallest direction cosine, in units of cells and against the axis across the slices, of rays that are marched by slices."""
+CELLS_PER_NODE = 16
+"""In large volumes rays at equal steps have at least a node for so many cells at a time: each time the backward pass fills an array of
+all cells."""
+BAND = 4
+"""Rows of cells in a band of slices."""
+REACH = 2
+"""How many cells beyond the one a place lies in count for its value."""
 
 
 @dataclass(frozen=True)
@@ -52,48 +59,98 @@ def through_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
     return torch.minimum(one, other).amax(-1).clamp(min=0), torch.maximum(one, other).amin(-1)
 
 
+@dataclass(frozen=True, eq=False)
 class Slices:
-    """Values where rays cross the planes through the cell centers across `axis`, and the two faces of the box."""
+    """Values where rays cross the `planes` [u] through the cell centers across `axis`, and the two faces of the box.
 
-    def __init__(self, fields: Tensor, smooth: Smooth | None, grid: Grid, axis: int, is_reversed: bool, steps: int):
-        self.smooth = smooth
-        self.axis, self.across = axis, [other for other in range(3) if other != axis]
-        self.lower, self.extent = grid.lower, grid.extent
+    They are held as `bands` of some rows each, `[N, channels, rows, columns]`, row `first` of `grid` first: what is marched at a time, and
+    its derivative, needs only those it meets.
+    """
+
+    grid: Grid
+    axis: int
+    planes: Tensor
+    bands: tuple[Tensor, ...]
+    smooth: Smooth | None
+    first: int = 0
+
+    @staticmethod
+    def of(fields: Tensor, smooth: Smooth | None, grid: Grid, axis: int, is_reversed: bool, steps: int) -> Slices:
+        """Those of `fields` [channels, z, y, x], in the order that light meets them from below, or from above where `is_reversed`."""
         count = grid.shape[axis]
         place = torch.arange(count + 2, dtype=fields.dtype, device=fields.device) - 0.5
         planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
         index = (place - 0.5).clamp(0, count - 1).long()
         if is_reversed:
             index, planes = index.flip(0), planes.flip(0)
-        row, column = self.across
+        row, column = (other for other in range(3) if other != axis)
         slices = fields.permute(1 + axis, 1 + row, 0, 1 + column).index_select(0, index).transpose(1, 2)
-        self.slices, self.planes = subdivided(slices, steps, smooth), subdivided(planes, steps)
-        self.nodes = len(self.planes)
+        return Slices(grid, axis, subdivided(planes, steps), subdivided(slices, steps, smooth).split(BAND, 2), smooth)
+
+    @property
+    def nodes(self) -> int:
+        """How many a ray has."""
+        return len(self.planes)
+
+    def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Slices]]:
+        """All of `rays`, `count` at a time and neighbors together: their indices, and what they meet."""
+        with torch.no_grad():
+            distance = self._distance(rays.origin, rays.direction)[[0, -1]]
+            row = self._across[0]
+            rows = rays.origin[:, row] + distance * rays.direction[:, row]
+            chunks = rows.sum(0).argsort(stable=True).split(count)
+            ranges = torch.stack([torch.stack([rows[:, chunk].min(), rows[:, chunk].max()]) for chunk in chunks]).tolist()
+        return [(chunk, self._between(*bounds)) for chunk, bounds in zip(chunks, ranges, strict=True)]
+
+    def lattice_parts(self, lattice: Lattice, count: int) -> list[tuple[Tensor, Slices]]:
+        """All rows [u] of `lattice`, `count` at a time, and what their rays meet."""
+        with torch.no_grad():
+            places = lattice.crossings(self.planes[[0, -1]], 0, lattice.rows)
+            low, high = places.amin(0).tolist(), places.amax(0).tolist()
+        chunks = range(0, len(low), count)
+        return [(lattice.rows[i : i + count], self._between(min(low[i : i + count]), max(high[i : i + count]))) for i in chunks]
+
+    def _between(self, low: float, high: float) -> Slices:
+        """The bands that third-order interpolation at rows from `low` to `high` [u] needs."""
+        row, rows = self._across[0], self.grid.shape[self._across[0]]
+        cells = [(place - self.grid.lower[row]) / self.grid.spacing[row] for place in (low, high)]
+        first = min(max(math.floor(cells[0]) - REACH, 0), rows - 1) // BAND
+        last = min(max(math.floor(cells[1]) + REACH, 0), rows - 1) // BAND
+        return replace(self, bands=self.bands[first : last + 1], first=first * BAND)
 
     def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """Values [N, channels, R] and distances [N, R] at the nodes of rays."""
-        distance = self._distance(origin, direction)
-        rows, columns = (self._scaled(origin[:, a] + distance * direction[:, a], a) for a in self.across)
-        values = sample_slices(self.slices, torch.stack([columns, rows], -1), self.smooth)
+        distance, slices = self._distance(origin, direction), torch.cat(self.bands, 2)
+        places = (origin[:, axis] + distance * direction[:, axis] for axis in self._across)
+        rows, columns = (self._scaled(place, which, slices) for which, place in enumerate(places))
+        values = sample_slices(slices, torch.stack([columns, rows], -1), self.smooth)
         return values, torch.minimum(torch.maximum(distance, near), far)
 
     def lattice_columns(self, lattice: Lattice) -> Weights:
         """What cells count for in the columns of `lattice`."""
-        return self._weights(lattice.crossings(self.planes, 1, lattice.columns), 1)
+        return self._weights(lattice.crossings(self.planes, 1, lattice.columns), 1, self.bands[0])
 
     def sample_rows(self, lattice: Lattice, rows: Tensor, columns: Weights, rays: Rays) -> tuple[Tensor, Tensor]:
         """Values [N, channels, R] where `rays`, those of some `rows` and all columns of `lattice`, meet the planes; distances [N, R]."""
-        down = self._weights(lattice.crossings(self.planes, 0, rows), 0)
-        return sample_lattice(self.slices, down, columns, self.smooth), self._distance(rays.origin, rays.direction)
+        slices = torch.cat(self.bands, 2)
+        down = self._weights(lattice.crossings(self.planes, 0, rows), 0, slices)
+        return sample_lattice(slices, down, columns, self.smooth), self._distance(rays.origin, rays.direction)
 
-    def _weights(self, places: Tensor, which: int) -> Weights:
-        return Weights.at(self._scaled(places, self.across[which]), self.slices.shape[2 + which], is_smooth=self.smooth is not None)
+    @property
+    def _across(self) -> tuple[int, int]:
+        row, column = (other for other in range(3) if other != self.axis)
+        return row, column
+
+    def _weights(self, places: Tensor, which: int, slices: Tensor) -> Weights:
+        return Weights.at(self._scaled(places, which, slices), slices.shape[2 + which], is_smooth=self.smooth is not None)
 
     def _distance(self, origin: Tensor, direction: Tensor) -> Tensor:
         return (self.planes[:, None] - origin[:, self.axis]) / direction[:, self.axis]
 
-    def _scaled(self, place: Tensor, axis: int) -> Tensor:
-        return 2 * (place - self.lower[axis]) / self.extent[axis] - 1
+    def _scaled(self, place: Tensor, which: int, slices: Tensor) -> Tensor:
+        """Places [u] among the rows (`which` = 0) or columns (1) of `slices`, in [-1, 1]."""
+        axis, first = self._across[which], 0 if which else self.first
+        return 2 * ((place - self.grid.lower[axis]) / self.grid.spacing[axis] - first) / slices.shape[2 + which] - 1
 
 
 class Equidistant:
@@ -103,6 +160,11 @@ class Equidistant:
         self.smooth = smooth
         self.fields, self.lower, self.extent = fields, fields.new_tensor(grid.lower), fields.new_tensor(grid.extent)
         self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
+
+    def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Equidistant]]:
+        """All of `rays`, `count` at a time or in large volumes more: their indices, and what they meet."""
+        size = max(count, self.fields[0].numel() // (CELLS_PER_NODE * self.nodes))
+        return [(chunk, self) for chunk in torch.arange(len(rays.direction), device=rays.direction.device).split(size)]
 
     def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """Values [N, channels, R] and distances [N, R] at the nodes of rays."""
@@ -120,5 +182,5 @@ def sampler_for(fields: Tensor, smooth: Smooth | None, grid: Grid, rays: Rays, c
     along = speed[:, axis]
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):
-        return Slices(fields, smooth, grid, axis, bool(along[0] < 0), steps)
+        return Slices.of(fields, smooth, grid, axis, bool(along[0] < 0), steps)
     return Equidistant(fields, smooth, grid, float((crossing.far - crossing.near).max()), steps)
