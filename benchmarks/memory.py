@@ -28,6 +28,7 @@ CASES = {
     "RGB, g 0.3, one round": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1},
     "RGB, flux-limited": {"albedo": [0.95, 0.9, 0.8], "model": "flux_limited"},
     "RGB fields": {"albedo": [0.95, 0.9, 0.8], "fields": True},
+    "density, sigma_a and sigma_s, g 0.3": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "joint": True},
 }
 SOLVE = """
 import sys, torch
@@ -52,6 +53,10 @@ def scene_of(cells: int, pixels: int, case: dict[str, object], is_optimized: boo
         parameters: dict[str, object] = {"density": {"init": 1}}
         if case.get("fields"):
             parameters["albedo"] = {"init": 0.9, "field": True}
+        if case.get("joint"):
+            del volume["sigma_t"], volume["albedo"]
+            volume |= {"sigma_a": [1.0, 2.0, 4.0], "sigma_s": [19.0, 18.0, 16.0]}
+            parameters |= {name: {"init": volume[name], "field": True} for name in ("sigma_a", "sigma_s")}
         scene["optimize"] = {"iterations": 1, "refine_at": [], "parameters": parameters}
     return scene
 
@@ -86,12 +91,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--cells", type=int, nargs="*", default=[64, 96])
     parser.add_argument("--pixels", type=int, default=256)
+    parser.add_argument("--scene", choices=CASES, nargs="*", default=list(CASES))
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         print("| scene | cells | solve, there and back [bytes per cell and color] | command | peak [MiB] | predicted / peak |")
         print(f"|{'---|' * 6}")
-        for title, case in CASES.items():
+        for title, case in ((title, CASES[title]) for title in arguments.scene):
             bases = {verb: measured(folder, verb, SMALL, 16, case)[0] for verb in ("solve", "render", "optimize")}
             for cells in arguments.cells:
                 solve = measured(folder, "solve", cells, 16, case)[0] - bases["solve"]

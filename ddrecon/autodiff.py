@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.utils.checkpoint import checkpoint
+from torch.autograd.graph import saved_tensors_hooks
 
 T = TypeVar("T")
 
@@ -34,8 +34,36 @@ def keep(ctx: Any, *tensors: Tensor) -> None:
 
 
 def recomputed(function: Callable[..., T], *arguments: object) -> T:
-    """`function(*arguments)`, which must not draw random numbers: the backward pass computes it again and keeps only the arguments."""
+    """`function(*arguments)`, which must not draw random numbers: the backward pass computes it again and keeps only the arguments.
+
+    What `torch.utils.checkpoint` does, without importing torch's compiler, which takes two seconds of every run.
+    """
     if not torch.is_grad_enabled():
         return function(*arguments)
-    result: T = checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)
-    return result
+    again = _Again(lambda: function(*arguments))
+    with saved_tensors_hooks(again.pack, again.unpack):
+        return function(*arguments)
+
+
+class _Again:
+    """Numbers in place of the tensors that `function` saves for its backward pass, and these tensors when they are asked for."""
+
+    def __init__(self, function: Callable[[], object]):
+        self.function = function
+        self.count = 0
+        self.made: dict[int, Tensor] = {}
+
+    def pack(self, _: Tensor) -> int:
+        self.count += 1
+        return self.count - 1
+
+    def unpack(self, number: int) -> Tensor:
+        if number not in self.made:
+            self._make()
+        return self.made.pop(number)
+
+    def _make(self) -> None:
+        made: list[Tensor] = []
+        with torch.enable_grad(), saved_tensors_hooks(lambda tensor: made.append(tensor.detach()), made.__getitem__):
+            self.function()
+        self.made = dict(enumerate(made))

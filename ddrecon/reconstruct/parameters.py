@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from ddrecon.grid import Grid
 from ddrecon.reconstruct.levels import resampled
@@ -34,7 +35,8 @@ class Parameter:
         self.tv = (kind.tv if settings.tv is None else settings.tv) if self.is_field else 0.0
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
-        self.optimizer = self._new_optimizer()
+        self.steps = value.new_zeros(())
+        self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
     def penalty(self) -> Tensor:
         """What its regularizers add to the loss, in units of the targets' mean square; see `ParameterSettings`."""
@@ -45,12 +47,24 @@ class Parameter:
 
     def step(self, gradient: Tensor, rate: float) -> None:
         """Moves the value against `gradient` by `rate` times its learning rate, and back within its bounds."""
-        self.value.grad = gradient
-        self.optimizer.param_groups[0]["lr"] = rate * self.rate
         length = self.value.detach().norm()
-        self.optimizer.step()
-        self.value.grad = None
+        first, second = self.moments
         with torch.no_grad():
+            adam(
+                [self.value],
+                [gradient],
+                [first],
+                [second],
+                [],
+                [self.steps],
+                amsgrad=False,
+                beta1=BETAS[0],
+                beta2=BETAS[1],
+                lr=rate * self.rate,
+                weight_decay=0.0,
+                eps=TINY,
+                maximize=False,
+            )
             self.value.clamp_(self.low, self.high)
             if self.name.endswith(".direction"):
                 self.value.mul_(length / self.value.norm())
@@ -58,26 +72,21 @@ class Parameter:
     def refine(self, grid: Grid) -> None:
         """Carries field and moments to `grid`; a derivative with respect to a cell shrinks with the cell's volume."""
         share = self.grid.cells / grid.cells
-        state = self.optimizer.state.get(self.value, {})
         self.grid = grid
         if not self.is_field:
             return
         self.value = resampled(self.value.detach(), grid).clone().requires_grad_()
-        self.optimizer = self._new_optimizer()
-        if state:
-            moments = {"exp_avg": resampled(state["exp_avg"], grid) * share, "exp_avg_sq": resampled(state["exp_avg_sq"], grid) * share**2}
-            self.optimizer.state[self.value] = {"step": state["step"], **moments}
+        first, second = (resampled(moment, grid) for moment in self.moments)
+        self.moments = first * share, second * share**2
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it."""
-        return {"value": self.value.detach(), "shape": list(self.grid.shape), "optimizer": self.optimizer.state_dict()}
+        return {"value": self.value.detach(), "shape": list(self.grid.shape), "steps": self.steps, "moments": list(self.moments)}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
         self.value = state["value"].to(self.value).clone().requires_grad_()
-        self.optimizer = self._new_optimizer()
-        self.optimizer.load_state_dict(state["optimizer"])
-
-    def _new_optimizer(self) -> torch.optim.Adam:
-        return torch.optim.Adam([self.value], lr=self.rate, betas=BETAS, eps=TINY)
+        self.steps = state["steps"].to(self.value)
+        first, second = (moment.to(self.value) for moment in state["moments"])
+        self.moments = first, second
