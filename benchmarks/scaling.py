@@ -4,7 +4,7 @@
 
 The plume of `ddrecon.bench.plume` is reconstructed from half its density, from its own images at full resolution. One thing grows at a
 time, from 64 x 96 x 64 cells, 128 x 128 pixels, one view, one light and one color; with the cells so does the width of the image, which has
-two pixels a cell: what a view can tell of so many.
+two pixels a cell: what a view can tell of so many. On a CPU these are seconds of one thread's processor time, whatever else may be running.
 """
 
 from __future__ import annotations
@@ -69,12 +69,18 @@ def seconds(scene: Scene, repeat: int) -> float:
     """The median of some iterations, after one that is not counted."""
     run, taken = started(scene), []
     for _ in range(repeat + 1):
-        start = time.perf_counter()
+        start = now(scene)
         run.step()
-        if scene.volume.density.is_cuda:
-            torch.cuda.synchronize()
-        taken.append(time.perf_counter() - start)
+        taken.append(now(scene) - start)
     return statistics.median(taken[1:])
+
+
+def now(scene: Scene) -> float:
+    """The time, once the device has done what it was given; on a CPU that of the process."""
+    if not scene.volume.density.is_cuda:
+        return time.process_time()
+    torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 def report(name: str, amounts: Sequence[int], scene_of: Callable[[int], Scene], repeat: int, dimensions: int = 1) -> None:
@@ -93,6 +99,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
+    torch.set_num_threads(1)
 
     def plume(cells: int = CELLS, pixels: int = PIXELS) -> Scene:
         return plume_scene(cells, pixels, torch.float32, torch.device(arguments.device))

@@ -73,18 +73,19 @@ GIVEN_BACK = 2**25
 def memory_estimate(scene: Scene) -> int:
     """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself.
 
-    A fit, in arrays of one value per cell and in buffers of marched nodes, to peaks measured before solves were by multigrid; between 0.7
-    and 1.7 times the peaks that `benchmarks/memory.py` finds now.
+    Fitted to what `benchmarks/memory.py` measures, in numbers per cell and in buffers of marched nodes. Those that are alive at a time are
+    known well; arrays of up to 32 MiB take more, as the allocator keeps what was given back for the next of another size.
     """
     medium = scaled_medium(scene.volume)
     colors, cells = medium.extinction.scale.shape[0], scene.volume.grid.cells
     size = torch.finfo(scene.volume.density.dtype).bits // 8
-    arrays, buffers = 25 + 14 * colors, 40
+    flux, sweeps, limited = has_flux(medium), scene.diffusion.transport_rounds > 0, scene.diffusion.model == "flux_limited"
+    numbers, buffers, kept = 17.0 + (21 + 3 * flux + 16 * sweeps + 7 * limited) * colors, 6.0 + 2 * colors, 1.1
     if scene.optimize is not None:
-        arrays, buffers = 60 + (200 if has_flux(medium) else 110) * colors, 60
-        if size * colors * cells > GIVEN_BACK:
-            arrays = arrays * 2 // 5
-    return size * (arrays * cells + buffers * CHUNK_NODES)
+        varied = sum(start.numel() for start in scene.starts.values()) / cells
+        numbers = 50 + 9 * varied + (7 + 13 * flux + 34 * sweeps + 32 * limited) * colors
+        buffers, kept = 18 * colors + 4 * varied, 1.9
+    return int(size * (numbers * cells + buffers * CHUNK_NODES) * (kept if size * colors * cells <= GIVEN_BACK else 1.1))
 
 
 def describe(scene: Scene) -> dict[str, Any]:

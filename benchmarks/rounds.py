@@ -1,0 +1,61 @@
+"""How long a render of the plume takes by transport rounds and directions, relative to none in the same run: docs/accuracy.md.
+
+python benchmarks/rounds.py [--repeat 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.renderer import render_each
+from ddrecon.scene.build import load_scene
+from ddrecon.world import Scene
+
+ROOT = Path(__file__).parents[1]
+CASES = {
+    "gray": ["volume.albedo=0.95", "render.samples_per_pixel=1"],
+    "RGB": ["render.samples_per_pixel=1"],
+    "RGB, 16 rays a pixel": ["render.samples_per_pixel=16"],
+}
+ROUNDS = ((0, 26), (1, 26), (2, 26), (4, 26), (1, 50), (2, 50))
+"""Rounds and directions."""
+
+
+def seconds(scene: Scene, repeat: int) -> float:
+    """The least time of a render of the first view, solves from zero."""
+    taken = []
+    for _ in range(repeat + 1):
+        start = time.perf_counter()
+        render_each(scene, scene.views[:1], SolveMemory())
+        taken.append(time.perf_counter() - start)
+    return min(taken[1:])
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--repeat", type=int, default=3)
+    arguments = parser.parse_args()
+    times: dict[tuple[int, int], list[float]] = {key: [] for key in ROUNDS}
+    with torch.no_grad():
+        for overrides in CASES.values():
+            truth = f"volume.density={{file: {ROOT / 'data/plume/density.npz'}}}"
+            scene = load_scene(ROOT / "configs/plume.yaml", overrides=[truth, "optimize.parameters.density={}", *overrides])
+            for rounds, directions in ROUNDS:
+                settings = replace(scene.diffusion, transport_rounds=rounds, transport_directions=directions)
+                times[rounds, directions].append(seconds(replace(scene, diffusion=settings), arguments.repeat))
+    print(f"| n | directions | {' | '.join(CASES)} |\n|{'---|' * (2 + len(CASES))}")
+    for (rounds, directions), row in times.items():
+        ratios = (f"{found / base:.1f}" for found, base in zip(row, times[ROUNDS[0]], strict=True))
+        print(f"| {rounds} | {directions if rounds else '-'} | {' | '.join(ratios)} |")
+    print("seconds at n = 0:", ", ".join(f"{name} {base:.2f}" for name, base in zip(CASES, times[ROUNDS[0]], strict=True)))
+
+
+if __name__ == "__main__":
+    main()
