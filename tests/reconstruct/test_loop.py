@@ -93,6 +93,12 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
         load_checkpoint(tmp_path / "last.pt", "scene")
 
 
+def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
+    torch.save({"format": 1, "scene": "scene", "state": {}}, tmp_path / "last.pt")
+    with pytest.raises(FormatError, match="a checkpoint of format 1; this version reads 2"):
+        load_checkpoint(tmp_path / "last.pt", "scene")
+
+
 def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
     assert ball_scene.optimize is not None
     run = Reconstruction(replace(ball_scene, optimize=replace(ball_scene.optimize, views_per_iteration=0)))
