@@ -53,7 +53,7 @@ class Case:
         grid, bundle = self.scene.volume.grid, rays(self.camera)
         crossing = cross_box(grid, bundle)
         fields = torch.cat([leaf.detach() for leaf in self.leaves])
-        sampler = sampler_for(fields, None, grid, bundle, crossing, 1)
+        sampler = sampler_for(fields, None, 0, grid, bundle, crossing, 1)
         if not isinstance(sampler, Slices):
             raise SystemExit("the view is not one by slices")
         for chunk in torch.arange(len(crossing.hit)).split((1 << 18) // sampler.nodes):

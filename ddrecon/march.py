@@ -13,7 +13,7 @@ from typing import TypeGuard
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import recomputed
+from ddrecon.autodiff import is_varied, recomputed
 from ddrecon.cameras import Rays
 from ddrecon.decay import decayed_sum
 from ddrecon.grid import Grid
@@ -123,12 +123,16 @@ def _march_lattice(emission: Emission, slices: Slices, lattice: Lattice) -> Tens
     return torch.cat([recomputed(run, *part) for part in slices.lattice_parts(lattice, count)], 1).unflatten(1, lattice.shape)
 
 
-def _packed(emission: Emission) -> tuple[Tensor, Smooth | None]:
-    """All fields to interpolate [channels, z, y, x], and which of them to third order."""
+def _packed(emission: Emission) -> tuple[Tensor, Smooth | None, int]:
+    """All fields to interpolate [channels, z, y, x], which of them to third order, and how many of the first tell what is empty.
+
+    None do where the medium is being varied: derivatives by the density of empty cells are wanted, and must be those of what is rendered.
+    """
     first = emission.extinction.field.shape[0] + emission.diffuse.shape[0]
     last = first + sum(beam.mass.shape[0] for beam in emission.beams)
     smooth = Smooth(first, last, emission.extinction.mass_bound) if emission.beams else None
-    return torch.cat(_fields(emission)), smooth
+    is_fixed = not (is_varied(emission.extinction.field) or is_varied(emission.scattering.field))
+    return torch.cat(_fields(emission)), smooth, emission.extinction.field.shape[0] if is_fixed else 0
 
 
 def _fields(emission: Emission) -> list[Tensor]:

@@ -26,6 +26,10 @@ class Weights:
         linear = _linear(coordinate, size, fades)
         return Weights(linear, excess(coordinate, size)[..., None] * bend(linear, 2) if is_smooth else None)
 
+    def between(self, first: int, last: int) -> Weights:
+        """Those of lines `first` to before `last`."""
+        return Weights(self.linear[first:last], None if self.excess is None else self.excess[first:last])
+
 
 def sample_lattice(slices: Tensor, rows: Weights, columns: Weights, smooth: Smooth | None = None) -> Tensor:
     """Values `[N, K, r c]` of `slices` [N, K, H, W] at every pair of `rows` [N, r, H] and `columns` [N, c, W].

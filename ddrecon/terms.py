@@ -67,14 +67,14 @@ def _counted(count: int, noun: str) -> str:
 
 
 GIVEN_BACK = 2**25
-"""Arrays larger than this many bytes leave the process when they are done with; smaller ones stay with its allocator."""
+"""Arrays larger than this many bytes leave the process when they are done with; smaller ones stay with its allocator (glibc's)."""
 
 
 def memory_estimate(scene: Scene) -> int:
     """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself.
 
     Fitted to what `benchmarks/memory.py` measures, in numbers per cell and in buffers of marched nodes. Those that are alive at a time are
-    known well; arrays of up to 32 MiB take more, as the allocator keeps what was given back for the next of another size.
+    known well; where arrays stay with the allocator it holds up to twice as much, for others of the same size.
     """
     medium = scaled_medium(scene.volume)
     colors, cells = medium.extinction.scale.shape[0], scene.volume.grid.cells
@@ -83,9 +83,9 @@ def memory_estimate(scene: Scene) -> int:
     numbers, buffers, kept = 17.0 + (21 + 3 * flux + 16 * sweeps + 7 * limited) * colors, 6.0 + 2 * colors, 1.1
     if scene.optimize is not None:
         varied = sum(start.numel() for start in scene.starts.values()) / cells
-        numbers = 50 + 9 * varied + (7 + 13 * flux + 34 * sweeps + 32 * limited) * colors
-        buffers, kept = 18 * colors + 4 * varied, 1.9
-    return int(size * (numbers * cells + buffers * CHUNK_NODES) * (kept if size * colors * cells <= GIVEN_BACK else 1.1))
+        numbers = 50 + 12 * varied + (7 + 13 * flux + 34 * sweeps + 32 * limited) * colors
+        buffers, kept = 18 * colors + 4 * varied, 1.9 if size * colors * cells <= GIVEN_BACK else 1.5
+    return int(size * (numbers * cells + buffers * CHUNK_NODES) * (kept if size * cells <= GIVEN_BACK else 1.1))
 
 
 def describe(scene: Scene) -> dict[str, Any]:

@@ -64,7 +64,8 @@ class Slices:
     """Values where rays cross the `planes` [u] through the cell centers across `axis`, and the two faces of the box.
 
     They are held as `bands` of some rows each, `[N, channels, rows, columns]`, row `first` of `grid` first: what is marched at a time, and
-    its derivative, needs only those it meets.
+    its derivative, needs only those it meets. `spans`: the first and last plane where each of all bands holds anything, None for an empty
+    one; planes `before` those of this part were left out.
     """
 
     grid: Grid
@@ -72,11 +73,16 @@ class Slices:
     planes: Tensor
     bands: tuple[Tensor, ...]
     smooth: Smooth | None
+    spans: list[tuple[int, int] | None]
     first: int = 0
+    before: int = 0
 
     @staticmethod
-    def of(fields: Tensor, smooth: Smooth | None, grid: Grid, axis: int, is_reversed: bool, steps: int) -> Slices:
-        """Those of `fields` [channels, z, y, x], in the order that light meets them from below, or from above where `is_reversed`."""
+    def of(fields: Tensor, smooth: Smooth | None, filled: int, grid: Grid, axis: int, is_reversed: bool, steps: int) -> Slices:
+        """Those of `fields` [channels, z, y, x], in the order that light meets them from below, or from above where `is_reversed`.
+
+        Where the first `filled` channels are zero there is nothing to be seen; 0: anywhere something may be.
+        """
         count = grid.shape[axis]
         place = torch.arange(count + 2, dtype=fields.dtype, device=fields.device) - 0.5
         planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
@@ -85,7 +91,8 @@ class Slices:
             index, planes = index.flip(0), planes.flip(0)
         row, column = (other for other in range(3) if other != axis)
         slices = fields.permute(1 + axis, 1 + row, 0, 1 + column).index_select(0, index).transpose(1, 2)
-        return Slices(grid, axis, subdivided(planes, steps), subdivided(slices, steps, smooth).split(BAND, 2), smooth)
+        bands = subdivided(slices, steps, smooth).split(BAND, 2)
+        return Slices(grid, axis, subdivided(planes, steps), bands, smooth, _spans(bands, filled))
 
     @property
     def nodes(self) -> int:
@@ -116,7 +123,11 @@ class Slices:
         cells = [(place - self.grid.lower[row]) / self.grid.spacing[row] for place in (low, high)]
         first = min(max(math.floor(cells[0]) - REACH, 0), rows - 1) // BAND
         last = min(max(math.floor(cells[1]) + REACH, 0), rows - 1) // BAND
-        return replace(self, bands=self.bands[first : last + 1], first=first * BAND)
+        spans = [span for span in self.spans[first : last + 1] if span is not None]
+        begin = max(min((span[0] for span in spans), default=1) - 1, 0)
+        end = max((span[1] for span in spans), default=0) + 2
+        bands = tuple(band[begin:end] for band in self.bands[first : last + 1])
+        return replace(self, planes=self.planes[begin:end], bands=bands, first=first * BAND, before=begin)
 
     def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """Values [N, channels, R] and distances [N, R] at the nodes of rays."""
@@ -132,7 +143,7 @@ class Slices:
 
     def sample_rows(self, lattice: Lattice, rows: Tensor, columns: Weights, rays: Rays) -> tuple[Tensor, Tensor]:
         """Values [N, channels, R] where `rays`, those of some `rows` and all columns of `lattice`, meet the planes; distances [N, R]."""
-        slices = torch.cat(self.bands, 2)
+        slices, columns = torch.cat(self.bands, 2), columns.between(self.before, self.before + self.nodes)
         down = self._weights(lattice.crossings(self.planes, 0, rows), 0, slices)
         return sample_lattice(slices, down, columns, self.smooth), self._distance(rays.origin, rays.direction)
 
@@ -151,6 +162,15 @@ class Slices:
         """Places [u] among the rows (`which` = 0) or columns (1) of `slices`, in [-1, 1]."""
         axis, first = self._across[which], 0 if which else self.first
         return 2 * ((place - self.grid.lower[axis]) / self.grid.spacing[axis] - first) / slices.shape[2 + which] - 1
+
+
+def _spans(bands: tuple[Tensor, ...], filled: int) -> list[tuple[int, int] | None]:
+    """The first and last plane where each of `bands` holds anything in its first `filled` channels; all planes where that is 0."""
+    if not filled:
+        return [(0, len(band) - 1) for band in bands]
+    is_full = torch.stack([(band[:, :filled].detach() != 0).flatten(1).any(1) for band in bands]).tolist()
+    planes = [[plane for plane, full in enumerate(row) if full] for row in is_full]
+    return [(found[0], found[-1]) if found else None for found in planes]
 
 
 class Equidistant:
@@ -175,12 +195,17 @@ class Equidistant:
         return values.transpose(0, 1), distance
 
 
-def sampler_for(fields: Tensor, smooth: Smooth | None, grid: Grid, rays: Rays, crossing: Crossing, steps: int) -> Slices | Equidistant:
-    """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps."""
+def sampler_for(
+    fields: Tensor, smooth: Smooth | None, filled: int, grid: Grid, rays: Rays, crossing: Crossing, steps: int
+) -> Slices | Equidistant:
+    """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps.
+
+    Slices leave out what is empty in the first `filled` of `fields`.
+    """
     speed = normalize(rays.direction[crossing.hit] / rays.direction.new_tensor(grid.spacing), dim=1)
     axis = int(speed.abs().mean(0).argmax())
     along = speed[:, axis]
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):
-        return Slices.of(fields, smooth, grid, axis, bool(along[0] < 0), steps)
+        return Slices.of(fields, smooth, filled, grid, axis, bool(along[0] < 0), steps)
     return Equidistant(fields, smooth, grid, float((crossing.far - crossing.near).max()), steps)

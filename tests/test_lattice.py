@@ -50,7 +50,7 @@ def scene_of(make_scene, make_camera, box):
 def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
     bundle, grid = rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
-    slices = sampler_for(scene.volume.density[None], None, grid, bundle, crossing, 1)
+    slices = sampler_for(scene.volume.density[None], None, 0, grid, bundle, crossing, 1)
     return lattice_for(grid, slices.axis, bundle.chosen(crossing.hit)), slices
 
 

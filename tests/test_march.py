@@ -16,6 +16,7 @@ from ddrecon.grid import Grid
 from ddrecon.lights import DirectionalLight
 from ddrecon.march import Emission, march
 from ddrecon.medium import Volume, scaled_medium
+from ddrecon.nodes import Nodes
 from ddrecon.phase import henyey_greenstein
 from ddrecon.reduced import reduced_light
 from ddrecon.renderer import render
@@ -106,6 +107,30 @@ def test_chunks_do_not_matter(view: dict, box, make_camera, random, monkeypatch)
     monkeypatch.setattr(view_rays, "BAND", 1)
     for one, other in zip(whole, marched(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
+
+
+@each_camera
+def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, box, make_camera, random, monkeypatch):
+    """Nothing is left out where the density is being varied."""
+    density = torch.zeros(20, 22, 21, dtype=torch.float64)
+    density[6:9, 12:15, 8:12] = 1 + random(3, 3, 4)
+    bundle, integrated, nodes = rays(make_camera(size=(9, 8), **view)), march_module._integrate, []
+
+    def counting(emission: Emission, values: Tensor, places: Nodes) -> Tensor:
+        nodes.append(values[:, 0].numel())
+        return integrated(emission, values, places)
+
+    monkeypatch.setattr(march_module, "_integrate", counting)
+    monkeypatch.setattr(march_module, "CHUNK_NODES", 200)
+    emissions = emission_of(box((20, 22, 21)), density), emission_of(box((20, 22, 21)), density.clone().requires_grad_())
+    seen, counts = [], []
+    for emission in emissions:
+        nodes.clear()
+        seen.append(march(emission, bundle, every_ray(1)))
+        counts.append(sum(nodes))
+    for one, other in zip(*seen, strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-12, atol=1e-15)
+    assert counts[0] < 0.6 * counts[1] or view is CAMERAS["inside"]
 
 
 @pytest.mark.parametrize("view", ["perspective", "oblique", "orthographic"])
