@@ -126,8 +126,10 @@ class Slices:
         spans = [span for span in self.spans[first : last + 1] if span is not None]
         begin = max(min((span[0] for span in spans), default=1) - 1, 0)
         end = max((span[1] for span in spans), default=0) + 2
-        bands = tuple(band[begin:end] for band in self.bands[first : last + 1])
-        return replace(self, planes=self.planes[begin:end], bands=bands, first=first * BAND, before=begin)
+        met = replace(self, bands=self.bands[first : last + 1], first=first * BAND)
+        if begin == 0 and end >= self.nodes:
+            return met
+        return replace(met, planes=self.planes[begin:end], bands=tuple(band[begin:end] for band in met.bands), before=begin)
 
     def sample(self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
         """Values [N, channels, R] and distances [N, R] at the nodes of rays."""
