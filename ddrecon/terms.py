@@ -84,7 +84,7 @@ def memory_estimate(scene: Scene) -> int:
     if scene.optimize is not None:
         varied = sum(start.numel() for start in scene.starts.values()) / cells
         numbers = 50 + 12 * varied + (7 + 13 * flux + 34 * sweeps + 32 * limited) * colors
-        buffers, kept = 18 * colors + 4 * varied, 1.9 if size * colors * cells <= GIVEN_BACK else 1.5
+        buffers, kept = 12 * colors + 4 * varied, 1.9 if size * colors * cells <= GIVEN_BACK else 1.5
     return int(size * (numbers * cells + buffers * CHUNK_NODES) * (kept if size * cells <= GIVEN_BACK else 1.1))
 
 
