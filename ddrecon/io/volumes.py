@@ -12,6 +12,7 @@ from ddrecon.errors import FormatError
 from ddrecon.io.field import Field
 from ddrecon.io.mitsuba import read_vol, write_vol
 from ddrecon.io.npz import read_npz, write_npz
+from ddrecon.io.vti import read_vti, write_vti
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,11 @@ class VolumeFormat:
     write: Callable[[Path, str, np.ndarray, np.ndarray], None]
 
 
-FORMATS: dict[str, VolumeFormat] = {".npz": VolumeFormat(read_npz, write_npz), ".vol": VolumeFormat(read_vol, write_vol)}
+FORMATS: dict[str, VolumeFormat] = {
+    ".npz": VolumeFormat(read_npz, write_npz),
+    ".vol": VolumeFormat(read_vol, write_vol),
+    ".vti": VolumeFormat(read_vti, write_vti),
+}
 
 
 def read_field(path: Path, name: str) -> Field:
