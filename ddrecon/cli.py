@@ -236,6 +236,18 @@ def export(session: Session, scene: Path, output: Path, overwrite: bool) -> None
 
 
 @main.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@AS_JSON
+@in_session
+def info(session: Session, file: Path) -> None:
+    """Print what is in FILE: a volume's box, cells and fields, or an image's size and values."""
+    from ddrecon.io.info import describe, lines
+
+    report = describe(file)
+    session.show(report, lines(report))
+
+
+@main.command()
 @SCENE
 @DTYPE
 @AS_JSON

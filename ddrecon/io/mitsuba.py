@@ -20,6 +20,11 @@ HEADER = struct.Struct("<3sB5i6f")
 MAGIC, VERSION, FLOAT32 = b"VOL", 3, 1
 
 
+def vol_names(path: Path) -> list[str]:
+    """The one name of the field at `path`, which the file does not say: what its own name ends with."""
+    return [path.stem.rpartition(".")[2]]
+
+
 def read_vol(path: Path, name: str) -> Field:
     """The field in the file at `path`, taken for `name`; raises FormatError when it is damaged or not a legal field."""
     try:

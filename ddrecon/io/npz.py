@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +20,34 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImp
 
 def read_npz(path: Path, name: str) -> Field:
     """The field `name` of the archive at `path`; raises FormatError when it is damaged, absent or not a legal field."""
+    with _opened(path) as archive:
+        names = _names(archive)
+        if name not in names:
+            raise FormatError(path, _absence(name, [other for other in names if other != "bounds"]))
+        bounds = _read_entry(archive, "bounds", path) if "bounds" in names else None
+        values = _read_entry(archive, name, path)
+    return checked_field(path, name, values, bounds)
+
+
+def npz_names(path: Path) -> list[str]:
+    """The names of all arrays of the archive at `path` but `bounds`; raises FormatError when it is damaged."""
+    with _opened(path) as archive:
+        return [name for name in _names(archive) if name != "bounds"]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
-            names = [entry.removesuffix(".npy") for entry in archive.namelist()]
-            if name not in names:
-                raise FormatError(path, _absence(name, [other for other in names if other != "bounds"]))
-            bounds = _read_entry(archive, "bounds", path) if "bounds" in names else None
-            values = _read_entry(archive, name, path)
+            yield archive
     except zipfile.BadZipFile as error:
         raise FormatError(path, f"not a complete .npz archive: {error}; write it with numpy.savez_compressed") from error
     except _DAMAGE as error:
         raise FormatError(path, f"cannot be read: {error}") from error
-    return checked_field(path, name, values, bounds)
+
+
+def _names(archive: zipfile.ZipFile) -> list[str]:
+    return [entry.removesuffix(".npy") for entry in archive.namelist()]
 
 
 def write_npz(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:

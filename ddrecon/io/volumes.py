@@ -10,24 +10,30 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.field import Field
-from ddrecon.io.mitsuba import read_vol, write_vol
-from ddrecon.io.npz import read_npz, write_npz
-from ddrecon.io.vti import read_vti, write_vti
+from ddrecon.io.mitsuba import read_vol, vol_names, write_vol
+from ddrecon.io.npz import npz_names, read_npz, write_npz
+from ddrecon.io.vti import read_vti, vti_names, write_vti
 
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """How one kind of volume file is read and written: `read(path, name)`, `write(path, name, values, bounds)`."""
+    """How one kind of volume file is read and written: `names(path)`, `read(path, name)`, `write(path, name, values, bounds)`."""
 
+    names: Callable[[Path], list[str]]
     read: Callable[[Path, str], Field]
     write: Callable[[Path, str, np.ndarray, np.ndarray], None]
 
 
 FORMATS: dict[str, VolumeFormat] = {
-    ".npz": VolumeFormat(read_npz, write_npz),
-    ".vol": VolumeFormat(read_vol, write_vol),
-    ".vti": VolumeFormat(read_vti, write_vti),
+    ".npz": VolumeFormat(npz_names, read_npz, write_npz),
+    ".vol": VolumeFormat(vol_names, read_vol, write_vol),
+    ".vti": VolumeFormat(vti_names, read_vti, write_vti),
 }
+
+
+def field_names(path: Path) -> list[str]:
+    """The fields that the volume file at `path` holds; raises FormatError when it cannot be read."""
+    return _format_of(path).names(path)
 
 
 def read_field(path: Path, name: str) -> Field:

@@ -6,8 +6,9 @@ Written as float32, appended raw. Read: uncompressed cell arrays of float32 or f
 from __future__ import annotations
 
 import base64
-import binascii
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -47,8 +48,22 @@ _"""
         temporary.write_bytes(head.encode() + np.array(len(data), "<u8").tobytes() + data + b"\n</AppendedData>\n</VTKFile>\n")
 
 
+def vti_names(path: Path) -> list[str]:
+    """The names of the cell arrays of the file at `path`; raises FormatError when it is damaged."""
+    with _opened(path) as (root, _):
+        return list(_arrays(_piece(root)))
+
+
 def read_vti(path: Path, name: str) -> Field:
     """The cell array `name` of the file at `path`; raises FormatError when it is damaged, absent, compressed or not a legal field."""
+    with _opened(path) as (root, appended):
+        values, bounds = _read(path, root, appended, name)
+    return checked_field(path, name, values, bounds)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[ElementTree.Element, bytes]]:
+    """The XML of the file at `path`, and the data appended to it."""
     try:
         check_size(path.stat().st_size, path, "the volume")
         content = path.read_bytes()
@@ -56,11 +71,9 @@ def read_vti(path: Path, name: str) -> Field:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     head, appended = _parted(content)
     try:
-        root = ElementTree.fromstring(head)
-        values, bounds = _read(path, root, appended, name)
-    except (ElementTree.ParseError, ValueError, KeyError, binascii.Error, OverflowError) as error:
+        yield ElementTree.fromstring(head), appended
+    except (ElementTree.ParseError, ValueError, KeyError, OverflowError) as error:
         raise FormatError(path, f"not VTK image data that can be read ({error}); {ADVICE}") from error
-    return checked_field(path, name, values, bounds)
 
 
 def _parted(content: bytes) -> tuple[bytes, bytes]:
@@ -72,8 +85,8 @@ def _parted(content: bytes) -> tuple[bytes, bytes]:
 
 
 def _read(path: Path, root: ElementTree.Element, appended: bytes, name: str) -> tuple[np.ndarray, np.ndarray]:
-    if root.get("type") != "ImageData" or "compressor" in root.attrib:
-        raise ValueError("compressed" if "compressor" in root.attrib else f"of type {root.get('type')}")
+    if "compressor" in root.attrib:
+        raise ValueError("compressed")
     image = _only(root, "ImageData")
     extent = [int(number) for number in image.attrib["WholeExtent"].split()]
     x, y, z = (last - first for first, last in zip(extent[::2], extent[1::2], strict=True))
@@ -81,10 +94,7 @@ def _read(path: Path, root: ElementTree.Element, appended: bytes, name: str) -> 
         np.array([float(number) for number in image.get(key, one).split()]) for key, one in (("Origin", "0 0 0"), ("Spacing", "1 1 1"))
     )
     low = origin + spacing * extent[::2]
-    piece = _only(image, "Piece")
-    if piece.attrib["Extent"].split() != image.attrib["WholeExtent"].split():
-        raise ValueError("in several pieces")
-    arrays = {array.get("Name"): array for array in piece.iterfind("CellData/DataArray")}
+    arrays = _arrays(_piece(root))
     if name not in arrays:
         raise FormatError(path, f"has no cell array {name!r}; it has {', '.join(map(repr, arrays)) or 'none'}")
     array = arrays[name]
@@ -95,6 +105,20 @@ def _read(path: Path, root: ElementTree.Element, appended: bytes, name: str) -> 
     values = np.frombuffer(data, order + TYPES[array.attrib["type"]])
     shape = (z, y, x) if components == 1 else (z, y, x, components)
     return values.reshape(shape), np.stack([low, low + spacing * [x, y, z]])
+
+
+def _piece(root: ElementTree.Element) -> ElementTree.Element:
+    if root.get("type") != "ImageData":
+        raise ValueError(f"of type {root.get('type')}")
+    image = _only(root, "ImageData")
+    piece = _only(image, "Piece")
+    if piece.attrib["Extent"].split() != image.attrib["WholeExtent"].split():
+        raise ValueError("in several pieces")
+    return piece
+
+
+def _arrays(piece: ElementTree.Element) -> dict[str, ElementTree.Element]:
+    return {array.get("Name", ""): array for array in piece.iterfind("CellData/DataArray")}
 
 
 def _only(parent: ElementTree.Element, tag: str) -> ElementTree.Element:

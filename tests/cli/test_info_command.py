@@ -1,0 +1,64 @@
+"""What `ddrecon info` says of volumes and images."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+
+from ddrecon.io.volumes import FORMATS, write_field
+
+Run = Callable[..., Result]
+Refuse = Callable[..., list[str]]
+BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 1.0, 1.0]])
+
+
+def colored() -> np.ndarray:
+    values = np.zeros((2, 3, 4, 3))
+    values[0, 0] = [0.5, 1.0, 0.0]
+    return values
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_volume(succeed: Run, suffix: str) -> None:
+    write_field(Path(f"smoke.albedo{suffix}"), "albedo", colored(), BOUNDS)
+    assert succeed("info", f"smoke.albedo{suffix}").stdout.splitlines() == [
+        "cells: 4 x 3 x 2 (x, y, z) of 0.5 x 1 x 2 u, from [-1.0, -2.0, -3.0] to [1.0, 1.0, 1.0]",
+        "albedo: RGB, 0 to 1, mean 0.08333, not 0 in 16.7 %",
+    ]
+
+
+def test_a_volume_without_a_box(succeed: Run) -> None:
+    np.savez("two.npz", density=np.ones((2, 3, 4)), sigma_a=colored())
+    lines = succeed("info", "two.npz").stdout.splitlines()
+    assert lines[0] == "cells: 4 x 3 x 2 (x, y, z), no box: the scene's volume.bounds will be taken"
+    assert [line.split(":")[0] for line in lines[1:]] == ["density", "sigma_a"]
+
+
+def test_no_fields(succeed: Run) -> None:
+    np.savez("none.npz", bounds=BOUNDS)
+    assert succeed("info", "none.npz").stdout == "no fields\n"
+
+
+def test_json(succeed: Run) -> None:
+    report = json.loads(succeed("info", "density.npz", "--json").stdout)
+    assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
+    field = report["fields"]["density"]
+    assert field["colors"] == 1 and 0 < field["min"] < field["mean"] < field["max"] < 1 and field["filled"] == 1
+
+
+def test_an_image(succeed: Run) -> None:
+    np.save("picture.npy", np.concatenate([np.full((4, 5, 3), 2.0), np.zeros((4, 5, 3))]))
+    assert succeed("info", "picture.npy").stdout == "image: 5 x 8 pixels, gray, linear radiance 0 to 2, mean 1, not 0 in 50 %\n"
+
+
+def test_refusals(refuse: Refuse) -> None:
+    Path("notes.txt").write_text("hello")
+    Path("bad.npz").write_text("hello")
+    assert "unknown image format '.txt'" in refuse(3, "info", "notes.txt")[-1]
+    assert "not a complete .npz" in refuse(3, "info", "bad.npz")[-1]
+    assert "cannot be read" in refuse(3, "info", "nothing.vol")[-1]
