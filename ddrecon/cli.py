@@ -221,17 +221,22 @@ def reference(
 
 
 @main.command()
-@SCENE
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FILE.xml", help="Where the scene goes.")
+@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SCENE | VOLUME...")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FILE", help="Where it goes.")
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
 @in_session
-def export(session: Session, scene: Path, output: Path, overwrite: bool) -> None:
-    """Write SCENE for Mitsuba 3: FILE.xml, and its volumes beside it."""
-    if output.suffix.lower() != ".xml":
-        raise click.UsageError(f"-o {output}: a scene for Mitsuba is an .xml file")
-    from ddrecon.reference.export import export_scene
+def export(session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool) -> None:
+    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), or all fields of VOLUMEs in the format of FILE's suffix."""
+    if output.suffix.lower() == ".xml":
+        from ddrecon.reference.export import export_scene
 
-    written = export_scene(session.load(scene), output, may_exist=overwrite)
+        if len(sources) > 1:
+            raise click.UsageError("one scene at a time is written for Mitsuba")
+        written = export_scene(session.load(sources[0]), output, may_exist=overwrite)
+    else:
+        from ddrecon.io.convert import convert
+
+        written = convert(sources, output, may_exist=overwrite)
     click.echo(f"written: {', '.join(map(str, written))}")
 
 

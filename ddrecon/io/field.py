@@ -5,6 +5,7 @@ Values are `[z, y, x]` or `[z, y, x, 3]`, cell-centered; bounds are in world ord
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,10 @@ class Field:
         """Cells along (x, y, z)."""
         z, y, x = self.values.shape[:3]
         return x, y, z
+
+
+Fields = Mapping[str, np.ndarray]
+"""Values of several fields of the same cells, by name."""
 
 
 def checked_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | None) -> Field:

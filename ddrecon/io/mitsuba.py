@@ -14,7 +14,7 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.io.arrays import as_float32, check_size
 from ddrecon.io.atomic import replacing
-from ddrecon.io.field import Field, checked_field
+from ddrecon.io.field import Field, Fields, checked_field
 
 HEADER = struct.Struct("<3sB5i6f")
 MAGIC, VERSION, FLOAT32 = b"VOL", 3, 1
@@ -42,8 +42,11 @@ def read_vol(path: Path, name: str) -> Field:
     return checked_field(path, name, values[..., 0] if colors == 1 else values, np.array(corners, np.float64).reshape(2, 3))
 
 
-def write_vol(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
-    """Writes `values` [z, y, x] or [z, y, x, C] and `bounds` [2, 3] (x, y, z), both as float32; the format knows no `name`."""
+def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+    """Writes the one of `fields` [z, y, x] or [z, y, x, C] and `bounds` [2, 3] (x, y, z), both as float32; the format knows no names."""
+    if len(fields) != 1:
+        raise FormatError(path, f"a .vol holds one field, not {', '.join(fields)}; write each into a file of its own")
+    (values,) = fields.values()
     colors = values.shape[3] if values.ndim == 4 else 1
     z, y, x = values.shape[:3]
     header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, colors, *np.asarray(bounds, np.float64).ravel())

@@ -13,7 +13,7 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.io.arrays import read_npy
 from ddrecon.io.atomic import replacing
-from ddrecon.io.field import Field, checked_field
+from ddrecon.io.field import Field, Fields, checked_field
 
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError)
 
@@ -50,10 +50,10 @@ def _names(archive: zipfile.ZipFile) -> list[str]:
     return [entry.removesuffix(".npy") for entry in archive.namelist()]
 
 
-def write_npz(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
-    """Writes `values` [z, y, x] or [z, y, x, 3] as float32 under `name`, with `bounds` [2, 3] (x, y, z), compressed."""
+def write_npz(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 under their names, with `bounds` [2, 3] (x, y, z), compressed."""
     with replacing(path) as temporary, temporary.open("wb") as stream:
-        arrays = {name: np.asarray(values, np.float32), "bounds": np.asarray(bounds, np.float64)}
+        arrays = {name: np.asarray(values, np.float32) for name, values in fields.items()} | {"bounds": np.asarray(bounds, np.float64)}
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.field import Field
+from ddrecon.io.field import Field, Fields
 from ddrecon.io.mitsuba import read_vol, vol_names, write_vol
 from ddrecon.io.npz import npz_names, read_npz, write_npz
 from ddrecon.io.vti import read_vti, vti_names, write_vti
@@ -17,11 +17,11 @@ from ddrecon.io.vti import read_vti, vti_names, write_vti
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """How one kind of volume file is read and written: `names(path)`, `read(path, name)`, `write(path, name, values, bounds)`."""
+    """How one kind of volume file is read and written: `names(path)`, `read(path, name)`, `write(path, fields, bounds)`."""
 
     names: Callable[[Path], list[str]]
     read: Callable[[Path, str], Field]
-    write: Callable[[Path, str, np.ndarray, np.ndarray], None]
+    write: Callable[[Path, Fields, np.ndarray], None]
 
 
 FORMATS: dict[str, VolumeFormat] = {
@@ -43,7 +43,17 @@ def read_field(path: Path, name: str) -> Field:
 
 def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
     """Writes `values` [z, y, x] or [z, y, x, 3] and `bounds` [2, 3] (x, y, z) in the format of `path`'s suffix, as float32."""
-    _format_of(path).write(path, name, values, bounds)
+    write_fields(path, {name: values}, bounds)
+
+
+def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+    """Writes several fields of the same cells, by name, each as `write_field`; raises FormatError where the format holds but one."""
+    _format_of(path).write(path, fields, bounds)
+
+
+def require_format(path: Path) -> None:
+    """Raises FormatError where the suffix of `path` is none of those in `FORMATS`."""
+    _format_of(path)
 
 
 def _format_of(path: Path) -> VolumeFormat:

@@ -11,13 +11,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.arrays import as_float32, check_size
 from ddrecon.io.atomic import replacing
-from ddrecon.io.field import Field, checked_field
+from ddrecon.io.field import Field, Fields, checked_field
 
 APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
 TYPES = {"Float32": "f4", "Float64": "f8"}
@@ -26,26 +27,31 @@ ORDERS = {"LittleEndian": "<", "BigEndian": ">"}
 ADVICE = 'save it uncompressed, cell data as Float32, encoded "Appended raw" or "Binary"'
 
 
-def write_vti(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
-    """Writes `values` [z, y, x] or [z, y, x, 3] as float32 cells called `name`, and `bounds` [2, 3] (x, y, z) as origin and spacing."""
-    cells, (low, high) = np.array(values.shape[2::-1]), np.asarray(bounds, np.float64)
-    data = as_float32(values).astype("<f4", copy=False).tobytes()
+def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and `bounds` [2, 3] (x, y, z) as origin and spacing."""
+    cells, (low, high) = np.array(next(iter(fields.values())).shape[2::-1]), np.asarray(bounds, np.float64)
     extent = " ".join(f"0 {count}" for count in cells)
     origin, spacing = (" ".join(repr(float(number)) for number in line) for line in (low, (high - low) / cells))
-    components = values.shape[3] if values.ndim == 4 else 1
+    arrays, data = "", b""
+    for name, values in fields.items():
+        components = values.shape[3] if values.ndim == 4 else 1
+        arrays += (
+            f'<DataArray type="Float32" Name={quoteattr(name)} NumberOfComponents="{components}" format="appended" offset="{len(data)}"/>\n'
+        )
+        block = as_float32(values).astype("<f4", copy=False).tobytes()
+        data += np.array(len(block), "<u8").tobytes() + block
     head = f"""<?xml version="1.0"?>
 <VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
 <ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}">
 <Piece Extent="{extent}">
-<CellData Scalars="{name}">
-<DataArray type="Float32" Name="{name}" NumberOfComponents="{components}" format="appended" offset="0"/>
-</CellData>
+<CellData>
+{arrays}</CellData>
 </Piece>
 </ImageData>
 <AppendedData encoding="raw">
 _"""
     with replacing(path) as temporary:
-        temporary.write_bytes(head.encode() + np.array(len(data), "<u8").tobytes() + data + b"\n</AppendedData>\n</VTKFile>\n")
+        temporary.write_bytes(head.encode() + data + b"\n</AppendedData>\n</VTKFile>\n")
 
 
 def vti_names(path: Path) -> list[str]:

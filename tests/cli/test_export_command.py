@@ -6,8 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
+import pytest
 from click.testing import Result
 from small_scene import contents
+
+from ddrecon.io.volumes import FORMATS, field_names, read_field, write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -32,8 +36,59 @@ def test_overwrite(succeed: Run, refuse: Refuse) -> None:
     assert Path("smoke.xml").read_bytes() != first
 
 
-def test_only_xml(refuse: Refuse) -> None:
-    assert refuse(2, "export", "scene.yaml", "-o", "smoke.obj")[-1] == "Error: -o smoke.obj: a scene for Mitsuba is an .xml file"
+def test_other_suffixes(refuse: Refuse) -> None:
+    (line,) = refuse(3, "export", "density.npz", "-o", "smoke.obj")
+    assert line == "smoke.obj: unknown volume format '.obj'; known: .npz, .vol, .vti"
+
+
+def test_one_scene_at_a_time(refuse: Refuse) -> None:
+    assert refuse(2, "export", "scene.yaml", "scene.yaml", "-o", "smoke.xml")[-1] == "Error: one scene at a time is written for Mitsuba"
+
+
+def test_volumes_through_every_format_keep_a_corner_in_its_place(succeed: Run) -> None:
+    values = np.zeros((2, 3, 4), np.float32)
+    values[0, 0, 3] = 7
+    bounds = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
+    write_field(Path("start.npz"), "density", values, bounds)
+    last = "start.npz"
+    for suffix in [*FORMATS, ".npz"]:
+        name = f"{last.partition('.')[0]}x.density{suffix}"
+        assert succeed("export", last, "-o", name).stdout == f"written: {name}\n"
+        last = name
+    field = read_field(Path(last), "density")
+    assert np.array_equal(field.values, values) and np.array_equal(field.bounds, bounds)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".vti"])
+def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
+    values = np.random.default_rng(1).random((4, 5, 6, 3)).astype(np.float32)
+    write_field(Path("smoke.albedo.vol"), "albedo", values, np.array([[-0.5] * 3, [0.5] * 3]))
+    succeed("export", "density.npz", "smoke.albedo.vol", "-o", f"both{suffix}")
+    assert field_names(Path(f"both{suffix}")) == ["density", "albedo"]
+    for name, source in (("density", "density.npz"), ("albedo", "smoke.albedo.vol")):
+        assert np.array_equal(read_field(Path(f"both{suffix}"), name).values, read_field(Path(source), name).values)
+
+
+def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
+    box = np.array([[-0.5] * 3, [0.5] * 3])
+    write_field(Path("other.npz"), "albedo", np.ones((4, 5, 7)), box)
+    write_field(Path("moved.npz"), "albedo", np.ones((4, 5, 6)), 2 * box)
+    np.savez("nowhere.npz", density=np.ones((2, 2, 2)))
+    np.savez("none.npz", bounds=box)
+    for sources, words in (
+        (["density.npz", "other.npz"], "other.npz: has 7 x 5 x 4 cells (x, y, z), the first field 6 x 5 x 4"),
+        (["density.npz", "moved.npz"], "moved.npz: lies in the box [[-1.0"),
+        (["density.npz", "density.npz"], "has a field 'density', and so has a file before it"),
+        (["nowhere.npz"], "says no box"),
+        (["none.npz"], "has no fields"),
+    ):
+        assert words in refuse(3, "export", *sources, "-o", "all.npz")[-1]
+        assert not Path("all.npz").exists()
+    np.savez("two.npz", density=np.ones((2, 2, 2)), albedo=np.ones((2, 2, 2)), bounds=box)
+    assert "a .vol holds one field, not density, albedo" in refuse(3, "export", "two.npz", "-o", "two.vol")[-1]
+    succeed("export", "two.npz", "-o", "two.vti")
+    assert "two.vti: already there" in refuse(2, "export", "density.npz", "-o", "two.vti")[-1]
+    succeed("export", "density.npz", "-o", "two.vti", "--overwrite")
 
 
 def test_no_folder(refuse: Refuse, folder: Path) -> None:
