@@ -194,6 +194,7 @@ G_ALONE = (
     "optimize.iterations=60",
 )
 """Overrides that leave nothing but g to be found."""
+PARTS = {name: (f"optimize.derivatives={name}",) for name in ("all", "diffusion", "single")}
 FINE = "volume.resolution=[192, 192, 192]"
 EXPERIMENTS = (
     Experiment("fig13", "fig13", show_density("bunny", "ring_00"), ("optimize.iterations=1000",)),
@@ -202,9 +203,7 @@ EXPERIMENTS = (
     Experiment("fig10", "fig10", show_optics, ("optimize.iterations=3000",), {"": (), "g_alone": G_ALONE}),
     Experiment("fig12_single", "smoke", show_smoke, (FINE,)),
     Experiment("fig12_four", "smoke", show_four, (FINE,)),
-    Experiment(
-        "fig09", "knot", show_derivatives, variants={name: (f"optimize.derivatives={name}",) for name in ("all", "diffusion", "single")}
-    ),
+    Experiment("fig09", "knot", show_derivatives, ("optimize.iterations=100",), PARTS),
     Experiment("fig14", "", show_photograph, (FINE, "views.0.image=../../data/cumulus/cumulus.webp")),
 )
 """In the order of docs/experiments.md."""
