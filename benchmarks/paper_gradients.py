@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
+from paper import as_options, ddrecon
 from paper_figures import Array, save, show
 
 from ddrecon.io.volumes import read_field, write_field
@@ -52,11 +52,6 @@ class Change:
     after: str
 
 
-def ddrecon(*arguments: str | Path) -> None:
-    """Runs a command, quietly."""
-    subprocess.run(["ddrecon", *arguments, "-q", "--overwrite"], check=True, stdout=subprocess.DEVNULL)
-
-
 def changes(folder: Path) -> list[Change]:
     """Both changes, with the volumes they need in `folder`."""
     cloud = read_field(CLOUD, "density")
@@ -87,8 +82,7 @@ def traced(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
 def ours(change: Change, folder: Path, model: str) -> Array:
     """Our derivative image [h, w] by one of `MODELS`."""
     output = folder / f"{change.parameter}_{model[0]}"
-    options = [part for override in (change.between, *MODELS[model]) for part in ("-D", override)]
-    ddrecon("render", CONFIG, "-o", output, "--gradient", change.parameter, *options)
+    ddrecon("render", CONFIG, "-o", output, "--gradient", change.parameter, *as_options([change.between, *MODELS[model]]))
     derivative: Array = np.load(output / "front.gradient.npy").mean(-1)
     return derivative
 
@@ -96,7 +90,7 @@ def ours(change: Change, folder: Path, model: str) -> Array:
 def regions(folder: Path) -> dict[str, NDArray[np.bool_]]:
     """Pixels [h, w] by what part of a light behind the cloud they would let through."""
     black = ["volume.sigma_s=0", "volume.sigma_a=12", "lights=[{type: ambient, radiance: 1}]"]
-    ddrecon("render", CONFIG, "-o", folder / "through", *(part for override in black for part in ("-D", override)))
+    ddrecon("render", CONFIG, "-o", folder / "through", *as_options(black))
     through = np.load(folder / "through" / "front.npy").mean(-1)
     return {"thick": through < 0.2, "thin": (through >= 0.2) & (through < 0.95), "empty": through >= 0.95}
 

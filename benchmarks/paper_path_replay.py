@@ -19,6 +19,7 @@ import torch
 from paper_figures import Array, projected, save, show
 from torch import Tensor
 
+from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.io.volumes import read_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
@@ -37,8 +38,6 @@ CONFIG = ROOT / "configs" / "paper" / "fig07.yaml"
 PICTURE = ROOT / "docs" / "pictures" / "paper" / "fig07.png"
 TARGET = ROOT / "data" / "paper" / "fig07" / "front.npy"
 PATHS, RATE = 64, 0.1
-DENSITY = ".sigma_t.data"
-"""How the name of the density ends among Mitsuba's parameters."""
 Steps = list[tuple[float, float]]
 """Seconds since the start, and the loss, of each iteration."""
 

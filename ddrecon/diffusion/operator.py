@@ -92,7 +92,10 @@ def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
 
 
 def harmonic_mean(u: Tensor, axis: int) -> Tensor:
-    """The harmonic mean of the cells on both sides of every interior face along `axis`; `u`: `[C, z, y, x]`, > 0."""
+    """The harmonic mean (E7) of the cells on both sides of every interior face along `axis`, in the units of `u`: `[C, z, y, x]`, > 0.
+
+    One entry shorter than `u` along `axis`.
+    """
     mean: Tensor = _HarmonicMean.apply(u, axis)
     return mean
 
