@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -17,6 +17,7 @@ from ddrecon.errors import SceneError, SolveError
 from ddrecon.io.folders import prepare_folder
 from ddrecon.io.json_file import write_json
 from ddrecon.reconstruct.checkpoint import load_checkpoint
+from ddrecon.reconstruct.events import event_log
 from ddrecon.reconstruct.loop import Reconstruction, Row
 from ddrecon.reconstruct.run_folder import CHECKPOINT, RunFolder
 from ddrecon.scene.dump import describe, dump_scene
@@ -39,7 +40,7 @@ def open_run(
     if resume:
         _resume(run, path, text)
     prepare_folder(path, may_exist=may_exist or resume)
-    folder = RunFolder(path, text)
+    folder = RunFolder(path, scene_file, text, environment)
     if not resume:
         folder.forget()
     dump_scene(scene_file, path / "scene.yaml")
@@ -60,8 +61,8 @@ def scene_text(scene_file: SceneFile) -> str:
     return json.dumps(described, indent=1)
 
 
-def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool) -> dict[str, Any]:
-    """Advances `run` until it is done, writing to `folder`; returns the summary.
+def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool, has_events: bool = False) -> dict[str, Any]:
+    """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as well; returns the summary.
 
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations; it and any failure write a checkpoint of the last good state
     before they are passed on.
@@ -71,11 +72,14 @@ def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_
     try:
         with (
             deferred_interrupt() as asked,
+            event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
             tqdm(total=total, initial=run.iteration, desc="optimize", file=sys.stderr, disable=is_quiet) as bar,
         ):
             while not run.is_done:
                 row = run.step()
                 folder.log(row)
+                if events is not None:
+                    events.log(row)
                 bar.set_postfix_str(progress_text(row, run.rows), refresh=False)
                 bar.update()
                 if preview_every and row.iteration % preview_every == 0:

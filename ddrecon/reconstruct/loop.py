@@ -7,7 +7,7 @@ whoever drives it may log, preview, stop or save between any two.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
@@ -84,6 +84,7 @@ class Reconstruction:
         self.train = _with_images(scene, is_test=False)
         if not self.train.views:
             raise SceneError("views: none has split: train and an image; there is nothing to reconstruct from")
+        _require_seen_cameras(self.settings.parameters, self.train)
         self.test = _with_images(scene, is_test=True)
         self.power = float(torch.stack([view.image.square().mean() for view in self.train.views if view.image is not None]).mean())
         self.factors = factors(scene, self.settings.refine_at)
@@ -226,6 +227,16 @@ class Reconstruction:
     def _diverged(self, what: str, loss: float) -> DivergenceError:
         rates = " and ".join(f"optimize.parameters.{parameter.name}.lr" for parameter in self.parameters)
         return DivergenceError(f"{what} is not finite", self.iteration, loss, f"lower {rates}")
+
+
+def _require_seen_cameras(names: Iterable[str], train: Scene) -> None:
+    """Raises SceneError where `names` has the camera of a view that is not among those of `train`, and so is never looked at."""
+    seen = {f"views.{view.name}.camera" for view in train.views}
+    unseen = [name for name in names if name.startswith("views.") and name not in seen]
+    if unseen:
+        raise SceneError(
+            [f"optimize.parameters.{name}: its view has no image, or split: test; only training views tell of cameras" for name in unseen]
+        )
 
 
 def _parameter(scene: Scene, name: str, settings: ParameterSettings) -> Parameter:
