@@ -10,7 +10,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,18 +106,19 @@ def render(
     session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], components: bool, parameter: str | None
 ) -> None:
     """Render the views of SCENE."""
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
     from ddrecon.render_folder import render_gradient_to_folder, render_to_folder, require_variation
 
     loaded = session.load(scene)
     views = session.chosen_views(loaded, names)
-    if parameter is None:
-        prepare_folder(output, may_exist=overwrite)
-        report = render_to_folder(loaded, views, output, components, session.progress)
-    else:
+    if parameter is not None:
         require_variation(loaded, parameter)
-        prepare_folder(output, may_exist=overwrite)
-        report = render_gradient_to_folder(loaded, views, output, components, parameter, session.progress)
+    with claimed_folder(output, may_exist=overwrite):
+        settings = views, output, components
+        if parameter is None:
+            report = render_to_folder(loaded, *settings, session.progress)
+        else:
+            report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
     session.show(report, session.render_lines(report, output))
 
 
@@ -135,13 +136,16 @@ def optimize(
     session: Session, scene: Path, output: Path, overwrite: bool, iterations: int | None, resume: bool, preview_every: int | None
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.reconstruct.drive import drive, open_run
+    from ddrecon.reconstruct.drive import drive, opened_run
 
     if iterations is not None:
         session = session.overriding(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
-    run, folder = open_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume)
-    summary = drive(run, folder, preview_every, session.is_quiet)
+    with opened_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume) as (
+        run,
+        folder,
+    ):
+        summary = drive(run, folder, preview_every, session.is_quiet)
     session.show(summary, session.summary_lines(summary, output))
 
 
@@ -183,11 +187,10 @@ def bench(
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     require_folder_of(report)
     from ddrecon.bench.run import bench_hard, bench_speed
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
 
-    if output is not None:
-        prepare_folder(output, may_exist=overwrite)
-    has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
+    with nullcontext() if output is None else claimed_folder(output, may_exist=overwrite):
+        has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
     if not has_passed:
         sys.exit(1)
 
@@ -206,17 +209,17 @@ def reference(
     session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], samples: int, is_only_traced: bool
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
     from ddrecon.reference.compare import compare_to_folder, trace_to_folder, write_report
     from ddrecon.reference.trace import open_tracer
 
     loaded = session.load(scene)
     views = session.chosen_views(loaded, names)
     tracer = open_tracer(loaded, views, threads=session.threads)
-    prepare_folder(output, may_exist=overwrite)
-    settings = output, samples, session.seed, session.progress
-    found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
-    report = write_report(output, found, session.environment())
+    with claimed_folder(output, may_exist=overwrite):
+        settings = output, samples, session.seed, session.progress
+        found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
+        report = write_report(output, found, session.environment())
     session.show(report, session.reference_lines(report, output))
 
 

@@ -32,7 +32,15 @@ def read_json(path: str) -> Any:
 def test_the_files_of_a_run(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out")
     expected = ["scene.yaml", "environment.json", "loss.csv", "parameters.json", "summary.json", "volumes", "volumes/density.npz"]
-    expected += ["checkpoints", "checkpoints/last.pt", "previews", "previews/density.slices.png", "previews/front.png", "previews/side.png"]
+    expected += [
+        "checkpoints",
+        "checkpoints/last.pt",
+        "checkpoints/previous.pt",
+        "previews",
+        "previews/density.slices.png",
+        "previews/front.png",
+        "previews/side.png",
+    ]
     assert set(contents(Path("out"))) == set(expected)
     parameters = read_json("out/parameters.json")
     assert parameters["g"] == pytest.approx(0.3) and parameters["lights.0.irradiance"] == [3]
@@ -131,4 +139,4 @@ def test_divergence_keeps_the_last_good_state(run: Run) -> None:
     (line,) = result.stderr.splitlines()
     assert "not finite" in line and "lower optimize.parameters.density.lr" in line
     state = torch.load("out/checkpoints/last.pt", weights_only=True)["state"]
-    assert torch.isfinite(state["parameters"]["density"]["value"]).all() and len(state["rows"]) == len(rows("out"))
+    assert torch.isfinite(state["parameters"]["density"]["value"]).all() and state["total"]["iteration"] == len(rows("out")) - 1
