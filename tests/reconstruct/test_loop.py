@@ -104,7 +104,7 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
 
 def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
     assert ball_scene.optimize is not None
-    run = Reconstruction(replace(ball_scene, optimize=replace(ball_scene.optimize, views_per_iteration=0)))
+    run = Reconstruction(replace(ball_scene, optimize=replace(ball_scene.optimize, views_per_iteration=0, refine_at=())))
     run.step()
     good = run.parameters[0].value.detach().clone()
     run.step()
