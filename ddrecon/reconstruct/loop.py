@@ -26,8 +26,8 @@ from ddrecon.reconstruct.rates import default_rate, rate_at
 from ddrecon.reconstruct.tolerance import enough
 from ddrecon.reconstruct.views import chosen
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import ParameterSettings
-from ddrecon.variables import value_of, with_values
+from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
+from ddrecon.variables import value_of, variable_names, with_values
 from ddrecon.world import Scene, View
 
 TEST_EVERY = 10
@@ -100,6 +100,7 @@ class Reconstruction:
         if not self.train.views:
             raise SceneError("views: none has split: train and an image; there is nothing to reconstruct from")
         self.test = _with_images(scene, is_test=True)
+        _require_usable(self.train, self.settings)
         self.power = float(torch.stack([view.image.square().mean() for view in self.train.views if view.image is not None]).mean())
         self.factors = factors(scene, self.settings.refine_at)
         self.parameters = [_parameter(scene, name, settings) for name, settings in self.settings.parameters.items()]
@@ -229,7 +230,8 @@ class Reconstruction:
         if not self.test_level.views:
             return None
         with torch.no_grad():
-            level = with_values(self.test_level, self._values())
+            known = variable_names(self.test_level)
+            level = with_values(self.test_level, {name: value for name, value in self._values().items() if name in known})
             return _mean_psnr(render_each(level, level.views, self.memory), level.views)
 
     def _differentiated(self, seen: list[View]) -> Differentiated:
@@ -260,6 +262,18 @@ def _parameter(scene: Scene, name: str, settings: ParameterSettings) -> Paramete
     start = scene.starts.get(name)
     start = value_of(scene, name) if start is None else start
     return Parameter(name, settings, settings.lr or default_rate(scene, name, start), start, scene.volume.grid)
+
+
+def _require_usable(train: Scene, settings: OptimizeSettings) -> None:
+    """Raises SceneError where a parameter does not touch the training views, or a target has pixels that are no numbers."""
+    known = variable_names(train)
+    absent = [name for name in settings.parameters if name not in known]
+    problems = [f"optimize.parameters.{name}: there is no training view of this name with an image" for name in absent]
+    for view in train.views:
+        if view.image is not None and (place := flawed_place("the image", view.image, is_field=False)):
+            problems.append(f"views.{view.name}: {place} is not finite")
+    if problems:
+        raise SceneError(problems)
 
 
 def _with_images(scene: Scene, is_test: bool) -> Scene:
