@@ -10,7 +10,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,7 +118,7 @@ def render(
     has_mp4: bool,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run."""
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
     from ddrecon.io.json_file import write_json
     from ddrecon.io.movies import require_mp4
     from ddrecon.render_folder import render_gradient_to_folder, render_to_folder, require_variation, write_ring
@@ -133,14 +133,15 @@ def render(
         loaded, views = session.without_targets(loaded, views, count)
     if parameter is not None:
         require_variation(loaded, parameter)
-    prepare_folder(output, may_exist=overwrite)
-    if parameter is None:
-        report = render_to_folder(loaded, views, output, components, session.progress)
-    else:
-        report = render_gradient_to_folder(loaded, views, output, components, parameter, session.progress)
-    if count is not None:
-        report["ring"] = write_ring(views, output, has_mp4)
-    write_json(output / "render.json", report)
+    with claimed_folder(output, may_exist=overwrite):
+        settings = views, output, components
+        if parameter is None:
+            report = render_to_folder(loaded, *settings, session.progress)
+        else:
+            report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
+        if count is not None:
+            report["ring"] = write_ring(views, output, has_mp4)
+        write_json(output / "render.json", report)
     session.show(report, session.render_lines(report, output))
 
 
@@ -166,7 +167,7 @@ def optimize(
     has_events: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.reconstruct.drive import drive, open_run
+    from ddrecon.reconstruct.drive import drive, opened_run
     from ddrecon.reconstruct.events import require_tensorboard
 
     if has_events:
@@ -175,8 +176,11 @@ def optimize(
     if iterations is not None:
         session = session.overriding(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
-    run, folder = open_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume)
-    summary = drive(run, folder, preview_every, session.is_quiet, has_events)
+    with opened_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume) as (
+        run,
+        folder,
+    ):
+        summary = drive(run, folder, preview_every, session.is_quiet, has_events)
     session.show(summary, session.summary_lines(summary, output))
 
 
@@ -220,11 +224,10 @@ def bench(
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     require_folder_of(report)
     from ddrecon.bench.run import bench_hard, bench_speed
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
 
-    if output is not None:
-        prepare_folder(output, may_exist=overwrite)
-    has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
+    with nullcontext() if output is None else claimed_folder(output, may_exist=overwrite):
+        has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
     if not has_passed:
         sys.exit(1)
 
@@ -243,17 +246,17 @@ def reference(
     session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], samples: int, is_only_traced: bool
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
     from ddrecon.reference.compare import compare_to_folder, trace_to_folder, write_report
     from ddrecon.reference.trace import open_tracer
 
     loaded = session.load(scene)
     views = session.chosen_views(loaded, names)
     tracer = open_tracer(loaded, views, threads=session.threads)
-    prepare_folder(output, may_exist=overwrite)
-    settings = output, samples, session.seed, session.progress
-    found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
-    report = write_report(output, found, session.environment())
+    with claimed_folder(output, may_exist=overwrite):
+        settings = output, samples, session.seed, session.progress
+        found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
+        report = write_report(output, found, session.environment())
     session.show(report, session.reference_lines(report, output))
 
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import csv
+import os
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -12,11 +16,12 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.io.atomic import replacing
+from ddrecon.errors import DataWarning
+from ddrecon.io.atomic import flush, refusals, remove_temporaries, replacing
 from ddrecon.io.images import write_linear, write_preview
 from ddrecon.io.json_file import write_json
 from ddrecon.io.volumes import write_field
-from ddrecon.reconstruct.checkpoint import save_checkpoint
+from ddrecon.reconstruct.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.reconstruct.loop import Reconstruction, Row
 from ddrecon.reconstruct.losses import psnr
 from ddrecon.reconstruct.previews import comparison, slices
@@ -28,39 +33,85 @@ from ddrecon.scene.load import SceneFile
 from ddrecon.variables import VOLUME, value_of, variable_names
 from ddrecon.world import Scene
 
-CHECKPOINT = Path("checkpoints", "last.pt")
-"""Where a run folder keeps its checkpoint."""
+CHECKPOINTS = "checkpoints"
+"""Where a run folder keeps its checkpoints."""
+CHECKPOINT_SECONDS = 60.0
+"""A run writes a checkpoint about this often,"""
+CHECKPOINT_SHARE = 0.05
+"""unless that would take more than this part of its time."""
 COLUMNS = [field.name for field in fields(Row)]
+KINDS: list[Callable[[str], Any]] = [int, float, float, float, lambda text: float(text) if text else None, int, int, int]
+"""What the cells of a row are."""
 
 
 class RunFolder:
-    """The output folder `path` of one run of `scene_file`, whose resolved text is `scene_text`, in an `environment`."""
+    """The output folder `path` of one run of `scene_file` in an `environment`; `result_of` is what the run's result depends on."""
 
-    def __init__(self, path: Path, scene_file: SceneFile, scene_text: str, environment: dict[str, Any]):
-        self.path, self.scene_file, self.scene_text, self.environment = path, scene_file, scene_text, environment
-        for name in ("volumes", "previews", "checkpoints"):
-            (path / name).mkdir(exist_ok=True)
-        self.checkpoint = path / CHECKPOINT
+    def __init__(self, path: Path, scene_file: SceneFile, result_of: Mapping[str, Any], environment: Mapping[str, Any]):
+        self.path, self.scene_file, self.result_of, self.environment = path, scene_file, result_of, environment
+        with refusals(path):
+            for name in ("volumes", "previews", CHECKPOINTS):
+                (path / name).mkdir(exist_ok=True)
+                remove_temporaries(path / name)
+            remove_temporaries(path)
+        self.checkpoints, self.log_file = path / CHECKPOINTS, path / "loss.csv"
+        self.saved, self.next_save = -1, 0.0
 
-    def forget(self) -> None:
-        """Removes the checkpoint of a run that was made here before."""
-        self.checkpoint.unlink(missing_ok=True)
+    def start(self, run: Reconstruction) -> None:
+        """Begins the log and the checkpoints of a new run; those of a run made here before are gone."""
+        with refusals(self.checkpoints):
+            forget_checkpoints(self.checkpoints)
+        self._write_log([])
+        self.save(run)
 
-    def start_log(self, rows: list[Row]) -> None:
-        """Writes `loss.csv` with the rows made so far: none at first, those of the checkpoint after a resume."""
-        with replacing(self.path / "loss.csv") as temporary, temporary.open("w", newline="") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(COLUMNS)
-            writer.writerows(_cells(row) for row in rows)
+    def resume(self, run: Reconstruction, loaded: Path) -> None:
+        """Goes on with `run` from the checkpoint `loaded`: the log ends where it does, and a damaged one after it is gone."""
+        with refusals(loaded):
+            os.replace(loaded, self.checkpoints / LAST)
+        rows = self._logged()[: run.iteration]
+        if len(rows) < run.iteration:
+            warnings.warn(f"{self.log_file}: has {len(rows)} of the {run.iteration} iterations made", DataWarning, 2)
+        self._write_log(rows)
+        self._note_saved(run, 0.0)
 
     def log(self, row: Row) -> None:
         """Adds one row to `loss.csv`."""
-        with (self.path / "loss.csv").open("a", newline="") as stream:
+        with refusals(self.log_file), self.log_file.open("a", newline="") as stream:
             csv.writer(stream).writerow(_cells(row))
 
     def save(self, run: Reconstruction) -> None:
-        """Writes the checkpoint."""
-        save_checkpoint(self.checkpoint, run.state(), self.scene_text)
+        """Writes a checkpoint, unless the last is of this very iteration; the log has all rows before it, whatever happens."""
+        if self.saved != run.iteration:
+            start = monotonic()
+            flush(self.log_file)
+            save_checkpoint(self.checkpoints, run.state(), self.result_of)
+            self._note_saved(run, monotonic() - start)
+
+    def save_in_time(self, run: Reconstruction) -> None:
+        """Writes a checkpoint if the last is old."""
+        if monotonic() >= self.next_save:
+            self.save(run)
+
+    def _note_saved(self, run: Reconstruction, seconds: float) -> None:
+        self.saved, self.next_save = run.iteration, monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
+
+    def _write_log(self, rows: list[list[str]]) -> None:
+        with replacing(self.log_file) as temporary, temporary.open("w", newline="") as stream:
+            csv.writer(stream).writerows([COLUMNS, *rows])
+
+    def _logged(self) -> list[list[str]]:
+        """The rows of `loss.csv` up to the first that is not whole, or not the next iteration's."""
+        try:
+            with self.log_file.open(newline="", errors="replace") as stream:
+                _, *rows = csv.reader(stream)
+        except (OSError, ValueError, csv.Error):
+            return []
+        count = next((i for i, row in enumerate(rows) if len(row) != len(COLUMNS) or row[0] != str(i + 1)), len(rows))
+        return rows[:count]
+
+    def _rows(self) -> list[Row]:
+        """The log as it was written."""
+        return [Row(*(kind(cell) for kind, cell in zip(KINDS, row, strict=True))) for row in self._logged()]
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
@@ -81,7 +132,7 @@ class RunFolder:
         summary = _summary(run) | {"views": quality}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
-        findings = Findings(scene, light_field, images, quality, run.rows, summary, self.environment, settings)
+        findings = Findings(scene, light_field, images, quality, self._rows(), summary, self.environment, settings)
         write_report(self.path / "report.html", findings)
         return summary
 
@@ -149,14 +200,5 @@ def _cells(row: Row) -> list[Any]:
 
 
 def _summary(run: Reconstruction) -> dict[str, Any]:
-    last, tests = run.rows[-1], [row.test_psnr for row in run.rows if row.test_psnr is not None]
-    return {
-        "iterations": run.iteration,
-        "seconds": last.seconds,
-        "loss": last.loss,
-        "psnr": last.psnr,
-        "test_psnr": tests[-1] if tests else None,
-        "forward_iterations": sum(row.forward_iterations for row in run.rows),
-        "adjoint_iterations": sum(row.adjoint_iterations for row in run.rows),
-        "cells": last.cells,
-    }
+    total = dict(vars(run.total))
+    return {"iterations": total.pop("iteration"), **total}

@@ -62,14 +62,17 @@ def finished(folder: Path, cross_sections: str, parameters: str) -> Any:
     np.save(folder / "sky.npy", random.random((4, 8, 3), dtype=np.float32))
     scene_file = read_scene(path)
     run = Reconstruction(build_scene(scene_file))
-    run.step()
+    row = run.step()
     for parameter in run.parameters:
         limit = 0.9 if parameter.name == "albedo" else torch.inf
         state = parameter.state()
         parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
     (folder / "out").mkdir()
     dump_scene(scene_file, folder / "out" / "scene.yaml")
-    RunFolder(folder / "out", scene_file, "", {}).finish(run)
+    run_folder = RunFolder(folder / "out", scene_file, {}, {})
+    run_folder.start(run)
+    run_folder.log(row)
+    run_folder.finish(run)
     return run.current_scene()
 
 
