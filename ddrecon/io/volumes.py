@@ -12,6 +12,8 @@ from ddrecon.errors import FormatError
 from ddrecon.io.field import Field, Fields
 from ddrecon.io.mitsuba import read_vol, vol_names, write_vol
 from ddrecon.io.npz import npz_names, read_npz, write_npz
+from ddrecon.io.vdb import write_vdb
+from ddrecon.io.vdb_reader import read_vdb, vdb_names
 from ddrecon.io.vti import read_vti, vti_names, write_vti
 
 
@@ -27,6 +29,7 @@ class VolumeFormat:
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(npz_names, read_npz, write_npz),
     ".vol": VolumeFormat(vol_names, read_vol, write_vol),
+    ".vdb": VolumeFormat(vdb_names, read_vdb, write_vdb),
     ".vti": VolumeFormat(vti_names, read_vti, write_vti),
 }
 
