@@ -1,7 +1,7 @@
 """OpenVDB files (.vdb), for Blender, Houdini and Karma: each field a fog volume of its own name, float, or vec3s for colors.
 
-Voxel (i, j, k) of a file is our cell (i, j, k) along x, y, z; its center is where the grid's transform puts that index. The background is 0,
-and active is what is not 0. How many cells the box has, which a sparse grid does not say, stands in the metadata `ddrecon_resolution`.
+Voxel (i, j, k) of a file is our cell (i, j, k) along x, y, z; its center is where the grid's transform puts that index. The background
+is 0, and active is what is not 0. How many cells the box has, which a sparse grid does not say, is its metadata `ddrecon_resolution`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _grid(name: str, values: np.ndarray, bounds: np.ndarray, start: int) -> byte
 
 @dataclass(frozen=True)
 class _Leaf:
-    """8^3 voxels: under which child of the root (x, y, z), number `upper` of its children, `lower` of that one's; active ones; their values."""
+    """8^3 voxels: under which child of the root (x, y, z), under which of its and of that one's children; the active ones, their values."""
 
     root: tuple[int, int, int]
     upper: int
