@@ -52,9 +52,10 @@ class Constant:
 
 @dataclass(frozen=True)
 class FieldFile:
-    """Values per cell, from a volume file."""
+    """Values per cell, from a volume file, where they are called `name` (None: as in the scene)."""
 
     file: Path
+    name: str | None = None
 
 
 Density = float | FieldFile

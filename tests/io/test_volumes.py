@@ -91,7 +91,7 @@ def test_a_missing_name_lists_what_there_is(tmp_path: Path):
 
 def test_a_single_other_name_says_which_to_use(tmp_path: Path):
     path = saved(tmp_path / "f.npz", arr_0=np.ones((2, 2, 2)), bounds=BOUNDS)
-    assert refusal(path) == "has no field 'density', only 'arr_0'; save that array under the name 'density'"
+    assert refusal(path) == "has no field 'density', only 'arr_0'; save that array as 'density', or say name: arr_0 beside file"
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 1), (0, 2, 2)])
