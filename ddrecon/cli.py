@@ -266,13 +266,20 @@ def reference(
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
 @in_session
 def export(session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool) -> None:
-    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), or all fields of VOLUMEs in the format of FILE's suffix."""
-    if output.suffix.lower() == ".xml":
+    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as NeRF's transforms.json), or all fields of
+    VOLUMEs in the format of FILE's suffix."""
+    kind = output.suffix.lower()
+    if kind in (".xml", ".json") and len(sources) > 1:
+        raise click.UsageError(f"one scene at a time is written as {kind}")
+    if kind == ".xml":
         from ddrecon.reference.export import export_scene
 
-        if len(sources) > 1:
-            raise click.UsageError("one scene at a time is written for Mitsuba")
         written = export_scene(session.load(sources[0]), output, may_exist=overwrite)
+    elif kind == ".json":
+        from ddrecon.scene.export_transforms import export_transforms
+
+        scene_file = session.read(sources[0])
+        written = export_transforms(session.build(scene_file), scene_file, output, may_exist=overwrite)
     else:
         from ddrecon.io.convert import convert
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddrecon.errors import MissingExtraError
+from ddrecon.extras import load_extra
 from ddrecon.io import srgb
 from ddrecon.io.atomic import replacing
 
@@ -36,10 +36,7 @@ def write_animation(path: Path, frames: np.ndarray) -> None:
 
 def require_mp4() -> None:
     """Raises MissingExtraError where no encoder for MP4 is installed."""
-    try:
-        import imageio_ffmpeg  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise MissingExtraError('MP4 needs: pip install "ddrecon[mp4]"') from error
+    load_extra("imageio_ffmpeg", "MP4")
 
 
 def write_mp4(path: Path, frames: np.ndarray) -> None:

@@ -13,6 +13,9 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.io.atomic import replacing
 
+MARK = "bounds"
+"""What the description of a stack that we wrote says, besides what ImageJ says."""
+DESCRIPTION = 270
 WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, OFFSETS = 256, 257, 258, 259, 262, 273
 ORIENTATION, SAMPLES, ROWS, COUNTS, PLANAR, SAMPLE_FORMAT = 274, 277, 278, 279, 284, 339
 _TYPES = {3: "H", 4: "I"}
@@ -58,6 +61,21 @@ def read_tiff(path: Path) -> np.ndarray:
         raise FormatError(path, f"is damaged: its strips do not hold {width} x {height} x {samples} floats")
     image = np.frombuffer(b"".join(strips), f"{order}f4").reshape(height, width, samples).astype(np.float32)
     return image[..., 0] if samples == 1 else image
+
+
+def is_stack(path: Path) -> bool:
+    """Whether the file at `path` is a TIFF of several pages, a large one (BigTIFF), or of one page whose description says a box."""
+    data = path.read_bytes()
+    try:
+        order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (entries,) = struct.unpack_from(f"{order}H", data, start)
+        (following,) = struct.unpack_from(f"{order}I", data, start + 2 + 12 * entries)
+        tags = [struct.unpack_from(f"{order}HHII", data, start + 2 + 12 * index) for index in range(entries)]
+    except (KeyError, struct.error):
+        return data[:4] in (b"II+\0", b"MM\0+")
+    texts = [data[offset : offset + count] for tag, _, count, offset in tags if tag == DESCRIPTION]
+    return following != 0 or any(f"\n{MARK}=".encode() in text for text in texts)
 
 
 def _read_tags(data: bytes, order: str) -> dict[int, tuple[int, ...]]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from ddrecon.errors import MissingExtraError
+from ddrecon.extras import load_extra
 from ddrecon.reconstruct.loop import Row
 
 FOLDER = "tensorboard"
@@ -17,8 +16,7 @@ FOLDER = "tensorboard"
 
 def require_tensorboard() -> None:
     """Raises MissingExtraError where TensorBoard is not installed."""
-    if find_spec("tensorboard") is None:
-        raise MissingExtraError('--tensorboard needs: pip install "ddrecon[tensorboard]"')
+    load_extra("tensorboard", "--tensorboard")
 
 
 class EventLog:
