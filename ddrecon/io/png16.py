@@ -18,6 +18,7 @@ from ddrecon.io.arrays import check_size
 MAGIC = b"\x89PNG\r\n\x1a\n"
 CHANNELS = {2: 3, 4: 2, 6: 4}
 """How many a color type has; gray alone (0) Pillow reads in full."""
+BAND = 512
 HEADER = struct.Struct(">IIBBBBB")
 
 
@@ -63,24 +64,42 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _unfiltered(filters: np.ndarray, stored: np.ndarray) -> np.ndarray:
-    """The bytes [h, w, b] that the `filters` [h] of rows took their predictions from.
+    """The bytes [h, w, b] that were stored less a prediction each, by the `filters` [h] of their rows; `BAND` rows at a time."""
+    known = np.zeros((len(stored) + 1, *stored.shape[1:]), np.uint8)
+    for top in range(0, len(stored), BAND):
+        band = slice(top, top + BAND)
+        known[1:][band] = _unfiltered_band(filters[band], stored[band], known[top])
+    return known[1:]
 
-    A byte is predicted from those to its left, above, and above left; so all places of an antidiagonal are found at once.
+
+def _unfiltered_band(filters: np.ndarray, stored: np.ndarray, previous: np.ndarray) -> np.ndarray:
+    """The same of rows below `previous` [w, b].
+
+    A byte is predicted from those to its left, above, and above left, so all places of an antidiagonal are found at once. Arrays are
+    skewed: their first axis is row + column, so that an antidiagonal, and what it follows from, are contiguous.
     """
     height, width, depth = stored.shape
-    known = np.zeros((height + 1, width + 1, depth), np.int16)
-    for diagonal in range(height + width - 1):
-        rows = np.arange(max(0, diagonal - width + 1), min(height, diagonal + 1))
-        columns = diagonal - rows
-        left, above, corner = known[rows + 1, columns], known[rows, columns + 1], known[rows, columns]
-        guesses = np.stack([np.zeros_like(left), left, above, (left + above) >> 1, _paeth(left, above, corner)])
-        known[rows + 1, columns + 1] = (stored[rows, columns] + guesses[filters[rows], np.arange(len(rows))]) & 255
-    return np.ascontiguousarray(known[1:, 1:]).astype(np.uint8)
+    given, known = np.zeros((height + width - 1, height, depth), np.int16), np.zeros((height + width + 1, height + 1, depth), np.int16)
+    _straight(given, height, width)[:] = stored
+    known[1 : width + 1, 0] = previous
+    is_left, is_above, is_mean, is_paeth = ((filters[:, None] == kind).astype(np.int16) for kind in (1, 2, 3, 4))
+    for line in range(height + width - 1):
+        rows = slice(max(0, line - width + 1), min(height, line + 1))
+        left, above, corner = known[line + 1, 1:][rows], known[line + 1, :-1][rows], known[line, :-1][rows]
+        guess = is_left[rows] * left + is_above[rows] * above + is_mean[rows] * ((left + above) >> 1)
+        guess += is_paeth[rows] * _paeth(left, above, corner)
+        known[line + 2, 1:][rows] = (given[line, rows] + guess) & 255
+    return _straight(known[2:, 1:], height, width).astype(np.uint8)
+
+
+def _straight(skewed: np.ndarray, height: int, width: int) -> np.ndarray:
+    """A view of `skewed` [row + column, row, b] as [row, column, b]."""
+    along, row, byte = skewed.strides
+    return np.lib.stride_tricks.as_strided(skewed, (height, width, skewed.shape[2]), (along + row, along, byte))
 
 
 def _paeth(left: np.ndarray, above: np.ndarray, corner: np.ndarray) -> np.ndarray:
     """Whichever of the three is closest to left + above - corner, the first where they tie."""
-    guess = left + above - corner
-    distances = [np.abs(guess - one) for one in (left, above, corner)]
-    is_left = (distances[0] <= distances[1]) & (distances[0] <= distances[2])
-    return np.where(is_left, left, np.where(distances[1] <= distances[2], above, corner))
+    by_left, by_above = np.abs(above - corner), np.abs(left - corner)
+    by_corner = np.abs(left + above - 2 * corner)
+    return np.where((by_left <= by_above) & (by_left <= by_corner), left, np.where(by_above <= by_corner, above, corner))

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image as Pillow
 
 from ddrecon.errors import FormatError
-from ddrecon.io import srgb
+from ddrecon.io import png16, srgb
 from ddrecon.io.images import read_image
 
 COLOR_TYPES = {2: 4, 3: 2, 4: 6}
@@ -66,6 +66,14 @@ def test_the_encoder_of_these_tests_is_right(tmp_path: Path, channels: int) -> N
     stored = (deep(channels) >> 8).astype(np.uint8)
     (tmp_path / "a.png").write_bytes(encoded(stored, FILTERS))
     assert np.array_equal(np.array(Pillow.open(tmp_path / "a.png")), stored)
+
+
+def test_bands_of_rows_follow_from_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored = deep(3)
+    for band in (1, 2, 3, 100):
+        monkeypatch.setattr(png16, "BAND", band)
+        (tmp_path / "a.png").write_bytes(encoded(stored, [4, 1, 3, 4, 2, 4, 3]))
+        assert np.array_equal(png16.read_deep_png(tmp_path / "a.png"), stored)
 
 
 def refusal(path: Path) -> str:
