@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.io.volumes import read_field
-from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.loop import optimize
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import rate_at
 from ddrecon.reference.mitsuba_scene import LONGEST
@@ -51,10 +51,8 @@ def smaller(picture: Array, times: int) -> Array:
 
 def by_us(scene: Scene) -> tuple[Steps, Array]:
     """Our reconstruction: its steps, and its density [z, y, x]."""
-    run = Reconstruction(scene)
-    while not run.is_done:
-        run.step()
-    return [(row.seconds, row.loss) for row in run.rows], run.current_scene().volume.density.numpy()
+    result = optimize(scene)
+    return [(row.seconds, row.loss) for row in result.rows], result.scene.volume.density.numpy()
 
 
 def by_path_replay(scene: Scene, target: Array, iterations: int) -> tuple[Steps, Array]:

@@ -49,7 +49,15 @@ class SolveError(DdreconError):
 
 
 class DivergenceError(SolveError):
-    """An optimization whose numbers are no longer finite."""
+    """An optimization that cannot go on: `iteration`, counted from 1, failed by what `what` says; `residual` is that of its solve."""
+
+    def __init__(self, iteration: int, what: str, residual: float, advice: str):
+        self.what, self.iterations, self.residual, self.advice = what, iteration, residual, advice
+        DdreconError.__init__(self, f"iteration {iteration}: {what}; {advice}")
+
+    def with_advice(self, more: str) -> DivergenceError:
+        """The same with `more` to know."""
+        return DivergenceError(self.iterations, self.what, self.residual, f"{self.advice}; {more}")
 
 
 class DataWarning(UserWarning):

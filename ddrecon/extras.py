@@ -7,7 +7,15 @@ from types import ModuleType
 
 from ddrecon.errors import FormatError, MissingExtraError
 
-EXTRAS = {"OpenEXR": "exr", "tifffile": "tiff", "netCDF4": "netcdf", "matplotlib": "plot", "mitsuba": "reference"}
+EXTRAS = {
+    "OpenEXR": "exr",
+    "tifffile": "tiff",
+    "netCDF4": "netcdf",
+    "matplotlib": "plot",
+    "mitsuba": "reference",
+    "imageio_ffmpeg": "mp4",
+    "tensorboard": "tensorboard",
+}
 """Which extra of ddrecon brings which package."""
 
 

@@ -18,7 +18,7 @@ def test_every_extra_brings_its_package_and_all_brings_every_extra() -> None:
     extras = {name: needs for name, needs in PROJECT.items() if name not in ("all", "dev")}
     assert set(extras) == set(EXTRAS.values())
     for package, name in EXTRAS.items():
-        assert any(need.startswith(f"{package}>=") for need in extras[name])
+        assert any(need.startswith(f"{package.replace('_', '-')}>=") for need in extras[name])
     assert PROJECT["all"] == [f"ddrecon[{','.join(extras)}]"]
 
 

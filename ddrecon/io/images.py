@@ -67,11 +67,17 @@ def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
 
 def write_preview(path: Path, pixels: np.ndarray) -> None:
     """Writes `pixels` [h, w, 3], linear, as an 8-bit sRGB .png at `path`, clipped to [0, 1]."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(png_of(pixels))
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
     import imageio.v3 as iio
 
-    encoded = srgb.encode(np.clip(np.nan_to_num(pixels), 0, 1))
-    with replacing(path) as temporary:
-        iio.imwrite(temporary, np.round(255 * encoded).astype(np.uint8), plugin="pillow", extension=".png")
+    encoded = np.round(255 * srgb.encode(np.clip(np.nan_to_num(pixels), 0, 1))).astype(np.uint8)
+    content: bytes = iio.imwrite("<bytes>", encoded, plugin="pillow", extension=".png")
+    return content
 
 
 def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
