@@ -86,8 +86,22 @@ def shown_warnings() -> Iterator[None]:
         yield
 
 
+def show_version(context: click.Context, parameter: click.Parameter, is_asked: bool) -> None:
+    """Prints what a run's result may depend on, and ends the program."""
+    if is_asked and not context.resilient_parsing:
+        import platform
+
+        import torch
+
+        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+        click.echo(f"ddrecon {__version__}, Python {platform.python_version()}, torch {torch.__version__}, device {device}")
+        context.exit()
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__)
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=show_version, help="Show versions and the device, and exit."
+)
 def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 

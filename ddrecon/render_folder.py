@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError
-from ddrecon.io.images import read_image, write_picture
+from ddrecon.io.images import PREVIEW, read_image, write_picture
 from ddrecon.io.movies import encoded, write_animation, write_mp4
 from ddrecon.reconstruct.losses import psnr
 from ddrecon.reconstruct.previews import diverging, pixels, white_of
@@ -93,7 +93,7 @@ def require_variation(scene: Scene, parameter: str) -> None:
 
 def _report(scene: Scene, memory: SolveMemory, seconds: dict[str, Any], files: dict[str, list[str]]) -> dict[str, Any]:
     solves = [{"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds} for r in memory.records]
-    return {"seconds": seconds, "solves": solves, "physics": needed_terms(scene), "files": files}
+    return {"seconds": seconds, "solves": solves, "physics": needed_terms(scene), "files": files, "preview": PREVIEW}
 
 
 def _images(light_field: LightField, scene: Scene, view: View, has_components: bool) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from ddrecon import __version__
 from ddrecon.errors import SceneError
+from ddrecon.extras import advice
 from ddrecon.reconstruct.result import RESULT
 from ddrecon.scene.build import build_scene
 from ddrecon.scene.load import SceneFile, read_scene
@@ -92,7 +93,7 @@ class Session:
             notes += [f"PSNR {report['psnr'][name]:.1f} dB"] if name in report["psnr"] else []
             lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
         if any(file.endswith(".tif") for files in report["files"].values() for file in files):
-            lines.append('no OpenEXR here, so float .tif instead of .exr; for EXR: pip install "ddrecon[exr]"')
+            lines.append(f"float .tif instead of .exr: EXR {advice('OpenEXR')}")
         if "ring" in report:
             lines.append(f"around: {', '.join(report['ring']['files'])} (radiance {report['ring']['white']:.3g} is white)")
         return [*lines, f"written to {folder}"]

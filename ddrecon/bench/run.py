@@ -110,8 +110,8 @@ def _drawn(rows: Sequence[Row], folder: Path) -> str:
     """Draws bench.png into `folder` where matplotlib is installed; what to tell the user."""
     try:
         draw(rows, folder / "bench.png")
-    except ModuleNotFoundError:
-        return f'written to {folder}; no plot, which needs matplotlib: pip install "ddrecon[plot]"'
+    except MissingExtraError as error:
+        return f"written to {folder}, without a plot: {error}"
     return f"written to {folder}"
 
 

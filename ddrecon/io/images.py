@@ -1,7 +1,7 @@
 """Images by suffix, in linear radiance. Row 0 is the top.
 
 Float formats (.exr, .hdr, .npy, .tif) are linear and, where they have alpha, premultiplied; 8- and 16-bit ones (.png, .jpg, .webp) are
-decoded from sRGB and multiplied by their alpha. Either way a pixel of alpha 0 is empty: black.
+decoded from sRGB and multiplied by their alpha. Either way a pixel of alpha 0 is empty: black. Previews have exposure 1.
 """
 
 from __future__ import annotations
@@ -18,7 +18,11 @@ from ddrecon.io.arrays import as_float32, read_npy
 from ddrecon.io.atomic import replacing
 from ddrecon.io.exr import has_exr, read_exr, write_exr
 from ddrecon.io.hdr import read_hdr
+from ddrecon.io.png16 import has_deep_colors, read_deep_png
 from ddrecon.io.tiff import read_tiff, write_tiff
+
+PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
+"""How the .png of an image is to be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +118,8 @@ def _read_array(path: Path) -> np.ndarray:
 def _read_encoded(path: Path) -> np.ndarray:
     import imageio.v3 as iio
 
+    if has_deep_colors(path):
+        return _decoded(read_deep_png(path))
     try:
         mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
         stored = iio.imread(path, plugin="pillow", index=0)

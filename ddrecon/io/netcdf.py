@@ -23,8 +23,8 @@ COLOR = "color"
 NAMES = {"x": ("x", "west_east", "nx"), "y": ("y", "south_north", "ny"), "z": ("z", "height", "altitude", "bottom_top", "lev", "nz")}
 """What the names of axes begin with."""
 METERS = {"m": 1.0, "meter": 1.0, "meters": 1.0, "metre": 1.0, "metres": 1.0, "km": 1000.0, "kilometer": 1000.0, "kilometers": 1000.0}
-EVEN = 1e-3
-"""How much spacings may differ, relatively: coordinates are often in single precision."""
+EVEN = 0.05
+"""How far off even spacing a coordinate may be, in cells: they are often rounded to a few digits."""
 
 
 def write_netcdf(path: Path, fields: Fields, bounds: np.ndarray) -> None:
@@ -127,7 +127,8 @@ def _edges(path: Path, file: Any, dimension: str) -> tuple[float, float] | None:
     coordinate = file.variables[dimension]
     centers = np.asarray(coordinate[:], np.float64)
     steps = np.diff(centers)
-    if len(steps) and not np.abs(steps - steps.mean()).max() <= EVEN * abs(steps.mean()):
+    even = np.linspace(centers[0], centers[-1], len(centers))
+    if len(steps) and not np.abs(centers - even).max() <= EVEN * abs(steps.mean()):
         least, most = np.abs(steps).min(), np.abs(steps).max()
         raise FormatError(path, f"{dimension} is not evenly spaced ({least:g} to {most:g}); interpolate it first (xarray: .interp)")
     scale = _scale(file, coordinate)

@@ -21,6 +21,7 @@ from ddrecon.scene.problems import Problems
 from ddrecon.scene.schema import ViewSection
 from ddrecon.scene.transforms_camera import Entries, read_camera
 
+MAX_BYTES = 64 * 2**20
 TEST_NAME = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)
 TRAIN_NAME = re.compile(r"(?<![a-z])train(?![a-z])", re.IGNORECASE)
 
@@ -42,11 +43,18 @@ def _document(node: Node, path: Path) -> Node:
     if not path.is_file():
         raise node.refused(f"{path} does not exist, or is not a file")
     try:
-        return _node("", str(path), json.loads(path.read_bytes()))
+        if path.stat().st_size > MAX_BYTES:
+            raise FormatError(path, f"is larger than {MAX_BYTES // 2**20} MiB; it holds more than cameras")
+        return _node("", str(path), json.loads(path.read_bytes(), parse_int=_whole))
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise FormatError(path, f"not JSON: {error}") from error
+
+
+def _whole(digits: str) -> int | float:
+    """A whole number; infinite where no arithmetic could be done with it."""
+    return int(digits) if len(digits) < 300 else float(digits)
 
 
 def _node(key: str, where: str, value: Any) -> Node:

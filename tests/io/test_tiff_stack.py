@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ddrecon.errors import FormatError
+from ddrecon.io.images import read_image
 from ddrecon.io.info import describe
 from ddrecon.io.tiff import write_tiff
 from ddrecon.io.volumes import read_field, write_field
@@ -62,6 +63,8 @@ def test_stacks_of_other_programs(tmp_path: Path, pages: np.ndarray, options: di
 def test_a_stack_is_told_from_an_image(tmp_path: Path) -> None:
     write_field(tmp_path / "one.tif", "density", VALUES[:1, ..., 0], BOUNDS)
     assert describe(tmp_path / "one.tif")["resolution"] == [4, 5, 1]
+    with pytest.raises(FormatError, match="is a volume"):
+        read_image(tmp_path / "one.tif")
     for index, pixels in enumerate((VALUES[0], VALUES[0, ..., 0])):
         write_tiff(tmp_path / f"{index}.tif", pixels)
         assert describe(tmp_path / f"{index}.tif")["pixels"] == [4, 5]

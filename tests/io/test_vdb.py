@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -115,3 +116,17 @@ def test_without_openvdb_the_ways_are_named(tmp_path: Path, monkeypatch: pytest.
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(FormatError, match=r"needs the Python module openvdb.*Blender.*apt-get install python3-openvdb.*docs/formats\.md"):
         read_field(written(tmp_path / "smoke.vdb", density=np.ones((1, 2, 3))), "density")
+
+
+def test_the_program_in_the_documentation_converts(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/formats.md").read_text()
+    (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    if sys.executable == openvdb_python.require():
+        program = program.replace("pyopenvdb", "openvdb")
+    density = np.pad(np.random.default_rng(0).random((3, 4, 5)) + 0.1, ((0, 0), (1, 0), (0, 2))).astype(np.float32)
+    written(tmp_path / "smoke.vdb", density=density)
+    openvdb_python.run(program, tmp_path / "smoke.vdb", "density", tmp_path / "smoke.npz")
+    field = read_field(tmp_path / "smoke.npz", "density")
+    side = (BOUNDS[1] - BOUNDS[0]) / (7, 5, 3)
+    assert np.array_equal(field.values, density[:, 1:, :5])
+    assert np.allclose(field.bounds, BOUNDS + np.array([[0, side[1], 0], [-2 * side[0], 0, 0]]))

@@ -148,6 +148,7 @@ def test_a_dumped_scene_is_the_same(read: Read, tmp_path: Path) -> None:
         ({"fl_x": 0}, "fl_x: must be above 0"),
         ({"w": 8.5}, "w: expected a whole number, found 8.5"),
         ({"w": None}, "w: expected a number, found nothing"),
+        ({"w": 10**400}, "w: expected a finite number"),
         ({"cx": float("nan")}, "cx: expected a finite number"),
     ],
 )
