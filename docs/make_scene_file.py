@@ -55,7 +55,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "volume.density, sigma_a, ...: {file: ...}",
         schema.FieldFile,
-        "A field from a volume file; formats are listed in [your_data.md](your_data.md).",
+        "A field from a volume file; formats are told of in [formats.md](formats.md).",
         {
             "file": "Relative to the scene file.",
             "name": "What the field is called in the file, where that is not its name here.",
@@ -231,8 +231,8 @@ def page() -> str:
     """The whole manual, in Markdown."""
     parts = [
         "# The scene file",
-        "Every key, with what it takes, its limits and its default, made from the program's own schema. Vectors are x, y, z; lengths are "
-        "in a world unit u of your choice; `1e-3` is a number; paths are relative to the scene file. Anything unknown, repeated or out of its "
+        "Every key, with what it takes, its limits and its default, made from the program's own schema. Vectors are x, y, z; lengths are in a "
+        "world unit u of your choice; `1e-3` is a number; paths are relative to the scene file. Anything unknown, repeated or out of its "
         "limits is refused with file, line, column and key.",
         *(_section(*section) for section in SECTIONS),
         _parameters(),
