@@ -35,6 +35,10 @@ KIND_NAMES = {
 }
 """How a user would call what a key takes."""
 
+INTRODUCTION = """\
+Every key, with what it takes, its limits and its default, made from the program's own schema. Vectors are x, y, z; lengths are in a world
+unit u of your choice; `1e-3` is a number; paths are relative to the scene file. Anything unknown, repeated or out of its limits is
+refused with file, line, column and key."""
 VOLUME = "The box, and what is in it. Either `sigma_a` and `sigma_s`, or `sigma_t` and `albedo`."
 SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
@@ -231,9 +235,7 @@ def page() -> str:
     """The whole manual, in Markdown."""
     parts = [
         "# The scene file",
-        "Every key, with what it takes, its limits and its default, made from the program's own schema. Vectors are x, y, z; lengths are in a "
-        "world unit u of your choice; `1e-3` is a number; paths are relative to the scene file. Anything unknown, repeated or out of its "
-        "limits is refused with file, line, column and key.",
+        INTRODUCTION,
         *(_section(*section) for section in SECTIONS),
         _parameters(),
     ]
