@@ -12,6 +12,7 @@ from ddrecon.errors import FormatError
 from ddrecon.io.field import Field, Fields
 from ddrecon.io.mitsuba import read_vol, vol_names, write_vol
 from ddrecon.io.npz import npz_names, read_npz, write_npz
+from ddrecon.io.reading import reading
 from ddrecon.io.vti import read_vti, vti_names, write_vti
 
 
@@ -33,12 +34,16 @@ FORMATS: dict[str, VolumeFormat] = {
 
 def field_names(path: Path) -> list[str]:
     """The fields that the volume file at `path` holds; raises FormatError when it cannot be read."""
-    return _format_of(path).names(path)
+    names = _format_of(path).names
+    with reading(path):
+        return names(path)
 
 
 def read_field(path: Path, name: str) -> Field:
     """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`; raises FormatError when it cannot be used."""
-    return _format_of(path).read(path, name)
+    read = _format_of(path).read
+    with reading(path):
+        return read(path, name)
 
 
 def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:

@@ -153,10 +153,10 @@ def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
 
 
 def _check_unique(entries: list[Node], names: list[str]) -> None:
-    problems = Problems()
+    problems, first = Problems(), dict[str, int]()
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
-        if name in names[:index]:
-            problems.note(_mapping(entry)["name"].refused(f"{name!r} is already the name of view {names.index(name)}"))
+        if first.setdefault(name, index) != index:
+            problems.note(_mapping(entry)["name"].refused(f"{name!r} is already the name of view {first[name]}"))
     problems.raise_any()
 
 
