@@ -21,6 +21,11 @@ class Problems:
         self.lines: list[str] = []
         self.unusable: list[FormatError] = []
 
+    @property
+    def are_many(self) -> bool:
+        """Whether there are more than are told: no need to look for others."""
+        return len(self.lines) > MOST
+
     def note(self, error: SceneError | FormatError) -> None:
         """Notes the problems of `error`."""
         if isinstance(error, FormatError):
@@ -41,8 +46,7 @@ class Problems:
         files = list(dict.fromkeys(str(error) for error in self.unusable))
         if self.lines:
             lines = [*dict.fromkeys(self.lines), *files]
-            more = [f"and {len(lines) - MOST} more"] if len(lines) > MOST else []
-            raise SceneError(lines[:MOST] + more)
+            raise SceneError([*lines[:MOST], "and more: mend these first"] if len(lines) > MOST else lines)
         if self.unusable:
             first = self.unusable[0]
             raise FormatError(first.path, first.reason, files[1:])

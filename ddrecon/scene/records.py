@@ -33,6 +33,8 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
                 raise child.key_refused(f"unknown key{suggestion(name, known)}")
             if name in declared:
                 values[name] = read_value(child, Rule(hints[name], declared[name].metadata, folder))
+        if problems.are_many:
+            break
     problems.raise_any()
     return _checked(node, kind(**values))
 
