@@ -61,6 +61,16 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
                 raise
             click.echo(str(error), err=True)
             sys.exit(error.exit_code)
+        except (MemoryError, RuntimeError) as error:
+            from ddrecon.memory import is_shortage
+
+            if debug or not is_shortage(error):
+                raise
+            reason = str(error).partition("\n")[0] or "no more is given"
+            click.echo(
+                f"out of memory: {reason}; make volume.resolution or the images smaller; --resume takes up an interrupted run", err=True
+            )
+            sys.exit(2)
         except KeyboardInterrupt as error:
             click.echo(f"interrupted {error}".strip(), err=True)
             sys.exit(130)

@@ -19,10 +19,13 @@ from ddrecon.io.atomic import replacing
 from ddrecon.io.exr import has_exr, read_exr, write_exr
 from ddrecon.io.hdr import read_hdr
 from ddrecon.io.png16 import has_deep_colors, read_deep_png
+from ddrecon.io.reading import reading
 from ddrecon.io.tiff import read_tiff, write_tiff
 
 PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
 """How the .png of an image is to be read."""
+BEGINNINGS = ((b"\x89PNG\r\n\x1a\n", b""), (b"\xff\xd8\xff", b""), (b"RIFF", b"WEBP"))
+"""How the first 12 bytes of encoded images begin and end. Pillow would look at nothing but the content, and run Ghostscript on some."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +94,8 @@ def _read_values(path: Path) -> np.ndarray:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"unknown image format {path.suffix!r}; known: {', '.join(READERS)}")
-    try:
+    with reading(path):
         values = reader(path)
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or values.size == 0:
         raise FormatError(path, f"has shape {list(values.shape)}; expected [h, w], [h, w, 3] or [h, w, 4]")
     return _finite(as_float32(values), path)
@@ -118,15 +119,14 @@ def _read_array(path: Path) -> np.ndarray:
 def _read_encoded(path: Path) -> np.ndarray:
     import imageio.v3 as iio
 
+    with path.open("rb") as stream:
+        start = stream.read(12)
+    if not any(start.startswith(beginning) and start.endswith(end) for beginning, end in BEGINNINGS):
+        raise FormatError(path, "is no PNG, JPEG or WebP image")
     if has_deep_colors(path):
         return _decoded(read_deep_png(path))
-    try:
-        mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
-        stored = iio.imread(path, plugin="pillow", index=0)
-    except OSError:
-        raise
-    except Exception as error:  # decoders of damaged files raise whatever they like
-        raise FormatError(path, f"not a complete image: {error}") from error
+    mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
+    stored = iio.imread(path, plugin="pillow", index=0)
     if mode not in {"1", "L", "LA", "P", "RGB", "RGBA"} and stored.dtype != np.uint16:
         raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
     return _decoded(stored)

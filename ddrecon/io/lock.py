@@ -18,6 +18,8 @@ from ddrecon.errors import SceneError
 
 LOCK = "ddrecon.lock"
 """The name of the lock file."""
+MAX_BYTES = 4096
+"""No lock is larger."""
 
 
 @contextmanager
@@ -68,7 +70,7 @@ def _discard_stale(path: Path) -> None:
 def _read(path: Path) -> dict[str, Any] | None:
     """What the lock at `path` says; None where it is gone, {} where it says nothing that can be understood."""
     try:
-        content = json.loads(path.read_bytes()[:4096])
+        content = json.loads(path.read_bytes()) if path.stat().st_size <= MAX_BYTES and path.is_file() else None
     except FileNotFoundError:
         return None
     except (OSError, ValueError):

@@ -21,6 +21,7 @@ WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, OFFSETS = 256, 257, 258, 259, 262
 ORIENTATION, SAMPLES, ROWS, COUNTS, PLANAR, SAMPLE_FORMAT = 274, 277, 278, 279, 284, 339
 ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
 BIG = (b"II+\0", b"MM\0+")
+_KNOWN = {WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, OFFSETS, ORIENTATION, SAMPLES, ROWS, COUNTS, PLANAR, SAMPLE_FORMAT}
 _TYPES = {3: "H", 4: "I"}
 _DEFAULTS = {COMPRESSION: (1,), SAMPLES: (1,), PLANAR: (1,), SAMPLE_FORMAT: (1,), ORIENTATION: (1,), BITS: (1,)}
 
@@ -91,10 +92,10 @@ def _goes_on(data: mmap.mmap) -> bool:
 def _read_tags(data: bytes, order: str) -> dict[int, tuple[int, ...]]:
     (start,) = struct.unpack_from(f"{order}I", data, 4)
     (entries,) = struct.unpack_from(f"{order}H", data, start)
-    tags = {}
+    tags: dict[int, tuple[int, ...]] = {}
     for position in range(start + 2, start + 2 + 12 * entries, 12):
         tag, kind, count = struct.unpack_from(f"{order}HHI", data, position)
-        if kind in _TYPES and 0 < count <= len(data):
+        if tag in _KNOWN and tag not in tags and kind in _TYPES and 0 < count <= len(data):
             layout = f"{order}{count}{_TYPES[kind]}"
             inline = struct.calcsize(layout) <= 4
             offset = position + 8 if inline else struct.unpack_from(f"{order}I", data, position + 8)[0]

@@ -55,7 +55,7 @@ def forget_checkpoints(folder: Path) -> None:
 
 def _load(path: Path) -> dict[str, Any]:
     """What is in the file at `path`: torch itself does not notice changed bytes, but they are in a zip archive with checksums."""
-    if not path.exists():
+    if not path.is_file():
         raise FormatError(path, "is missing; start anew with --overwrite")
     try:
         with zipfile.ZipFile(path) as archive:

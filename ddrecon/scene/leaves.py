@@ -43,6 +43,8 @@ def read_each(nodes: Sequence[Node], rule: Rule, read: Callable[[Node, Rule], T]
     for node in nodes:
         with problems.collecting():
             values.append(read(node, rule))
+        if problems.are_many:
+            break
     problems.raise_any()
     return tuple(values)
 

@@ -34,6 +34,8 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
                 raise child.key_refused(f"unknown key{suggestion(name, known)}")
             if name in declared:
                 values[name] = read_value(child, Rule(hints[name], declared[name].metadata, folder))
+        if problems.are_many:
+            break
     problems.raise_any()
     return _checked(node, kind(**values))
 
@@ -157,10 +159,10 @@ def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
 
 
 def _check_unique(entries: list[Node], names: list[str]) -> None:
-    problems = Problems()
+    problems, first = Problems(), dict[str, int]()
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
-        if name in names[:index]:
-            problems.note(_mapping(entry)["name"].refused(f"{name!r} is already the name of view {names.index(name)}"))
+        if first.setdefault(name, index) != index:
+            problems.note(_mapping(entry)["name"].refused(f"{name!r} is already the name of view {first[name]}"))
     problems.raise_any()
 
 

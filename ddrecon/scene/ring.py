@@ -33,5 +33,7 @@ def ring_views(node: Node, ring: RingSection, pattern: str | None, folder: Path)
 
 
 def matches(pattern: str, folder: Path) -> list[Path]:
-    """The files that match the glob `pattern`, relative to `folder`, as sorted absolute paths."""
+    """The files that match the glob `pattern`, relative to `folder`, as sorted absolute paths; wildcards stand in its last two parts."""
+    if glob.has_magic(str(Path(pattern).parent.parent)):
+        return []
     return sorted(path for name in glob.glob(pattern, root_dir=folder) if (path := (folder / name).absolute()).is_file())

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from ddrecon.cameras import Camera, Rays, rays
 from ddrecon.grid import Grid
 
 COARSER = 8
+MOST_PIXELS = 2**18
+"""Images are made about this small before they are looked at closely."""
 
 
 def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
@@ -22,7 +26,8 @@ def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
 
 def sees_box(camera: Camera, grid: Grid) -> bool:
     """Whether any pixel of `camera` looks through the box of `grid`; a coarser image is tried first, because it is quick."""
-    return any(bool(rays_hit_box(rays(image), grid).any()) for image in (camera.resized(COARSER), camera))
+    finer = max(1, math.ceil(math.sqrt(camera.size[0] * camera.size[1] / MOST_PIXELS)))
+    return any(bool(rays_hit_box(rays(image), grid).any()) for image in (camera.resized(COARSER * finer), camera.resized(finer)))
 
 
 def blindness(camera: Camera, grid: Grid) -> str:
