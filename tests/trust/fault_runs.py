@@ -112,7 +112,7 @@ def fill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
         code = ended(start(folder, out, lambda most=most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))))
         lines = (folder / "stderr").read_text().splitlines()
         faults += code == 3
-        if code != 0 and (code != 3 or "cannot be written" not in lines[-1] or len(lines) > 2):
+        if code != 0 and (code != 3 or "cannot be written: File too large" not in lines[-1] or len(lines) > 2):
             wrong.append(f"at most {most} bytes: {code}: {lines}")
     if code := ended(start(folder, out, nothing)):
         wrong.append(f"with space again: {code}: {(folder / 'stderr').read_text()}")
