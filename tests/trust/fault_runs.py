@@ -54,7 +54,7 @@ def start(folder: Path, out: Path, prepare: Callable[[], None]) -> int:
 def optimize(folder: Path, out: Path) -> None:
     """The command that a user gives, at first and again."""
     going_on = ["--resume"] if any(out.glob("checkpoints/*.pt")) else ["--overwrite"]
-    main(["optimize", str(folder / "scene.yaml"), "-q", "--preview-every", "5", "-o", str(out), *going_on])
+    main(["optimize", str(folder / "scene.yaml"), "-q", "--preview-every", "4", "-o", str(out), *going_on])
 
 
 def ended(pid: int) -> int:
@@ -79,14 +79,14 @@ def nothing() -> None:
 
 
 def kill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
-    """Runs that receive `count` signals, each within a third of the time a whole run takes from its start."""
+    """Runs that receive `count` signals, each within a quarter of the time a whole run takes from its start."""
     faults, wrong, finished, number = 0, list[str](), 0, 0
     out = folder / "out_0"
     while faults < count or not finished:
         pid = start(folder, out, nothing)
         sent = None
         if faults < count:
-            time.sleep(random.uniform(0, duration / 3))
+            time.sleep(random.uniform(0, duration / 4))
             sent = SIGNALS[faults % len(SIGNALS)]
             os.kill(pid, sent)
         code = ended(pid)
