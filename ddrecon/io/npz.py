@@ -68,5 +68,5 @@ def _read_entry(archive: zipfile.ZipFile, name: str, path: Path) -> np.ndarray:
 
 def _absence(name: str, others: list[str]) -> str:
     if len(others) == 1:
-        return f"has no field {name!r}, only {others[0]!r}; save that array under the name {name!r}"
+        return f"has no field {name!r}, only {others[0]!r}; save that array as {name!r}, or say name: {others[0]} beside file"
     return f"has no field {name!r}; it has {', '.join(map(repr, others)) or 'none'}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -17,6 +17,7 @@ from ddrecon.io.folders import claimed_folder
 from ddrecon.io.json_file import write_json
 from ddrecon.reconstruct.checkpoint import LAST, load_checkpoint
 from ddrecon.reconstruct.differences import fingerprint
+from ddrecon.reconstruct.events import event_log
 from ddrecon.reconstruct.loop import Reconstruction, Row
 from ddrecon.reconstruct.run_folder import CHECKPOINTS, RunFolder
 from ddrecon.scene.dump import dump_scene
@@ -40,13 +41,13 @@ def opened_run(
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
     with claimed_folder(path, may_exist=may_exist or resume):
-        folder = RunFolder(path, result_of)
+        folder = RunFolder(path, scene_file, result_of, environment | {"seed": run.seed})
         if loaded is None:
             folder.start(run)
         else:
             folder.resume(run, loaded)
         dump_scene(scene_file, path / "scene.yaml")
-        write_json(path / "environment.json", environment | {"seed": run.seed})
+        write_json(path / "environment.json", folder.environment)
         yield run, folder
 
 
@@ -62,8 +63,8 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     return loaded
 
 
-def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool) -> dict[str, Any]:
-    """Advances `run` until it is done, writing to `folder`; returns the summary.
+def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool, has_events: bool = False) -> dict[str, Any]:
+    """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as well; returns the summary.
 
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint before it is passed on. So does a
     divergence; any other failure leaves the checkpoints written so far.
@@ -72,12 +73,15 @@ def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_
     try:
         with (
             deferred_interrupt() as asked,
+            event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
             tqdm(total=total, initial=run.iteration, desc="optimize", file=sys.stderr, disable=is_quiet) as bar,
         ):
             while not run.is_done:
                 folder.save_in_time(run)
                 row = run.step()
                 folder.log(row)
+                if events is not None:
+                    events.log(row)
                 bar.set_postfix_str(progress_text(run.total, row), refresh=False)
                 bar.update()
                 if preview_every and row.iteration % preview_every == 0:

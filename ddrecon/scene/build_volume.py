@@ -84,13 +84,16 @@ def _read_fields(scene_file: SceneFile) -> Fields:
         value = getattr(scene_file.tree.volume, name)
         if isinstance(value, FieldFile):
             with problems.collecting():
-                fields[name] = read_referenced(scene_file, f"volume.{name}.file", value.file, partial(_read_quantity, name=name))
+                fields[name] = read_referenced(
+                    scene_file, f"volume.{name}.file", value.file, partial(_read_quantity, name=name, called=value.name or name)
+                )
     problems.raise_any()
     return fields
 
 
-def _read_quantity(path: Path, name: str) -> Field:
-    field = read_field(path, name)
+def _read_quantity(path: Path, name: str, called: str) -> Field:
+    """The quantity `name`, which the file has as `called`."""
+    field = read_field(path, called)
     if name == "density" and field.values.ndim != 3:
         raise FormatError(path, f"density has shape {list(field.values.shape)}; expected [z, y, x]: colors belong to the cross sections")
     if name == "albedo" and (highest := field.values.max()) > 1:

@@ -35,5 +35,12 @@ def blindness(camera: Camera, grid: Grid) -> str:
     (low, high), pose = grid.bounds_xyz, camera.pose.double()
     center = (pose.new_tensor(low) + pose.new_tensor(high)) / 2
     if torch.dot(center - pose[:, 3], -pose[:, 2]) < 0:
-        return "the volume lies behind the camera (a camera looks along its -z axis, as in OpenGL)"
-    return "the camera looks past it: check its target, its field of view or width, and volume.bounds"
+        return (
+            "the volume lies behind the camera, which looks along its -z axis with +y up, as in OpenGL: where poses are in OpenCV's axes, "
+            "negate the second and third column of each matrix"
+        )
+    away = torch.dist(center, pose[:, 3]) / torch.dist(pose.new_tensor(low), pose.new_tensor(high))
+    return (
+        f"the camera looks past it, from {away:.3g} diagonals of the box away: check volume.bounds (are they in the units of the "
+        "cameras?), its target, and its field of view or width"
+    )
