@@ -131,21 +131,25 @@ class Reconstruction:
         stage = stage_of(self.iteration, self.settings.iterations, self.settings.refine_at)
         if stage > self.stage:
             self._enter_stage(stage)
-        before = self.state()
+        begun = dict(self.memory.last)
         try:
-            return self._iterate(start, before)
+            return self._iterate(start, begun)
         except SolveError as error:
             failure = error if isinstance(error, DivergenceError) else self._unsolved(error)
-            self.restore(self.good or before)
+            if self.good is None:
+                self.memory.last = begun
+            else:
+                self.restore(self.good)
             raise failure from error.__cause__
 
-    def _iterate(self, start: float, before: dict[str, Any]) -> Row:
+    def _iterate(self, start: float, begun: dict[tuple[str, int], Tensor]) -> Row:
         self.memory.records.clear()
         seen = self._seen()
         found = self._differentiated(seen)
         loss, gradients = self._penalized(found.loss, found.gradients)
         self._require_finite(gradients)
-        self.good = before
+        self.good = None  # one copy of the state at a time
+        self.good = self.state() | {"solutions": begun}
         self.misfit = math.sqrt(float(found.loss) / self.power) if self.power else 1.0
         solves = {kind: sum(r.iterations for r in self.memory.records if r.kind == kind) for kind in ("forward", "adjoint")}
         for parameter in self.parameters:
