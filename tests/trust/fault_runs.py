@@ -27,22 +27,30 @@ from ddrecon.cli import main
 from ddrecon.reconstruct import run_folder
 
 SIGNALS = [*[signal.SIGKILL] * 10, signal.SIGTERM, signal.SIGINT]
+TOO_EARLY = "\nAborted!\n"
+"""What click says of an interrupt before the command has begun."""
 EXPECTED = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 130, signal.SIGINT: 130}
 
 
 def start(folder: Path, out: Path, prepare: Callable[[], None]) -> int:
     """A child that begins the run in `out`, or goes on with it; its stderr goes to a file."""
+    asked = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, asked)  # until the child can say what became of it
     pid = os.fork()
     if pid:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, asked)
         return pid
     try:
         with (folder / "stderr").open("w") as stderr:
             os.dup2(stderr.fileno(), 2)
             os.dup2(stderr.fileno(), 1)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for number in asked:
+            signal.signal(number, signal.default_int_handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, asked)
         prepare()
         optimize(folder, out)
+    except KeyboardInterrupt:
+        sys.stderr.write(TOO_EARLY)
     except SystemExit as end:
         os._exit(end.code if isinstance(end.code, int) else 0)
     except BaseException:  # a child must never return into its parent's code
@@ -97,7 +105,7 @@ def kill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
             out = folder / f"out_{number}"
             continue
         faults += 1
-        is_too_early = (folder / "stderr").read_text() == "\nAborted!\n"  # click, before the command has begun
+        is_too_early = (folder / "stderr").read_text() == TOO_EARLY
         if sent is None or (code != EXPECTED[sent] and not is_too_early):
             wrong.append(f"{sent}: {code}: {(folder / 'stderr').read_text()}")
     return {"faults": faults, "finished": finished, "wrong": wrong}
