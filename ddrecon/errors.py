@@ -38,7 +38,8 @@ class FormatError(DdreconError):
 
     def __init__(self, path: object, reason: str, others: Sequence[str] = ()):
         self.path, self.reason = str(path), reason
-        super().__init__("\n".join(one_line(line) for line in (f"{path}: {reason}", *others)))
+        self.lines = [one_line(line) for line in (f"{path}: {reason}", *others)]
+        super().__init__("\n".join(self.lines))
 
 
 class MissingExtraError(DdreconError):

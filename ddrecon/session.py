@@ -52,7 +52,7 @@ class Session:
 
     def read(self, path: Path) -> SceneFile:
         """The scene file at `path`, or the result in the folder of a finished run, checked."""
-        return read_scene(result_in(path) if path.is_dir() else path, self.overrides)
+        return read_scene(result_in(path) if os.path.isdir(path) else path, self.overrides)
 
     def build(self, scene_file: SceneFile) -> Scene:
         """The scene as tensors on this session's device."""

@@ -43,7 +43,7 @@ class Problems:
 
     def raise_any(self) -> None:
         """Raises an error with every problem noted, each once, if there is one: FormatError where only files are to blame."""
-        files = list(dict.fromkeys(str(error) for error in self.unusable))
+        files = list(dict.fromkeys(line for error in self.unusable for line in error.lines))
         if self.lines:
             lines = [*dict.fromkeys(self.lines), *files]
             raise SceneError([*lines[:MOST], "and more: mend these first"] if len(lines) > MOST else lines)

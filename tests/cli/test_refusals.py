@@ -77,9 +77,10 @@ def test_unreadable_files_are_told_at_once(refuse: Refuse) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize(("scene", "what"), [("gone.yaml", "No such file or directory"), (".", "Is a directory")])
+@pytest.mark.parametrize(("scene", "what"), [("gone.yaml", "cannot be read: No such file or directory"), (".", "holds no result.yaml")])
 def test_no_scene(refuse: Refuse, command: str, scene: str, what: str) -> None:
-    assert refuse(2, *(scene if word == "scene.yaml" else word for word in COMMANDS[command])) == [f"{scene}: cannot be read: {what}"]
+    (line,) = refuse(2, *(scene if word == "scene.yaml" else word for word in COMMANDS[command]))
+    assert line.startswith(f"{scene}: {what}")
 
 
 @pytest.mark.parametrize(
