@@ -2,8 +2,9 @@
 
     python benchmarks/paper.py [NAME]... [-o FOLDER] [--size paper] [--keep]
 
-NAME is that of a config in configs/paper. `--size paper` path-traces pictures of the paper's size first and runs as many cells and
-iterations as the paper did, which wants a GPU; its figures are printed, and docs/ is left alone. `--keep` draws finished runs again.
+NAME is that of a config in configs/paper; without one, all are remade, Fig. 7 and 8 too where Mitsuba can run. `--size paper` path-traces
+pictures of the paper's size first and runs as many cells and iterations as the paper did (or `--iterations`), which wants a GPU; its
+figures are printed, and docs/ is left alone. `--keep` draws finished runs again.
 """
 
 from __future__ import annotations
@@ -17,16 +18,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import paper_gradients
+import paper_path_replay
+import path_replay
 import yaml
-from paper_figures import Array, Log, Pair, draw, pace, projected, read_log
+from paper_figures import Array, Log, Pair, draw, draw_derivatives, pace, projected, read_log
+from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, read_table, rewrite_table
 
 from ddrecon.io.images import read_image
 from ddrecon.io.volumes import read_field
 
-ROOT = Path(__file__).parents[1]
-CONFIGS, SHAPES, PICTURES = ROOT / "configs" / "paper", ROOT / "data" / "shapes", ROOT / "docs" / "pictures" / "paper"
-PAGE = ROOT / "docs" / "experiments.md"
-BEGIN, END = "<!-- table: python benchmarks/paper.py -->\n", "<!-- end of table -->"
+SCRIPT = Path(__file__).name
 PAPER_PIXELS = 512
 TOP = (
     "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | loss | PSNR shown, novel | found |\n"
@@ -67,7 +69,7 @@ class Experiment:
     """How the config `name` is run: by `variants`, names of runs with their overrides, and at the paper's size with `paper_size` besides.
 
     `truth` names the folder of data/paper its pictures are in, if they are path-traced. `shown` makes the pairs to draw and says what was
-    found.
+    found. `others` are variants too, of the small size alone, whose logs are not drawn; `draw_more` makes further pictures of them all.
     """
 
     name: str
@@ -75,6 +77,8 @@ class Experiment:
     shown: Shown
     paper_size: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"": ()})
+    others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    draw_more: Callable[[Runs], None] = lambda runs: None
 
 
 def first(runs: Runs) -> Run:
@@ -109,6 +113,36 @@ def show_density(truth: str, front: str) -> Shown:
         return pairs, f"relative L1 error of the density {apart(run.field('density'), density):.2f}"
 
     return shown
+
+
+def draw_rounds(runs: Runs) -> None:
+    """Fig. 13 by other models: a picture of the densities, and a table."""
+    truth, lines, pairs = shape("bunny"), [], []
+    for name, run in runs.items():
+        density, log = run.field("density"), read_log(run.folder)
+        true = truth if density.shape == truth.shape else truth.reshape(32, 2, 48, 2, 32, 2).mean((1, 3, 5))
+        pairs.append(Pair(f"{NAMES_13[name]}:\ndensity along x", projected(true, 2, 1), projected(density, 2, 1)))
+        low = slice(0, len(density[0]) // 3)
+        quality = f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"
+        parts = (
+            f"{apart(density, true):.3f} | {apart(density[:, low], true[:, low]):.2f} | {density[:, low].sum() / true[:, low].sum():.2f}"
+        )
+        lines.append(f"| {NAMES_13[name]} | {len(log['loss'])} | {log['seconds'][-1]:.0f} | {quality} | {parts} |\n")
+    draw(PICTURES / "fig13_rounds.png", pairs, {})
+    rewrite_table(f"{SCRIPT} fig13", TOP_13 + "".join(lines))
+
+
+def draw_parts(runs: Runs) -> None:
+    """Fig. 9: derivatives of pixels by density, of each part of the radiance, at the start and at what each run found."""
+    images, parts = [], {"single": ("reduced", "single"), "diffusion": ("multiple",), "all": ("reduced", "single", "multiple")}
+    for name in parts:
+        run, places = runs[name], {"start": ["volume.density={file: ../../data/shapes/bunny.npz}"]}
+        for place, overrides in (places | {"end": found(run)}).items():
+            folder, scene = run.folder / f"derivative_{place}", CONFIGS / "fig09.yaml"
+            ddrecon("render", scene, "-o", folder, "--view", "front", "--components", "--gradient", "density", *as_options(overrides))
+            image = sum(np.load(folder / f"front.gradient.{part}.npy").mean(-1) for part in parts[name])
+            images.append((f"{name}, {'at the bunny' if place == 'start' else 'in the end'}", image))
+    draw_derivatives(PICTURES / "fig09_derivatives.png", images)
 
 
 def show_light(runs: Runs) -> tuple[list[Pair], str]:
@@ -194,37 +228,46 @@ G_ALONE = (
     "optimize.iterations=60",
 )
 """Overrides that leave nothing but g to be found."""
+HALF = ("volume.resolution=[32, 48, 32]", "optimize.refine_at=[0.5]", "optimize.iterations=120")
+"""Fig. 13 in cells twice as large, where the printed scheme, by Jacobi iteration, comes to an end."""
+ROUNDS = {
+    "one_round": ("diffusion.transport_rounds=1",),
+    "half": HALF,
+    "half_one_round": (*HALF, "diffusion.transport_rounds=1"),
+    "half_printed": (*HALF, "diffusion.scheme=printed"),
+}
+NAMES_13 = {
+    "default": "default",
+    "one_round": "one round",
+    "half": "half the cells, default",
+    "half_one_round": "half the cells, one round",
+    "half_printed": "half the cells, printed",
+}
+TOP_13 = (
+    "| model | iterations | seconds | PSNR shown, novel | L1 error of the density | in the lowest third | density there, in truth 1 |\n"
+    "|---|---|---|---|---|---|---|\n"
+)
 PARTS = {name: (f"optimize.derivatives={name}",) for name in ("all", "diffusion", "single")}
 FINE = "volume.resolution=[192, 192, 192]"
 EXPERIMENTS = (
-    Experiment("fig13", "fig13", show_density("bunny", "ring_00"), ("optimize.iterations=1000",)),
+    Experiment("fig13", "fig13", show_density("bunny", "ring_00"), ("optimize.iterations=1000",), others=ROUNDS, draw_more=draw_rounds),
     Experiment("fig06_light", "fig06_light", show_light, ("optimize.iterations=100",)),
     Experiment("fig06_density", "knot", show_density("knot", "front")),
     Experiment("fig10", "fig10", show_optics, ("optimize.iterations=3000",), {"": (), "g_alone": G_ALONE}),
     Experiment("fig12_single", "smoke", show_smoke, (FINE,)),
     Experiment("fig12_four", "smoke", show_four, (FINE,)),
-    Experiment("fig09", "knot", show_derivatives, ("optimize.iterations=100",), PARTS),
+    Experiment("fig09", "knot", show_derivatives, (), PARTS, draw_more=draw_parts),
     Experiment("fig14", "", show_photograph, (FINE, "views.0.image=../../data/cumulus/cumulus.webp")),
 )
 """In the order of docs/experiments.md."""
 
 
-def ddrecon(*arguments: str | Path) -> None:
-    """Runs a command, quietly."""
-    subprocess.run(["ddrecon", *arguments, "-q", "--overwrite"], check=True, stdout=subprocess.DEVNULL)
-
-
-def optimize(experiment: Experiment, variant: str, folder: Path, overrides: list[str]) -> Run:
-    """Runs one variant of `experiment` into `folder`, and renders what it found."""
-    run = Run(experiment.name, folder)
-    ddrecon("optimize", CONFIGS / f"{experiment.name}.yaml", "-o", folder, *as_options([*overrides, *experiment.variants[variant]]))
+def optimize(name: str, folder: Path, overrides: list[str]) -> Run:
+    """Runs the config `name` into `folder`, and renders what it found."""
+    run = Run(name, folder)
+    ddrecon("optimize", CONFIGS / f"{name}.yaml", "-o", folder, *as_options(overrides))
     ddrecon("render", folder / "scene.yaml", "-o", folder / "views", *as_options(found(run)))
     return run
-
-
-def as_options(overrides: list[str]) -> list[str]:
-    """`overrides` as a command takes them."""
-    return [part for override in overrides for part in ("-D", override)]
 
 
 def found(run: Run) -> list[str]:
@@ -235,15 +278,17 @@ def found(run: Run) -> list[str]:
     return [*fields, f"volume.g={numbers['g']}", *lights]
 
 
-def at_paper_size(experiment: Experiment, output: Path) -> list[str]:
-    """Overrides for the paper's size, after its pictures have been path-traced."""
+def at_paper_size(experiment: Experiment, output: Path, iterations: int | None) -> list[str]:
+    """Overrides for the paper's size, after its pictures have been path-traced; fewer `iterations` are all at full resolution."""
+    fewer = () if iterations is None else (f"optimize.iterations={iterations}", "optimize.refine_at=[]")
+    size = [*experiment.paper_size, *fewer]
     if not experiment.truth:
-        return list(experiment.paper_size)
+        return size
     traced, views = output / "targets", yaml.safe_load((CONFIGS / f"{experiment.name}.yaml").read_text())["views"]
     options = ["--pixels", str(PAPER_PIXELS), "-o", traced]
     subprocess.run([sys.executable, ROOT / "data" / "make_targets.py", experiment.truth, *options], check=True)
     images = {index: traced.resolve() / experiment.truth / Path(view["image"]).name for index, view in enumerate(views) if "image" in view}
-    return [*(f"views.{index}.image={image}" for index, image in images.items()), *experiment.paper_size]
+    return [*(f"views.{index}.image={image}" for index, image in images.items()), *size]
 
 
 def row(experiment: Experiment, log: Log, words: str) -> str:
@@ -257,14 +302,42 @@ def row(experiment: Experiment, log: Log, words: str) -> str:
     return f"| {experiment.name} | {len(seconds)} | {times} | {solves} | {losses} | {quality} | {words} |\n"
 
 
-def rewrite_table(rows: dict[str, str]) -> None:
+def merge_rows(rows: dict[str, str]) -> None:
     """Puts `rows` into the table of docs/experiments.md in place of those of the same experiments."""
-    before, rest = PAGE.read_text().split(BEGIN)
-    table, after = rest.split(END)
-    kept = {line.split(" | ")[0].removeprefix("| "): line for line in table.removeprefix(TOP).splitlines(keepends=True) if line.strip()}
-    merged = kept | rows
-    lines = "".join(merged[experiment.name] for experiment in EXPERIMENTS if experiment.name in merged)
-    PAGE.write_text(before + BEGIN + TOP + lines + END + after)
+    lines = read_table(SCRIPT).removeprefix(TOP).splitlines(keepends=True)
+    merged = {line.split(" | ")[0].removeprefix("| "): line for line in lines if line.strip()} | rows
+    rewrite_table(SCRIPT, TOP + "".join(merged[experiment.name] for experiment in EXPERIMENTS if experiment.name in merged))
+
+
+def remake(experiment: Experiment, output: Path, overrides: list[str], is_small: bool, is_kept: bool) -> str:
+    """Runs `experiment` unless `is_kept` and done, draws it, and returns its line of the table."""
+    runs = {}
+    variants = {**experiment.variants, **experiment.others} if is_small else experiment.variants
+    for variant in variants:
+        folder = output / (f"{experiment.name}_{variant}" if variant else experiment.name)
+        is_done = is_kept and (folder / "summary.json").exists()
+        runs[variant or "default"] = (
+            Run(experiment.name, folder) if is_done else optimize(experiment.name, folder, [*overrides, *variants[variant]])
+        )
+    pairs, words = experiment.shown(runs)
+    logs = {name: read_log(run.folder) for name, run in runs.items() if name not in experiment.others}
+    draw((PICTURES if is_small else output) / f"{experiment.name}.png", pairs, logs)
+    if is_small:
+        experiment.draw_more(runs)
+    return row(experiment, read_log(first(runs).folder), words)
+
+
+def remake_replay(names: list[str], output: Path, is_kept: bool) -> None:
+    """Fig. 8, and where path replay can run Fig. 7."""
+    if "fig08" in names:
+        paper_gradients.remake(output / "fig08")
+    if "fig07" not in names:
+        return
+    lacking = path_replay.why_not()
+    if lacking:
+        print(f"fig07 left out, it {lacking}; fig08 is without path replay")
+    else:
+        paper_path_replay.remake(output / "fig07", is_kept=is_kept)
 
 
 def main() -> None:
@@ -273,25 +346,19 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="of a config in configs/paper; all unless given")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper")
     parser.add_argument("--size", choices=("small", "paper"), default="small")
+    parser.add_argument("--iterations", type=int, help="instead of as many as the paper's size has")
     parser.add_argument("--keep", action="store_true", help="do not run again what has been run")
     given = parser.parse_args()
-    is_small, rows = given.size == "small", dict[str, str]()
+    names, is_small, rows = given.names or [config.stem for config in CONFIGS.glob("*.yaml")], given.size == "small", dict[str, str]()
     for experiment in EXPERIMENTS:
-        if given.names and experiment.name not in given.names:
+        if experiment.name not in names:
             continue
-        overrides = [] if is_small else at_paper_size(experiment, given.output)
-        runs = {}
-        for variant in experiment.variants:
-            folder = given.output / given.size / (f"{experiment.name}_{variant}" if variant else experiment.name)
-            is_done = given.keep and (folder / "summary.json").exists()
-            runs[variant or "all"] = Run(experiment.name, folder) if is_done else optimize(experiment, variant, folder, overrides)
-        pairs, words = experiment.shown(runs)
-        logs = {name: read_log(run.folder) for name, run in runs.items()}
-        draw((PICTURES if is_small else given.output) / f"{experiment.name}.png", pairs, logs)
-        rows[experiment.name] = row(experiment, read_log(first(runs).folder), words)
-        print(rows[experiment.name], end="")
+        overrides = [] if is_small else at_paper_size(experiment, given.output, given.iterations)
+        rows[experiment.name] = remake(experiment, given.output / given.size, overrides, is_small, given.keep)
+        print(rows[experiment.name], end="", flush=True)
     if is_small:
-        rewrite_table(rows)
+        merge_rows(rows)
+        remake_replay(names, given.output, given.keep)
 
 
 if __name__ == "__main__":
