@@ -21,15 +21,19 @@ import numpy as np
 import paper_gradients
 import paper_path_replay
 import path_replay
+import torch
 import yaml
 from paper_figures import Array, Log, Pair, draw, draw_derivatives, pace, projected, read_log
 from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, read_table, rewrite_table
 
+from ddrecon.grid import Grid
 from ddrecon.io.images import read_image
-from ddrecon.io.volumes import read_field
+from ddrecon.io.volumes import read_field, write_field
+from ddrecon.reconstruct.levels import resampled
 
 SCRIPT = Path(__file__).name
-PAPER_PIXELS = 512
+PAPER_PIXELS, PAPER_CELLS = 512, 192
+CUBE = np.array([[-0.5] * 3, [0.5] * 3])
 TOP = (
     "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | loss | PSNR shown, novel | found |\n"
     "|---|---|---|---|---|---|---|\n"
@@ -70,6 +74,7 @@ class Experiment:
 
     `truth` names the folder of data/paper its pictures are in, if they are path-traced. `shown` makes the pairs to draw and says what was
     found. `others` are variants too, of the small size alone, whose logs are not drawn; `draw_more` makes further pictures of them all.
+    `known` names the shape whose density is given, which at the paper's size is interpolated to its cells.
     """
 
     name: str
@@ -78,6 +83,7 @@ class Experiment:
     paper_size: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"": ()})
     others: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    known: str = ""
     draw_more: Callable[[Runs], None] = lambda runs: None
 
 
@@ -86,9 +92,14 @@ def first(runs: Runs) -> Run:
     return next(iter(runs.values()))
 
 
-def shape(name: str, field: str = "density") -> Array:
-    """A field of the true volume `name`."""
-    return read_field(SHAPES / f"{name}.npz", field).values
+def shape(name: str, like: Array, field: str = "density") -> Array:
+    """A field of the true volume `name`, in cells as small as those of `like` [z, y, x, ...]."""
+    values = read_field(SHAPES / f"{name}.npz", field)
+    grid = Grid(like.shape[:3], *(tuple(corner[::-1]) for corner in values.bounds))  # type: ignore[arg-type]
+    found = torch.from_numpy(values.values)
+    moved = found if found.ndim == 3 else found.movedim(-1, 0)
+    carried = resampled(moved, grid)
+    return (carried if found.ndim == 3 else carried.movedim(0, -1)).numpy()
 
 
 def apart(ours: Array, truth: Array) -> float:
@@ -108,7 +119,8 @@ def show_density(truth: str, front: str) -> Shown:
     """What to show of a run that looks for the density of the shape `truth` and was shown the view `front`."""
 
     def shown(runs: Runs) -> tuple[list[Pair], str]:
-        run, density = first(runs), shape(truth)
+        run = first(runs)
+        density = shape(truth, run.field("density"))
         pairs = [run.view(front, "a view it was shown"), run.view("novel", "novel view"), *densities(run, density)]
         return pairs, f"relative L1 error of the density {apart(run.field('density'), density):.2f}"
 
@@ -117,10 +129,10 @@ def show_density(truth: str, front: str) -> Shown:
 
 def draw_rounds(runs: Runs) -> None:
     """Fig. 13 by other models: a picture of the densities, and a table."""
-    truth, lines, pairs = shape("bunny"), [], []
+    lines, pairs = [], []
     for name, run in runs.items():
         density, log = run.field("density"), read_log(run.folder)
-        true = truth if density.shape == truth.shape else truth.reshape(32, 2, 48, 2, 32, 2).mean((1, 3, 5))
+        true = shape("bunny", density)
         pairs.append(Pair(f"{NAMES_13[name]}:\ndensity along x", projected(true, 2, 1), projected(density, 2, 1)))
         low = slice(0, len(density[0]) // 3)
         quality = f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"
@@ -161,11 +173,11 @@ def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
 
 def show_optics(runs: Runs) -> tuple[list[Pair], str]:
     """Absorption and scattering coefficients in the middle of the cloud, and g."""
-    run, density = first(runs), shape("cloud")[..., None]
-    names = ("sigma_a", "sigma_s")
-    truths, found = (
-        [density * values for values in group] for group in ([shape("cloud", n) for n in names], [run.field(n) for n in names])
-    )
+    run = first(runs)
+    fields = [run.field(name) for name in ("sigma_a", "sigma_s")]
+    density = shape("cloud", fields[0])[..., None]
+    truths = [density * shape("cloud", field, name) for name, field in zip(("sigma_a", "sigma_s"), fields, strict=True)]
+    found = [density * field for field in fields]
     pairs = [run.view("ring_00", "a view it was shown"), run.view("novel", "novel view")]
     for title, color, truth, ours in zip(("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True):
         pairs.append(Pair(f"{title}, middle slices", *(middle(field[..., color]) for field in (truth, ours))))
@@ -177,7 +189,7 @@ def show_optics(runs: Runs) -> tuple[list[Pair], str]:
 def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
     """The colored smoke, and its coefficients in the middle."""
     run = first(runs)
-    truths, found = ([density * sigma for sigma in sigmas] for density, *sigmas in (smoke_truth(), smoke_found(run)))
+    truths, found = ([density * sigma for sigma in sigmas] for density, *sigmas in (smoke_truth(run.field("density")), smoke_found(run)))
     pairs = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
     for title, color, truth, ours in zip(("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True):
         pairs.append(Pair(f"{title}, along z", *(projected(field[..., color], 0, 1) for field in (truth, ours))))
@@ -185,9 +197,9 @@ def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
     return pairs, f"relative L1 error of absorption and scattering {errors}"
 
 
-def smoke_truth() -> list[Array]:
-    """Density [z, y, x, 1], sigma_a and sigma_s of the colored smoke."""
-    return [shape("smoke")[..., None], shape("smoke", "sigma_a"), shape("smoke", "sigma_s")]
+def smoke_truth(like: Array) -> list[Array]:
+    """Density [z, y, x, 1], sigma_a and sigma_s of the colored smoke, in cells as small as those of `like`."""
+    return [shape("smoke", like)[..., None], shape("smoke", like, "sigma_a"), shape("smoke", like, "sigma_s")]
 
 
 def smoke_found(run: Run) -> list[Array]:
@@ -253,7 +265,7 @@ EXPERIMENTS = (
     Experiment("fig13", "fig13", show_density("bunny", "ring_00"), ("optimize.iterations=1000",), others=ROUNDS, draw_more=draw_rounds),
     Experiment("fig06_light", "fig06_light", show_light, ("optimize.iterations=100",)),
     Experiment("fig06_density", "knot", show_density("knot", "front")),
-    Experiment("fig10", "fig10", show_optics, ("optimize.iterations=3000",), {"": (), "g_alone": G_ALONE}),
+    Experiment("fig10", "fig10", show_optics, ("optimize.iterations=3000",), {"": (), "g_alone": G_ALONE}, known="cloud"),
     Experiment("fig12_single", "smoke", show_smoke, (FINE,)),
     Experiment("fig12_four", "smoke", show_four, (FINE,)),
     Experiment("fig09", "knot", show_derivatives, (), PARTS, draw_more=draw_parts),
@@ -278,14 +290,19 @@ def found(run: Run) -> list[str]:
     return [*fields, f"volume.g={numbers['g']}", *lights]
 
 
-def at_paper_size(experiment: Experiment, output: Path, iterations: int | None) -> list[str]:
-    """Overrides for the paper's size, after its pictures have been path-traced; fewer `iterations` are all at full resolution."""
+def at_paper_size(experiment: Experiment, output: Path, iterations: int | None, paths: int | None) -> list[str]:
+    """Overrides for the paper's size, after its pictures have been traced by so many `paths`; given `iterations` are all at full resolution."""
     fewer = () if iterations is None else (f"optimize.iterations={iterations}", "optimize.refine_at=[]")
     size = [*experiment.paper_size, *fewer]
+    if experiment.known:
+        output.mkdir(parents=True, exist_ok=True)
+        path = output / f"{experiment.known}.npz"
+        write_field(path, "density", shape(experiment.known, np.empty(3 * [PAPER_CELLS])), CUBE)
+        size.append(f"volume.density={{file: {path.resolve()}}}")
     if not experiment.truth:
         return size
     traced, views = output / "targets", yaml.safe_load((CONFIGS / f"{experiment.name}.yaml").read_text())["views"]
-    options = ["--pixels", str(PAPER_PIXELS), "-o", traced]
+    options = ["--pixels", str(PAPER_PIXELS), "-o", traced, *([] if paths is None else ["--paths", str(paths)])]
     subprocess.run([sys.executable, ROOT / "data" / "make_targets.py", experiment.truth, *options], check=True)
     images = {index: traced.resolve() / experiment.truth / Path(view["image"]).name for index, view in enumerate(views) if "image" in view}
     return [*(f"views.{index}.image={image}" for index, image in images.items()), *size]
@@ -347,13 +364,14 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper")
     parser.add_argument("--size", choices=("small", "paper"), default="small")
     parser.add_argument("--iterations", type=int, help="instead of as many as the paper's size has")
+    parser.add_argument("--paths", type=int, help="a pixel of the pictures at the paper's size, instead of as many as those shipped have")
     parser.add_argument("--keep", action="store_true", help="do not run again what has been run")
     given = parser.parse_args()
     names, is_small, rows = given.names or [config.stem for config in CONFIGS.glob("*.yaml")], given.size == "small", dict[str, str]()
     for experiment in EXPERIMENTS:
         if experiment.name not in names:
             continue
-        overrides = [] if is_small else at_paper_size(experiment, given.output, given.iterations)
+        overrides = [] if is_small else at_paper_size(experiment, given.output, given.iterations, given.paths)
         rows[experiment.name] = remake(experiment, given.output / given.size, overrides, is_small, given.keep)
         print(rows[experiment.name], end="", flush=True)
     if is_small:

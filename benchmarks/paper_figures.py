@@ -72,7 +72,7 @@ def draw(path: Path, pairs: Sequence[Pair], logs: Mapping[str, Log]) -> None:
 
 
 def draw_derivatives(path: Path, images: Sequence[tuple[str, Array]]) -> None:
-    """Writes a PNG of titled derivative images [h, w] in a row: red where pixels grow brighter, blue where darker, each to its own scale."""
+    """Writes a PNG of titled derivative images [h, w] in a row: red where pixels grow brighter, blue where darker, each to a scale."""
     figure, axes = plt.subplots(1, len(images), figsize=(2.1 * len(images), 2.6), layout="constrained")
     for axis, (title, image) in zip(axes, images, strict=True):
         full = float(np.quantile(np.abs(image), 0.999))

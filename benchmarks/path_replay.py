@@ -1,7 +1,7 @@
 """Path replay backpropagation in Mitsuba 3 (Vicini, Speierer and Jakob 2021), with room above the densest cell.
 
 Mitsuba's majorant is the greatest extinction in the grid. Where extinction reaches it there are no null collisions, and those carry the
-derivative of transmittance: path replay does not see it there. Hence cells are added around the grid, outside the box that holds the medium,
+derivative of transmittance: path replay does not see it there. So cells are added around the grid, outside the box that holds the medium,
 one of them HEADROOM times as dense as the densest within; images are the same.
 """
 
