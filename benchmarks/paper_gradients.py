@@ -1,6 +1,6 @@
 """Fig. 8 of docs/experiments.md: our derivative images beside differences of path-traced ones.
 
-    python benchmarks/paper_gradients.py [-o FOLDER] [--paths 16384] [--replay-paths 1024]
+    python benchmarks/paper_gradients.py [-o FOLDER] [--paths 8192] [--replay-paths 512]
 
 Every cell's density, or its absorption, changes by the same amount. Derivatives are taken in the middle between two scenes that Mitsuba
 traces: the cloud as it is, and with a little more density everywhere; for absorption, less and more. Where DRJIT_LIBLLVM_PATH is set, path
@@ -13,6 +13,7 @@ import argparse
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -31,7 +32,7 @@ import matplotlib.pyplot as plt
 
 SCRIPT = Path(__file__).name
 CONFIG, CLOUD, PICTURE = CONFIGS / "fig08.yaml", SHAPES / "cloud.npz", PICTURES / "fig08.png"
-PATHS, REPLAY_PATHS = 16384, 1024
+PATHS, REPLAY_PATHS = 8192, 512
 LARGER = 2
 """Path replay's pixels are so many times as large."""
 HAZE, ABSORPTION = 0.03, 1.0
@@ -214,7 +215,7 @@ def main() -> None:
     remake(given.output, given.paths, given.replay_paths)
 
 
-def _compared(axis: plt.Axes, error_axis: plt.Axes, image: Array, truth: Array, full: float, title: str) -> None:
+def _compared(axis: Any, error_axis: Any, image: Array, truth: Array, full: float, title: str) -> None:
     for each in (axis, error_axis):
         each.axis("on")
     signed(axis, image, full, title)
