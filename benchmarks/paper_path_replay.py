@@ -46,7 +46,7 @@ JUDGED_AT = (5, 15, 40)
 JUDGING, CONVERGED = 64, 512
 """Paths a pixel of each trace that judges, and of each target."""
 TOP = (
-    "| pixels | total variation | | seconds an iteration | times ours | error, shown view | novel view | L1 error of the density | along z |\n"
+    "| pixels | total variation | | seconds an iteration | times ours | error, shown view | novel view | L1 error of density | along z |\n"
     "|---|---|---|---|---|---|---|---|---|\n"
 )
 
