@@ -21,18 +21,22 @@ class Camera:
     """A camera: `pose` is the camera-to-world matrix `[3, 4]` with OpenGL axes (right, up, backward, origin), rigid.
 
     `size`: (height, width) in pixels. `is_perspective` chooses between perspective, whose horizontal field of view is
-    `2 atan(half_width)`, and orthographic, whose image is `2 half_width` world units wide.
+    `2 atan(half_width)`, and orthographic, whose image is `2 half_width` world units wide. The axis meets the image at
+    `principal_point`, as parts of its width and height from the top left; `pixel_aspect` is the height of a pixel over its width.
     """
 
     pose: Tensor
     size: tuple[int, int]
     half_width: float
     is_perspective: bool = True
+    principal_point: tuple[float, float] = (0.5, 0.5)
+    pixel_aspect: float = 1.0
 
     def resized(self, factor: int) -> Camera:
-        """The same camera with `factor` times fewer pixels along each side (at least one)."""
+        """The same camera, seeing the same, with `factor` times fewer pixels along each side (at least one)."""
         height, width = (max(1, side // factor) for side in self.size)
-        return Camera(self.pose, (height, width), self.half_width, self.is_perspective)
+        aspect = self.pixel_aspect * (self.size[0] * width) / (self.size[1] * height)
+        return replace(self, size=(height, width), pixel_aspect=aspect)
 
 
 def twisted(camera: Camera, twist: Tensor, pivot: Triple) -> Camera:
@@ -109,8 +113,9 @@ def rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Rays:
     """The rays through every pixel, row by row, at `offset` (row, column) within the pixel: R = height * width."""
     height, width = camera.size
     pose = camera.pose
-    row = (torch.arange(height, dtype=pose.dtype, device=pose.device) + offset[0] - height / 2) * (-2 / width)
-    column = (torch.arange(width, dtype=pose.dtype, device=pose.device) + offset[1] - width / 2) * (2 / width)
+    middle = camera.principal_point
+    row = (torch.arange(height, dtype=pose.dtype, device=pose.device) + offset[0] - middle[1] * height) * (-2 * camera.pixel_aspect / width)
+    column = (torch.arange(width, dtype=pose.dtype, device=pose.device) + offset[1] - middle[0] * width) * (2 / width)
     y, x = torch.meshgrid(row * camera.half_width, column * camera.half_width, indexing="ij")
     right, up, backward, origin = pose.unbind(1)
     plane = x.reshape(-1, 1) * right + y.reshape(-1, 1) * up

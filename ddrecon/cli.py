@@ -5,89 +5,23 @@ torch is imported inside the commands, so that `--help` answers at once.
 
 from __future__ import annotations
 
-import functools
-import os
 import sys
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from ddrecon import __version__
-from ddrecon.errors import DataWarning, DdreconError
+from ddrecon.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, in_session, require_folder_of, show_version
 
 if TYPE_CHECKING:
     from ddrecon.session import Session
 
-COMMON = (
-    click.option("-D", "overrides", multiple=True, metavar="KEY.PATH=VALUE", help="Override a value of the scene file; repeatable."),
-    click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True),
-    click.option("--threads", type=click.IntRange(min=1), help="Processor threads; OMP_NUM_THREADS or all cores unless given."),
-    click.option("--seed", type=int, default=0, show_default=True),
-    click.option("-q", "--quiet", is_flag=True, help="No progress line."),
-    click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),
-    click.option("--debug", is_flag=True, help="Show the traceback of an error."),
-)
-THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
-"""Waiting threads spin for a moment, then sleep: 1.5 times faster than sleeping at once, without the stalls of endless spinning."""
-DTYPE = click.option("--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True)
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-SCENE = click.argument("scene", type=click.Path(path_type=Path))
-OUTPUT = click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
-REPORT = click.option("--json", "report", type=click.Path(path_type=Path), metavar="FILE", help="Also write the result to FILE.")
-OVERWRITE = click.option("--overwrite", is_flag=True, help="Write into a folder that is not empty.")
-
-
-def in_session(command: Callable[..., None]) -> Callable[..., None]:
-    """Adds the common options, handed on as one `Session`; an error of the user's becomes one line and an exit code."""
-
-    @functools.wraps(command)
-    def wrapped(
-        overrides: tuple[str, ...], device: str, threads: int | None, seed: int, quiet: bool, verbose: bool, debug: bool, **others: Any
-    ) -> None:
-        for name, value in THREADING.items():
-            os.environ.setdefault(name, value)
-        try:
-            from ddrecon.session import open_session
-
-            printing = {"dtype": others.pop("dtype", "float64"), "as_json": others.pop("as_json", False)}
-            with shown_warnings():
-                command(session=open_session(overrides, device, threads, seed, quiet, verbose, **printing), **others)
-        except DdreconError as error:
-            if debug:
-                raise
-            click.echo(str(error), err=True)
-            sys.exit(error.exit_code)
-        except KeyboardInterrupt as error:
-            click.echo(f"interrupted {error}".strip(), err=True)
-            sys.exit(130)
-
-    for option in reversed(COMMON):
-        wrapped = option(wrapped)
-    return wrapped
-
-
-def require_folder_of(report: Path | None) -> None:
-    """Raises click.UsageError where `report` is to be written into a folder that does not exist."""
-    if report is not None and not report.absolute().parent.is_dir():
-        raise click.UsageError(f"--json {report}: there is no folder {report.absolute().parent}")
-
-
-@contextmanager
-def shown_warnings() -> Iterator[None]:
-    """Warnings about data become lines on stderr; those of libraries are for developers and stay unseen."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = lambda message, *_: click.echo(f"warning: {message}", err=True)
-        yield
-
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__)
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=show_version, help="Show versions and the device, and exit."
+)
 def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
@@ -99,25 +33,49 @@ def main() -> None:
 @click.option("--view", "names", multiple=True, metavar="NAME", help="Render only this view; repeatable.")
 @click.option("--components", is_flag=True, help="Also write reduced, single and multiple radiance, which sum to the image.")
 @click.option("--gradient", "parameter", metavar="PARAM", help="Also write each image's derivative: density, g, lights.0.direction.x, ...")
+@click.option("--light", "lights", multiple=True, metavar="LIGHT", help="Light it by '{type: directional, ...}' instead; repeatable.")
+@click.option("--ring", "count", type=click.IntRange(min=2), metavar="N", help="N views around the volume instead, and ring.png of them.")
+@click.option("--mp4", "has_mp4", is_flag=True, help="With --ring, also write ring.mp4.")
 @DTYPE
 @AS_JSON
 @in_session
 def render(
-    session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], components: bool, parameter: str | None
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    names: tuple[str, ...],
+    components: bool,
+    parameter: str | None,
+    lights: tuple[str, ...],
+    count: int | None,
+    has_mp4: bool,
 ) -> None:
-    """Render the views of SCENE."""
-    from ddrecon.io.folders import prepare_folder
-    from ddrecon.render_folder import render_gradient_to_folder, render_to_folder, require_variation
+    """Render the views of SCENE, a scene file or the folder of a finished run."""
+    from ddrecon.io.folders import claimed_folder
+    from ddrecon.io.json_file import write_json
+    from ddrecon.io.movies import require_mp4
+    from ddrecon.render_folder import render_gradient_to_folder, render_to_folder, require_variation, write_ring
 
-    loaded = session.load(scene)
+    if count is None and has_mp4:
+        raise click.UsageError("--mp4 is a movie of --ring N")
+    if has_mp4:
+        require_mp4()
+    loaded = session.relit(lights).load(scene)
     views = session.chosen_views(loaded, names)
-    if parameter is None:
-        prepare_folder(output, may_exist=overwrite)
-        report = render_to_folder(loaded, views, output, components, session.progress)
-    else:
+    if lights or count is not None:
+        loaded, views = session.without_targets(loaded, views, count)
+    if parameter is not None:
         require_variation(loaded, parameter)
-        prepare_folder(output, may_exist=overwrite)
-        report = render_gradient_to_folder(loaded, views, output, components, parameter, session.progress)
+    with claimed_folder(output, may_exist=overwrite):
+        settings = views, output, components
+        if parameter is None:
+            report = render_to_folder(loaded, *settings, session.progress)
+        else:
+            report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
+        if count is not None:
+            report["ring"] = write_ring(views, output, has_mp4)
+        write_json(output / "render.json", report)
     session.show(report, session.render_lines(report, output))
 
 
@@ -128,20 +86,35 @@ def render(
 @click.option("--iterations", type=click.IntRange(min=1), help="Total number of iterations, also after --resume.")
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
 @click.option("--preview-every", type=click.IntRange(min=1), metavar="K", help="Write pictures every K iterations.")
+@click.option("--tensorboard", "has_events", is_flag=True, help="Also write the loss log for TensorBoard.")
 @DTYPE
 @AS_JSON
 @in_session
 def optimize(
-    session: Session, scene: Path, output: Path, overwrite: bool, iterations: int | None, resume: bool, preview_every: int | None
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    iterations: int | None,
+    resume: bool,
+    preview_every: int | None,
+    has_events: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.reconstruct.drive import drive, open_run
+    from ddrecon.reconstruct.drive import drive, opened_run
+    from ddrecon.reconstruct.events import require_tensorboard
+
+    if has_events:
+        require_tensorboard()
 
     if iterations is not None:
         session = session.overriding(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
-    run, folder = open_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume)
-    summary = drive(run, folder, preview_every, session.is_quiet)
+    with opened_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume) as (
+        run,
+        folder,
+    ):
+        summary = drive(run, folder, preview_every, session.is_quiet, has_events)
     session.show(summary, session.summary_lines(summary, output))
 
 
@@ -169,7 +142,9 @@ def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: in
 @click.argument("scene", required=False, type=click.Path(path_type=Path))
 @click.option("--quick", "is_quick", is_flag=True, help="A small scene, or SCENE made coarser, measured once.")
 @click.option("--hard", "is_hard", is_flag=True, help="Instead: numerical stability on hard cases, in float32 against float64.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for the results: bench.json and bench.png, or hard.json.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Folder for the results: bench.json, bench.png and report.html, or hard.json."
+)
 @OVERWRITE
 @REPORT
 @in_session
@@ -183,11 +158,10 @@ def bench(
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     require_folder_of(report)
     from ddrecon.bench.run import bench_hard, bench_speed
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
 
-    if output is not None:
-        prepare_folder(output, may_exist=overwrite)
-    has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
+    with nullcontext() if output is None else claimed_folder(output, may_exist=overwrite):
+        has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
     if not has_passed:
         sys.exit(1)
 
@@ -206,17 +180,17 @@ def reference(
     session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], samples: int, is_only_traced: bool
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
-    from ddrecon.io.folders import prepare_folder
+    from ddrecon.io.folders import claimed_folder
     from ddrecon.reference.compare import compare_to_folder, trace_to_folder, write_report
     from ddrecon.reference.trace import open_tracer
 
     loaded = session.load(scene)
     views = session.chosen_views(loaded, names)
     tracer = open_tracer(loaded, views, threads=session.threads)
-    prepare_folder(output, may_exist=overwrite)
-    settings = output, samples, session.seed, session.progress
-    found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
-    report = write_report(output, found, session.environment())
+    with claimed_folder(output, may_exist=overwrite):
+        settings = output, samples, session.seed, session.progress
+        found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
+        report = write_report(output, found, session.environment())
     session.show(report, session.reference_lines(report, output))
 
 
@@ -226,13 +200,20 @@ def reference(
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
 @in_session
 def export(session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool) -> None:
-    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), or all fields of VOLUMEs in the format of FILE's suffix."""
-    if output.suffix.lower() == ".xml":
+    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as NeRF's transforms.json), or all fields of
+    VOLUMEs in the format of FILE's suffix."""
+    kind = output.suffix.lower()
+    if kind in (".xml", ".json") and len(sources) > 1:
+        raise click.UsageError(f"one scene at a time is written as {kind}")
+    if kind == ".xml":
         from ddrecon.reference.export import export_scene
 
-        if len(sources) > 1:
-            raise click.UsageError("one scene at a time is written for Mitsuba")
         written = export_scene(session.load(sources[0]), output, may_exist=overwrite)
+    elif kind == ".json":
+        from ddrecon.scene.export_transforms import export_transforms
+
+        scene_file = session.read(sources[0])
+        written = export_transforms(session.build(scene_file), scene_file, output, may_exist=overwrite)
     else:
         from ddrecon.io.convert import convert
 

@@ -7,6 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+LONGEST = 1000
+"""Lines of more characters are shortened in the middle."""
+
+
+def one_line(text: str) -> str:
+    """`text` as a line that can be printed: what cannot be is escaped, and what is too long shortened."""
+    line = text if text.isprintable() else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+
 
 class DdreconError(Exception):
     """Base of every error a user can cause; `exit_code` is what the command line returns."""
@@ -18,18 +27,18 @@ class SceneError(DdreconError):
     """A scene that cannot be used: one line per problem, `file:line:column: key.path: what is wrong`."""
 
     def __init__(self, problems: str | Sequence[str]):
-        self.problems = [problems] if isinstance(problems, str) else list(problems)
+        self.problems = [one_line(problem) for problem in ([problems] if isinstance(problems, str) else problems)]
         super().__init__("\n".join(self.problems))
 
 
 class FormatError(DdreconError):
-    """A data file that exists but cannot be used."""
+    """A data file that exists but cannot be used, or several: the first, and the lines that tell of the `others`."""
 
     exit_code = 3
 
-    def __init__(self, path: object, reason: str):
+    def __init__(self, path: object, reason: str, others: Sequence[str] = ()):
         self.path, self.reason = str(path), reason
-        super().__init__(f"{path}: {reason}")
+        super().__init__("\n".join(one_line(line) for line in (f"{path}: {reason}", *others)))
 
 
 class MissingExtraError(DdreconError):
@@ -49,7 +58,15 @@ class SolveError(DdreconError):
 
 
 class DivergenceError(SolveError):
-    """An optimization whose numbers are no longer finite."""
+    """An optimization that cannot go on: `iteration`, counted from 1, failed by what `what` says; `residual` is that of its solve."""
+
+    def __init__(self, iteration: int, what: str, residual: float, advice: str):
+        self.what, self.iterations, self.residual, self.advice = what, iteration, residual, advice
+        DdreconError.__init__(self, f"iteration {iteration}: {what}; {advice}")
+
+    def with_advice(self, more: str) -> DivergenceError:
+        """The same with `more` to know."""
+        return DivergenceError(self.iterations, self.what, self.residual, f"{self.advice}; {more}")
 
 
 class DataWarning(UserWarning):

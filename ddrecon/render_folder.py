@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError
-from ddrecon.io.images import write_picture
-from ddrecon.io.json_file import write_json
+from ddrecon.io.images import PREVIEW, read_image, write_picture
+from ddrecon.io.movies import encoded, write_animation, write_mp4
 from ddrecon.reconstruct.losses import psnr
-from ddrecon.reconstruct.previews import diverging, pixels
+from ddrecon.reconstruct.previews import diverging, pixels, white_of
 from ddrecon.renderer import LightField, solve_light, view_components, view_image
 from ddrecon.tangents import render_tangent, variation
 from ddrecon.terms import needed_terms
@@ -27,7 +27,7 @@ Progress = Callable[[list[View], str], Iterable[View]]
 
 
 def render_to_folder(scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Progress) -> dict[str, Any]:
-    """Renders `views` of `scene` into `folder` and returns the report that `render.json` holds."""
+    """Renders `views` of `scene` into `folder` and returns a report of it."""
     memory, files, seconds, quality = SolveMemory(), {}, {}, {}
     with torch.no_grad():
         start = perf_counter()
@@ -40,9 +40,7 @@ def render_to_folder(scene: Scene, views: list[View], folder: Path, has_componen
             files[view.name] = [path.name for name, image in images.items() for path in write_picture(folder / name, pixels(image))]
             if view.image is not None:
                 quality[view.name] = psnr(images[view.name], view.image, view.mask)
-    report = _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {"psnr": quality}
-    write_json(folder / "render.json", report)
-    return report
+    return _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {"psnr": quality}
 
 
 def render_gradient_to_folder(
@@ -70,9 +68,19 @@ def render_gradient_to_folder(
         picture, scales[derived] = diverging(derivative)
         written = write_picture(folder / name, pixels(image)) + write_picture(folder / derived, pixels(derivative), picture)
         files[view] += [path.name for path in written]
-    report = _report(scene, memory, seconds, files) | {"psnr": {}, "gradient": {"parameter": parameter, "full_scale": scales}}
-    write_json(folder / "render.json", report)
-    return report
+    return _report(scene, memory, seconds, files) | {"psnr": {}, "gradient": {"parameter": parameter, "full_scale": scales}}
+
+
+def write_ring(views: list[View], folder: Path, has_mp4: bool) -> dict[str, Any]:
+    """Writes the images of `views` in `folder` as one movie, `ring.png` and where asked for `ring.mp4`; what the report says of it."""
+    images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
+    white = max(map(white_of, images))
+    frames, written = encoded(images, white), ["ring.png"]
+    write_animation(folder / "ring.png", frames)
+    if has_mp4:
+        write_mp4(folder / "ring.mp4", frames)
+        written.append("ring.mp4")
+    return {"files": written, "white": white}
 
 
 def require_variation(scene: Scene, parameter: str) -> None:
@@ -85,7 +93,7 @@ def require_variation(scene: Scene, parameter: str) -> None:
 
 def _report(scene: Scene, memory: SolveMemory, seconds: dict[str, Any], files: dict[str, list[str]]) -> dict[str, Any]:
     solves = [{"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds} for r in memory.records]
-    return {"seconds": seconds, "solves": solves, "physics": needed_terms(scene), "files": files}
+    return {"seconds": seconds, "solves": solves, "physics": needed_terms(scene), "files": files, "preview": PREVIEW}
 
 
 def _images(light_field: LightField, scene: Scene, view: View, has_components: bool) -> dict[str, Tensor]:

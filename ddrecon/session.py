@@ -18,9 +18,12 @@ from tqdm import tqdm
 
 from ddrecon import __version__
 from ddrecon.errors import SceneError
+from ddrecon.extras import advice
+from ddrecon.reconstruct.result import RESULT
 from ddrecon.scene.build import build_scene
 from ddrecon.scene.load import SceneFile, read_scene
 from ddrecon.scene.problems import suggestion
+from ddrecon.turntable import turntable
 from ddrecon.world import Scene, View
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -43,9 +46,13 @@ class Session:
         """The same session with more overrides of the scene file."""
         return replace(self, overrides=self.overrides + overrides)
 
+    def relit(self, lights: tuple[str, ...]) -> Session:
+        """The same session with `lights`, each as a scene file has it, instead of all of the scene's; without any, as it is."""
+        return self.overriding(f"lights=[{', '.join(lights)}]") if lights else self
+
     def read(self, path: Path) -> SceneFile:
-        """The scene file at `path`, checked."""
-        return read_scene(path, self.overrides)
+        """The scene file at `path`, or the result in the folder of a finished run, checked."""
+        return read_scene(result_in(path) if path.is_dir() else path, self.overrides)
 
     def build(self, scene_file: SceneFile) -> Scene:
         """The scene as tensors on this session's device."""
@@ -62,6 +69,12 @@ class Session:
         if unknown:
             raise SceneError([f"--view {name}: no such view{suggestion(name, known)}" for name in unknown])
         return [view for view in scene.views if not names or view.name in names]
+
+    @staticmethod
+    def without_targets(scene: Scene, views: list[View], count: int | None) -> tuple[Scene, list[View]]:
+        """`scene` and `views` as if there were no target images; with `count`, so many views around the volume from the first of them."""
+        plain = turntable(scene, views[0], count) if count is not None else [View(view.name, view.camera) for view in views]
+        return replace(scene, views=plain), plain
 
     def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
         """`items` with a progress bar on stderr, unless quiet."""
@@ -80,7 +93,9 @@ class Session:
             notes += [f"PSNR {report['psnr'][name]:.1f} dB"] if name in report["psnr"] else []
             lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
         if any(file.endswith(".tif") for files in report["files"].values() for file in files):
-            lines.append('no OpenEXR here, so float .tif instead of .exr; for EXR: pip install "ddrecon[exr]"')
+            lines.append(f"float .tif instead of .exr: EXR {advice('OpenEXR')}")
+        if "ring" in report:
+            lines.append(f"around: {', '.join(report['ring']['files'])} (radiance {report['ring']['white']:.3g} is white)")
         return [*lines, f"written to {folder}"]
 
     @staticmethod
@@ -128,6 +143,16 @@ class Session:
             "overrides": list(self.overrides),
             "command": sys.argv,
         }
+
+
+def result_in(folder: Path) -> Path:
+    """The scene file that a run has left in its `folder` at its end; raises SceneError where there is none."""
+    path = folder / RESULT
+    if not path.is_file():
+        raise SceneError(
+            f"{folder}: holds no {RESULT}, as `ddrecon optimize` writes it at its end; name a scene file, or finish the run with --resume"
+        )
+    return path
 
 
 def open_session(

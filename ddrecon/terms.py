@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.march import CHUNK_NODES
 from ddrecon.medium import scaled_medium
+from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.renderer import has_flux, multiply_scatters
 from ddrecon.settings import DiffusionSettings
 from ddrecon.sky import count_suns
@@ -66,26 +66,21 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' if count > 1 else ''}"
 
 
-GIVEN_BACK = 2**25
-"""Arrays larger than this many bytes leave the process when they are done with; smaller ones stay with its allocator (glibc's)."""
-
-
 def memory_estimate(scene: Scene) -> int:
-    """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself.
-
-    Fitted to what `benchmarks/memory.py` measures, in numbers per cell and in buffers of marched nodes. Those that are alive at a time are
-    known well; where arrays stay with the allocator it holds up to twice as much, for others of the same size.
-    """
-    medium = scaled_medium(scene.volume)
-    colors, cells = medium.extinction.scale.shape[0], scene.volume.grid.cells
-    size = torch.finfo(scene.volume.density.dtype).bits // 8
-    flux, sweeps, limited = has_flux(medium), scene.diffusion.transport_rounds > 0, scene.diffusion.model == "flux_limited"
-    numbers, buffers, kept = 17.0 + (21 + 3 * flux + 16 * sweeps + 7 * limited) * colors, 6.0 + 2 * colors, 1.1
-    if scene.optimize is not None:
-        varied = sum(start.numel() for start in scene.starts.values()) / cells
-        numbers = 50 + 12 * varied + (7 + 13 * flux + 34 * sweeps + 32 * limited) * colors
-        buffers, kept = 12 * colors + 4 * varied, 1.9 if size * colors * cells <= GIVEN_BACK else 1.5
-    return int(size * (numbers * cells + buffers * CHUNK_NODES) * (kept if size * cells <= GIVEN_BACK else 1.1))
+    """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself."""
+    volume, grid = scene.volume, scene.volume.grid
+    fields = [start for start in scene.starts.values() if tuple(start.shape[-3:]) == grid.shape]
+    needs = Needs(
+        (grid.shape[2], grid.shape[1], grid.shape[0]),
+        max(volume.sigma_a.shape[0], volume.sigma_s.shape[0]),
+        torch.finfo(volume.density.dtype).bits // 8,
+        sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
+        has_flux=bool(volume.g != 0) or "g" in scene.starts,
+        has_rounds=scene.diffusion.transport_rounds > 0,
+        is_limited=scene.diffusion.model == "flux_limited",
+        varied=None if scene.optimize is None else sum(field.numel() for field in fields) / grid.cells,
+    )
+    return memory_of(needs)
 
 
 def describe(scene: Scene) -> dict[str, Any]:
@@ -118,7 +113,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(_counted_entries(*item) for item in report['optimizes'].items()) or 'nothing'}",
-        f"memory: about {report['memory_bytes'] / 2**20:.0f} MiB at the peak, besides torch itself",
+        f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
+from ddrecon.io.volumes import FORMATS
 from ddrecon.lights import AmbientLight, DirectionalLight
 from ddrecon.medium import Volume
 from ddrecon.settings import DiffusionSettings, RenderSettings
@@ -126,3 +128,25 @@ order = _factory(_order)
 def same_seed() -> None:
     """No test depends on those before it: which views an iteration looks at follows from the seed."""
     torch.manual_seed(0)
+
+
+PACKAGES = {".vdb": ("openvdb", "pyopenvdb"), ".tif": ("tifffile",), ".tiff": ("tifffile",), ".nc": ("netCDF4",)}
+"""What reading a format needs: one of these."""
+
+
+def _is_readable(suffix: str) -> bool:
+    return suffix not in PACKAGES or any(find_spec(name) for name in PACKAGES[suffix])
+
+
+@pytest.fixture(scope="session")
+def readable_formats() -> list[str]:
+    """The suffixes of all volume files that can be read here."""
+    return [suffix for suffix in FORMATS if _is_readable(suffix)]
+
+
+@pytest.fixture(scope="session", params=FORMATS)
+def suffix(request: pytest.FixtureRequest) -> str:
+    """The suffix of each kind of volume file that can be read here."""
+    if not _is_readable(request.param):
+        pytest.skip(f"reading {request.param} needs {' or '.join(PACKAGES[request.param])}, not installed here")
+    return request.param

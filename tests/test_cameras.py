@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -75,6 +76,28 @@ def test_a_smaller_picture_sees_the_same():
     view = camera((6, 8))
     torch.testing.assert_close(rays(view.resized(2), (0.5, 0.5)).direction[0], rays(view, (1.0, 1.0)).direction[0], rtol=0, atol=1e-15)
     assert view.resized(100).size == (1, 1)
+
+
+@pytest.mark.parametrize("is_perspective", [True, False])
+def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective: bool):
+    """Also where its size is no whole fraction, and whatever the principal point."""
+    view = replace(camera((7, 11), is_perspective=is_perspective), principal_point=(0.3, 0.6), pixel_aspect=1.1)
+    for factor in (2, 3, 100):
+        for corner, index in (((0.0, 0.0), 0), ((1.0, 1.0), -1)):
+            small, large = rays(view.resized(factor), corner), rays(view, corner)
+            torch.testing.assert_close(small.direction[index], large.direction[index], rtol=0, atol=1e-15)
+            torch.testing.assert_close(small.origin[index], large.origin[index], rtol=0, atol=1e-14)
+
+
+def test_rays_of_a_calibrated_pinhole():
+    """x = (column - cx) / fx to the right, y = (cy - row) / fy up, whatever the focal lengths."""
+    height, width, fx, fy, cx, cy = 3, 5, 7.0, 6.0, 2.2, 1.9
+    view = Camera(look_at(ORIGIN, TARGET, UP), (height, width), width / 2 / fx, True, (cx / width, cy / height), fx / fy)
+    right, up, backward, _ = view.pose.unbind(1)
+    for row in range(height):
+        for column in range(width):
+            toward = (column + 0.5 - cx) / fx * right + (cy - row - 0.5) / fy * up - backward
+            torch.testing.assert_close(rays(view).direction[row * width + column].flip(0), toward / toward.norm(), rtol=0, atol=1e-15)
 
 
 @given(st.integers(1, 64))

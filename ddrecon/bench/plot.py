@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.bench.report import Row, error_of
+from ddrecon.extras import load_extra
 
 FLOOR = 1e-8
 """Errors below this are drawn here."""
@@ -16,11 +17,9 @@ FLOOR = 1e-8
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Writes a PNG: the time of an image against its error, and of an image with its gradient against the gradient's numerical error.
 
-    Raises ModuleNotFoundError where matplotlib is not installed.
+    Raises MissingExtraError where matplotlib is not installed.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
+    load_extra("matplotlib", "a plot").use("Agg")
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")

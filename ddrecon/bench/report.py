@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from ddrecon.bench.measure import Shot, Timing, correlation, relative_error
 from ddrecon.bench.path_tracing import Truth
+from ddrecon.report import page
+from ddrecon.report.page import paragraph, picture, section, write_page
 
 
 @dataclass(frozen=True)
@@ -64,33 +68,45 @@ def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> 
     return row
 
 
+HEAD = [
+    "variant",
+    "image s",
+    "+ gradient s",
+    "times base",
+    "iterations",
+    "image num. error",
+    "gradient num. error",
+    "image error",
+    "gradient corr.",
+    "",
+]
+"""The columns of the table."""
+
+
+def cells(rows: Sequence[Row]) -> list[list[str]]:
+    """The rows as text under `HEAD`; times also as multiples of the first row's."""
+    return [_cells(row, rows[0]) for row in rows]
+
+
+def _cells(row: Row, base: Row) -> list[str]:
+    times = [f"{row.image_seconds:.3f}", f"{row.both_seconds:.3f}", f"{row.both_seconds / base.both_seconds:.2f}", str(row.iterations)]
+    numerical = ["" if value is None else f"{value:.1e}" for value in (row.image_numerical, row.gradient_numerical)]
+    traced = ["" if value is None else f"{value:.3f}" for value in (row.image_error, row.gradient_correlation)]
+    return [row.name, *times, *numerical, *traced, "best" if row.is_best else ""]
+
+
 def table(rows: Sequence[Row]) -> list[str]:
-    """The rows as a Markdown table; times also as multiples of the first row's."""
-    head = [
-        "variant",
-        "image s",
-        "+ gradient s",
-        "times base",
-        "iterations",
-        "image num. error",
-        "gradient num. error",
-        "image error",
-        "gradient corr.",
-        "",
+    """The rows as a Markdown table."""
+    return [f"| {' | '.join(line)} |" for line in (HEAD, ["---"] * len(HEAD), *cells(rows))]
+
+
+def write_report(path: Path, rows: Sequence[Row], remarks: Sequence[str], plot: bytes | None, environment: Mapping[str, Any]) -> None:
+    """Writes the rows, `remarks` on them, the `plot` (a PNG) where there is one, and the versions as a page."""
+    drawn = [section("Error against time", picture(plot, "numbers are those of the legend; the line joins the best", 1080))] if plot else []
+    versions = [(key, " ".join(map(str, value)) if isinstance(value, list) else value) for key, value in environment.items()]
+    sections = [
+        *drawn,
+        section("Variants", page.table(HEAD, cells(rows)), *map(paragraph, remarks)),
+        section("Versions", page.table(["", ""], versions)),
     ]
-    lines = [_line(head), _line(["---"] * len(head))]
-    for row in rows:
-        shown = [
-            f"{row.image_seconds:.3f}",
-            f"{row.both_seconds:.3f}",
-            f"{row.both_seconds / rows[0].both_seconds:.2f}",
-            str(row.iterations),
-        ]
-        shown += ["" if value is None else f"{value:.1e}" for value in (row.image_numerical, row.gradient_numerical)]
-        shown += ["" if value is None else f"{value:.3f}" for value in (row.image_error, row.gradient_correlation)]
-        lines.append(_line([row.name, *shown, "best" if row.is_best else ""]))
-    return lines
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    write_page(path, "ddrecon bench", "Speed against error: medians of whole renders, in one run.", sections)

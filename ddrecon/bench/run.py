@@ -15,7 +15,7 @@ from ddrecon.bench.measure import Progress, blocks_of, exact_shots, measure, sho
 from ddrecon.bench.path_tracing import PathTracer, Truth
 from ddrecon.bench.plot import draw
 from ddrecon.bench.plume import plume_scene
-from ddrecon.bench.report import Row, rows_of, table
+from ddrecon.bench.report import Row, rows_of, table, write_report
 from ddrecon.bench.variants import QUICK, Sweep, variants_of
 from ddrecon.errors import MissingExtraError, SceneError
 from ddrecon.io.json_file import write_json
@@ -39,10 +39,13 @@ def bench_speed(session: Session, path: Path | None, is_quick: bool, output: Pat
     tracer = _tracer(scene, has_gradient=not is_quick)
     rows, truth = run_bench(scene, double, tracer, is_quick, session.progress)
     found = describe(rows, truth, scene, session.environment())
-    click.echo("\n".join([*table(rows), *against_path_tracing(rows)]))
+    remarks = against_path_tracing(rows)
+    click.echo("\n".join([*table(rows), *remarks]))
     if output is not None:
         write_json(output / "bench.json", found)
         click.echo(_drawn(rows, output))
+        plot = output / "bench.png"
+        write_report(output / "report.html", rows, remarks, plot.read_bytes() if plot.is_file() else None, session.environment())
     if report is not None:
         write_json(report, found)
     return True
@@ -107,8 +110,8 @@ def _drawn(rows: Sequence[Row], folder: Path) -> str:
     """Draws bench.png into `folder` where matplotlib is installed; what to tell the user."""
     try:
         draw(rows, folder / "bench.png")
-    except ModuleNotFoundError:
-        return f'written to {folder}; no plot, which needs matplotlib: pip install "ddrecon[plot]"'
+    except MissingExtraError as error:
+        return f"written to {folder}, without a plot: {error}"
     return f"written to {folder}"
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ddrecon.errors import FormatError
+
+TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
 
 
 @contextmanager
@@ -17,11 +20,47 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Raises FormatError where the system refuses to write.
     """
-    temporary = path.with_name(f".{path.stem}-{uuid.uuid4().hex[:12]}{path.suffix}")
-    try:
+    temporary = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:12]}{path.suffix}")
+    with refusals(path):
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_durably(path: Path, kept_as: Path) -> Iterator[Path]:
+    """As `replacing`, but safe from a loss of power once it has ended; what `path` was until then is kept as `kept_as`."""
+    with replacing(path) as temporary:
         yield temporary
-        os.replace(temporary, path)
+        flush(temporary)
+        with suppress(FileNotFoundError):
+            os.replace(path, kept_as)
+    flush(path.parent)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Removes what processes that were killed while writing have left in `folder`."""
+    for path in folder.iterdir():
+        if TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+def flush(path: Path) -> None:
+    """Has the system put the file or folder at `path` on its disk; raises FormatError where it cannot."""
+    with refusals(path):
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+@contextmanager
+def refusals(path: Path) -> Iterator[None]:
+    """An OSError inside the block becomes a FormatError that says `path` cannot be written."""
+    try:
+        yield
     except OSError as error:
         raise FormatError(path, f"cannot be written: {error.strerror or error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
 from ddrecon.errors import FormatError
+from ddrecon.extras import load_for_file
 from ddrecon.io.arrays import as_float32, check_size
 from ddrecon.io.atomic import replacing
 
@@ -23,7 +23,7 @@ def has_exr() -> bool:
 
 def read_exr(path: Path) -> np.ndarray:
     """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4]; raises FormatError when it cannot be used."""
-    module = _module(path)
+    module = load_for_file("OpenEXR", path)
     try:
         _check_window(module.File(str(path), header_only=True).header(), path)
         channels = {name: channel.pixels for name, channel in module.File(str(path), separate_channels=True).channels().items()}
@@ -35,19 +35,10 @@ def read_exr(path: Path) -> np.ndarray:
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:
     """Writes `pixels` [h, w, 3] as float32 RGB; raises FormatError where OpenEXR is not installed."""
-    module = _module(path)
+    module = load_for_file("OpenEXR", path)
     header = {"compression": module.ZIP_COMPRESSION, "type": module.scanlineimage}
     with replacing(path) as temporary:
         module.File(header, {"RGB": as_float32(pixels)}).write(str(temporary))
-
-
-def _module(path: Path) -> ModuleType:
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise FormatError(path, 'needs OpenEXR: pip install "ddrecon[exr]"') from error
-    module: ModuleType = OpenEXR
-    return module
 
 
 def _check_window(header: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:

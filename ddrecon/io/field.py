@@ -33,6 +33,19 @@ Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
 
 
+def name_from_file(path: Path) -> list[str]:
+    """The one name of the field at `path`, where the file does not say it: what its own name ends with."""
+    return [path.stem.rpartition(".")[2]]
+
+
+def only_field(path: Path, fields: Fields) -> np.ndarray:
+    """The values of the one of `fields`, for a format that holds no more."""
+    if len(fields) != 1:
+        raise FormatError(path, f"a {path.suffix} holds one field, not {', '.join(fields)}; write each into a file of its own")
+    (values,) = fields.values()
+    return values
+
+
 def checked_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | None) -> Field:
     """The field of `values` and `bounds` as a file at `path` gave them; raises FormatError unless they are legal."""
     if values.ndim not in (3, 4) or (values.ndim == 4 and values.shape[3] != 3) or values.size == 0:

@@ -1,7 +1,7 @@
 """Images by suffix, in linear radiance. Row 0 is the top.
 
 Float formats (.exr, .hdr, .npy, .tif) are linear and, where they have alpha, premultiplied; 8- and 16-bit ones (.png, .jpg, .webp) are
-decoded from sRGB and multiplied by their alpha. Either way a pixel of alpha 0 is empty: black.
+decoded from sRGB and multiplied by their alpha. Either way a pixel of alpha 0 is empty: black. Previews have exposure 1.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from ddrecon.io.arrays import as_float32, read_npy
 from ddrecon.io.atomic import replacing
 from ddrecon.io.exr import has_exr, read_exr, write_exr
 from ddrecon.io.hdr import read_hdr
+from ddrecon.io.png16 import has_deep_colors, read_deep_png
+from ddrecon.io.reading import reading
 from ddrecon.io.tiff import read_tiff, write_tiff
+
+PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
+"""How the .png of an image is to be read."""
+BEGINNINGS = ((b"\x89PNG\r\n\x1a\n", b""), (b"\xff\xd8\xff", b""), (b"RIFF", b"WEBP"))
+"""How the first 12 bytes of encoded images begin and end. Pillow would look at nothing but the content, and run Ghostscript on some."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +70,17 @@ def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
 
 def write_preview(path: Path, pixels: np.ndarray) -> None:
     """Writes `pixels` [h, w, 3], linear, as an 8-bit sRGB .png at `path`, clipped to [0, 1]."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(png_of(pixels))
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
     import imageio.v3 as iio
 
-    encoded = srgb.encode(np.clip(np.nan_to_num(pixels), 0, 1))
-    with replacing(path) as temporary:
-        iio.imwrite(temporary, np.round(255 * encoded).astype(np.uint8), plugin="pillow", extension=".png")
+    encoded = np.round(255 * srgb.encode(np.clip(np.nan_to_num(pixels), 0, 1))).astype(np.uint8)
+    content: bytes = iio.imwrite("<bytes>", encoded, plugin="pillow", extension=".png")
+    return content
 
 
 def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
@@ -81,10 +94,8 @@ def _read_values(path: Path) -> np.ndarray:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"unknown image format {path.suffix!r}; known: {', '.join(READERS)}")
-    try:
+    with reading(path):
         values = reader(path)
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or values.size == 0:
         raise FormatError(path, f"has shape {list(values.shape)}; expected [h, w], [h, w, 3] or [h, w, 4]")
     return _finite(as_float32(values), path)
@@ -108,13 +119,14 @@ def _read_array(path: Path) -> np.ndarray:
 def _read_encoded(path: Path) -> np.ndarray:
     import imageio.v3 as iio
 
-    try:
-        mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
-        stored = iio.imread(path, plugin="pillow", index=0)
-    except OSError:
-        raise
-    except Exception as error:  # decoders of damaged files raise whatever they like
-        raise FormatError(path, f"not a complete image: {error}") from error
+    with path.open("rb") as stream:
+        start = stream.read(12)
+    if not any(start.startswith(beginning) and start.endswith(end) for beginning, end in BEGINNINGS):
+        raise FormatError(path, "is no PNG, JPEG or WebP image")
+    if has_deep_colors(path):
+        return _decoded(read_deep_png(path))
+    mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
+    stored = iio.imread(path, plugin="pillow", index=0)
     if mode not in {"1", "L", "LA", "P", "RGB", "RGBA"} and stored.dtype != np.uint16:
         raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
     return _decoded(stored)

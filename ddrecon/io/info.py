@@ -7,13 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ddrecon.io.images import read_image
+from ddrecon.io.images import READERS, read_image
+from ddrecon.io.tiff import is_stack
 from ddrecon.io.volumes import FORMATS, field_names, read_field
 
 
 def describe(path: Path) -> dict[str, Any]:
     """The contents of the volume or image at `path`; raises FormatError when it is neither, or damaged."""
-    return _describe_volume(path) if path.suffix.lower() in FORMATS else _describe_image(path)
+    return _describe_volume(path) if _is_volume(path) else _describe_image(path)
+
+
+def _is_volume(path: Path) -> bool:
+    """Told by suffix; a .tif is a volume where it has several pages."""
+    suffix = path.suffix.lower()
+    return suffix in FORMATS and (suffix not in READERS or (path.is_file() and is_stack(path)))
 
 
 def _describe_volume(path: Path) -> dict[str, Any]:

@@ -14,15 +14,10 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.io.arrays import as_float32, check_size
 from ddrecon.io.atomic import replacing
-from ddrecon.io.field import Field, Fields, checked_field
+from ddrecon.io.field import Field, Fields, checked_field, only_field
 
 HEADER = struct.Struct("<3sB5i6f")
 MAGIC, VERSION, FLOAT32 = b"VOL", 3, 1
-
-
-def vol_names(path: Path) -> list[str]:
-    """The one name of the field at `path`, which the file does not say: what its own name ends with."""
-    return [path.stem.rpartition(".")[2]]
 
 
 def read_vol(path: Path, name: str) -> Field:
@@ -44,9 +39,7 @@ def read_vol(path: Path, name: str) -> Field:
 
 def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """Writes the one of `fields` [z, y, x] or [z, y, x, C] and `bounds` [2, 3] (x, y, z), both as float32; the format knows no names."""
-    if len(fields) != 1:
-        raise FormatError(path, f"a .vol holds one field, not {', '.join(fields)}; write each into a file of its own")
-    (values,) = fields.values()
+    values = only_field(path, fields)
     colors = values.shape[3] if values.ndim == 4 else 1
     z, y, x = values.shape[:3]
     header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, colors, *np.asarray(bounds, np.float64).ravel())

@@ -16,6 +16,7 @@ from ddrecon.io.atomic import replacing
 from ddrecon.io.field import Field, Fields, checked_field
 
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError)
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def read_npz(path: Path, name: str) -> Field:
@@ -59,11 +60,13 @@ def write_npz(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 
 def _read_entry(archive: zipfile.ZipFile, name: str, path: Path) -> np.ndarray:
     entry = archive.getinfo(f"{name}.npy")
+    if entry.compress_type not in _METHODS:
+        raise FormatError(path, f"{name} is compressed by method {entry.compress_type}; write it with numpy.savez_compressed")
     with archive.open(entry) as stream:
         return read_npy(stream, entry.file_size, path, name)
 
 
 def _absence(name: str, others: list[str]) -> str:
     if len(others) == 1:
-        return f"has no field {name!r}, only {others[0]!r}; save that array under the name {name!r}"
+        return f"has no field {name!r}, only {others[0]!r}; save that array as {name!r}, or say name: {others[0]} beside file"
     return f"has no field {name!r}; it has {', '.join(map(repr, others)) or 'none'}"

@@ -5,6 +5,7 @@ imageio alone writes no float colors, and this much needs no library.
 
 from __future__ import annotations
 
+import mmap
 import struct
 from pathlib import Path
 
@@ -13,8 +14,14 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.io.atomic import replacing
 
+MARK = "bounds"
+"""What the description of a stack that we wrote says, besides what ImageJ says."""
+DESCRIPTION = 270
 WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, OFFSETS = 256, 257, 258, 259, 262, 273
 ORIENTATION, SAMPLES, ROWS, COUNTS, PLANAR, SAMPLE_FORMAT = 274, 277, 278, 279, 284, 339
+ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+BIG = (b"II+\0", b"MM\0+")
+_KNOWN = {WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, OFFSETS, ORIENTATION, SAMPLES, ROWS, COUNTS, PLANAR, SAMPLE_FORMAT}
 _TYPES = {3: "H", 4: "I"}
 _DEFAULTS = {COMPRESSION: (1,), SAMPLES: (1,), PLANAR: (1,), SAMPLE_FORMAT: (1,), ORIENTATION: (1,), BITS: (1,)}
 
@@ -43,9 +50,11 @@ def _directory(tags: dict[int, list[int]], start: int) -> bytes:
 
 def read_tiff(path: Path) -> np.ndarray:
     """The pixels of the TIFF file at `path`, float32 [h, w] or [h, w, samples]; raises FormatError for any other kind of TIFF."""
+    if is_stack(path):
+        raise FormatError(path, "is a volume (several pages) or a BigTIFF; an image is a single page of plain TIFF")
     data = path.read_bytes()
     try:
-        order = {b"II*\0": "<", b"MM\0*": ">"}[data[:4]]
+        order = ORDERS[data[:4]]
         tags = _DEFAULTS | _read_tags(data, order)
         height, width, samples = tags[HEIGHT][0], tags[WIDTH][0], tags[SAMPLES][0]
     except (KeyError, struct.error, IndexError) as error:
@@ -60,13 +69,33 @@ def read_tiff(path: Path) -> np.ndarray:
     return image[..., 0] if samples == 1 else image
 
 
+def is_stack(path: Path) -> bool:
+    """Whether the file at `path` is a TIFF of several pages, a large one (BigTIFF), or of one page whose description says a box."""
+    try:
+        with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            return data[:4] in BIG or _goes_on(data)
+    except (OSError, ValueError, KeyError, struct.error):
+        return False
+
+
+def _goes_on(data: mmap.mmap) -> bool:
+    """Whether there is a page after the first, or a box in the first one's description."""
+    order = ORDERS[data[:4]]
+    (start,) = struct.unpack_from(f"{order}I", data, 4)
+    (entries,) = struct.unpack_from(f"{order}H", data, start)
+    (following,) = struct.unpack_from(f"{order}I", data, start + 2 + 12 * entries)
+    tags = [struct.unpack_from(f"{order}HHII", data, start + 2 + 12 * index) for index in range(entries)]
+    texts = [data[offset : offset + count] for tag, _, count, offset in tags if tag == DESCRIPTION]
+    return following != 0 or any(f"\n{MARK}=".encode() in text for text in texts)
+
+
 def _read_tags(data: bytes, order: str) -> dict[int, tuple[int, ...]]:
     (start,) = struct.unpack_from(f"{order}I", data, 4)
     (entries,) = struct.unpack_from(f"{order}H", data, start)
-    tags = {}
+    tags: dict[int, tuple[int, ...]] = {}
     for position in range(start + 2, start + 2 + 12 * entries, 12):
         tag, kind, count = struct.unpack_from(f"{order}HHI", data, position)
-        if kind in _TYPES and 0 < count <= len(data):
+        if tag in _KNOWN and tag not in tags and kind in _TYPES and 0 < count <= len(data):
             layout = f"{order}{count}{_TYPES[kind]}"
             inline = struct.calcsize(layout) <= 4
             offset = position + 8 if inline else struct.unpack_from(f"{order}I", data, position + 8)[0]

@@ -9,9 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.field import Field, Fields
-from ddrecon.io.mitsuba import read_vol, vol_names, write_vol
+from ddrecon.io.field import Field, Fields, name_from_file
+from ddrecon.io.mitsuba import read_vol, write_vol
+from ddrecon.io.netcdf import netcdf_names, read_netcdf, write_netcdf
 from ddrecon.io.npz import npz_names, read_npz, write_npz
+from ddrecon.io.reading import reading
+from ddrecon.io.tiff_stack import read_stack, write_stack
+from ddrecon.io.vdb import write_vdb
+from ddrecon.io.vdb_reader import read_vdb, vdb_names
 from ddrecon.io.vti import read_vti, vti_names, write_vti
 
 
@@ -26,19 +31,26 @@ class VolumeFormat:
 
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(npz_names, read_npz, write_npz),
-    ".vol": VolumeFormat(vol_names, read_vol, write_vol),
+    ".vol": VolumeFormat(name_from_file, read_vol, write_vol),
+    ".vdb": VolumeFormat(vdb_names, read_vdb, write_vdb),
     ".vti": VolumeFormat(vti_names, read_vti, write_vti),
+    ".nc": VolumeFormat(netcdf_names, read_netcdf, write_netcdf),
+    **dict.fromkeys((".tif", ".tiff"), VolumeFormat(name_from_file, read_stack, write_stack)),
 }
 
 
 def field_names(path: Path) -> list[str]:
     """The fields that the volume file at `path` holds; raises FormatError when it cannot be read."""
-    return _format_of(path).names(path)
+    names = _format_of(path).names
+    with reading(path):
+        return names(path)
 
 
 def read_field(path: Path, name: str) -> Field:
     """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`; raises FormatError when it cannot be used."""
-    return _format_of(path).read(path, name)
+    read = _format_of(path).read
+    with reading(path):
+        return read(path, name)
 
 
 def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:

@@ -76,6 +76,8 @@ def _opened(path: Path) -> Iterator[tuple[ElementTree.Element, bytes]]:
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     head, appended = _parted(content)
+    if b"<!DOCTYPE" in head:
+        raise FormatError(path, f"has a document type, which may define entities without end; {ADVICE}")
     try:
         yield ElementTree.fromstring(head), appended
     except (ElementTree.ParseError, ValueError, KeyError, OverflowError) as error:

@@ -2,89 +2,97 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from tqdm import tqdm
 
-from ddrecon.errors import SceneError, SolveError
-from ddrecon.io.folders import prepare_folder
+from ddrecon.errors import DivergenceError, FormatError, SceneError
+from ddrecon.io.folders import claimed_folder
 from ddrecon.io.json_file import write_json
-from ddrecon.reconstruct.checkpoint import load_checkpoint
+from ddrecon.reconstruct.checkpoint import LAST, load_checkpoint
+from ddrecon.reconstruct.differences import fingerprint
+from ddrecon.reconstruct.events import event_log
 from ddrecon.reconstruct.loop import Reconstruction, Row
-from ddrecon.reconstruct.run_folder import CHECKPOINT, RunFolder
-from ddrecon.scene.dump import describe, dump_scene
+from ddrecon.reconstruct.run_folder import CHECKPOINTS, RunFolder
+from ddrecon.scene.dump import dump_scene
 from ddrecon.scene.load import SceneFile
 from ddrecon.world import Scene
 
 
-def open_run(
+@contextmanager
+def opened_run(
     scene: Scene, scene_file: SceneFile, path: Path, environment: dict[str, Any], *, may_exist: bool, resume: bool
-) -> tuple[Reconstruction, RunFolder]:
-    """A run of `scene` and its folder `path`, with the resolved scene and the environment written there.
+) -> Iterator[tuple[Reconstruction, RunFolder]]:
+    """A run of `scene` and its folder `path`, this process's alone until the block ends, with the resolved scene and environment in it.
 
-    Raises SceneError for a folder that is not empty, unless it may be or the run goes on from the checkpoint in it.
+    Raises SceneError for a folder that another process writes to or that is not empty, unless it may be or the run goes on from the
+    checkpoint in it.
     """
     try:
         run = Reconstruction(scene)
     except SceneError as error:
         raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
-    text = scene_text(scene_file)
-    if resume:
-        _resume(run, path, text)
-    prepare_folder(path, may_exist=may_exist or resume)
-    folder = RunFolder(path, text)
-    if not resume:
-        folder.forget()
-    dump_scene(scene_file, path / "scene.yaml")
-    write_json(path / "environment.json", environment)
-    return run, folder
+    result_of = fingerprint(scene_file, scene.volume.density.dtype)
+    loaded = _resume(run, path, result_of) if resume else None
+    with claimed_folder(path, may_exist=may_exist or resume):
+        folder = RunFolder(path, scene_file, result_of, environment | {"seed": run.seed})
+        if loaded is None:
+            folder.start(run)
+        else:
+            folder.resume(run, loaded)
+        dump_scene(scene_file, path / "scene.yaml")
+        write_json(path / "environment.json", folder.environment)
+        yield run, folder
 
 
-def _resume(run: Reconstruction, path: Path, text: str) -> None:
-    run.restore(load_checkpoint(path / CHECKPOINT, text))
+def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
+    """Restores `run` from the run folder `path`; returns the file it took."""
+    state, loaded = load_checkpoint(path / CHECKPOINTS, scene)
+    try:
+        run.restore(state)
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        raise FormatError(loaded, "not a usable checkpoint; start anew with --overwrite") from error
     if run.iteration > run.settings.iterations:
         raise SceneError(f"{path}: {run.iteration} iterations are made already; ask for more than that, in all, with --iterations")
+    return loaded
 
 
-def scene_text(scene_file: SceneFile) -> str:
-    """The resolved scene as text, less its number of iterations, which a resumed run may change."""
-    described = describe(scene_file)
-    described["optimize"] = {key: value for key, value in described["optimize"].items() if key != "iterations"}
-    return json.dumps(described, indent=1)
+def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool, has_events: bool = False) -> dict[str, Any]:
+    """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as well; returns the summary.
 
-
-def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool) -> dict[str, Any]:
-    """Advances `run` until it is done, writing to `folder`; returns the summary.
-
-    An interrupt (SIGINT or SIGTERM) takes effect between two iterations; it and any failure write a checkpoint of the last good state
-    before they are passed on.
+    An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint before it is passed on. So does a
+    divergence; any other failure leaves the checkpoints written so far.
     """
-    folder.start_log(run.rows)
     total = run.settings.iterations
     try:
         with (
             deferred_interrupt() as asked,
+            event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
             tqdm(total=total, initial=run.iteration, desc="optimize", file=sys.stderr, disable=is_quiet) as bar,
         ):
             while not run.is_done:
+                folder.save_in_time(run)
                 row = run.step()
                 folder.log(row)
-                bar.set_postfix_str(progress_text(row, run.rows), refresh=False)
+                if events is not None:
+                    events.log(row)
+                bar.set_postfix_str(progress_text(run.total, row), refresh=False)
                 bar.update()
                 if preview_every and row.iteration % preview_every == 0:
                     folder.preview(run)
                 if asked:
+                    folder.save(run)
                     raise KeyboardInterrupt(f"after {run.iteration} iterations; go on with --resume")
-    except (KeyboardInterrupt, SolveError):
+    except DivergenceError as error:
         folder.save(run)
-        raise
+        kept = folder.checkpoints / LAST
+        raise error.with_advice(f"the state after {run.iteration} iterations is kept in {kept}: go on from it with --resume") from error
     return folder.finish(run)
 
 
@@ -95,7 +103,7 @@ def deferred_interrupt() -> Iterator[list[int]]:
 
     def note(number: int, _: FrameType | None) -> None:
         if asked:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt("at once; go on from the last checkpoint with --resume")
         asked.append(number)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -106,8 +114,7 @@ def deferred_interrupt() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def progress_text(row: Row, rows: list[Row]) -> str:
+def progress_text(total: Row, row: Row) -> str:
     """Loss, PSNR of training and (last known) test views, and solver iterations, for the progress line."""
-    tests = [r.test_psnr for r in rows if r.test_psnr is not None]
-    test = f"/{tests[-1]:.1f}" if tests else ""
+    test = "" if total.test_psnr is None else f"/{total.test_psnr:.1f}"
     return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {row.forward_iterations}+{row.adjoint_iterations}"

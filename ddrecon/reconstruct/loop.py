@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import DivergenceError, SceneError, SolveError
+from ddrecon.reconstruct.divergence import flawed_place, largest_place
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
 from ddrecon.reconstruct.losses import image_loss, psnr
@@ -25,8 +26,8 @@ from ddrecon.reconstruct.rates import default_rate, rate_at
 from ddrecon.reconstruct.tolerance import enough
 from ddrecon.reconstruct.views import chosen
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import ParameterSettings
-from ddrecon.variables import value_of, with_values
+from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
+from ddrecon.variables import value_of, variable_names, with_values
 from ddrecon.world import Scene, View
 
 TEST_EVERY = 10
@@ -47,6 +48,20 @@ class Row:
     cells: int
 
 
+NOTHING = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0)
+"""The sum of no rows."""
+
+
+def summed(total: Row, row: Row) -> Row:
+    """`total` of the rows before `row`, and it: `row` itself, with all solver iterations so far and the last known PSNR of test views."""
+    return replace(
+        row,
+        test_psnr=total.test_psnr if row.test_psnr is None else row.test_psnr,
+        forward_iterations=total.forward_iterations + row.forward_iterations,
+        adjoint_iterations=total.adjoint_iterations + row.adjoint_iterations,
+    )
+
+
 @dataclass(frozen=True)
 class Result:
     """A finished reconstruction: the `scene` with its reconstructed volume, and the log."""
@@ -61,16 +76,16 @@ def optimize(scene: Scene, iterations: int | None = None, watch: Callable[[Row],
     `iterations` replaces those of the scene; `watch` is called with the log's row after each. Raises SceneError when the scene does not
     say what to optimize or has no training image, SolveError when the run diverges.
     """
-    run = Reconstruction(scene, iterations)
+    run, rows = Reconstruction(scene, iterations), list[Row]()
     while not run.is_done:
-        row = run.step()
+        rows.append(run.step())
         if watch is not None:
-            watch(row)
-    return run.result()
+            watch(rows[-1])
+    return Result(run.current_scene(), rows)
 
 
 class Reconstruction:
-    """The state of a run: what is optimized, at which resolution, and the log so far.
+    """The state of a run: what is optimized, at which resolution, and what its iterations have come to, `total`.
 
     The objective is the weighted mean of the views' image loss plus, for each parameter, its penalty times `power`, the mean square of the
     targets: brighter light or a wider frame change nothing.
@@ -85,19 +100,21 @@ class Reconstruction:
         if not self.train.views:
             raise SceneError("views: none has split: train and an image; there is nothing to reconstruct from")
         self.test = _with_images(scene, is_test=True)
+        _require_usable(self.train, self.settings)
         self.power = float(torch.stack([view.image.square().mean() for view in self.train.views if view.image is not None]).mean())
         self.factors = factors(scene, self.settings.refine_at)
         self.parameters = [_parameter(scene, name, settings) for name, settings in self.settings.parameters.items()]
-        self.rows: list[Row] = []
-        self.elapsed = 0.0
+        self.total = NOTHING
         self.misfit = 1.0
+        self.seed = torch.initial_seed()
         self.memory = SolveMemory(scene.diffusion.warm_start)
+        self.good: dict[str, Any] | None = None
         self._enter_stage(0)
 
     @property
     def iteration(self) -> int:
         """How many iterations have been made."""
-        return len(self.rows)
+        return self.total.iteration
 
     @property
     def is_done(self) -> bool:
@@ -105,16 +122,30 @@ class Reconstruction:
         return self.iteration >= self.settings.iterations
 
     def step(self) -> Row:
-        """Makes one iteration and returns its row of the log; raises SolveError, with the state unchanged, when it diverges."""
+        """Makes one iteration and returns its row of the log.
+
+        Raises DivergenceError when the iteration fails; the state is then the last from which one could be made, which is that before the
+        last step, since it was this step that led astray.
+        """
         start = perf_counter()
         stage = stage_of(self.iteration, self.settings.iterations, self.settings.refine_at)
         if stage > self.stage:
             self._enter_stage(stage)
+        before = self.state()
+        try:
+            return self._iterate(start, before)
+        except SolveError as error:
+            failure = error if isinstance(error, DivergenceError) else self._unsolved(error)
+            self.restore(self.good or before)
+            raise failure from error.__cause__
+
+    def _iterate(self, start: float, before: dict[str, Any]) -> Row:
         self.memory.records.clear()
         seen = self._seen()
         found = self._differentiated(seen)
         loss, gradients = self._penalized(found.loss, found.gradients)
-        self._require_finite(loss, gradients)
+        self._require_finite(gradients)
+        self.good = before
         self.misfit = math.sqrt(float(found.loss) / self.power) if self.power else 1.0
         solves = {kind: sum(r.iterations for r in self.memory.records if r.kind == kind) for kind in ("forward", "adjoint")}
         for parameter in self.parameters:
@@ -122,10 +153,10 @@ class Reconstruction:
         quality = _mean_psnr(found.images, seen)
         last = self.iteration + 1
         test = self._test_psnr() if last % TEST_EVERY == 0 or last == self.settings.iterations else None
-        self.elapsed += perf_counter() - start
-        cells = self.train_level.volume.grid.cells
-        self.rows.append(Row(last, self.elapsed, float(loss), quality, test, solves["forward"], solves["adjoint"], cells))
-        return self.rows[-1]
+        seconds, cells = self.total.seconds + perf_counter() - start, self.train_level.volume.grid.cells
+        row = Row(last, seconds, float(loss), quality, test, solves["forward"], solves["adjoint"], cells)
+        self.total = summed(self.total, row)
+        return row
 
     def current_scene(self) -> Scene:
         """The scene at full resolution, with everything as reconstructed so far."""
@@ -136,28 +167,23 @@ class Reconstruction:
             }
             return with_values(self.full, values)
 
-    def result(self) -> Result:
-        """The scene as reconstructed, and the log."""
-        return Result(self.current_scene(), list(self.rows))
-
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on as if nothing had happened."""
-        rows = [list(vars(row).values()) for row in self.rows]
         return {
             "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "stage": self.stage,
-            "rows": rows,
-            "elapsed": self.elapsed,
+            "total": dict(vars(self.total)),
             "solutions": dict(self.memory.last),
             "misfit": self.misfit,
+            "seed": self.seed,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up where the run that made `state` stopped."""
         for parameter in self.parameters:
             parameter.restore(state["parameters"][parameter.name])
-        self.rows = [Row(*row) for row in state["rows"]]
-        self.elapsed, self.misfit = state["elapsed"], state["misfit"]
+        self.total = Row(**state["total"])
+        self.misfit, self.seed = state["misfit"], state["seed"]
         self._enter_stage(state["stage"])
         self.memory.last = {kind: field.to(self.full.volume.density) for kind, field in state["solutions"].items()}
 
@@ -175,7 +201,7 @@ class Reconstruction:
 
     def _seen(self) -> list[View]:
         views = self.train_level.views
-        return [views[index] for index in chosen(len(views), self.settings.views_per_iteration, self.iteration)]
+        return [views[index] for index in chosen(len(views), self.settings.views_per_iteration, self.iteration, self.seed)]
 
     def _loss_of(self, views: list[View]) -> Callable[[View, Tensor], Tensor]:
         """What a view adds to the objective: its share, by weight, of the mean over `views`."""
@@ -185,7 +211,7 @@ class Reconstruction:
             ((_, target, mask),) = _compared([image], [view])
             loss = view.weight / total * image_loss(self.settings.loss, image, target, mask)
             if not bool(torch.isfinite(loss)):
-                raise self._diverged(f"the loss of view {view.name}", float(loss.detach()))
+                raise self._diverged(f"the loss of view {view.name} is not finite")
             return loss
 
         return loss_of
@@ -204,34 +230,50 @@ class Reconstruction:
         if not self.test_level.views:
             return None
         with torch.no_grad():
-            level = with_values(self.test_level, self._values())
+            known = variable_names(self.test_level)
+            level = with_values(self.test_level, {name: value for name, value in self._values().items() if name in known})
             return _mean_psnr(render_each(level, level.views, self.memory), level.views)
 
     def _differentiated(self, seen: list[View]) -> Differentiated:
         self.memory.enough = enough(self.misfit)
         try:
             return differentiate(self.train_level, [view.name for view in seen], self._values(), self._loss_of(seen), self.memory)
-        except SolveError as error:
-            if isinstance(error, DivergenceError) or math.isfinite(error.residual):
-                raise
-            raise self._diverged("the light", error.residual) from error
         finally:
             self.memory.enough = {}
 
-    def _require_finite(self, loss: Tensor, gradients: dict[str, Tensor]) -> None:
-        for name, gradient in gradients.items():
-            if not bool(torch.isfinite(gradient).all()):
-                raise self._diverged(f"the derivative of the loss with respect to {name}", float(loss.detach()))
+    def _require_finite(self, gradients: dict[str, Tensor]) -> None:
+        for parameter in self.parameters:
+            if place := flawed_place(parameter.name, gradients[parameter.name], parameter.is_field):
+                raise self._diverged(f"the derivative of the loss with respect to {place} is not finite")
 
-    def _diverged(self, what: str, loss: float) -> DivergenceError:
-        rates = " and ".join(f"optimize.parameters.{parameter.name}.lr" for parameter in self.parameters)
-        return DivergenceError(f"{what} is not finite", self.iteration, loss, f"lower {rates}")
+    def _unsolved(self, error: SolveError) -> DivergenceError:
+        if not math.isfinite(error.residual):
+            return self._diverged("the light is not finite")
+        return self._diverged(str(error).partition(";")[0], error.residual, f"{error.advice}, or ")
+
+    def _diverged(self, what: str, residual: float = math.nan, advice: str = "") -> DivergenceError:
+        """The error of the iteration being made; `advice` goes before that to lower learning rates."""
+        largest = "; ".join(largest_place(parameter.name, parameter.value, parameter.is_field) for parameter in self.parameters)
+        rates = " and ".join(f"optimize.parameters.{parameter.name}.lr (now {parameter.rate:.3g})" for parameter in self.parameters)
+        return DivergenceError(self.iteration + 1, f"{what}; at most, {largest}", residual, f"{advice}lower {rates}")
 
 
 def _parameter(scene: Scene, name: str, settings: ParameterSettings) -> Parameter:
     start = scene.starts.get(name)
     start = value_of(scene, name) if start is None else start
     return Parameter(name, settings, settings.lr or default_rate(scene, name, start), start, scene.volume.grid)
+
+
+def _require_usable(train: Scene, settings: OptimizeSettings) -> None:
+    """Raises SceneError where a parameter does not touch the training views, or a target has pixels that are no numbers."""
+    known = variable_names(train)
+    absent = [name for name in settings.parameters if name not in known]
+    problems = [f"optimize.parameters.{name}: there is no training view of this name with an image" for name in absent]
+    for view in train.views:
+        if view.image is not None and (place := flawed_place("the image", view.image, is_field=False)):
+            problems.append(f"views.{view.name}: {place} is not finite")
+    if problems:
+        raise SceneError(problems)
 
 
 def _with_images(scene: Scene, is_test: bool) -> Scene:

@@ -80,13 +80,14 @@ class Parameter:
         self.moments = first * share, second * share**2
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps of it."""
-        return {"value": self.value.detach(), "shape": list(self.grid.shape), "steps": self.steps, "moments": list(self.moments)}
+        """What a checkpoint keeps of it, untouched by further steps."""
+        moments = [moment.clone() for moment in self.moments]
+        return {"value": self.value.detach().clone(), "shape": list(self.grid.shape), "steps": self.steps.clone(), "moments": moments}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
         self.value = state["value"].to(self.value).clone().requires_grad_()
-        self.steps = state["steps"].to(self.value)
-        first, second = (moment.to(self.value) for moment in state["moments"])
+        self.steps = state["steps"].to(self.value).clone()
+        first, second = (moment.to(self.value).clone() for moment in state["moments"])
         self.moments = first, second

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import csv
+import os
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -12,76 +16,137 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.io.atomic import replacing
+from ddrecon.errors import DataWarning
+from ddrecon.io.atomic import flush, refusals, remove_temporaries, replacing
 from ddrecon.io.images import write_linear, write_preview
 from ddrecon.io.json_file import write_json
 from ddrecon.io.volumes import write_field
-from ddrecon.reconstruct.checkpoint import save_checkpoint
+from ddrecon.reconstruct.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.reconstruct.loop import Reconstruction, Row
 from ddrecon.reconstruct.losses import psnr
 from ddrecon.reconstruct.previews import comparison, slices
-from ddrecon.renderer import render_each
+from ddrecon.reconstruct.report import Findings, write_report
+from ddrecon.reconstruct.result import RESULT, describe_result, found_names
+from ddrecon.renderer import LightField, solve_light, view_image
+from ddrecon.scene.dump import write_described
+from ddrecon.scene.load import SceneFile
 from ddrecon.variables import VOLUME, value_of, variable_names
 from ddrecon.world import Scene
 
-CHECKPOINT = Path("checkpoints", "last.pt")
-"""Where a run folder keeps its checkpoint."""
+CHECKPOINTS = "checkpoints"
+"""Where a run folder keeps its checkpoints."""
+CHECKPOINT_SECONDS = 60.0
+"""A run writes a checkpoint about this often,"""
+CHECKPOINT_SHARE = 0.05
+"""unless that would take more than this part of its time."""
 COLUMNS = [field.name for field in fields(Row)]
+KINDS: list[Callable[[str], Any]] = [int, float, float, float, lambda text: float(text) if text else None, int, int, int]
+"""What the cells of a row are."""
 
 
 class RunFolder:
-    """The output folder `path` of one run of the scene whose resolved text is `scene_text`."""
+    """The output folder `path` of one run of `scene_file` in an `environment`; `result_of` is what the run's result depends on."""
 
-    def __init__(self, path: Path, scene_text: str):
-        self.path, self.scene_text = path, scene_text
-        for name in ("volumes", "previews", "checkpoints"):
-            (path / name).mkdir(exist_ok=True)
-        self.checkpoint = path / CHECKPOINT
+    def __init__(self, path: Path, scene_file: SceneFile, result_of: Mapping[str, Any], environment: Mapping[str, Any]):
+        self.path, self.scene_file, self.result_of, self.environment = path, scene_file, result_of, environment
+        with refusals(path):
+            for name in ("volumes", "previews", CHECKPOINTS):
+                (path / name).mkdir(exist_ok=True)
+                remove_temporaries(path / name)
+            remove_temporaries(path)
+        self.checkpoints, self.log_file = path / CHECKPOINTS, path / "loss.csv"
+        self.saved, self.next_save = -1, 0.0
 
-    def forget(self) -> None:
-        """Removes the checkpoint of a run that was made here before."""
-        self.checkpoint.unlink(missing_ok=True)
+    def start(self, run: Reconstruction) -> None:
+        """Begins the log and the checkpoints of a new run; those of a run made here before are gone."""
+        with refusals(self.checkpoints):
+            forget_checkpoints(self.checkpoints)
+        self._write_log([])
+        self.save(run)
 
-    def start_log(self, rows: list[Row]) -> None:
-        """Writes `loss.csv` with the rows made so far: none at first, those of the checkpoint after a resume."""
-        with replacing(self.path / "loss.csv") as temporary, temporary.open("w", newline="") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(COLUMNS)
-            writer.writerows(_cells(row) for row in rows)
+    def resume(self, run: Reconstruction, loaded: Path) -> None:
+        """Goes on with `run` from the checkpoint `loaded`: the log ends where it does, and a damaged one after it is gone."""
+        with refusals(loaded):
+            os.replace(loaded, self.checkpoints / LAST)
+        rows = self._logged()[: run.iteration]
+        if len(rows) < run.iteration:
+            warnings.warn(f"{self.log_file}: has {len(rows)} of the {run.iteration} iterations made", DataWarning, 2)
+        self._write_log(rows)
+        self._note_saved(run, 0.0)
 
     def log(self, row: Row) -> None:
         """Adds one row to `loss.csv`."""
-        with (self.path / "loss.csv").open("a", newline="") as stream:
+        with refusals(self.log_file), self.log_file.open("a", newline="") as stream:
             csv.writer(stream).writerow(_cells(row))
 
     def save(self, run: Reconstruction) -> None:
-        """Writes the checkpoint."""
-        save_checkpoint(self.checkpoint, run.state(), self.scene_text)
+        """Writes a checkpoint, unless the last is of this very iteration; the log has all rows before it, whatever happens."""
+        if self.saved != run.iteration:
+            start = monotonic()
+            flush(self.log_file)
+            save_checkpoint(self.checkpoints, run.state(), self.result_of)
+            self._note_saved(run, monotonic() - start)
+
+    def save_in_time(self, run: Reconstruction) -> None:
+        """Writes a checkpoint if the last is old."""
+        if monotonic() >= self.next_save:
+            self.save(run)
+
+    def _note_saved(self, run: Reconstruction, seconds: float) -> None:
+        self.saved, self.next_save = run.iteration, monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
+
+    def _write_log(self, rows: list[list[str]]) -> None:
+        with replacing(self.log_file) as temporary, temporary.open("w", newline="") as stream:
+            csv.writer(stream).writerows([COLUMNS, *rows])
+
+    def _logged(self) -> list[list[str]]:
+        """The rows of `loss.csv` up to the first that is not whole, or not the next iteration's."""
+        try:
+            with self.log_file.open(newline="", errors="replace") as stream:
+                _, *rows = csv.reader(stream)
+        except (OSError, ValueError, csv.Error):
+            return []
+        count = next((i for i, row in enumerate(rows) if len(row) != len(COLUMNS) or row[0] != str(i + 1)), len(rows))
+        return rows[:count]
+
+    def _rows(self) -> list[Row]:
+        """The log as it was written."""
+        return [Row(*(kind(cell) for kind, cell in zip(KINDS, row, strict=True))) for row in self._logged()]
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
-        self._pictures(run.current_scene(), f"_{run.iteration:06d}")
+        scene = run.current_scene()
+        self._pictures(scene, _images(scene, _light(scene)), f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
-        """Writes checkpoint, volume, parameters, pictures and `summary.json`, and returns what the summary says."""
+        """Writes checkpoint, volumes, parameters, result, pictures, summary and report, and returns what the summary says."""
         self.save(run)
         scene = run.current_scene()
-        fields = {"density"} | {parameter.name for parameter in run.parameters if parameter.is_field}
-        for name in sorted(fields):
-            self._write_volume(scene, name)
+        found = {name: self._stored(scene, name) for name in found_names([parameter.name for parameter in run.parameters])}
+        self._stored(scene, "density")
+        write_described(describe_result(self.scene_file, scene, found), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene))
-        summary = _summary(run) | {"views": self._pictures(scene, "")}
+        light_field = _light(scene)
+        images = _images(scene, light_field)
+        quality = self._pictures(scene, images, "")
+        summary = _summary(run) | {"views": quality}
         write_json(self.path / "summary.json", summary)
+        settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
+        findings = Findings(scene, light_field, images, quality, self._rows(), summary, self.environment, settings)
+        write_report(self.path / "report.html", findings)
         return summary
 
-    def _write_volume(self, scene: Scene, name: str) -> None:
-        value = value_of(scene, name).float().cpu()
-        array = (
-            value.numpy()
-            if value.ndim == 3
-            else value.expand(3 if len(value) > 1 else 1, -1, -1, -1).permute(1, 2, 3, 0).squeeze(-1).numpy()
-        )
-        write_field(self.path / "volumes" / f"{name}.npz", name, array, np.array(scene.volume.grid.bounds_xyz))
+    def _stored(self, scene: Scene, name: str) -> Any:
+        """The value of a variable as plain numbers, or where a file of this folder holds it, which is written here."""
+        value = value_of(scene, name)
+        if name not in VOLUME and value.ndim == 3:
+            return self._write_map(name, value)
+        if value.ndim < 3:
+            return _plain(value)
+        array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
+        file = Path("volumes", f"{name}.npz")
+        write_field(self.path / file, name, array.float().cpu().numpy(), np.array(scene.volume.grid.bounds_xyz))
+        return {"file": str(file)}
 
     def _parameters(self, scene: Scene) -> dict[str, Any]:
         """Everything of `scene` that is not a volume, as plain values; maps become files of their own."""
@@ -90,7 +155,7 @@ class RunFolder:
         for name in variable_names(scene):
             if name.startswith("lights."):
                 value = value_of(scene, name)
-                lights[name] = self._write_map(name, value) if value.ndim == 3 else value.tolist()
+                lights[name] = self._stored(scene, name) if value.ndim == 3 else value.tolist()
         cameras = {f"views.{view.name}.camera": {"matrix": [*view.camera.pose.tolist(), [0, 0, 0, 1]]} for view in scene.views}
         return volume | lights | cameras
 
@@ -99,19 +164,34 @@ class RunFolder:
         write_linear(self.path / name, radiance.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy())
         return f"{name}.npy"
 
-    def _pictures(self, scene: Scene, mark: str) -> dict[str, Any]:
+    def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> dict[str, Any]:
+        """Writes slices of every field of `scene`, and `images` beside their targets; returns how good each is."""
         for name in VOLUME:
             if (value := value_of(scene, name)).ndim >= 3:
                 write_preview(self.path / "previews" / f"{name}.slices{mark}.png", slices(value))
-        views = [view for view in scene.views if view.image is not None]
         quality = {}
-        with torch.no_grad():
-            images = render_each(scene, views, SolveMemory())
-        for view, image in zip(views, images, strict=True):
+        for view in scene.views:
             if view.image is not None:
+                image = images[view.name]
                 write_preview(self.path / "previews" / f"{view.name}{mark}.png", comparison(view.image, image))
                 quality[view.name] = {"split": "test" if view.is_test else "train", "psnr": psnr(image, view.image, view.mask)}
         return quality
+
+
+def _light(scene: Scene) -> LightField:
+    with torch.no_grad():
+        return solve_light(scene, SolveMemory())
+
+
+def _images(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
+    """The images of the views that have a target."""
+    with torch.no_grad():
+        return {view.name: view_image(light_field, scene, view.camera) for view in scene.views if view.image is not None}
+
+
+def _plain(value: Tensor) -> Any:
+    """`value` as nested lists; one number by itself."""
+    return value.item() if value.numel() == 1 else value.tolist()
 
 
 def _cells(row: Row) -> list[Any]:
@@ -120,14 +200,5 @@ def _cells(row: Row) -> list[Any]:
 
 
 def _summary(run: Reconstruction) -> dict[str, Any]:
-    last, tests = run.rows[-1], [row.test_psnr for row in run.rows if row.test_psnr is not None]
-    return {
-        "iterations": run.iteration,
-        "seconds": last.seconds,
-        "loss": last.loss,
-        "psnr": last.psnr,
-        "test_psnr": tests[-1] if tests else None,
-        "forward_iterations": sum(row.forward_iterations for row in run.rows),
-        "adjoint_iterations": sum(row.adjoint_iterations for row in run.rows),
-        "cells": last.cells,
-    }
+    total = dict(vars(run.total))
+    return {"iterations": total.pop("iteration"), **total}

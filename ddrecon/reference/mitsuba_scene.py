@@ -35,14 +35,16 @@ GRAY = 1e-5
 FINER, MANY = 3, 2**20
 NEAR = 1e-4
 """How far from the eye Mitsuba's rays start, in diagonals of the box; it wants more than 0."""
+SQUARE = 1e-5
+"""Pixels this little off square are taken for square, which is an error of as many parts of the image's height."""
 MEDIUM = "medium"
 
 
 def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[str, Any]:
     """`scene` seen by the cameras of `views`, by paths of at most `depth` segments (2: scattered once; -1: up to `LONGEST`).
 
-    The cameras are `sensor_0`, `sensor_1`, ... Raises SceneError for what Mitsuba cannot show: several environment maps, and views of
-    whose rays only some start inside the volume.
+    The cameras are `sensor_0`, `sensor_1`, ... Raises SceneError for what Mitsuba cannot show: several environment maps, pixels that are
+    not square, and views of whose rays only some start inside the volume.
     """
     return {
         "type": "scene",
@@ -148,8 +150,13 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     if _starts_inside(view.name, camera, grid):
         sensor[MEDIUM] = {"type": "ref", "id": MEDIUM}
     if camera.is_perspective:
+        if not math.isclose(camera.pixel_aspect, 1, rel_tol=SQUARE):
+            raise SceneError(
+                f"view {view.name!r}: Mitsuba's pixels are square, those of this camera {camera.pixel_aspect:.6g} times as high as wide"
+            )
         fov = 2 * math.degrees(math.atan(camera.half_width))
-        return {"type": "perspective", "fov": fov, "fov_axis": "x", "to_world": matrix, **sensor}
+        offsets = {f"principal_point_offset_{axis}": 0.5 - place for axis, place in zip("xy", camera.principal_point, strict=True)}
+        return {"type": "perspective", "fov": fov, "fov_axis": "x", **offsets, "to_world": matrix, **sensor}
     scale = np.diag([camera.half_width, camera.half_width, 1.0, 1.0])
     return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
 

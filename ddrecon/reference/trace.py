@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ddrecon.errors import MissingExtraError
+from ddrecon.extras import load_extra
 from ddrecon.reference.colors import of_color
 from ddrecon.reference.mitsuba_scene import is_gray, mitsuba_scene, sensor_id
 from ddrecon.world import Scene, View
@@ -49,17 +49,14 @@ def load_mitsuba(threads: int | None = None) -> ModuleType:
 
     Raises MissingExtraError where it is not installed.
     """
-    try:
-        import drjit
-        import mitsuba
-    except ImportError:
-        raise MissingExtraError("the reference renderer needs: pip install ddrecon[reference]") from None
+    mitsuba = load_extra("mitsuba", "the reference renderer")
     mitsuba.set_variant("llvm_ad_rgb" if os.environ.get("DRJIT_LIBLLVM_PATH") else "scalar_rgb")
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     if threads is not None:
+        import drjit
+
         drjit.set_thread_count(threads)
-    module: ModuleType = mitsuba
-    return module
+    return mitsuba
 
 
 def translated(module: ModuleType, value: Any) -> Any:

@@ -58,7 +58,7 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
 def _from_file(scene_file: SceneFile, key: str, name: str, init: FieldFile, value: Tensor) -> Tensor:
     """Values per cell, or per pixel of an environment map, from the file that `init` names."""
     if KINDS[pattern_of(name)].is_cellwise:
-        array = torch.from_numpy(read_referenced(scene_file, key, init.file, partial(read_field, name=name)).values)
+        array = torch.from_numpy(read_referenced(scene_file, key, init.file, partial(read_field, name=init.name or name)).values)
         if name == "density" and array.ndim == 4:
             raise scene_file.refused(key, f"density has no colors, but the file has {list(array.shape)} values [z, y, x, color]")
         return array.permute(3, 0, 1, 2).to(value) if array.ndim == 4 else array.to(value) if name == "density" else array[None].to(value)

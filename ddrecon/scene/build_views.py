@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -51,7 +52,7 @@ def _build_view(scene_file: SceneFile, index: int, grid: Grid | None, dtype: tor
                     f"{key}.camera", f"no pixel of view {section.name!r} looks through the volume; {blindness(camera, grid)}"
                 )
     problems.raise_any()
-    camera = Camera(camera.pose.to(device, dtype), camera.size, camera.half_width, camera.is_perspective)
+    camera = replace(camera, pose=camera.pose.to(device, dtype))
     return View(section.name, camera, image, mask, section.split == "test", section.weight)
 
 
@@ -69,7 +70,7 @@ def _build_camera(scene_file: SceneFile, key: str, section: CameraSection, size:
     except ValueError as error:
         raise scene_file.refused(key, str(error)) from error
     if isinstance(section, PerspectiveSection):
-        return Camera(pose, size, math.tan(math.radians(section.fov) / 2))
+        return Camera(pose, size, math.tan(math.radians(section.fov) / 2), True, section.principal_point, section.pixel_aspect)
     return Camera(pose, size, section.width / 2, is_perspective=False)
 
 

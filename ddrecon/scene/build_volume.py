@@ -15,10 +15,11 @@ from ddrecon.grid import Grid, Triple
 from ddrecon.io.field import Field
 from ddrecon.io.volumes import read_field
 from ddrecon.medium import Volume
+from ddrecon.memory import Needs, shortage
 from ddrecon.scene.files import read_referenced
 from ddrecon.scene.load import SceneFile
 from ddrecon.scene.problems import Problems
-from ddrecon.scene.schema import Color, FieldFile
+from ddrecon.scene.schema import Color, FieldFile, ParameterSettings
 from ddrecon.variables import cross_sections
 
 QUANTITIES = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo")
@@ -30,6 +31,8 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     section = scene_file.tree.volume
     fields = _read_fields(scene_file)
     grid = _agreed_grid(scene_file, fields)
+    if too_much := shortage(_needs(scene_file, fields, grid, dtype), device):
+        raise scene_file.refused("volume.resolution", too_much)
 
     def quantity(name: str) -> Tensor:
         if name in fields:
@@ -48,19 +51,49 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     return Volume(grid, *tensors)
 
 
+def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype) -> Needs:
+    """What the scene's memory depends on; views that are as large as their images count as nothing, since those are not read yet."""
+    tree, section = scene_file.tree, scene_file.tree.volume
+    given = [fields[name].values.ndim == 4 if name in fields else isinstance(getattr(section, name), tuple) for name in QUANTITIES]
+    colors = 3 if any(given) else 1
+    optimized = tree.optimize.parameters if tree.optimize else {}
+    sizes = [view.camera.resolution for view in tree.views if view.camera.resolution is not None]
+    return Needs(
+        (grid.shape[2], grid.shape[1], grid.shape[0]),
+        colors,
+        torch.finfo(dtype).bits // 8,
+        sum(width * height for width, height in sizes),
+        has_flux=section.g != 0 or "g" in optimized,
+        has_rounds=tree.diffusion.transport_rounds > 0,
+        is_limited=tree.diffusion.model == "flux_limited",
+        varied=sum(_varied(name, settings, fields, colors) for name, settings in optimized.items()) if tree.optimize else None,
+    )
+
+
+def _varied(name: str, settings: ParameterSettings, fields: Fields, colors: int) -> int:
+    """How many numbers a cell the parameter `name` has."""
+    if name == "density":
+        return 1
+    is_field = name in fields or isinstance(settings.init, FieldFile) if settings.field is None else settings.field
+    return colors if name in QUANTITIES and is_field else 0
+
+
 def _read_fields(scene_file: SceneFile) -> Fields:
     problems, fields = Problems(), {}
     for name in QUANTITIES:
         value = getattr(scene_file.tree.volume, name)
         if isinstance(value, FieldFile):
             with problems.collecting():
-                fields[name] = read_referenced(scene_file, f"volume.{name}.file", value.file, partial(_read_quantity, name=name))
+                fields[name] = read_referenced(
+                    scene_file, f"volume.{name}.file", value.file, partial(_read_quantity, name=name, called=value.name or name)
+                )
     problems.raise_any()
     return fields
 
 
-def _read_quantity(path: Path, name: str) -> Field:
-    field = read_field(path, name)
+def _read_quantity(path: Path, name: str, called: str) -> Field:
+    """The quantity `name`, which the file has as `called`."""
+    field = read_field(path, called)
     if name == "density" and field.values.ndim != 3:
         raise FormatError(path, f"density has shape {list(field.values.shape)}; expected [z, y, x]: colors belong to the cross sections")
     if name == "albedo" and (highest := field.values.max()) > 1:

@@ -22,7 +22,12 @@ def describe(scene_file: SceneFile) -> dict[str, Any]:
 
 def dump_scene(scene_file: SceneFile, path: Path) -> None:
     """Writes the resolved scene to `path` as YAML that `read_scene` reads back as the same tree."""
-    text = yaml.dump(describe(scene_file), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6, default_flow_style=None)
+    write_described(describe(scene_file), path)
+
+
+def write_described(described: dict[str, Any], path: Path) -> None:
+    """Writes a scene in plain values, as `describe` returns it, to `path`."""
+    text = yaml.dump(described, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6, default_flow_style=None)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ddrecon.scene.load import SceneFile
 
@@ -25,3 +26,19 @@ def require(scene_file: SceneFile, key: str, path: Path) -> None:
         raise scene_file.refused(key, f"{path} cannot be reached: {error.strerror or error}") from error
     if not is_file:
         raise scene_file.refused(key, f"{path} {'is not a file' if exists else 'does not exist'}")
+
+
+def referenced_files(scene_file: SceneFile) -> list[Path]:
+    """Every file that the scene names, each once, in the order of the scene."""
+    return list(dict.fromkeys(_paths(scene_file.tree)))
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    if isinstance(value, Path):
+        yield value
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from _paths(getattr(value, field.name))
+    elif isinstance(value, Mapping | tuple):
+        for entry in value.values() if isinstance(value, Mapping) else value:
+            yield from _paths(entry)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from ddrecon.grid import Triple
 from ddrecon.scene.nodes import Node, found, shown
 from ddrecon.scene.problems import Problems, suggestion
-from ddrecon.scene.schema import Color, Count, Matrix, Row, Size
+from ddrecon.scene.schema import Color, Count, Matrix, Pair, Paths, Row, Size
 
 T = TypeVar("T")
 
@@ -43,6 +43,8 @@ def read_each(nodes: Sequence[Node], rule: Rule, read: Callable[[Node, Rule], T]
     for node in nodes:
         with problems.collecting():
             values.append(read(node, rule))
+        if problems.are_many:
+            break
     problems.raise_any()
     return tuple(values)
 
@@ -117,6 +119,11 @@ def read_path(node: Node, rule: Rule) -> Path:
     return (rule.folder / read_text(node, rule)).absolute()
 
 
+def read_paths(node: Node, rule: Rule) -> tuple[Path, ...]:
+    """One path or a list of them."""
+    return read_each(read_list(node), rule, read_path) if isinstance(node.value, list) else (read_path(node, rule),)
+
+
 def read_vector(node: Node, rule: Rule) -> tuple[float, ...]:
     """As many numbers as the tuple `rule.hint` has."""
     return read_each(_entries(node, len(rule.hint.__args__), "numbers"), rule, read_number)
@@ -156,6 +163,8 @@ LEAVES: dict[Any, Callable[[Node, Rule], Any]] = {
     Triple: read_vector,
     Count: read_counts,
     Size: read_counts,
+    Pair: read_vector,
+    Paths: read_paths,
     Matrix: read_matrix,
     Color: read_color,
     tuple[float, ...]: read_fraction_list,

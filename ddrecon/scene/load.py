@@ -7,14 +7,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import FormatError, SceneError
+from ddrecon.io.reading import require_stored
 from ddrecon.scene.nodes import Node, parse
 from ddrecon.scene.overrides import override
 from ddrecon.scene.problems import Problems
 from ddrecon.scene.records import read_record
 from ddrecon.scene.schema import SceneTree
 
-MAX_BYTES = 4 * 2**20
+MAX_BYTES = 2**20
+"""A scene file is no larger; thousands of views fit."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,11 @@ def _marks(root: Node) -> dict[str, str]:
 
 def _text(path: Path) -> str:
     try:
+        require_stored(path)
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
+    except FormatError as error:
+        raise SceneError(str(error)) from error
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror or error}") from error
     if len(data) > MAX_BYTES:

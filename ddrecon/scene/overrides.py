@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ddrecon.errors import SceneError
-from ddrecon.scene.nodes import Node, found, parse
+from ddrecon.scene.nodes import MAX_DEPTH, Node, found, parse
 from ddrecon.scene.parameter_kinds import KINDS, pattern_of
 from ddrecon.scene.problems import Problems, suggestion
 
@@ -21,6 +21,8 @@ def override(root: Node, text: str, problems: Problems) -> None:
     key, separator, value = text.partition("=")
     if not separator or not all(key.split(".")):
         raise SceneError(f"{where}: expected key.path=value")
+    if key.count(".") > MAX_DEPTH:
+        raise SceneError(f"{where}: nested more than {MAX_DEPTH} deep")
     parent, rest = root, key
     while True:
         name, rest = _step(parent, rest, where)

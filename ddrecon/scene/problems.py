@@ -8,6 +8,11 @@ from contextlib import contextmanager
 
 from ddrecon.errors import FormatError, SceneError
 
+MOST = 100
+"""Problems that are told in one go."""
+LONGEST = 60
+"""Names of more characters are not compared with those that are known."""
+
 
 class Problems:
     """The problem lines found so far, and the files that could not be used."""
@@ -15,6 +20,11 @@ class Problems:
     def __init__(self) -> None:
         self.lines: list[str] = []
         self.unusable: list[FormatError] = []
+
+    @property
+    def are_many(self) -> bool:
+        """Whether there are more than are told: no need to look for others."""
+        return len(self.lines) > MOST
 
     def note(self, error: SceneError | FormatError) -> None:
         """Notes the problems of `error`."""
@@ -35,13 +45,14 @@ class Problems:
         """Raises an error with every problem noted, each once, if there is one: FormatError where only files are to blame."""
         files = list(dict.fromkeys(str(error) for error in self.unusable))
         if self.lines:
-            raise SceneError([*dict.fromkeys(self.lines), *files])
+            lines = [*dict.fromkeys(self.lines), *files]
+            raise SceneError([*lines[:MOST], "and more: mend these first"] if len(lines) > MOST else lines)
         if self.unusable:
             first = self.unusable[0]
-            raise FormatError(first.path, "\n".join([first.reason, *files[1:]]))
+            raise FormatError(first.path, first.reason, files[1:])
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
     """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them where none is near."""
-    near = difflib.get_close_matches(name.lower(), known, n=1)
+    near = difflib.get_close_matches(name.lower(), known, n=1) if len(name) <= LONGEST else []
     return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"

@@ -13,8 +13,9 @@ from ddrecon.scene.leaves import LEAVES, Rule, read_color, read_each, read_list,
 from ddrecon.scene.nodes import Node, found
 from ddrecon.scene.parameter_kinds import KINDS, Kind, pattern_of
 from ddrecon.scene.problems import Problems, suggestion
-from ddrecon.scene.ring import read_ring_views
-from ddrecon.scene.schema import Constant, Density, FieldFile, ParameterSettings, Quantity, RingViews, Start, ViewSection
+from ddrecon.scene.ring import ring_views
+from ddrecon.scene.schema import Constant, Density, FieldFile, ParameterSettings, Quantity, Start, ViewSection, ViewSource
+from ddrecon.scene.transforms import read_transforms
 
 R = TypeVar("R")
 
@@ -33,6 +34,8 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
                 raise child.key_refused(f"unknown key{suggestion(name, known)}")
             if name in declared:
                 values[name] = read_value(child, Rule(hints[name], declared[name].metadata, folder))
+        if problems.are_many:
+            break
     problems.raise_any()
     return _checked(node, kind(**values))
 
@@ -142,7 +145,10 @@ def _read_start(node: Node, rule: Rule) -> Any:
 
 def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
     if isinstance(node.value, dict):
-        return read_ring_views(node, read_record(node, RingViews, rule.folder), rule.folder)
+        source = read_record(node, ViewSource, rule.folder)
+        if source.ring is not None:
+            return ring_views(node, source.ring, source.images, rule.folder)
+        return read_transforms(node.value["transforms"], source.transforms or (), source.test_every)
     entries = read_list(node)
     for index, entry in enumerate(entries):
         if isinstance(entry.value, dict):
@@ -153,10 +159,10 @@ def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
 
 
 def _check_unique(entries: list[Node], names: list[str]) -> None:
-    problems = Problems()
+    problems, first = Problems(), dict[str, int]()
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
-        if name in names[:index]:
-            problems.note(_mapping(entry)["name"].refused(f"{name!r} is already the name of view {names.index(name)}"))
+        if first.setdefault(name, index) != index:
+            problems.note(_mapping(entry)["name"].refused(f"{name!r} is already the name of view {first[name]}"))
     problems.raise_any()
 
 

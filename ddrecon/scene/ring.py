@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 from ddrecon.scene.nodes import Node
-from ddrecon.scene.schema import PerspectiveSection, RingSection, RingViews, ViewSection
+from ddrecon.scene.schema import PerspectiveSection, RingSection, ViewSection
 
 
 def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
@@ -20,18 +20,20 @@ def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
     ]
 
 
-def read_ring_views(node: Node, views: RingViews, folder: Path) -> tuple[ViewSection, ...]:
-    """The views of the section `node`, named ring_00, ring_01, ...; raises SceneError unless there are as many images as cameras."""
-    cameras = ring_cameras(views.ring)
+def ring_views(node: Node, ring: RingSection, pattern: str | None, folder: Path) -> tuple[ViewSection, ...]:
+    """The views of the section `node`, named ring_00, ...; raises SceneError unless `pattern` matches as many images as cameras."""
+    cameras = ring_cameras(ring)
     images: list[Path] | list[None] = [None] * len(cameras)
-    if views.images is not None:
-        images = matches(views.images, folder)
+    if pattern is not None:
+        images = matches(pattern, folder)
         if len(images) != len(cameras):
             entry = node.value["images"] if isinstance(node.value, dict) else node
-            raise entry.refused(f"{views.images!r} matches {len(images)} files, but the ring has {len(cameras)} cameras")
+            raise entry.refused(f"{pattern!r} matches {len(images)} files, but the ring has {len(cameras)} cameras")
     return tuple(ViewSection(f"ring_{index:02d}", camera, image) for index, (camera, image) in enumerate(zip(cameras, images, strict=True)))
 
 
 def matches(pattern: str, folder: Path) -> list[Path]:
-    """The files that match the glob `pattern`, relative to `folder`, as sorted absolute paths."""
+    """The files that match the glob `pattern`, relative to `folder`, as sorted absolute paths; wildcards stand in its last two parts."""
+    if glob.has_magic(str(Path(pattern).parent.parent)):
+        return []
     return sorted(path for name in glob.glob(pattern, root_dir=folder) if (path := (folder / name).absolute()).is_file())

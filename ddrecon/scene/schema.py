@@ -21,6 +21,8 @@ from ddrecon.settings import DERIVATIVES, DiffusionSettings, RenderSettings, bou
 
 Count = tuple[int, int, int]
 Size = tuple[int, int]
+Pair = tuple[float, float]
+Paths = tuple[Path, ...]
 Color = float | Triple
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
@@ -50,9 +52,10 @@ class Constant:
 
 @dataclass(frozen=True)
 class FieldFile:
-    """Values per cell, from a volume file."""
+    """Values per cell, from a volume file, where they are called `name` (None: as in the scene)."""
 
     file: Path
+    name: str | None = None
 
 
 Density = float | FieldFile
@@ -174,11 +177,17 @@ def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
 
 @dataclass(frozen=True, kw_only=True)
 class PerspectiveSection(PoseSection):
-    """`fov`: horizontal field of view [degrees]."""
+    """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
+
+    The axis meets the image at `principal_point`, parts of its width and height from the top left. `pixel_aspect`: height of a pixel over
+    its width.
+    """
 
     type: ClassVar[str] = "perspective"
 
     fov: float = limited(above=0, below=180)
+    principal_point: Pair = (0.5, 0.5)
+    pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,15 +236,27 @@ class RingSection:
 
 
 @dataclass(frozen=True)
-class RingViews:
-    """Views from a ring; `images` is a glob pattern whose matches, sorted, belong to the cameras in turn."""
+class ViewSource:
+    """Views that are not listed one by one: from a ring, or from transforms.json files of NeRF, instant-ngp or nerfstudio.
 
-    ring: RingSection
+    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every `test_every` views of files that
+    say nothing of it, the first is a test view.
+    """
+
+    ALTERNATIVES: ClassVar = (("ring",), ("transforms",))
+
+    ring: RingSection | None = None
+    transforms: Paths | None = None
     images: str | None = None
+    test_every: int | None = optional(minimum=2)
 
     def problems(self) -> Iterator[Problem]:
-        if self.images is None and self.ring.resolution is None:
+        if self.ring is not None and self.images is None and self.ring.resolution is None:
             yield "ring", "missing key 'resolution'; only views with images can go without"
+        if self.ring is None and self.images is not None:
+            yield "images", "is for a ring; transforms name their images themselves"
+        if self.ring is not None and self.test_every is not None:
+            yield "test_every", "is for transforms; list the views of a ring to keep some as test views"
 
 
 @dataclass(frozen=True)

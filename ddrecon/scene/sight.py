@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from ddrecon.cameras import Camera, Rays, rays
 from ddrecon.grid import Grid
 
 COARSER = 8
+MOST_PIXELS = 2**18
+"""Images are made about this small before they are looked at closely."""
 
 
 def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
@@ -22,7 +26,8 @@ def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
 
 def sees_box(camera: Camera, grid: Grid) -> bool:
     """Whether any pixel of `camera` looks through the box of `grid`; a coarser image is tried first, because it is quick."""
-    return any(bool(rays_hit_box(rays(image), grid).any()) for image in (camera.resized(COARSER), camera))
+    finer = max(1, math.ceil(math.sqrt(camera.size[0] * camera.size[1] / MOST_PIXELS)))
+    return any(bool(rays_hit_box(rays(image), grid).any()) for image in (camera.resized(COARSER * finer), camera.resized(finer)))
 
 
 def blindness(camera: Camera, grid: Grid) -> str:
@@ -30,5 +35,12 @@ def blindness(camera: Camera, grid: Grid) -> str:
     (low, high), pose = grid.bounds_xyz, camera.pose.double()
     center = (pose.new_tensor(low) + pose.new_tensor(high)) / 2
     if torch.dot(center - pose[:, 3], -pose[:, 2]) < 0:
-        return "the volume lies behind the camera (a camera looks along its -z axis, as in OpenGL)"
-    return "the camera looks past it: check its target, its field of view or width, and volume.bounds"
+        return (
+            "the volume lies behind the camera, which looks along its -z axis with +y up, as in OpenGL: where poses are in OpenCV's axes, "
+            "negate the second and third column of each matrix"
+        )
+    away = torch.dist(center, pose[:, 3]) / torch.dist(pose.new_tensor(low), pose.new_tensor(high))
+    return (
+        f"the camera looks past it, from {away:.3g} diagonals of the box away: check volume.bounds (are they in the units of the "
+        "cameras?), its target, and its field of view or width"
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
@@ -27,6 +29,18 @@ def test_a_scene_becomes_xml_and_a_volume(succeed: Run) -> None:
     assert {emitter.attrib["type"] for emitter in root.iter("emitter")} == {"directional", "constant"}
 
 
+def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
+    assert succeed("export", "scene.yaml", "-o", "transforms.json").stdout == "written: transforms.json\n"
+    frames = json.loads(Path("transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["front.npy", "side.npy"]
+    before = succeed("check", "scene.yaml", "--json").stdout
+    succeed("export", "scene.yaml", "-o", "transforms.json", "--overwrite")
+    Path("again.yaml").write_text(
+        re.sub(r"(?ms)^views:.*?(?=^\w|\Z)", "views: {transforms: transforms.json}\n", Path("scene.yaml").read_text())
+    )
+    assert succeed("check", "again.yaml", "--json").stdout == before
+
+
 def test_overwrite(succeed: Run, refuse: Refuse) -> None:
     succeed("export", "scene.yaml", "-o", "smoke.xml")
     (line,) = refuse(2, "export", "scene.yaml", "-o", "smoke.xml", "-D", "volume.g=0")
@@ -38,20 +52,20 @@ def test_overwrite(succeed: Run, refuse: Refuse) -> None:
 
 def test_other_suffixes(refuse: Refuse) -> None:
     (line,) = refuse(3, "export", "density.npz", "-o", "smoke.obj")
-    assert line == "smoke.obj: unknown volume format '.obj'; known: .npz, .vol, .vti"
+    assert line == "smoke.obj: unknown volume format '.obj'; known: " + ", ".join(FORMATS)
 
 
 def test_one_scene_at_a_time(refuse: Refuse) -> None:
-    assert refuse(2, "export", "scene.yaml", "scene.yaml", "-o", "smoke.xml")[-1] == "Error: one scene at a time is written for Mitsuba"
+    assert refuse(2, "export", "scene.yaml", "scene.yaml", "-o", "smoke.xml")[-1] == "Error: one scene at a time is written as .xml"
 
 
-def test_volumes_through_every_format_keep_a_corner_in_its_place(succeed: Run) -> None:
+def test_volumes_through_every_format_keep_a_corner_in_its_place(succeed: Run, readable_formats: list[str]) -> None:
     values = np.zeros((2, 3, 4), np.float32)
     values[0, 0, 3] = 7
     bounds = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
     write_field(Path("start.npz"), "density", values, bounds)
     last = "start.npz"
-    for suffix in [*FORMATS, ".npz"]:
+    for suffix in [*readable_formats, ".npz"]:
         name = f"{last.partition('.')[0]}x.density{suffix}"
         assert succeed("export", last, "-o", name).stdout == f"written: {name}\n"
         last = name

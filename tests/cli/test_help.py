@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+import torch
 from click.testing import CliRunner
 
 from ddrecon import __version__
 from ddrecon.cli import main
 
+README = (Path(__file__).parents[2] / "README.md").read_text()
 PROGRAM = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
 
 
@@ -21,7 +25,7 @@ def seconds(*arguments: str) -> float:
     return time.perf_counter() - start
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["optimize", "--help"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["optimize", "--help"]])
 def test_help_takes_under_a_third_of_a_second(arguments: list[str]) -> None:
     assert min(seconds(*arguments) for _ in range(5)) < 0.3
 
@@ -40,4 +44,27 @@ def test_a_command_says_what_it_does(command: str) -> None:
 
 
 def test_version() -> None:
-    assert __version__ in CliRunner().invoke(main, ["--version"]).stdout
+    python = ".".join(map(str, sys.version_info[:3]))
+    (line,) = CliRunner().invoke(main, ["--version"]).stdout.splitlines()
+    assert line.startswith(f"ddrecon {__version__}, Python {python}, torch {torch.__version__}, device ")
+    assert line.endswith(" cpu") or torch.cuda.is_available()
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("ddrecon ren", ["plain,render"]),
+        ("ddrecon optimize --res", ["plain,--resume"]),
+        ("ddrecon render --device c", ["plain,cpu", "plain,cuda"]),
+    ],
+)
+def test_a_shell_completes_what_was_typed(typed: str, expected: list[str]) -> None:
+    words = {"_DDRECON_COMPLETE": "bash_complete", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    program = [*PROGRAM[:2], PROGRAM[2].replace("main()", "main(prog_name='ddrecon')")]
+    assert subprocess.run(program, env=os.environ | words, capture_output=True, text=True).stdout.split() == expected
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_is_told_how_to_complete(shell: str) -> None:
+    told = CliRunner().invoke(main, env={"_DDRECON_COMPLETE": f"{shell}_source"}, prog_name="ddrecon").stdout
+    assert f"_DDRECON_COMPLETE={shell}_complete" in told and f"_DDRECON_COMPLETE={shell}_source ddrecon" in README

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,9 @@ def read_json(path: str) -> Any:
 
 def test_the_files_of_a_run(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out")
-    expected = ["scene.yaml", "environment.json", "loss.csv", "parameters.json", "summary.json", "volumes", "volumes/density.npz"]
-    expected += ["checkpoints", "checkpoints/last.pt", "previews", "previews/density.slices.png", "previews/front.png", "previews/side.png"]
+    expected = ["scene.yaml", "result.yaml", "environment.json", "loss.csv", "parameters.json", "summary.json", "report.html"]
+    expected += ["volumes", "volumes/density.npz", "checkpoints", "checkpoints/last.pt", "checkpoints/previous.pt"]
+    expected += ["previews", "previews/density.slices.png", "previews/front.png", "previews/side.png"]
     assert set(contents(Path("out"))) == set(expected)
     parameters = read_json("out/parameters.json")
     assert parameters["g"] == pytest.approx(0.3) and parameters["lights.0.irradiance"] == [3]
@@ -129,6 +131,32 @@ def test_divergence_keeps_the_last_good_state(run: Run) -> None:
     result = run(*OPTIMIZE, "out", "-D", "optimize.parameters.density.lr=1e37")
     assert (result.exit_code, result.stdout) == (4, "")
     (line,) = result.stderr.splitlines()
-    assert "not finite" in line and "lower optimize.parameters.density.lr" in line
+    assert re.match(r"iteration 2: .* not finite; at most, density at voxel \[\d, \d, \d\] is \d", line)
+    assert "; lower optimize.parameters.density.lr (now 1e+37); the state after 0 iterations is kept in out/checkpoints/last.pt" in line
     state = torch.load("out/checkpoints/last.pt", weights_only=True)["state"]
-    assert torch.isfinite(state["parameters"]["density"]["value"]).all() and len(state["rows"]) == len(rows("out"))
+    assert torch.isfinite(state["parameters"]["density"]["value"]).all() and state["total"]["iteration"] == len(rows("out")) - 1
+
+
+def test_the_report_shows_every_view_field_and_setting(succeed: Run) -> None:
+    succeed(*OPTIMIZE, "out")
+    text, summary = Path("out/report.html").read_text(), read_json("out/summary.json")
+    assert text.count("<img ") == 2 + 2 + 1 and text.count("<svg ") == 2
+    for name, view in summary["views"].items():
+        assert f"{name} ({view['split']}): {view['psnr']:.2f} dB" in text
+    for told in ("density, middle slices", "means along the axes", "Once around", "irradiance: 3.0", "fluxes Q1 and L1", "torch"):
+        assert told in text
+
+
+def test_the_log_goes_to_tensorboard_too_and_goes_on_there(succeed: Run) -> None:
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="TensorBoard is an extra")
+    succeed(*OPTIMIZE, "out", "--tensorboard", "--iterations", "3")
+    succeed(*OPTIMIZE, "out", "--tensorboard", "--resume", "--iterations", "5")
+    events = accumulator.EventAccumulator("out/tensorboard").Reload()
+    log = rows("out")
+    assert [event.step for event in events.Scalars("loss")] == [1, 2, 3, 4, 5]
+    assert [event.value for event in events.Scalars("loss")] == pytest.approx([float(row["loss"]) for row in log], rel=1e-6)
+
+
+def test_the_camera_of_a_view_that_is_not_looked_at_is_refused(refuse: Callable[..., list[str]]) -> None:
+    (told,) = refuse(2, *OPTIMIZE, "out", "-D", "optimize.parameters={views.side.camera: {}}")
+    assert "optimize.parameters.views.side.camera" in told and "no training view" in told

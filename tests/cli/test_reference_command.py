@@ -80,7 +80,7 @@ def test_seeds_choose_paths(succeed: Run) -> None:
 
 def test_without_mitsuba(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    assert refuse(3, *REFERENCE) == ["the reference renderer needs: pip install ddrecon[reference]"]
+    assert refuse(3, *REFERENCE) == ['the reference renderer needs mitsuba: pip install "ddrecon[reference]"']
 
 
 def test_a_folder_with_something_in_it(refuse: Refuse) -> None:

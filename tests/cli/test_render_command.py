@@ -131,3 +131,45 @@ def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:
     loud, quiet = run(*RENDER[:-1], "-v"), run(*RENDER, "--overwrite")
     assert "2/2" in loud.stderr and quiet.stderr == ""
     assert "render:" not in loud.stdout and "written to out" in quiet.stdout
+
+
+def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:
+    import imageio.v3 as iio
+
+    said = succeed(*RENDER, "--ring", "5", "--view", "front").stdout
+    report = json.loads(Path("out/render.json").read_text())
+    movie = iio.imread("out/ring.png", index=..., plugin="pillow")[..., :3]
+    assert "around: ring.png" in said and report["ring"]["files"] == ["ring.png"] and report["psnr"] == {}
+    assert list(report["files"]) == [f"ring_{index:03d}" for index in range(5)]
+    for frame, name in zip(movie, report["files"], strict=True):
+        assert np.abs(frame - encoded(pixels(name).astype(float) / report["ring"]["white"])).max() <= 1
+    succeed("render", "scene.yaml", "-o", "front", "-q", "--view", "front")
+    assert np.allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
+
+
+def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
+    lights = ["{type: ambient, radiance: 0.3}", "{type: point, position: [0, 2, 0], intensity: [1, 2, 3]}"]
+    said = succeed(*RENDER, *(argument for light in lights for argument in ("--light", light))).stdout
+    relit = pixels("front")
+    succeed(*RENDER, "--overwrite", "-D", f"lights=[{', '.join(lights)}]")
+    assert np.array_equal(pixels("front"), relit) and "PSNR" not in said
+
+
+def test_a_finished_run_is_rendered_as_it_was_found(succeed: Run) -> None:
+    succeed("optimize", "scene.yaml", "-o", "found", "-q")
+    told = json.loads(Path("found/summary.json").read_text())["views"]
+    report = json.loads(succeed("render", "found", "-o", "out", "-q", "--json").stdout)
+    assert report["psnr"] == {name: pytest.approx(view["psnr"], abs=1e-3) for name, view in told.items()}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["scene.yaml", "--mp4"], "--mp4 is a movie of --ring N"),
+        (["scene.yaml", "--ring", "1"], "1 is not in the range x>=2"),
+        (["."], ".: holds no result.yaml"),
+        (["scene.yaml", "--light", "{type: sun}"], "lights.0.type: expected one of directional"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(refuse: Callable[..., list[str]], arguments: list[str], told: str) -> None:
+    assert told in refuse(2, "render", *arguments, "-o", "out")[-1]

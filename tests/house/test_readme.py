@@ -1,4 +1,7 @@
-"""What the README and the configs' first lines tell people to type is understood by the program."""
+"""What the configs' first lines tell people to type is understood by the program, and scenes on the pages are legal.
+
+(The commands on the pages are run by tests/docs.)
+"""
 
 from __future__ import annotations
 
@@ -13,22 +16,19 @@ from ddrecon.cli import main
 from ddrecon.scene.load import read_scene
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+def scenes() -> list[str]:
+    """Every block of YAML on a page that is a whole scene."""
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    return [block for text in texts for block in re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)]
 
 
 def commands() -> list[str]:
-    """Every `ddrecon ...` in the README's code blocks and in comments at the top of configs."""
-    typed = [part.strip() for block in blocks("(?:bash|sh|console|)") for line in block.splitlines() for part in line.split("&&")]
-    told = [
-        line
-        for config in sorted((ROOT / "configs").glob("*.yaml"))
-        for line in re.findall(r"^#.*?(ddrecon .*)$", config.read_text(), re.MULTILINE)
-    ]
-    return [line for line in [*typed, *told] if line.startswith("ddrecon ")]
+    """Every `ddrecon ...` in comments of configs."""
+    configs = sorted((ROOT / "configs").rglob("*.yaml"))
+    return [line for config in configs for line in re.findall(r"^#.*?(ddrecon .*)$", config.read_text(encoding="utf-8"), re.MULTILINE)]
 
 
 def parsed(line: str) -> click.Context:
@@ -40,14 +40,13 @@ def parsed(line: str) -> click.Context:
     return command.make_context(name, arguments)
 
 
-def test_there_are_commands() -> None:
-    assert len(commands()) >= 4
+def test_there_are_commands_and_scenes() -> None:
+    assert len(commands()) >= 15 and len(scenes()) >= 2
 
 
 @pytest.mark.parametrize("line", dict.fromkeys(commands()))
 def test_a_command_is_understood(line: str) -> None:
-    scene = parsed(line).params.get("scene")
-    assert scene is None or (ROOT / scene).is_file()
+    assert (ROOT / parsed(line).params["scene"]).is_file()
 
 
 @pytest.mark.parametrize("line", ["ddrecon paint a.yaml", "ddrecon check a.yaml --colour", "ddrecon render a.yaml"])
@@ -56,8 +55,8 @@ def test_a_wrong_command_is_not(line: str) -> None:
         parsed(line)
 
 
-@pytest.mark.parametrize("text", blocks("yaml"))
-def test_a_scene_in_the_readme_is_legal(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize("text", scenes())
+def test_a_scene_on_a_page_is_legal(tmp_path: Path, text: str) -> None:
     path = tmp_path / "scene.yaml"
     path.write_text(text)
     assert read_scene(path).tree.views

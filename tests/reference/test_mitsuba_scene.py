@@ -60,6 +60,11 @@ def test_the_middle_of_a_films_edges_is_seen_along_our_rays(make_scene, make_cam
         np.testing.assert_allclose(theirs / np.linalg.norm(theirs), ours.direction[ray].flip(-1), atol=1e-12)
 
 
+def test_pixels_that_are_not_square_are_refused(make_scene, make_camera, random) -> None:
+    with pytest.raises(SceneError, match=r"pixels are square, those of this camera 1\.1 times as high as wide"):
+        described(make_scene(random(*SHAPE), camera=replace(make_camera(), pixel_aspect=1.1)))
+
+
 @pytest.mark.parametrize("sigma", [(0.5,), (0.5, 1.0, 2.0)])
 def test_constant_cross_sections(make_scene, random, sigma: tuple[float, ...]) -> None:
     scene = make_scene(random(*SHAPE), sigma_a=sigma, sigma_s=tuple(3 * value for value in reversed(sigma)))

@@ -11,10 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, look_at
+from ddrecon.cameras import Camera, look_at, rays
 from ddrecon.grid import Grid
 from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.reference.trace import Traced, open_tracer
+from ddrecon.reference.mitsuba_scene import mitsuba_scene
+from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
 from ddrecon.renderer import render
 from ddrecon.settings import RenderSettings
 from ddrecon.world import Scene
@@ -127,3 +128,16 @@ def test_nothing_and_nothing_that_shines(make_scene) -> None:
     empty = make_scene(torch.zeros(2, 2, 2, dtype=torch.float64), ambient=(0.5,))
     np.testing.assert_allclose(passes(empty, 1, 4)[0], 0.5, rtol=1e-6)
     assert not passes(replace(empty, lights=[]), 1, 4)[0].any()
+
+
+def test_an_off_center_camera_is_theirs(make_scene, make_camera, random) -> None:
+    """Mitsuba's own rays through the corners of the film are ours."""
+    mitsuba = load_mitsuba()
+    camera = replace(make_camera(size=(4, 6), half_width=0.4), principal_point=(0.3, 0.65))
+    scene = make_scene(random(3, 4, 5), camera=camera)
+    sensor = mitsuba_scene(scene, scene.views)["sensor_0"]
+    sensor["to_world"] = mitsuba.ScalarTransform4f(sensor["to_world"])
+    theirs = mitsuba.load_dict(sensor)
+    for corner, index in (((0.0, 0.0), 0), ((1.0, 1.0), -1)):
+        ray, _ = theirs.sample_ray(0.0, 0.5, mitsuba.ScalarPoint2f(*corner), mitsuba.ScalarPoint2f(0.5))
+        np.testing.assert_allclose(np.array(ray.d).ravel(), rays(camera, corner).direction[index].flip(-1), atol=1e-6)

@@ -14,7 +14,7 @@ import yaml
 from example_scene import SCENE, changed
 
 from ddrecon.errors import FormatError, SceneError
-from ddrecon.io.volumes import write_field
+from ddrecon.io.volumes import write_field, write_fields
 from ddrecon.lights import AmbientLight, DirectionalLight
 from ddrecon.scene.build import load_scene
 
@@ -219,3 +219,14 @@ def test_ring_problems_lead_to_the_ring(write: Write):
     ring = {"count": 2, "radius": 3, "fov": 20, "target": [9, 0, 0], "resolution": [4, 4]}
     lines = problems(write(changed(views={"ring": ring})))
     assert len(lines) == 2 and "views.0.camera: no pixel of view 'ring_00'" in lines[0] and lines[0].startswith("scene.yaml:")
+
+
+def test_a_field_may_have_another_name_in_its_file(write: Write, tmp_path: Path):
+    """In the volume and where a parameter starts."""
+    lwc, ice = np.random.default_rng(0).random((2, 4, 3, 2)).astype(np.float32)
+    write_fields(tmp_path / "les.npz", {"lwc": lwc, "ice": ice}, BOUNDS)
+    start = {"parameters": {"density": {"init": {"file": "les.npz", "name": "ice"}}}}
+    scene = load_scene(write(changed(volume=VOLUME | {"density": {"file": "les.npz", "name": "lwc"}}, optimize=start)))
+    assert np.array_equal(scene.volume.density, lwc) and np.array_equal(scene.starts["density"], ice)
+    with pytest.raises(FormatError, match="has no field 'rain'; it has 'lwc', 'ice'"):
+        load_scene(tmp_path / "scene.yaml", overrides=["volume.density.name=rain"])

@@ -105,6 +105,6 @@ def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
     assert "cannot be read" in problem(tmp_path)
     (tmp_path / "b.yaml").write_bytes(b"a: b\n" + b"\n" * MAX_BYTES)
     start = time.perf_counter()
-    assert "larger than 4 MiB" in problem(tmp_path / "b.yaml") and time.perf_counter() - start < 1
+    assert "larger than 1 MiB" in problem(tmp_path / "b.yaml") and time.perf_counter() - start < 1
     (tmp_path / "c.yaml").write_bytes(b"a: 1\nb: \xff\n")
     assert problem(tmp_path / "c.yaml").endswith("c.yaml:2:4: is not UTF-8 text")

@@ -74,7 +74,7 @@ def test_as_many_images_as_cameras(refusal: Refusal, tmp_path: Path):
         ({"ring": RING | {"count": 10**9}}, "views.ring.count: must be at most 10000"),
         ({"ring": RING | {"radius": 0}}, "views.ring.radius: must be above 0"),
         ({"ring": {"count": 3, "radius": 1, "fov": 30}}, "views.ring: missing key 'resolution'"),
-        ({"images": "*.exr"}, "views: missing key 'ring'"),
+        ({"images": "*.exr"}, "views: missing ring or transforms"),
         ({"image": "*.exr", "ring": RING}, "views.image: unknown key; did you mean 'images'?"),
         ("ring", "views: expected a list with at least one entry, found 'ring'"),
     ],

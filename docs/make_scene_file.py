@@ -1,0 +1,298 @@
+"""Makes docs/scene_file.md, the manual of scene files, from the schema: keys, kinds, limits and defaults are those the program checks.
+
+python docs/make_scene_file.py
+"""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, Field, fields
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from ddrecon.scene import schema
+from ddrecon.scene.parameter_kinds import KINDS
+from ddrecon.settings import DiffusionSettings, RenderSettings
+
+PAGE = Path(__file__).parent / "scene_file.md"
+KIND_NAMES = {
+    schema.Color: "number or [r, g, b]",
+    schema.Quantity: "number, [r, g, b] or {file: ...}",
+    schema.Density: "number or {file: ...}",
+    schema.Start: "number, list or {file: ...}",
+    schema.Triple: "[x, y, z]",
+    schema.Count: "[nx, ny, nz]",
+    schema.Size: "[width, height]",
+    schema.Pair: "[x, y]",
+    schema.Paths: "file, or list of files",
+    schema.Matrix: "4 rows of 4 numbers",
+    tuple[float, ...]: "list of numbers",
+    float: "number",
+    int: "whole number",
+    bool: "true or false",
+    str: "text",
+    Path: "file",
+}
+"""How a user would call what a key takes."""
+
+INTRODUCTION = """\
+Every key, with what it takes, its limits and its default, made from the program's own schema. Vectors are x, y, z; lengths are in a world
+unit u of your choice; `1e-3` is a number; paths are relative to the scene file. Anything unknown, repeated or out of its limits is
+refused with file, line, column and key."""
+VOLUME = "The box, and what is in it. Either `sigma_a` and `sigma_s`, or `sigma_t` and `albedo`."
+SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
+    (
+        "volume",
+        schema.VolumeSection,
+        VOLUME,
+        {
+            "density": "What scatters and absorbs, per cell; everything else is multiplied by it. `{constant: 0.1}` is the same as `0.1`.",
+            "bounds": "The corners of the box [u], `{min: [x, y, z], max: [x, y, z]}`; of the field's file where left out.",
+            "resolution": "Cells along x, y and z; those of the field's file where left out.",
+            "sigma_a": "Absorption coefficient per unit of density [1/u].",
+            "sigma_s": "Scattering coefficient per unit of density [1/u].",
+            "sigma_t": "Extinction coefficient per unit of density [1/u]: absorption and scattering together.",
+            "albedo": "Single-scattering albedo: the part of the extinction that scatters.",
+            "g": "Mean cosine of the scattering angle (asymmetry parameter) of the Henyey-Greenstein phase function; above 0 is forward.",
+        },
+    ),
+    (
+        "volume.density, sigma_a, ...: {file: ...}",
+        schema.FieldFile,
+        "A field from a volume file; formats are told of in [formats.md](formats.md).",
+        {
+            "file": "Relative to the scene file.",
+            "name": "What the field is called in the file, where that is not its name here.",
+        },
+    ),
+    (
+        "lights: {type: directional}",
+        schema.DirectionalSection,
+        "Parallel light, such as the sun's.",
+        {
+            "direction": "The way the light travels, of any length.",
+            "irradiance": "On a plane that faces it, in units of radiance times steradian.",
+        },
+    ),
+    (
+        "lights: {type: ambient}",
+        schema.AmbientSection,
+        "The same light from everywhere.",
+        {
+            "radiance": "Of every direction.",
+        },
+    ),
+    (
+        "lights: {type: environment}",
+        schema.EnvironmentSection,
+        "A latitude-longitude map (HDRI), +y up, oriented as Mitsuba's `envmap`. Small bright regions become suns.",
+        {
+            "file": "An image of linear radiance: .exr, .hdr, .npy, .tif.",
+            "scale": "Factor on its pixels.",
+            "rotation": "About +y, in degrees.",
+            "directions": "How many directions its light on the volume is gathered into: more are slower and closer.",
+        },
+    ),
+    (
+        "lights: {type: point}",
+        schema.PointSection,
+        "Light from a point, inside or outside the box.",
+        {
+            "position": "Where it is [u].",
+            "intensity": "Power per solid angle.",
+        },
+    ),
+    (
+        "views",
+        schema.ViewSection,
+        "A list of pictures or of cameras to render. Or a ring, or NeRF cameras: see the next table.",
+        {
+            "name": "Files of the view are called so.",
+            "camera": "Where it is seen from; see below.",
+            "image": "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg and .webp are decoded from sRGB; "
+            "alpha 0 is empty.",
+            "mask": "A picture of the same size, black where pixels are ignored.",
+            "split": "`test` views are never optimized on, and always reported.",
+            "weight": "How much a training view counts.",
+        },
+    ),
+    (
+        "views: {ring: ...} or {transforms: ...}",
+        schema.ViewSource,
+        "Views that are not listed one by one.",
+        {
+            "ring": "Cameras in a circle; see below.",
+            "transforms": "`transforms.json` of NeRF, instant-ngp or nerfstudio, read as it is.",
+            "images": "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted, belong to the cameras in turn.",
+            "test_every": "For transforms that say nothing of splits: of every so many views, the first is a test view.",
+        },
+    ),
+    (
+        "views: {ring: ...}",
+        schema.RingSection,
+        "Cameras around `target`, the first towards +z of it, the next towards +x.",
+        {
+            "count": "How many.",
+            "radius": "Of the circle [u].",
+            "fov": "Horizontal field of view, in degrees.",
+            "height": "Of the circle above the target [u].",
+            "target": "What they look at [u].",
+            "up": "Which way is up in their images.",
+            "resolution": "Pixels; left out where images say it.",
+        },
+    ),
+    (
+        "camera: {type: perspective}",
+        schema.PerspectiveSection,
+        "A pinhole camera. Either `origin`, `target` and `up`, or `matrix`.",
+        {
+            "fov": "Horizontal field of view, in degrees.",
+            "principal_point": "Where the axis meets the image, as parts of its width and height from the top left.",
+            "pixel_aspect": "Height of a pixel over its width.",
+            "origin": "Where the camera stands [u].",
+            "target": "A point on its axis [u].",
+            "up": "Which way is up in the image.",
+            "matrix": "Camera to world, with OpenGL axes: the columns are right, up, backward and origin.",
+            "resolution": "Pixels; left out where the view has an image.",
+        },
+    ),
+    (
+        "camera: {type: orthographic}",
+        schema.OrthographicSection,
+        "Parallel rays, as a satellite far away sees. Its other keys are those of a perspective camera.",
+        {
+            "width": "Of the image [u].",
+        },
+    ),
+    (
+        "render",
+        RenderSettings,
+        "How view rays are sampled.",
+        {
+            "samples_per_pixel": "Rays a pixel, over its area; one goes through its center.",
+            "steps_per_voxel": "Samples a cell along a ray.",
+            "tolerance": "Pixels finer than half a cell are interpolated between rays, but where they may change by more than "
+            "this part of the image's root mean square. 0: every pixel has a ray of its own.",
+            "background": "Whether ambient light and environment maps are seen behind the volume.",
+        },
+    ),
+    (
+        "diffusion",
+        DiffusionSettings,
+        "How light that is scattered more than once is found. [settings.md](settings.md) says how to choose.",
+        {
+            "model": "`none` leaves such light out; `flux_limited` is the paper's for thin smoke.",
+            "scheme": "`printed` is the paper's own discretization, for comparison.",
+            "closure": "What the diffusion coefficient becomes in empty space.",
+            "floor": "Of the smooth closure.",
+            "limiter": "Of the flux-limited model.",
+            "solver": "Of the linear system.",
+            "tolerance": "Relative residual of a solve.",
+            "warm_start": "Whether a solve begins at the last one's solution.",
+            "transport_rounds": "Sweeps along rays that take diffusion towards the transport equation: 1 or 2 bring images within 2 %.",
+            "transport_directions": "Directions of such a sweep.",
+        },
+    ),
+    (
+        "optimize",
+        schema.OptimizeSettings,
+        "What `ddrecon optimize` finds, and how.",
+        {
+            "parameters": "What to find: names, as in the last table, with their settings.",
+            "iterations": "In all.",
+            "loss": "What is made small, as a mean over pixels.",
+            "optimizer": "How.",
+            "views_per_iteration": "Training views drawn at random for each iteration; 0 for all.",
+            "derivatives": "Which light passes derivatives on: all, that scattered once, or that of the diffusion.",
+            "refine_at": "Fractions of the run at which cells and pixels become half as large: coarse to fine.",
+        },
+    ),
+    (
+        "optimize.parameters: {NAME: ...}",
+        schema.ParameterSettings,
+        "Settings of one parameter; all may be left out, `{}`.",
+        {
+            "init": "Where it starts; from what the scene says unless given.",
+            "lr": "Learning rate, in the parameter's own unit; chosen by its size unless given.",
+            "min": "It is kept at least this large.",
+            "max": "And at most this large.",
+            "tv": "Weight of its total variation, which smooths a field. 1 would weigh as much as the whole brightness of the pictures. "
+            f"Unless given, {KINDS['density'].tv:g} for density and 0 for others.",
+            "l1": "Weight of its mean, which empties what no picture needs.",
+            "field": "Whether it differs from cell to cell; as where it starts unless given. Density always does.",
+        },
+    ),
+]
+"""Each section: its heading, its record, what it is, and what each key is, in words."""
+
+
+def main() -> None:
+    """Writes the page."""
+    PAGE.write_text(page(), encoding="utf-8")
+
+
+def page() -> str:
+    """The whole manual, in Markdown."""
+    parts = [
+        "# The scene file",
+        INTRODUCTION,
+        *(_section(*section) for section in SECTIONS),
+        _parameters(),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(heading: str, record: type, what: str, texts: dict[str, str]) -> str:
+    hints = get_type_hints(record)
+    declared = {field.name: field for field in fields(record)}
+    own = {name: declared[name] for name in texts}
+    rows = [f"| `{name}` | {_takes(hints[name], field)} | {_default(field)} | {texts[name]} |" for name, field in own.items()]
+    return "\n".join([f"## {heading}", "", what, "", "| key | takes | default | what |", "|---|---|---|---|", *rows])
+
+
+def _takes(hint: Any, field: Field[Any]) -> str:
+    """What a key takes, in words, with its limits."""
+    limits = {key: value for key, value in field.metadata.items() if value is not None}
+    if "choices" in limits:
+        return ", ".join(f"`{choice}`" for choice in limits["choices"])
+    words = {"minimum": "at least {:g}", "above": "above {:g}", "maximum": "at most {:g}", "below": "below {:g}"}
+    within = [words[key].format(value) for key, value in limits.items()]
+    return ", ".join([_kind(hint), *within])
+
+
+def _kind(hint: Any) -> str:
+    return next((name for known, name in KIND_NAMES.items() if _alternatives(known) == _alternatives(hint)), "mapping")
+
+
+def _alternatives(hint: Any) -> set[Any]:
+    """What a union is one of, None left out; a hint of another kind by itself."""
+    return set(get_args(hint)) - {NoneType} if get_origin(hint) in (Union, UnionType) else {hint}
+
+
+def _default(field: Field[Any]) -> str:
+    """What stands where the key is left out."""
+    if field.default is MISSING and field.default_factory is MISSING:
+        return "required"
+    value = field.default
+    if value is None or value is MISSING:
+        return ""
+    if isinstance(value, tuple):
+        return f"`[{', '.join(f'{entry:g}' for entry in value)}]`"
+    return f"`{str(value).lower() if isinstance(value, bool) else f'{value:g}' if isinstance(value, float) else value}`"
+
+
+def _parameters() -> str:
+    """The table of what can be optimized."""
+    rows = []
+    for name, kind in KINDS.items():
+        limits = (
+            "" if kind.low == -float("inf") else f"{kind.low:g} to {kind.high:g}" if kind.high < float("inf") else f"at least {kind.low:g}"
+        )
+        rows.append(f"| `{name}` | {limits} | {'yes' if kind.is_color else ''} | {'yes' if kind.is_cellwise else ''} |")
+    told = "What can be found. N is a light's place in the list, counted from 0, NAME a view's name."
+    head = ["## Names of parameters", "", told, "", "| name | kept within | by color | from cell to cell |", "|---|---|---|---|"]
+    return "\n".join([*head, *rows])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""Every command line of the README and the documentation runs, in the order in which it stands there, on fewer cells, paths and samples."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from ddrecon.bench import run as bench_run
+from ddrecon.cli import main
+from ddrecon.reconstruct.levels import at_level
+from ddrecon.validate.hard_cases import CASES
+from ddrecon.world import Scene
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def commands(page: Path) -> list[str]:
+    """Every `ddrecon ...` in a code block of `page`."""
+    text = page.read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(?:bash|sh|console)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    parts = [part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&")]
+    return [part for part in parts if part.startswith("ddrecon ")]
+
+
+def fewer_cells(scene: str) -> list[str]:
+    """Overrides that leave `scene` about 8 cells along its shortest side, where it says how many it has."""
+    found = re.search(r"^  resolution: \[(\d+), (\d+), (\d+)\]", Path(scene).read_text(encoding="utf-8"), re.MULTILINE)
+    sizes = [int(size) for size in found.groups()] if found else []
+    return ["-D", f"volume.resolution={[size * 8 // min(sizes) for size in sizes]}"] if sizes else []
+
+
+def quick(command: str) -> list[str]:
+    """The arguments of `command`, and those that make it quick."""
+    _, name, *rest = shlex.split(command, comments=True)
+    added = {
+        "optimize": lambda: ["--iterations", "2", *fewer_cells(rest[0])],
+        "reference": lambda: ["--spp", "4"],
+        "gradcheck": lambda: ["--samples", "2"],
+    }
+    return [name, *rest, *(added[name]() if name in added else []), "-q"]
+
+
+def coarse(load: Callable[..., Scene]) -> Callable[..., Scene]:
+    return lambda *arguments: at_level(load(*arguments), 4)
+
+
+@pytest.fixture
+def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder with the project's configs and data in it; few hard cases; a bench of few cells, without path tracing."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("configs", "data"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    for name in list(CASES)[2:]:
+        monkeypatch.delitem(CASES, name)
+    monkeypatch.setattr(bench_run, "_scene", coarse(bench_run._scene))
+    monkeypatch.setattr(bench_run, "_tracer", lambda scene, has_gradient: None)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_commands_of_a_page_run(page: Path, surroundings: None) -> None:
+    for command in commands(page):
+        if command.startswith("ddrecon reference"):
+            pytest.importorskip("mitsuba", reason="Mitsuba 3 is not installed (extra `reference`)")
+        result = CliRunner().invoke(main, quick(command))
+        assert result.exit_code == 0, f"{command}: {result.output}"
+
+
+def test_there_are_commands() -> None:
+    assert sum(len(commands(page)) for page in PAGES) >= 15

@@ -1,0 +1,38 @@
+"""Optional packages: each belongs to an extra that pip knows, and where one is absent, the user is told which."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from ddrecon.errors import FormatError, MissingExtraError
+from ddrecon.extras import EXTRAS, load_extra, load_for_file
+
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+def test_every_extra_brings_its_package_and_all_brings_every_extra() -> None:
+    extras = {name: needs for name, needs in PROJECT.items() if name not in ("all", "dev")}
+    assert set(extras) == set(EXTRAS.values())
+    for package, name in EXTRAS.items():
+        assert any(need.startswith(f"{package.replace('_', '-')}>=") for need in extras[name])
+    assert PROJECT["all"] == [f"ddrecon[{','.join(extras)}]"]
+
+
+@pytest.mark.parametrize("package", EXTRAS)
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    advice = f'needs {package}: pip install "ddrecon[{EXTRAS[package]}]"'
+    with pytest.raises(MissingExtraError) as caught:
+        load_extra(package, "what you asked for")
+    assert str(caught.value) == f"what you asked for {advice}"
+    with pytest.raises(FormatError) as refused:
+        load_for_file(package, "smoke.abc")
+    assert str(refused.value) == f"smoke.abc: {advice}"
+
+
+def test_what_is_there_is_loaded() -> None:
+    assert load_extra("sys", "nothing") is sys and load_for_file("sys", "smoke.abc") is sys

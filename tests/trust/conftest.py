@@ -1,0 +1,45 @@
+"""A tiny scene in a folder of its own, and commands run on it in this process."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from click.testing import CliRunner, Result
+from tiny_scene import write_scene
+
+from ddrecon.cli import main
+
+
+@pytest.fixture(autouse=True)
+def surroundings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What commands change in their process is put back."""
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+    yield
+    torch.set_num_threads(threads)
+    torch.set_rng_state(state)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with scene.yaml and its images."""
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(folder: Path) -> Callable[..., Result]:
+    """Runs a command in `folder`; a bug's exception is not swallowed."""
+
+    def run_command(*arguments: str) -> Result:
+        result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result
+
+    return run_command

@@ -1,0 +1,139 @@
+"""Runs that are killed, interrupted or out of disk space at random moments, until they are done all the same.
+
+    python fault_runs.py kill|full FOLDER COUNT
+
+One process imports torch and forks a child for every fault, so that each costs a fraction of a second. Prints as JSON what happened.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import redirect_stdout, suppress
+from io import StringIO
+from pathlib import Path
+
+import torch
+from tiny_scene import write_scene
+
+from ddrecon.cli import main
+from ddrecon.reconstruct import run_folder
+
+SIGNALS = [*[signal.SIGKILL] * 10, signal.SIGTERM, signal.SIGINT]
+EXPECTED = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: 130, signal.SIGINT: 130}
+
+
+def start(folder: Path, out: Path, prepare: Callable[[], None]) -> int:
+    """A child that begins the run in `out`, or goes on with it; its stderr goes to a file."""
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        with (folder / "stderr").open("w") as stderr:
+            os.dup2(stderr.fileno(), 2)
+            os.dup2(stderr.fileno(), 1)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        prepare()
+        optimize(folder, out)
+    except SystemExit as end:
+        os._exit(end.code if isinstance(end.code, int) else 0)
+    except BaseException:  # a child must never return into its parent's code
+        traceback.print_exc()
+    sys.stderr.flush()
+    os._exit(99)
+
+
+def optimize(folder: Path, out: Path) -> None:
+    """The command that a user gives, at first and again."""
+    going_on = ["--resume"] if any(out.glob("checkpoints/*.pt")) else ["--overwrite"]
+    main(["optimize", str(folder / "scene.yaml"), "-q", "--preview-every", "5", "-o", str(out), *going_on])
+
+
+def ended(pid: int) -> int:
+    """The exit code of the child, or the negative of the signal it died of."""
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def result_of(out: Path) -> dict[str, object]:
+    """What a run has come to, without the seconds it took: parameters, log, volumes and pictures."""
+    rows = [line.split(",") for line in (out / "loss.csv").read_text().splitlines()]
+    seconds = rows[0].index("seconds")
+    log = [row[:seconds] + row[seconds + 1 :] for row in rows]
+    files = {str(path.relative_to(out)): path.read_bytes().hex() for path in sorted(out.glob("previews/*"))}
+    state = torch.load(out / "checkpoints" / "last.pt", weights_only=True)["state"]
+    moments = {name: [moment.tolist() for moment in entry["moments"]] for name, entry in state["parameters"].items()}
+    values = {name: entry["value"].tolist() for name, entry in state["parameters"].items()}
+    return {"log": log, "files": files, "moments": moments, "values": values, "parameters": (out / "parameters.json").read_text()}
+
+
+def nothing() -> None:
+    """No preparation."""
+
+
+def kill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
+    """Runs that receive `count` signals, each within a third of the time a whole run takes from its start."""
+    faults, wrong, finished, number = 0, list[str](), 0, 0
+    out = folder / "out_0"
+    while faults < count or not finished:
+        pid = start(folder, out, nothing)
+        sent = None
+        if faults < count:
+            time.sleep(random.uniform(0, duration / 3))
+            sent = SIGNALS[faults % len(SIGNALS)]
+            os.kill(pid, sent)
+        code = ended(pid)
+        if code == 0:
+            finished += 1
+            wrong += [f"run {number} differs"] * (result_of(out) != whole)
+            number += 1
+            out = folder / f"out_{number}"
+            continue
+        faults += 1
+        is_too_early = (folder / "stderr").read_text() == "\nAborted!\n"  # click, before the command has begun
+        if sent is None or (code != EXPECTED[sent] and not is_too_early):
+            wrong.append(f"{sent}: {code}: {(folder / 'stderr').read_text()}")
+    return {"faults": faults, "finished": finished, "wrong": wrong}
+
+
+def fill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
+    """A run whose files cannot grow beyond a random size, `count` times, and then can; checkpoints are the largest of them."""
+    out, wrong, faults = folder / "out_0", list[str](), 0
+    largest = (folder / "whole" / "checkpoints" / "last.pt").stat().st_size
+    for _ in range(count):
+        most = int(random.uniform(0.02, 1.0) * largest)
+        code = ended(start(folder, out, lambda most=most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))))
+        lines = (folder / "stderr").read_text().splitlines()
+        faults += code == 3
+        if code != 0 and (code != 3 or "cannot be written" not in lines[-1] or len(lines) > 2):
+            wrong.append(f"at most {most} bytes: {code}: {lines}")
+    if code := ended(start(folder, out, nothing)):
+        wrong.append(f"with space again: {code}: {(folder / 'stderr').read_text()}")
+    elif result_of(out) != whole:
+        wrong.append("differs")
+    return {"faults": faults, "finished": 1, "wrong": wrong}
+
+
+def run(kind: str, folder: Path, count: int) -> None:
+    torch.set_num_threads(1)
+    random.seed(0)
+    run_folder.CHECKPOINT_SECONDS, run_folder.CHECKPOINT_SHARE = 0.0, 1e9
+    write_scene(folder)
+    with suppress(SystemExit), redirect_stdout(StringIO()):  # here, so that what is imported on the way is imported once
+        optimize(folder, folder / "whole")
+    begin = time.monotonic()
+    ended(start(folder, folder / "again", nothing))
+    duration = time.monotonic() - begin
+    faulty = kill if kind == "kill" else fill
+    sys.stdout.write(json.dumps(faulty(folder, count, result_of(folder / "whole"), duration) | {"seconds": duration}))
+
+
+if __name__ == "__main__":
+    run(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]))

@@ -1,0 +1,172 @@
+"""Checkpoints: damage is noticed and costs at most one of them, and only a run of the same inputs goes on."""
+
+from __future__ import annotations
+
+import random
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from click.testing import Result
+
+from ddrecon.errors import DataWarning
+from ddrecon.reconstruct import drive, loop
+from ddrecon.reconstruct.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
+from ddrecon.reconstruct.loop import Reconstruction
+
+Run = Callable[..., Result]
+OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o", "out"]
+RESUME = [*OPTIMIZE, "--resume"]
+
+
+def flattened(value: Any) -> Iterator[Any]:
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            yield key
+            yield from flattened(entry)
+    elif isinstance(value, list | tuple):
+        for entry in value:
+            yield from flattened(entry)
+    else:
+        yield value.tolist() if isinstance(value, torch.Tensor) else value
+
+
+def density(folder: str = "out") -> np.ndarray:
+    with np.load(Path(folder, "volumes", "density.npz"), allow_pickle=False) as archive:
+        return archive["density"]
+
+
+def iterations(folder: str = "out") -> list[int]:
+    return [int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]]
+
+
+def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
+    states = [{"field": torch.rand(300), "text": "a text", "total": {"iteration": number}} for number in (1, 2)]
+    for state in states:
+        save_checkpoint(tmp_path, state, {"g": 0.1})
+    whole, chance, fallbacks = (tmp_path / LAST).read_bytes(), random.Random(0), 0
+    for _ in range(150):
+        data = bytearray(whole)
+        data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        (tmp_path / LAST).write_bytes(data)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            found, path = load_checkpoint(tmp_path, {"g": 0.1})
+        assert list(flattened(found)) == list(flattened(states[0 if path.name == PREVIOUS else 1]))
+        assert sum(warning.category is DataWarning for warning in told) == (path.name == PREVIOUS)
+        fallbacks += path.name == PREVIOUS
+    assert fallbacks > 50
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_one_before_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(*OPTIMIZE, "--iterations", "4")
+    whole = density()
+    last = Path("out/checkpoints/last.pt")
+    last.write_bytes(last.read_bytes()[:1000])
+    result = run(*RESUME, "--iterations", "4")
+    assert result.exit_code == 0
+    assert result.stderr == f"warning: {last}: not a usable checkpoint; going on from {last.with_name('previous.pt')}\n"
+    assert np.array_equal(density(), whole) and iterations() == [1, 2, 3, 4]
+
+
+def test_the_log_ends_where_the_checkpoint_does(run: Run) -> None:
+    run(*OPTIMIZE, "--iterations", "3")
+    log = Path("out/loss.csv")
+    whole = log.read_text()
+    log.write_text(whole + "4,1.5,0.1,2\n5,1.6,0.")
+    assert run(*RESUME, "--iterations", "3").exit_code == 0
+    assert log.read_text() == whole
+
+
+def test_a_log_with_lost_rows_is_told(run: Run) -> None:
+    run(*OPTIMIZE, "--iterations", "3")
+    log = Path("out/loss.csv")
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
+    assert run(*RESUME, "--iterations", "3").stderr == "warning: out/loss.csv: has 1 of the 3 iterations made\n"
+
+
+def test_a_second_ctrl_c_saves_no_torn_state(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(*OPTIMIZE, "--iterations", "3")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt("at once")
+
+    before = Path("out/checkpoints/last.pt").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(loop.Parameter, "step", interrupted)
+        assert run(*RESUME, "--iterations", "5").exit_code == 130
+    assert Path("out/checkpoints/last.pt").read_bytes() == before
+
+
+def test_the_seed_belongs_to_the_state(run: Run) -> None:
+    run(*OPTIMIZE, "--iterations", "2", "--seed", "7")
+    run(*RESUME, "--iterations", "6")
+    resumed = density()
+    run(*OPTIMIZE, "--iterations", "2", "--seed", "7", "--overwrite")
+    run(*RESUME, "--iterations", "6", "--seed", "7")
+    assert np.array_equal(density(), resumed)
+    run(*OPTIMIZE, "--iterations", "2", "--overwrite")
+    run(*RESUME, "--iterations", "6")
+    assert not np.array_equal(density(), resumed)
+
+
+@pytest.mark.parametrize(
+    ("change", "difference"),
+    [
+        (["-D", "views.1.camera.fov=31"], "views.1.camera.fov is 30.0 there, 31.0 now"),
+        (["-D", "optimize.parameters.g.min=0"], "optimize.parameters.g.min is absent there, 0.0 now"),
+        (["-D", "views.0.camera.up=[1, 1, 0]"], "views.0.camera.up is [0.0, 1.0, 0.0] there, [1.0, 1.0, 0.0] now"),
+        (["--dtype", "float64"], '--dtype is "float32" there, "float64" now'),
+    ],
+)
+def test_what_has_changed_is_named(run: Run, change: list[str], difference: str) -> None:
+    run(*OPTIMIZE, "--iterations", "1")
+    result = run(*RESUME, *change)
+    line = f"out/checkpoints/last.pt: belongs to another scene: {difference}; use another output folder\n"
+    assert (result.exit_code, result.stderr) == (2, line)
+
+
+def test_a_changed_picture_is_named(run: Run, folder: Path) -> None:
+    run(*OPTIMIZE, "--iterations", "1")
+    np.save("side.npy", 2 * np.load("side.npy"))
+    result = run(*RESUME)
+    assert result.exit_code == 2 and f"the content of {folder / 'side.npy'} is" in result.stderr
+
+
+def test_a_diverged_run_goes_on_with_lower_rates(run: Run) -> None:
+    assert run(*OPTIMIZE, "-D", "optimize.parameters.density.lr=1e37").exit_code == 4
+    assert run(*RESUME, "-D", "optimize.parameters.density.lr=0.1").exit_code == 0
+
+
+def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
+    run(*OPTIMIZE, "--iterations", "1")
+    path = Path("out/checkpoints/last.pt")
+    content = torch.load(path, weights_only=True)
+    del content["state"]["parameters"]["g"]
+    torch.save(content, path)
+    result = run(*RESUME)
+    assert (result.exit_code, result.stderr) == (3, f"{path}: not a usable checkpoint; start anew with --overwrite\n")
+
+
+def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """About as often as they are to be, and not so often that they take more than their share of the time."""
+    saved: list[int] = []
+    original = drive.RunFolder.save
+
+    def save(self: drive.RunFolder, run: Reconstruction) -> None:
+        saved.append(run.iteration)
+        original(self, run)
+
+    monkeypatch.setattr(drive.RunFolder, "save", save)
+    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SHARE", 1e9)
+    run(*OPTIMIZE, "--iterations", "4")
+    assert saved == [0, 0, 1, 2, 3, 4]
+    saved.clear()
+    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SHARE", 1e-9)
+    run(*OPTIMIZE, "--iterations", "4", "--overwrite")
+    assert saved == [0, 4]

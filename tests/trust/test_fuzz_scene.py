@@ -1,0 +1,191 @@
+"""Scene files by strangers: whatever they say, `check` takes them or refuses them in lines that name the place, at once."""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from deadline import deadline
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from small_files import files_below
+from strange_scene import KEYS, NESTED, RING, SCENE, VALUES, WORDS
+
+from ddrecon.cli import main
+from ddrecon.io.volumes import write_field
+from ddrecon.scene.load import MAX_BYTES
+
+CASES = settings(
+    derandomize=True, database=None, deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+PLACE = re.compile(r"(scene\.yaml(:\d+:\d+)?|-D |and more: |/).*")
+"""How every line begins: with the place in the scene or override, or with the path of a data file."""
+
+
+def in_a_ring(scene: dict[str, Any]) -> dict[str, Any]:
+    """`scene` with a ring of views, and so without the parameter that is one of its own views' camera."""
+    scene = copy.deepcopy({**scene, "views": RING})
+    del scene["optimize"]["parameters"]["views.front.camera"]
+    return scene
+
+
+def places(tree: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """The path of everything in `tree` but its root."""
+    entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    return [path for key, value in entries for path in [(*here, key), *places(value, (*here, key))]]
+
+
+def flow(tree: Any) -> str:
+    """`tree` as YAML in flow style, what is text in it as it stands."""
+    if isinstance(tree, dict):
+        return "{" + ", ".join(f"{key}: {flow(value)}" for key, value in tree.items()) + "}"
+    return "[" + ", ".join(map(flow, tree)) + "]" if isinstance(tree, list) else str(tree)
+
+
+def block(tree: dict[str, Any]) -> str:
+    return "".join(f"{key}: {flow(value)}\n" for key, value in tree.items())
+
+
+@st.composite
+def trees(draw: Callable[..., Any]) -> str:
+    """The scene with a few of its values, keys or sections replaced, removed, added or doubled."""
+    tree = in_a_ring(SCENE) if draw(st.booleans()) else copy.deepcopy(SCENE)
+    for _ in range(draw(st.integers(1, 3))):
+        paths = places(tree)
+        *above, last = paths[draw(st.integers(0, len(paths) - 1))]
+        parent = tree
+        for key in above:
+            parent = parent[key]
+        what = draw(st.sampled_from(["replace", "replace", "replace", "remove", "add", "double"]))
+        if what == "replace":
+            parent[last] = draw(VALUES)
+        elif what == "remove":
+            del parent[last]
+        elif isinstance(parent, dict):
+            parent[draw(KEYS) if what == "add" else f"{last}: 1, {last}"] = draw(VALUES)
+        else:
+            parent.append(draw(VALUES) if what == "add" else parent[last])
+        if not tree:
+            break
+    return block(tree)
+
+
+@st.composite
+def texts(draw: Callable[..., Any]) -> bytes:
+    """The scene's text with characters replaced, removed or put in, or cut off; not always UTF-8."""
+    data = bytearray(block(SCENE).encode())
+    for _ in range(draw(st.integers(1, 4))):
+        start = draw(st.integers(0, len(data)))
+        end = start + draw(st.sampled_from([0, 0, 1, 1, 2, 30, 100000]))
+        data[start:end] = draw(
+            st.one_of(st.sampled_from(WORDS + NESTED).map(str.encode), st.binary(max_size=4), st.just(b"\n"), st.just(b": "))
+        )
+    return bytes(data)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with the files that scenes name: good ones, a pipe, a loop of links, a folder."""
+    monkeypatch.chdir(tmp_path)
+    np.save("front.npy", np.full((6, 8, 3), 0.5, np.float32))
+    np.save("to.npy", np.full((6, 8, 3), 0.5, np.float32))
+    write_field(Path("density.npz"), "density", np.random.default_rng(0).random((4, 5, 6)), np.array([[-0.5] * 3, [0.5] * 3]))
+    os.mkfifo("pipe.npy")
+    os.mkfifo("pipe.npz")
+    os.symlink("loop.npy", "loop.npy")
+    os.symlink("front.npy", "link.npy")
+    Path("folder.npy").mkdir()
+    return tmp_path
+
+
+def require_taken_or_refused(folder: Path, *arguments: str) -> int:
+    """Runs a command that must end at once, with 0, 2 or 3, lines that name the place, and no new file; its exit code."""
+    before = files_below(folder)
+    with deadline():
+        result = CliRunner().invoke(main, list(arguments))
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code in (0, 2, 3), result.output
+    assert files_below(folder) == before
+    if result.exit_code:
+        assert result.stdout == ""
+        lines = [line for line in result.stderr.split("\n")[:-1] if not line.startswith("warning: ")]
+        assert lines and all(PLACE.fullmatch(line) and len(line) <= 1100 for line in lines), result.stderr
+    return result.exit_code
+
+
+def test_the_scene_itself_is_taken(folder: Path) -> None:
+    for scene in (SCENE, in_a_ring(SCENE)):
+        Path("scene.yaml").write_text(block(scene))
+        assert require_taken_or_refused(folder, "check", "scene.yaml") == 0
+
+
+@CASES
+@given(text=trees())
+def test_changed_keys_and_values(folder: Path, text: str) -> None:
+    Path("scene.yaml").write_text(text, encoding="utf-8", errors="surrogatepass")
+    require_taken_or_refused(folder, "check", "scene.yaml")
+
+
+@settings(CASES, max_examples=350)
+@given(data=texts())
+def test_changed_characters(folder: Path, data: bytes) -> None:
+    Path("scene.yaml").write_bytes(data)
+    require_taken_or_refused(folder, "check", "scene.yaml")
+
+
+@settings(CASES, max_examples=250)
+@given(
+    path=st.sampled_from([".".join(map(str, path)) for path in places(SCENE)]) | KEYS,
+    value=VALUES,
+    extra=st.sampled_from(["", ".x", ".0", ".0.0", "." + ".".join("a" * 500)]),
+)
+def test_overrides(folder: Path, path: str, value: str, extra: str) -> None:
+    Path("scene.yaml").write_text(block(SCENE))
+    require_taken_or_refused(folder, "check", "scene.yaml", "-D", f"{path}{extra}={value}")
+
+
+def bomb(count: int) -> str:
+    """Each anchor is a list of nine of the one before: nine to the power of `count` entries in all."""
+    return "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, count))
+
+
+LARGE = {
+    "aliases": bomb(30),
+    "nested lists": "volume: " + "[" * 500_000,
+    "nested mappings": "{a: " * 200_000,
+    "nested blocks": "".join(" " * i + "a:\n" for i in range(1000)),
+    "unknown keys": "".join(f"kee{i}: 1\n" for i in range(60_000)),
+    "repeated keys": "render: {}\n" * 60_000,
+    "views": "views:\n" + "- {camera: {}}\n" * 50_000,
+    "views of one name": "views:\n" + "- {name: a, camera: 1}\n" * 30_000,
+    "one long key": "a" * 1_000_000 + ": 1",
+    "one long value": "volume: " + "a" * 1_000_000,
+    "one long number": "volume: " + "9" * 1_000_000,
+    "one long list": "views: [" + "1," * 200_000 + "1]",
+    "broken at its end": "views:\n" + "- {camera: {}}\n" * 50_000 + "]",
+    "too large": "#" * (MAX_BYTES + 1),
+}
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_large_scenes(folder: Path, kind: str) -> None:
+    Path("scene.yaml").write_text(LARGE[kind])
+    assert require_taken_or_refused(folder, "check", "scene.yaml") == 2
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    "scene", ["pipe.npy", "loop.npy", "folder.npy", "/dev/zero", "/dev/stdin", "gone.yaml", "front.npy", "a\nb", "a" * 300]
+)
+def test_what_is_no_scene_file(folder: Path, scene: str) -> None:
+    result = CliRunner().invoke(main, ["check", scene])
+    assert (result.exit_code, result.stdout) == (2, "") and len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith(scene.replace("\n", "\\n"))

@@ -1,0 +1,113 @@
+"""Memory is predicted before it is taken: too much is refused with what would fit, and a shortage is told in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from click.testing import Result
+
+from ddrecon import memory, render_folder
+from ddrecon.io.volumes import write_field
+from ddrecon.memory import Needs, is_shortage, memory_of
+from ddrecon.scene import build_volume
+from ddrecon.scene.build import load_scene
+from ddrecon.terms import memory_estimate
+
+Run = Callable[..., Result]
+COMMANDS = {
+    "render": ["render", "scene.yaml", "-o", "out"],
+    "optimize": ["optimize", "scene.yaml", "-o", "out"],
+    "gradcheck": ["gradcheck", "scene.yaml"],
+    "check": ["check", "scene.yaml"],
+}
+LINE = r"scene\.yaml:3:15: volume\.resolution: takes about [\d.]+ GiB, but this machine has [\d.]+ [GM]iB free; this would fit: .*"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) -> None:
+    text = Path("scene.yaml").read_text()
+    Path("scene.yaml").write_text(text.replace("[16, 4, 3]", "[1024, 1024, 1024]"))
+    result = run(*COMMANDS[command])
+    assert (result.exit_code, result.stdout) == (2, "") and re.fullmatch(LINE + "\n", result.stderr)
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    "change", [[], ["--dtype", "float64"], ["-D", "diffusion.transport_rounds=1"], ["-D", "diffusion.model=flux_limited"]], ids=str
+)
+def test_what_is_said_to_fit_fits(run: Run, monkeypatch: pytest.MonkeyPatch, change: list[str]) -> None:
+    """Each of the proposals, made one after another, is taken."""
+    large = ["check", "scene.yaml", "-D", "volume.resolution=[96, 64, 64]", *change]
+    free = 100 * 2**20
+    monkeypatch.setattr(memory, "free_memory", lambda _: free)
+    result = run(*large)
+    assert result.exit_code == 2
+    proposals = result.stderr.strip().partition("this would fit: ")[2].split(", or ")
+    for proposal in proposals:
+        key, _, value = proposal.removeprefix("-D ").partition(": " if ": " in proposal else "=")
+        words = proposal.split() if proposal.startswith("--") else ["-D", f"{key}={value}"]
+        assert run(*large, *words).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [],
+        ["volume.sigma_s=[1, 2, 3]", "volume.g=0"],
+        ["volume.g=0", "optimize.parameters={density: {}, sigma_s: {field: true}}"],
+        ["volume.sigma_s=[1, 2, 3]", "optimize.parameters={density: {}, sigma_s: {field: true}, sigma_a: {}}"],
+        ["diffusion.transport_rounds=2", "volume.density={file: density.npz}"],
+        ["diffusion.model=flux_limited"],
+    ],
+    ids=str,
+)
+def test_the_prediction_is_the_estimate(run: Run, monkeypatch: pytest.MonkeyPatch, overrides: list[str]) -> None:
+    """What is predicted from the scene file alone is what `check` says of the tensors."""
+    bounds = torch.tensor([[-0.5, -0.3, -0.3], [0.5, 0.3, 0.3]]).numpy()
+    write_field(Path("density.npz"), "density", torch.rand(3, 4, 16).numpy(), bounds)
+    predicted: list[Needs] = []
+    monkeypatch.setattr(build_volume, "shortage", lambda needs, _: predicted.append(needs))
+    scene = load_scene("scene.yaml", overrides=overrides)
+    assert memory_of(predicted[0]) == memory_estimate(scene) > 0
+
+
+def write_group(folder: Path, files: dict[str, str]) -> None:
+    folder.mkdir(parents=True)
+    for name, content in files.items():
+        (folder / name).write_text(content + "\n")
+
+
+def test_limits_of_control_groups(tmp_path: Path) -> None:
+    write_group(tmp_path / "v2/a/b", {"memory.max": "1000", "memory.current": "700", "memory.stat": "anon 1\ninactive_file 50"})
+    (tmp_path / "v2/a/memory.max").write_text("max\n")
+    write_group(
+        tmp_path / "v1/memory/c",
+        {"memory.limit_in_bytes": "900", "memory.usage_in_bytes": "100", "memory.stat": "total_inactive_file 25\ninactive_file 1"},
+    )
+    own = tmp_path / "own"
+    own.write_text("0::/a/b\n")
+    assert list(memory._group_limits(tmp_path / "v2", own)) == [350]
+    own.write_text("3:cpu,memory:/c\n1:cpu:/\n")
+    assert list(memory._group_limits(tmp_path / "v1", own)) == [825]
+    assert list(memory._group_limits(tmp_path / "none", own)) == []
+
+
+def test_a_shortage_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def solve_light(*_: Any) -> torch.Tensor:
+        return torch.empty(2**52)
+
+    monkeypatch.setattr(render_folder, "solve_light", solve_light)
+    result = run("render", "scene.yaml", "-q", "-o", "out")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("out of memory: ") and result.stderr.count("\n") == 1
+
+
+def test_other_errors_are_no_shortage() -> None:
+    with pytest.raises(RuntimeError) as caught:
+        torch.ones(2) @ torch.ones(3)
+    assert not is_shortage(caught.value) and is_shortage(torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"))
