@@ -92,7 +92,7 @@ EXPERIMENTS = (
     Experiment("fig13", "fig13", show_density("bunny", "ring_00"), ("optimize.iterations=1000",), others=ROUNDS, draw_more=draw_rounds),
     Experiment("fig06_light", "fig06_light", show_light, ("optimize.iterations=100",)),
     Experiment("fig06_density", "knot", show_density("knot", "front")),
-    Experiment("fig10", "fig10", show_optics, ("optimize.iterations=3000",), {"": (), "g_alone": G_ALONE}, known="cloud"),
+    Experiment("fig10", "fig10", show_optics, ("optimize.iterations=3000",), others={"g_alone": G_ALONE}, known="cloud"),
     Experiment("fig12_single", "smoke", show_smoke, (FINE,)),
     Experiment("fig12_four", "smoke", show_four, (FINE,)),
     Experiment("fig09", "knot", show_derivatives, (), PARTS, draw_more=draw_parts),

@@ -232,7 +232,7 @@ def table(entries: list[Entry], enlarged: dict[str, float], truth: Array) -> str
 def draw(entries: list[Entry], truth: Array, path: Path) -> None:
     """Writes the picture: for each case errors against iterations and seconds, and the density along z."""
     cases = list(dict.fromkeys(entry.case for entry in entries))
-    figure, axes = plt.subplots(len(cases), 7, figsize=(14, 2.6 * len(cases)), layout="constrained", width_ratios=(1.5, 1.5, 1, 1, 1, 1, 1))
+    figure, axes = plt.subplots(len(cases), 6, figsize=(12.5, 2.6 * len(cases)), layout="constrained", width_ratios=(1.5, 1.5, 1, 1, 1, 1))
     full = float(projected(truth, 0, 1).max())
     for row, case in zip(axes, cases, strict=True):
         for axis in row[2:]:

@@ -154,8 +154,8 @@ def show_optics(runs: Runs) -> tuple[list[Pair], str]:
     for title, color, truth, ours in zip(("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True):
         pairs.append(Pair(f"{title}, middle slices", *(middle(field[..., color]) for field in (truth, ours))))
     errors = ", ".join(f"{apart(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True))
-    alone = runs["g_alone"].number("g")
-    return pairs, f"g {run.number('g'):.3f}, alone {alone:.3f}, in truth -0.802; relative L1 error of absorption and scattering {errors}"
+    alone = f", alone {runs['g_alone'].number('g'):.3f}" if "g_alone" in runs else ""
+    return pairs, f"g {run.number('g'):.3f}{alone}, in truth -0.802; relative L1 error of absorption and scattering {errors}"
 
 
 def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
