@@ -40,6 +40,7 @@ class _Layout:
 
 def read_hdr(path: Path) -> np.ndarray:
     """The pixels of the file at `path`, float32 [h, w, 3], exposure divided out; raises FormatError when it cannot be used."""
+    check_size(path.stat().st_size, path, "the image")
     data = path.read_bytes()
     if not data.startswith(b"#?"):
         raise FormatError(path, "not a Radiance picture: it does not begin with #?")

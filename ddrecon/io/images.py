@@ -14,7 +14,7 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io import srgb
-from ddrecon.io.arrays import as_float32, read_npy
+from ddrecon.io.arrays import as_float32, check_size, read_npy
 from ddrecon.io.atomic import replacing
 from ddrecon.io.exr import has_exr, read_exr, write_exr
 from ddrecon.io.hdr import read_hdr
@@ -118,6 +118,7 @@ def _read_array(path: Path) -> np.ndarray:
 
 def _read_encoded(path: Path) -> np.ndarray:
     import imageio.v3 as iio
+    from PIL import Image as Pillow
 
     with path.open("rb") as stream:
         start = stream.read(12)
@@ -125,6 +126,9 @@ def _read_encoded(path: Path) -> np.ndarray:
         raise FormatError(path, "is no PNG, JPEG or WebP image")
     if has_deep_colors(path):
         return _decoded(read_deep_png(path))
+    with Pillow.open(path) as picture:
+        width, height = picture.size
+    check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
     mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
     stored = iio.imread(path, plugin="pillow", index=0)
     if mode not in {"1", "L", "LA", "P", "RGB", "RGBA"} and stored.dtype != np.uint16:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
+from ddrecon.io.arrays import check_size
 from ddrecon.io.atomic import replacing
 
 MARK = "bounds"
@@ -52,6 +53,7 @@ def read_tiff(path: Path) -> np.ndarray:
     """The pixels of the TIFF file at `path`, float32 [h, w] or [h, w, samples]; raises FormatError for any other kind of TIFF."""
     if is_stack(path):
         raise FormatError(path, "is a volume (several pages) or a BigTIFF; an image is a single page of plain TIFF")
+    check_size(path.stat().st_size, path, "the image")
     data = path.read_bytes()
     try:
         order = ORDERS[data[:4]]

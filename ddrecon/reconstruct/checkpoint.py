@@ -22,11 +22,11 @@ LAST, PREVIOUS = "last.pt", "previous.pt"
 
 def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any]) -> None:
     """Writes `state`, and a description of the `scene` it belongs to, as the last checkpoint in `folder`."""
-    with replacing_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary:
+    with replacing_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary, temporary.open("wb") as stream:
         try:
-            torch.save({"format": FORMAT, "scene": scene, "state": state}, temporary)
-        except RuntimeError as error:  # what torch's writer makes of a full disk
-            raise OSError(str(error).splitlines()[0]) from error
+            torch.save({"format": FORMAT, "scene": scene, "state": state}, stream)
+        except RuntimeError as error:  # in which torch's writer wraps that the disk is full
+            raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 
 
 def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:

@@ -62,13 +62,14 @@ def _mapping(node: Node) -> dict[str, Node]:
 
 
 def _absences(kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]) -> list[str]:
-    """What is wrong with the set of keys given: required ones missing, or not exactly one group of alternatives."""
+    """What is wrong with the set of keys given: required ones missing or, of alternatives, empty, or not exactly one group of those."""
     required = [name for name, field in declared.items() if field.default is MISSING and field.default_factory is MISSING]
     groups: tuple[tuple[str, ...], ...] = getattr(kind, "ALTERNATIVES", ())
-    given = [group for group in groups if any(name in entries for name in group)]
-    if len(given) == 1:
-        required += [name for name in given[0] if declared[name].default is None]
+    filled = {name for name, child in entries.items() if child.value is not None}
+    given = [group for group in groups if any(name in filled for name in group)]
     wrong = [f"missing key {name!r}" for name in required if name not in entries]
+    if len(given) == 1:
+        wrong += [f"missing key {name!r}" for name in given[0] if declared[name].default is None and name not in filled]
     if groups and len(given) != 1:
         names = " or ".join(" and ".join(name for name in group if declared[name].default is None) for group in groups)
         wrong.append(f"{'give only one of' if given else 'missing'} {names}")

@@ -54,7 +54,7 @@ def start(folder: Path, out: Path, prepare: Callable[[], None]) -> int:
 def optimize(folder: Path, out: Path) -> None:
     """The command that a user gives, at first and again."""
     going_on = ["--resume"] if any(out.glob("checkpoints/*.pt")) else ["--overwrite"]
-    main(["optimize", str(folder / "scene.yaml"), "-q", "--preview-every", "5", "-o", str(out), *going_on])
+    main(["optimize", str(folder / "scene.yaml"), "-q", "--preview-every", "4", "-o", str(out), *going_on])
 
 
 def ended(pid: int) -> int:
@@ -79,14 +79,14 @@ def nothing() -> None:
 
 
 def kill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
-    """Runs that receive `count` signals, each within a third of the time a whole run takes from its start."""
+    """Runs that receive `count` signals, each within a quarter of the time a whole run takes from its start."""
     faults, wrong, finished, number = 0, list[str](), 0, 0
     out = folder / "out_0"
     while faults < count or not finished:
         pid = start(folder, out, nothing)
         sent = None
         if faults < count:
-            time.sleep(random.uniform(0, duration / 3))
+            time.sleep(random.uniform(0, duration / 4))
             sent = SIGNALS[faults % len(SIGNALS)]
             os.kill(pid, sent)
         code = ended(pid)
@@ -112,7 +112,7 @@ def fill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
         code = ended(start(folder, out, lambda most=most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))))
         lines = (folder / "stderr").read_text().splitlines()
         faults += code == 3
-        if code != 0 and (code != 3 or "cannot be written" not in lines[-1] or len(lines) > 2):
+        if code != 0 and (code != 3 or "cannot be written: File too large" not in lines[-1] or len(lines) > 2):
             wrong.append(f"at most {most} bytes: {code}: {lines}")
     if code := ended(start(folder, out, nothing)):
         wrong.append(f"with space again: {code}: {(folder / 'stderr').read_text()}")

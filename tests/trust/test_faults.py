@@ -13,7 +13,7 @@ import pytest
 SCRIPT = Path(__file__).parent / "fault_runs.py"
 
 
-@pytest.mark.parametrize(("kind", "count"), [("kill", 60), ("full", 12)])
+@pytest.mark.parametrize(("kind", "count"), [("kill", 60), ("full", 8)])
 def test_no_fault_loses_anything(tmp_path: Path, kind: str, count: int) -> None:
     """Of 60 signals 50 are SIGKILL, 5 SIGTERM and 5 Ctrl-C."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}

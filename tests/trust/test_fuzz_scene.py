@@ -152,6 +152,13 @@ def test_overrides(folder: Path, path: str, value: str, extra: str) -> None:
     require_taken_or_refused(folder, "check", "scene.yaml", "-D", f"{path}{extra}={value}")
 
 
+@pytest.mark.parametrize("empty", ["volume.sigma_t", "volume.albedo", "views.0.camera.origin", "views.1.camera.matrix"])
+def test_empty_alternatives_are_missing(folder: Path, empty: str) -> None:
+    """What fuzzing found: one of two keys that belong together was there, but empty, and was taken for given."""
+    Path("scene.yaml").write_text(block(SCENE))
+    assert require_taken_or_refused(folder, "check", "scene.yaml", "-D", f"{empty}=~") == 2
+
+
 def bomb(count: int) -> str:
     """Each anchor is a list of nine of the one before: nine to the power of `count` entries in all."""
     return "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, count))

@@ -22,7 +22,7 @@ views:
   - {name: test, image: side.npy, split: test,
      camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1, resolution: [8, 6]}}
 optimize:
-  iterations: 16
+  iterations: 10
   views_per_iteration: 1
   refine_at: [0.5]
   parameters: {density: {init: 0.1, tv: 1e-3}, g: {init: 0.1}, views.front.camera: {}}
