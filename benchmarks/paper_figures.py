@@ -58,16 +58,34 @@ def projected(field: Array, axis: int, side: float) -> Array:
 
 
 def draw(path: Path, pairs: Sequence[Pair], logs: Mapping[str, Log]) -> None:
-    """Writes a PNG: a column for each of `pairs`, and below them the loss, the solves and the time of each run in `logs`."""
-    figure = plt.figure(figsize=(max(2.1 * len(pairs), 8), 8.6), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=(3, 1.15))
+    """Writes a PNG: a column for each of `pairs`, and below them loss, solves and time of each run in `logs`, if there are any."""
+    figure = plt.figure(figsize=(max(2.1 * len(pairs), 8), 8.6 if logs else 6.4), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=(3, 1.15)) if logs else (figure, figure)
     axes = upper.subplots(3, len(pairs), squeeze=False)
     for column, pair in zip(axes.T, pairs, strict=True):
         _draw_pair(column, pair)
     for axis, name in zip(axes[:, 0], ("reference", "ours", "|difference|"), strict=True):
         axis.set_ylabel(name, fontsize=9)
-    _draw_logs(lower.subplots(1, 3), logs)
+    if logs:
+        _draw_logs(lower.subplots(1, 3), logs)
     save(figure, path)
+
+
+def draw_derivatives(path: Path, images: Sequence[tuple[str, Array]]) -> None:
+    """Writes a PNG of titled derivative images [h, w] in a row: red where pixels grow brighter, blue where darker, each to a scale."""
+    figure, axes = plt.subplots(1, len(images), figsize=(2.1 * len(images), 2.6), layout="constrained")
+    for axis, (title, image) in zip(axes, images, strict=True):
+        full = float(np.quantile(np.abs(image), 0.999))
+        signed(axis, image, full, title)
+        axis.set_xlabel(f"to {full:.2g}", fontsize=7)
+    save(figure, path)
+
+
+def signed(axis: Any, values: Array, full: float, title: str) -> None:
+    """Draws a signed map on `axis`: white is 0, red is `full`, blue minus that."""
+    axis.imshow(values, cmap="RdBu_r", vmin=-full, vmax=full)
+    axis.set(xticks=[], yticks=[])
+    axis.set_title(title, fontsize=8)
 
 
 def save(figure: Any, path: Path) -> None:

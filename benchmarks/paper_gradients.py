@@ -1,34 +1,40 @@
 """Fig. 8 of docs/experiments.md: our derivative images beside differences of path-traced ones.
 
-    python benchmarks/paper_gradients.py [-o FOLDER] [--paths 16384]
+    python benchmarks/paper_gradients.py [-o FOLDER] [--paths 8192] [--replay-paths 512]
 
 Every cell's density, or its absorption, changes by the same amount. Derivatives are taken in the middle between two scenes that Mitsuba
-traces: the cloud as it is, and with a little more density everywhere; for absorption, less and more. Pictures that are there already are
-not traced again.
+traces: the cloud as it is, and with a little more density everywhere; for absorption, less and more. Where DRJIT_LIBLLVM_PATH is set, path
+replay's are shown too, of pixels twice as large, one by one. Pictures that are there already are not traced again.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from paper import as_options, ddrecon
-from paper_figures import Array, save, show
+from paper_figures import Array, save, show, signed
+from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, rewrite_table
+from path_replay import ALBEDO, Replay, why_not
 
+from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.io.volumes import read_field, write_field
+from ddrecon.scene.build import load_scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-ROOT = Path(__file__).parents[1]
-CONFIG = ROOT / "configs" / "paper" / "fig08.yaml"
-CLOUD = ROOT / "data" / "shapes" / "cloud.npz"
-PICTURE = ROOT / "docs" / "pictures" / "paper" / "fig08.png"
+SCRIPT = Path(__file__).name
+CONFIG, CLOUD, PICTURE = CONFIGS / "fig08.yaml", SHAPES / "cloud.npz", PICTURES / "fig08.png"
+PATHS, REPLAY_PATHS = 8192, 512
+LARGER = 2
+"""Path replay's pixels are so many times as large."""
 HAZE, ABSORPTION = 0.03, 1.0
 """Differences of density, and of sigma_a [1/u], between the two scenes that are traced."""
 ENLARGED = 4
@@ -39,6 +45,8 @@ MODELS = {
     "2 rounds": ("diffusion.transport_rounds=2",),
 }
 """The paper's own scheme, and ours without and with transport rounds, as overrides."""
+TOP = "| by | what | noise | error | in the regions | correlation |\n|---|---|---|---|---|---|\n"
+TOP_PARTS = "| by | what | light scattered more than once | its derivative |\n|---|---|---|---|\n"
 
 
 @dataclass(frozen=True)
@@ -79,12 +87,55 @@ def traced(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
     return (pictures[1] - pictures[0]) / change.amount, variance**0.5 / change.amount
 
 
-def ours(change: Change, folder: Path, model: str) -> Array:
-    """Our derivative image [h, w] by one of `MODELS`."""
+def replayed(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
+    """The derivative image [h, w] by path replay, in larger pixels, and the standard error of its pixels (root mean square).
+
+    Each pixel is a picture of its own, one camera being shifted from one to the next: a gradient has but one loss.
+    """
+    path = folder / f"{change.parameter}_replay.npy"
+    if not path.exists():
+        np.save(path, [_replayed_once(change, paths, seed) for seed in range(2)])
+    both = np.load(path)
+    return both.mean(0), float(np.sqrt(((both[0] - both[1]) ** 2).mean()) / 2)
+
+
+def _replayed_once(change: Change, paths: int, seed: int) -> Array:
+    import drjit
+
+    scene = load_scene(CONFIG, overrides=[change.between])
+    (view,), (height, width) = scene.views, scene.views[0].camera.resized(LARGER).size
+    small = replace(view.camera, size=(1, 1), half_width=view.camera.half_width / width)
+    replay, volume = Replay.of(replace(scene, views=[replace(view, camera=small)])), scene.volume
+    names, image = [replay.name(ending) for ending in (DENSITY, ALBEDO)], np.zeros((height, width), np.float32)
+    for row, column in np.ndindex(height, width):
+        replay.parameters[replay.name("principal_point_offset_x")] = column + 0.5 - width / 2
+        replay.parameters[replay.name("principal_point_offset_y")] = row + 0.5 - height / 2
+        pixel = seed * height * width + row * width + column
+        _, (by_density, by_albedo) = replay.gradients(lambda picture: drjit.mean(picture, axis=None), names, pixel, paths)
+        if change.parameter == "density":
+            image[row, column] = by_density.sum()
+        else:
+            sigma_a, sigma_s = float(volume.sigma_a), float(volume.sigma_s)
+            by_extinction = float(replay.by_density(by_density, volume.density).mul(volume.density).sum()) / (sigma_a + sigma_s)
+            image[row, column] = by_extinction - by_albedo.sum() * sigma_s / (sigma_a + sigma_s) ** 2
+    return image
+
+
+def ours(change: Change, folder: Path, model: str) -> dict[str, Array]:
+    """By one of `MODELS`: the `image` [h, w] and its `derivative`, and of each the part of light scattered more than once, as `many`."""
     output = folder / f"{change.parameter}_{model[0]}"
-    ddrecon("render", CONFIG, "-o", output, "--gradient", change.parameter, *as_options([change.between, *MODELS[model]]))
-    derivative: Array = np.load(output / "front.gradient.npy").mean(-1)
-    return derivative
+    ddrecon("render", CONFIG, "-o", output, "--components", "--gradient", change.parameter, *as_options([change.between, *MODELS[model]]))
+    names = {"single": "front.single", "multiple": "front.multiple"}
+    parts = {name: np.load(output / f"{file}.npy").mean(-1) for name, file in names.items()}
+    slopes = {name: np.load(output / f"{file.replace('front', 'front.gradient')}.npy").mean(-1) for name, file in names.items()}
+    reduced = np.load(output / "front.gradient.reduced.npy").mean(-1)
+    return {
+        "derivative": slopes["single"] + slopes["multiple"] + reduced,
+        "single": parts["single"],
+        "single slope": slopes["single"] + reduced,
+        "multiple": parts["multiple"],
+        "multiple slope": slopes["multiple"],
+    }
 
 
 def regions(folder: Path) -> dict[str, NDArray[np.bool_]]:
@@ -100,37 +151,76 @@ def relative(image: Array, truth: Array) -> float:
     return float(np.sqrt(((image - truth) ** 2).mean() / (truth**2).mean()))
 
 
-def main() -> None:
-    """Draws the picture and prints the errors."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper" / "fig08")
-    parser.add_argument("--paths", type=int, default=16384)
-    given = parser.parse_args()
-    given.output.mkdir(parents=True, exist_ok=True)
-    seen = regions(given.output)
-    figure, axes = plt.subplots(2, 7, figsize=(12, 4), layout="constrained")
-    for row, change in zip(axes, changes(given.output), strict=True):
-        truth, noise = traced(change, given.output, given.paths)
-        size = np.sqrt((truth**2).mean())
+def coarser(image: Array) -> Array:
+    """`image` [h, w] in pixels `LARGER` times as large."""
+    height, width = (side // LARGER for side in image.shape)
+    mean: Array = image.reshape(height, LARGER, width, LARGER).mean((1, 3))
+    return mean
+
+
+def remake(folder: Path, paths: int = PATHS, replay_paths: int = REPLAY_PATHS) -> None:
+    """Draws the picture and rewrites both tables."""
+    torch.set_num_threads(1)
+    folder.mkdir(parents=True, exist_ok=True)
+    seen, lines, parts = regions(folder), [], []
+    figure, axes = plt.subplots(2, 9, figsize=(15, 4), layout="constrained")
+    for row, change in zip(axes, changes(folder), strict=True):
+        truth, noise = traced(change, folder, paths)
         full = float(np.quantile(np.abs(truth), 0.99))
         row[0].set_ylabel(f"by {change.parameter}")
-        _signed(row[0], truth, full, f"path tracing,\nnoise {noise / size:.2f}")
-        for model, axis, error_axis in zip(MODELS, row[1:4], row[4:], strict=True):
-            image = ours(change, given.output, model)
-            parts = {name: relative(image[region], truth[region]) for name, region in seen.items()}
-            _signed(axis, image, full, f"ours, {model}")
-            show(error_axis, np.abs(image - truth), full / ENLARGED, "inferno")
-            error_axis.set_title(f"{ENLARGED} x |error|, {model}:\n{relative(image, truth):.2f}", fontsize=8)
-            error, alike = relative(image, truth), np.corrcoef(image.ravel(), truth.ravel())[0, 1]
-            told = ", ".join(f"{name} {part:.3f}" for name, part in parts.items())
-            print(f"| {change.parameter} | {model} | {noise / size:.3f} | {error:.3f} | {told} | {alike:.3f} |")
+        signed(row[0], truth, full, "differences of\npath tracing")
+        images = {name: ours(change, folder, name) for name in MODELS}
+        for (name, found), axis, error_axis in zip(images.items(), row[2:5], row[6:], strict=True):
+            lines.append(line(change, name, found["derivative"], truth, noise, seen))
+            _compared(axis, error_axis, found["derivative"], truth, full, f"ours, {name}")
+        parts += shares(change, images, folder, truth, seen["thick"])
+        for axis in (row[1], row[5]):
+            axis.axis("off")
+        if why_not() is None:
+            image, scatter = replayed(change, folder, replay_paths)
+            regions_there = {name: coarser(region.astype(np.float32)) > 0.5 for name, region in seen.items()}
+            lines.append(line(change, "path replay, larger pixels", image, coarser(truth), scatter, regions_there))
+            _compared(row[1], row[5], image, coarser(truth), full, "path replay")
     save(figure, PICTURE)
+    for name, top, text in ((SCRIPT, TOP, lines), (f"{SCRIPT} (parts)", TOP_PARTS, parts)):
+        print(top + "".join(text), end="")
+        rewrite_table(name, top + "".join(text))
 
 
-def _signed(axis: plt.Axes, values: Array, full: float, title: str) -> None:
-    axis.imshow(values, cmap="RdBu_r", vmin=-full, vmax=full)
-    axis.set(xticks=[], yticks=[])
-    axis.set_title(title, fontsize=8)
+def line(change: Change, name: str, image: Array, truth: Array, noise: float, seen: dict[str, NDArray[np.bool_]]) -> str:
+    """A line of the table: errors of `image`, and the `noise` there is in truth, or in it."""
+    told = ", ".join(f"{region} {relative(image[where], truth[where]):.3f}" for region, where in seen.items())
+    size, alike = np.sqrt((truth**2).mean()), np.corrcoef(image.ravel(), truth.ravel())[0, 1]
+    return f"| {change.parameter} | {name} | {noise / size:.3f} | {relative(image, truth):.3f} | {told} | {alike:.3f} |\n"
+
+
+def shares(change: Change, images: dict[str, dict[str, Array]], folder: Path, truth: Array, where: NDArray[np.bool_]) -> list[str]:
+    """Lines of the other table: light scattered more than once, as parts of what path tracing has, in the pixels `where`."""
+    ends = [np.load(folder / f"{change.parameter}_{name}" / "front.npy").mean(-1) for name in ("before", "after")]
+    light, slope = ((ends[0] + ends[1]) / 2)[where].mean(), truth[where].mean()
+    return [
+        f"| {change.parameter} | {name} | {found['multiple'][where].mean() / (light - found['single'][where].mean()):.3f} "
+        f"| {found['multiple slope'][where].mean() / (slope - found['single slope'][where].mean()):.3f} |\n"
+        for name, found in images.items()
+    ]
+
+
+def main() -> None:
+    """Remakes Fig. 8."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper" / "fig08")
+    parser.add_argument("--paths", type=int, default=PATHS)
+    parser.add_argument("--replay-paths", type=int, default=REPLAY_PATHS)
+    given = parser.parse_args()
+    remake(given.output, given.paths, given.replay_paths)
+
+
+def _compared(axis: Any, error_axis: Any, image: Array, truth: Array, full: float, title: str) -> None:
+    for each in (axis, error_axis):
+        each.axis("on")
+    signed(axis, image, full, title)
+    show(error_axis, np.abs(image - truth), full / ENLARGED, "inferno")
+    error_axis.set_title(f"{ENLARGED} x |error|,\n{title}: {relative(image, truth):.2f}", fontsize=8)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Makes data/paper: the pictures that configs/paper reconstructs from, path-traced by Mitsuba 3 through `ddrecon reference`.
 
-    python data/make_targets.py [NAME]... [--pixels 512] [--paths 1024] [-o FOLDER]
+    python data/make_targets.py [NAME]... [--pixels 512] [--paths 1024] [--threads 2] [-o FOLDER]
 
 NAME is that of a folder in data/paper. Pictures are kept as float16, whose rounding is far below their noise. Without --pixels and
 --paths they are as those shipped, noise included.
@@ -42,13 +42,13 @@ TRUTHS = {
 }
 
 
-def reference(truth: Truth, pixels: int, paths: int, output: Path) -> None:
-    """Path-traces every view of `truth` into the folder `output`."""
+def reference(truth: Truth, pixels: int, paths: int, threads: int | None, output: Path) -> None:
+    """Path-traces every view of `truth` into the folder `output`, on so many `threads` (None: all)."""
     config = ROOT / "configs" / "paper" / f"{truth.config}.yaml"
     count = len(yaml.safe_load(config.read_text())["views"])
     sizes = [f"views.{index}.camera.resolution=[{pixels}, {pixels}]" for index in range(count)]
     overrides = [*truth.overrides, *(f"views.{index}.image=" for index in range(count)), *sizes]
-    options = [part for override in overrides for part in ("-D", override)]
+    options = [part for override in overrides for part in ("-D", override)] + ([] if threads is None else ["--threads", str(threads)])
     subprocess.run(["ddrecon", "reference", config, "-o", output, "--views", "--spp", str(paths), "-q", *options], check=True)
 
 
@@ -68,12 +68,13 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(TRUTHS)}")
     parser.add_argument("--pixels", type=int)
     parser.add_argument("--paths", type=int)
+    parser.add_argument("--threads", type=int)
     parser.add_argument("-o", "--output", type=Path, default=FOLDER)
     given = parser.parse_args()
     for name in given.names or TRUTHS:
         truth = TRUTHS[name]
         with tempfile.TemporaryDirectory() as traced:
-            reference(truth, given.pixels or truth.pixels, given.paths or truth.paths, Path(traced))
+            reference(truth, given.pixels or truth.pixels, given.paths or truth.paths, given.threads, Path(traced))
             keep(Path(traced), given.output / name)
 
 

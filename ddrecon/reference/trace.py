@@ -41,7 +41,7 @@ def open_tracer(scene: Scene, views: Sequence[View], depth: int = -1, threads: i
     """
     module = load_mitsuba(threads)
     scenes = [scene] if is_gray(scene.volume) else [of_color(scene, color) for color in range(3)]
-    return Tracer(module, tuple(module.load_dict(_translated(module, mitsuba_scene(one, views, depth))) for one in scenes))
+    return Tracer(module, tuple(module.load_dict(translated(module, mitsuba_scene(one, views, depth))) for one in scenes))
 
 
 def load_mitsuba(threads: int | None = None) -> ModuleType:
@@ -59,10 +59,10 @@ def load_mitsuba(threads: int | None = None) -> ModuleType:
     return mitsuba
 
 
-def _translated(module: ModuleType, value: Any) -> Any:
+def translated(module: ModuleType, value: Any) -> Any:
     """A description by `mitsuba_scene` with Mitsuba's own objects in it."""
     if isinstance(value, dict):
-        return {key: _translated(module, entry) for key, entry in value.items()}
+        return {key: translated(module, entry) for key, entry in value.items()}
     if isinstance(value, tuple):
         return {"type": "rgb", "value": list(value)}
     if isinstance(value, np.ndarray):

@@ -66,7 +66,7 @@ def reconstructed(name: str) -> tuple[Scene, Result]:
 
 def test_every_experiment_has_a_config_and_a_picture() -> None:
     pictures = re.findall(r"\]\((pictures/paper/.*?)\)", (ROOT / "docs" / "experiments.md").read_text())
-    assert {Path(picture).stem for picture in pictures} == set(CONFIGS)
+    assert set(CONFIGS) <= {Path(picture).stem for picture in pictures}
     assert {int(name[3:5]) for name in CONFIGS} == {6, 7, 8, 9, 10, 12, 13, 14}
     assert max((ROOT / "docs" / picture).stat().st_size for picture in pictures) < 150_000
 

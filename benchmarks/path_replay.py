@@ -1,0 +1,105 @@
+"""Path replay backpropagation in Mitsuba 3 (Vicini, Speierer and Jakob 2021), with room above the densest cell.
+
+Mitsuba's majorant is the greatest extinction in the grid. Where extinction reaches it there are no null collisions, and those carry the
+derivative of transmittance: path replay does not see it there. So cells are added around the grid, outside the box that holds the medium,
+one of them HEADROOM times as dense as the densest within; images are the same.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddrecon.bench.path_tracing import DENSITY
+from ddrecon.grid import Grid
+from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
+from ddrecon.reference.trace import load_mitsuba, translated
+from ddrecon.world import Scene
+
+RING = 2
+HEADROOM = 2.0
+ALBEDO = ".albedo.value.value"
+"""How the name of a constant albedo ends among Mitsuba's parameters."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Mitsuba on the first view of a gray scene: `gradients` of a loss by what `parameters` are called `names`."""
+
+    module: Any
+    scene: Any
+    parameters: Any
+    integrator: Any
+    headroom: float
+
+    @staticmethod
+    def of(scene: Scene, headroom: float = HEADROOM) -> Replay:
+        """That of `scene`, on as many threads as torch has; `headroom` 1: as Mitsuba comes."""
+        module = load_mitsuba(torch.get_num_threads())
+        described = mitsuba_scene(scene, scene.views[:1]) | {MEDIUM: mitsuba_scene(_roomy_scene(scene, headroom), [])[MEDIUM]}
+        loaded = module.load_dict(translated(module, described))
+        integrator = module.load_dict({"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST})
+        return Replay(module, loaded, module.traverse(loaded), integrator, headroom)
+
+    def name(self, ending: str) -> str:
+        """The parameter whose name ends so."""
+        (name,) = (key for key in self.parameters.keys() if key.endswith(ending))  # noqa: SIM118 - Mitsuba's own mapping
+        return str(name)
+
+    def set_density(self, density: Tensor) -> None:
+        """Puts `density` [z, y, x] into the scene."""
+        self.parameters[self.name(DENSITY)] = self.module.TensorXf(roomy(density, self.headroom).numpy()[..., None])
+        self.parameters.update()
+
+    def gradients(self, loss_of: Callable[[Any], Any], names: list[str], seed: int, paths: int) -> tuple[float, list[np.ndarray]]:
+        """`loss_of` the image by so many `paths` a pixel, and its derivatives by the parameters called `names`."""
+        import drjit
+
+        for name in names:
+            drjit.enable_grad(self.parameters[name])
+        self.parameters.update()
+        image = self.module.render(self.scene, self.parameters, integrator=self.integrator, sensor=0, seed=seed, spp=paths)
+        loss = loss_of(image)
+        drjit.backward(loss)
+        found = [np.array(drjit.grad(self.parameters[name]), np.float32) for name in names]
+        for name in names:
+            drjit.disable_grad(self.parameters[name])
+        return float(np.array(loss).item()), found
+
+    def by_density(self, gradient: np.ndarray, density: Tensor) -> Tensor:
+        """The derivative by the cells of `density` [z, y, x] from that by Mitsuba's grid."""
+        leaf = density.detach().requires_grad_()
+        padded = roomy(leaf, self.headroom)
+        (own,) = torch.autograd.grad(padded, leaf, torch.from_numpy(gradient).view_as(padded))
+        return own
+
+
+def roomy(density: Tensor, headroom: float) -> Tensor:
+    """`density` [z, y, x] with RING more cells on all sides, like their neighbors but for one in a corner, `headroom` times the densest."""
+    padded = torch.nn.functional.pad(density[None, None], (RING,) * 6, mode="replicate")[0, 0]
+    is_corner = torch.zeros_like(padded, dtype=torch.bool)
+    is_corner[0, 0, 0] = True
+    return torch.where(is_corner, headroom * density.detach().max(), padded)
+
+
+def _roomy_scene(scene: Scene, headroom: float) -> Scene:
+    grid, volume = scene.volume.grid, scene.volume
+    lower = tuple(low - RING * step for low, step in zip(grid.lower, grid.spacing, strict=True))
+    upper = tuple(high + RING * step for high, step in zip(grid.upper, grid.spacing, strict=True))
+    wide = Grid(tuple(count + 2 * RING for count in grid.shape), lower, upper)  # type: ignore[arg-type]
+    return replace(scene, volume=replace(volume, grid=wide, density=roomy(volume.density, headroom)))
+
+
+def why_not() -> str | None:
+    """Why path replay cannot run here, or None."""
+    try:
+        import mitsuba  # noqa: F401
+    except ImportError:
+        return "needs Mitsuba 3: pip install ddrecon[reference]"
+    return None if os.environ.get("DRJIT_LIBLLVM_PATH") else "needs an LLVM: set DRJIT_LIBLLVM_PATH"
