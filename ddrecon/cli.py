@@ -106,14 +106,11 @@ def optimize(
 
     if has_events:
         require_tensorboard()
-
     if iterations is not None:
         session = session.overriding(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
-    with opened_run(session.build(scene_file), scene_file, output, session.environment(), may_exist=overwrite, resume=resume) as (
-        run,
-        folder,
-    ):
+    built, environment = session.build(scene_file), session.environment()
+    with opened_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (run, folder):
         summary = drive(run, folder, preview_every, session.is_quiet, has_events)
     session.show(summary, session.summary_lines(summary, output))
 

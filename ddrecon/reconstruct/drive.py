@@ -79,7 +79,7 @@ def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_
             while not run.is_done:
                 folder.save_in_time(run)
                 row = run.step()
-                folder.log(row)
+                folder.log.add(row)
                 if events is not None:
                     events.log(row)
                 bar.set_postfix_str(progress_text(run.total, row), refresh=False)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import os
-import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import fields
+from collections.abc import Mapping
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -16,13 +13,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import DataWarning
-from ddrecon.io.atomic import flush, refusals, remove_temporaries, replacing
+from ddrecon.io.atomic import refusals, remove_temporaries
 from ddrecon.io.images import write_linear, write_preview
 from ddrecon.io.json_file import write_json
 from ddrecon.io.volumes import write_field
 from ddrecon.reconstruct.checkpoint import LAST, forget_checkpoints, save_checkpoint
-from ddrecon.reconstruct.loop import Reconstruction, Row
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.loss_log import LossLog
 from ddrecon.reconstruct.losses import psnr
 from ddrecon.reconstruct.previews import comparison, slices
 from ddrecon.reconstruct.report import Findings, write_report
@@ -39,9 +36,6 @@ CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
-COLUMNS = [field.name for field in fields(Row)]
-KINDS: list[Callable[[str], Any]] = [int, float, float, float, lambda text: float(text) if text else None, int, int, int]
-"""What the cells of a row are."""
 
 
 class RunFolder:
@@ -54,36 +48,28 @@ class RunFolder:
                 (path / name).mkdir(exist_ok=True)
                 remove_temporaries(path / name)
             remove_temporaries(path)
-        self.checkpoints, self.log_file = path / CHECKPOINTS, path / "loss.csv"
+        self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
         self.saved, self.next_save = -1, 0.0
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run; those of a run made here before are gone."""
         with refusals(self.checkpoints):
             forget_checkpoints(self.checkpoints)
-        self._write_log([])
+        self.log.start()
         self.save(run)
 
     def resume(self, run: Reconstruction, loaded: Path) -> None:
         """Goes on with `run` from the checkpoint `loaded`: the log ends where it does, and a damaged one after it is gone."""
         with refusals(loaded):
             os.replace(loaded, self.checkpoints / LAST)
-        rows = self._logged()[: run.iteration]
-        if len(rows) < run.iteration:
-            warnings.warn(f"{self.log_file}: has {len(rows)} of the {run.iteration} iterations made", DataWarning, 2)
-        self._write_log(rows)
+        self.log.cut(run.iteration)
         self._note_saved(run, 0.0)
-
-    def log(self, row: Row) -> None:
-        """Adds one row to `loss.csv`."""
-        with refusals(self.log_file), self.log_file.open("a", newline="") as stream:
-            csv.writer(stream).writerow(_cells(row))
 
     def save(self, run: Reconstruction) -> None:
         """Writes a checkpoint, unless the last is of this very iteration; the log has all rows before it, whatever happens."""
         if self.saved != run.iteration:
             start = monotonic()
-            flush(self.log_file)
+            self.log.flush()
             save_checkpoint(self.checkpoints, run.state(), self.result_of)
             self._note_saved(run, monotonic() - start)
 
@@ -94,24 +80,6 @@ class RunFolder:
 
     def _note_saved(self, run: Reconstruction, seconds: float) -> None:
         self.saved, self.next_save = run.iteration, monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
-
-    def _write_log(self, rows: list[list[str]]) -> None:
-        with replacing(self.log_file) as temporary, temporary.open("w", newline="") as stream:
-            csv.writer(stream).writerows([COLUMNS, *rows])
-
-    def _logged(self) -> list[list[str]]:
-        """The rows of `loss.csv` up to the first that is not whole, or not the next iteration's."""
-        try:
-            with self.log_file.open(newline="", errors="replace") as stream:
-                _, *rows = csv.reader(stream)
-        except (OSError, ValueError, csv.Error):
-            return []
-        count = next((i for i, row in enumerate(rows) if len(row) != len(COLUMNS) or row[0] != str(i + 1)), len(rows))
-        return rows[:count]
-
-    def _rows(self) -> list[Row]:
-        """The log as it was written."""
-        return [Row(*(kind(cell) for kind, cell in zip(KINDS, row, strict=True))) for row in self._logged()]
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
@@ -132,7 +100,7 @@ class RunFolder:
         summary = _summary(run) | {"views": quality}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
-        findings = Findings(scene, light_field, images, quality, self._rows(), summary, self.environment, settings)
+        findings = Findings(scene, light_field, images, quality, self.log.rows(), summary, self.environment, settings)
         write_report(self.path / "report.html", findings)
         return summary
 
@@ -192,11 +160,6 @@ def _images(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
 def _plain(value: Tensor) -> Any:
     """`value` as nested lists; one number by itself."""
     return value.item() if value.numel() == 1 else value.tolist()
-
-
-def _cells(row: Row) -> list[Any]:
-    values = (getattr(row, name) for name in COLUMNS)
-    return ["" if value is None else f"{value:.8g}" if isinstance(value, float) else value for value in values]
 
 
 def _summary(run: Reconstruction) -> dict[str, Any]:

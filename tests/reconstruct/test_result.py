@@ -71,7 +71,7 @@ def finished(folder: Path, cross_sections: str, parameters: str) -> Any:
     dump_scene(scene_file, folder / "out" / "scene.yaml")
     run_folder = RunFolder(folder / "out", scene_file, {}, {})
     run_folder.start(run)
-    run_folder.log(row)
+    run_folder.log.add(row)
     run_folder.finish(run)
     return run.current_scene()
 
