@@ -14,6 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -164,7 +165,10 @@ def remake(experiment: Experiment, output: Path, overrides: list[str], is_small:
 
 
 def remake_replay(names: list[str], output: Path, is_kept: bool) -> None:
-    """Fig. 8, and where path replay can run Fig. 7."""
+    """Fig. 8, where Mitsuba is installed, and where its path replay can run Fig. 7."""
+    if find_spec("mitsuba") is None:
+        print("fig07 and fig08 left out, they need Mitsuba 3: pip install ddrecon[reference]")
+        return
     if "fig08" in names:
         paper_gradients.remake(output / "fig08")
     if "fig07" not in names:
