@@ -6,13 +6,16 @@ import math
 import os
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from click.testing import CliRunner, Result
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
+from ddrecon.cli import main
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
 from ddrecon.io.volumes import FORMATS
@@ -150,3 +153,16 @@ def suffix(request: pytest.FixtureRequest) -> str:
     if not _is_readable(request.param):
         pytest.skip(f"reading {request.param} needs {' or '.join(PACKAGES[request.param])}, not installed here")
     return request.param
+
+
+@pytest.fixture
+def run(folder: Path) -> Callable[..., Result]:
+    """Runs a command in the current folder, which the fixture `folder` of the tests has made; a bug's exception is not swallowed."""
+
+    def run_command(*arguments: str) -> Result:
+        result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+        return result
+
+    return run_command

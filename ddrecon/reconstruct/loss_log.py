@@ -19,7 +19,7 @@ KINDS: list[Callable[[str], Any]] = [int, float, float, float, lambda text: floa
 
 
 class LossLog:
-    """The log in the file at `path`."""
+    """The log in the file at `path`. Whatever writes raises FormatError where the system refuses."""
 
     def __init__(self, path: Path):
         self.path = path

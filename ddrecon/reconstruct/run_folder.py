@@ -90,10 +90,10 @@ class RunFolder:
         """Writes checkpoint, volumes, parameters, result, pictures, summary and report, and returns what the summary says."""
         self.save(run)
         scene = run.current_scene()
-        found = {name: self._stored(scene, name) for name in found_names([parameter.name for parameter in run.parameters])}
-        self._stored(scene, "density")
+        names = dict.fromkeys(["density", *found_names([parameter.name for parameter in run.parameters])])
+        found = {name: self._stored(scene, name) for name in names}
         write_described(describe_result(self.scene_file, scene, found), self.path / RESULT)
-        write_json(self.path / "parameters.json", self._parameters(scene))
+        write_json(self.path / "parameters.json", self._parameters(scene, found))
         light_field = _light(scene)
         images = _images(scene, light_field)
         quality = self._pictures(scene, images, "")
@@ -116,14 +116,14 @@ class RunFolder:
         write_field(self.path / file, name, array.float().cpu().numpy(), np.array(scene.volume.grid.bounds_xyz))
         return {"file": str(file)}
 
-    def _parameters(self, scene: Scene) -> dict[str, Any]:
-        """Everything of `scene` that is not a volume, as plain values; maps become files of their own."""
+    def _parameters(self, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
+        """Everything of `scene` that is not a volume, as plain values; maps become files of their own, but for those that are `stored`."""
         volume = {name: value.tolist() for name in ("sigma_a", "sigma_s", "g") if (value := value_of(scene, name)).ndim < 2}
         lights: dict[str, Any] = {}
         for name in variable_names(scene):
             if name.startswith("lights."):
                 value = value_of(scene, name)
-                lights[name] = self._stored(scene, name) if value.ndim == 3 else value.tolist()
+                lights[name] = value.tolist() if value.ndim < 3 else stored[name] if name in stored else self._stored(scene, name)
         cameras = {f"views.{view.name}.camera": {"matrix": [*view.camera.pose.tolist(), [0, 0, 0, 1]]} for view in scene.views}
         return volume | lights | cameras
 

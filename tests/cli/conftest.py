@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner, Result
+from click.testing import Result
 from small_scene import SCENE, contents
 
-from ddrecon.cli import main
 from ddrecon.io.volumes import write_field
 
 Run = Callable[..., Result]
@@ -43,19 +41,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     values = np.random.default_rng(0).random((4, 5, 6))
     write_field(Path("density.npz"), "density", values, np.array([[-0.5] * 3, [0.5] * 3]))
     return tmp_path
-
-
-@pytest.fixture
-def run(folder: Path) -> Run:
-    """Runs a command in `folder`; a bug's exception is not swallowed."""
-
-    def run_command(*arguments: str) -> Result:
-        result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
-
-    return run_command
 
 
 @pytest.fixture

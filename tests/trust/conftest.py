@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
-from click.testing import CliRunner, Result
 from tiny_scene import write_scene
-
-from ddrecon.cli import main
 
 
 @pytest.fixture(autouse=True)
@@ -30,16 +26,3 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     write_scene(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def run(folder: Path) -> Callable[..., Result]:
-    """Runs a command in `folder`; a bug's exception is not swallowed."""
-
-    def run_command(*arguments: str) -> Result:
-        result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result
-
-    return run_command
