@@ -25,12 +25,12 @@ from traced import Traced, traced
 from ddrecon.cameras import Camera, look_at, rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight, Light, PointLight
-from ddrecon.medium import Volume
-from ddrecon.phase import henyey_greenstein
+from ddrecon.light.lights import AmbientLight, DirectionalLight, Light, PointLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.renderer import render, solve_light, view_components, view_image
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.world import Scene, View
 
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Density at x, y and z, each from -0.5 to 0.5 across the box."""

@@ -17,12 +17,12 @@ import torch
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.lights import DirectionalLight
-from ddrecon.medium import Volume
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.medium.coefficients import Volume
 from ddrecon.renderer import render
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables import with_values
-from ddrecon.world import Scene, View
+from ddrecon.variables.values import with_values
 
 CELLS, SIGMA_T, ALBEDO, FOV = 64, 20.0, 0.99, 28.0
 EYE, TRAVEL = (0.0, 0.3, 3.2), (-2.0, -2.0, -1.0)

@@ -18,8 +18,8 @@ from ddrecon.bench.plume import plume_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.settings import OptimizeSettings, ParameterSettings
 
 CASES = {
     "64 x 96 x 64, 512 x 512, density (the paper: 22.5 iterations a second on an RTX 2080 Ti)": (64, 512, False, 30),

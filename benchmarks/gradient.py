@@ -15,10 +15,10 @@ from pathlib import Path
 import torch
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.reconstruct.losses import image_loss, psnr
+from ddrecon.losses import image_loss, psnr
 from ddrecon.renderer import render_each
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 ROOT = Path(__file__).parents[1]
 

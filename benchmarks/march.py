@@ -20,12 +20,14 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at, rays
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.march.box import cross_box
+from ddrecon.march.samplers import sampler_for
+from ddrecon.march.slices import Slices
+from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.renderer import LightField, solve_light, view_image
-from ddrecon.sampling import sample_slices
-from ddrecon.scene.build import load_scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import RenderSettings
-from ddrecon.view_rays import Slices, cross_box, sampler_for
-from ddrecon.world import Scene
 
 ROOT = Path(__file__).parents[1]
 TOLERANCES = (0.0, 0.01, 0.03, 0.05, 0.1, 1.0)

@@ -42,7 +42,7 @@ from paper_shown import (
     show_smoke,
 )
 
-from ddrecon.io.volumes import write_field
+from ddrecon.io.volumes.table import write_field
 
 SCRIPT = Path(__file__).name
 PAPER_PIXELS, PAPER_CELLS = 512, 192

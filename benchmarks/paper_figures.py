@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ddrecon.io import srgb
+from ddrecon.io.images import srgb
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -24,8 +24,8 @@ from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, rew
 from path_replay import ALBEDO, Replay, why_not
 
 from ddrecon.bench.path_tracing import DENSITY
-from ddrecon.io.volumes import read_field, write_field
-from ddrecon.scene.build import load_scene
+from ddrecon.io.volumes.table import read_field, write_field
+from ddrecon.scene_file.build import load_scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -25,13 +25,13 @@ from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, rewrite_table
 from path_replay import HEADROOM, Replay, why_not
 
 from ddrecon.bench.path_tracing import DENSITY
-from ddrecon.io.volumes import read_field
+from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import rate_at
 from ddrecon.reference.trace import open_tracer
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -14,8 +14,8 @@ from paper_figures import Array, Pair, draw, draw_derivatives, projected, read_l
 from paper_page import CONFIGS, PICTURES, SHAPES, as_options, ddrecon, rewrite_table
 
 from ddrecon.grid import Grid
-from ddrecon.io.images import read_image
-from ddrecon.io.volumes import read_field
+from ddrecon.io.images.table import read_image
+from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.levels import resampled
 
 NAMES_13 = {

@@ -20,7 +20,7 @@ from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.grid import Grid
 from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
 from ddrecon.reference.trace import load_mitsuba, translated
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 RING = 2
 HEADROOM = 2.0

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddrecon.io.volumes import read_field
+from ddrecon.io.volumes.table import read_field
 
 TRUTH = Path(__file__).parents[1] / "data/plume/density.npz"
 

@@ -14,8 +14,8 @@ import torch
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import render_each
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 ROOT = Path(__file__).parents[1]
 CASES = {

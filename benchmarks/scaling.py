@@ -22,11 +22,11 @@ import torch
 from ddrecon.bench.plume import plume_scene
 from ddrecon.cameras import look_at
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.lights import DirectionalLight
+from ddrecon.light.lights import DirectionalLight
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.settings import OptimizeSettings, ParameterSettings
 
 CELLS, PIXELS = 64, 128
 SIZES = (16, 24, 32, 48, 64, 96, 128, 192)

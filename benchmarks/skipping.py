@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.io.volumes import read_field
+from ddrecon.io.volumes.table import read_field
 from ddrecon.renderer import solve_light, view_image
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 ROOT = Path(__file__).parents[1]
 PLUME = f"volume.density={{file: {ROOT / 'data/plume/density.npz'}}}"

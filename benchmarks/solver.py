@@ -24,10 +24,10 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.grid import Grid
-from ddrecon.io.volumes import read_field
-from ddrecon.lights import DirectionalLight
-from ddrecon.medium import Volume, scaled_medium
-from ddrecon.reduced import reduced_light
+from ddrecon.io.volumes.table import read_field
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.reduced import reduced_light
+from ddrecon.medium.coefficients import Volume, scaled_medium
 
 PLUME = Path(__file__).parents[1] / "data/plume/density.npz"
 

@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.reference.trace import Traced, open_tracer
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 SAMPLES, LEAST = 128, 4
 """Paths a pixel in each pass, and the fewest passes."""

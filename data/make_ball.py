@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 import ddrecon
-from ddrecon.io.images import write_linear
-from ddrecon.io.volumes import write_field
-from ddrecon.reconstruct.previews import pixels
+from ddrecon.io.images.table import write_linear
+from ddrecon.io.volumes.table import write_field
+from ddrecon.report.pictures import pixels
 
 CELLS = 16
 FOLDER = Path(__file__).parent / "ball"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddrecon.io.images import read_image
+from ddrecon.io.images.table import read_image
 
 FOLDER = Path(__file__).parent / "cumulus"
 TIMES = 4

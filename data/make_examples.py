@@ -17,7 +17,7 @@ import numpy as np
 from make_shapes import centers, smoothly, swirled, write
 from make_targets import keep
 
-from ddrecon.io.images import read_image
+from ddrecon.io.images.table import read_image
 
 ROOT = Path(__file__).parents[1]
 FIELD, SKY = ROOT / "data" / "cumulus_field", ROOT / "data" / "smoke_sky"

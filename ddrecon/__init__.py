@@ -9,12 +9,12 @@ from typing import Any
 
 __version__ = "0.1.0"
 _HOMES = {
-    "load_scene": "ddrecon.scene.build",
+    "load_scene": "ddrecon.scene_file.build",
     "render": "ddrecon.renderer",
     "VolumeRenderer": "ddrecon.layer",
     "optimize": "ddrecon.reconstruct.loop",
     "Result": "ddrecon.reconstruct.loop",
-    "Scene": "ddrecon.world",
+    "Scene": "ddrecon.scene",
     "DdreconError": "ddrecon.errors",
     "SceneError": "ddrecon.errors",
     "FormatError": "ddrecon.errors",

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import render
-from ddrecon.variables import with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.values import with_values
 
 
 class VolumeRenderer(torch.nn.Module):

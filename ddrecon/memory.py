@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from ddrecon.march import CHUNK_NODES
+from ddrecon.march.integral import CHUNK_NODES
 
 GIVEN_BACK = 2**25
 """Arrays larger than this many bytes leave the process when they are done with; smaller ones stay with its allocator (glibc's)."""

@@ -12,24 +12,27 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import is_varied, recomputed
 from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
-from ddrecon.diffusion import conservative, flux_limited, printed
+from ddrecon.diffusion import conservative, flux_limited
 from ddrecon.diffusion.closures import CLOSURES, smooth
 from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.limiters import LIMITERS
+from ddrecon.diffusion.paper import printed
+from ddrecon.diffusion.rounds.transport import transported
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.diffusion.transport import transported
-from ddrecon.environment import environment_radiance
-from ddrecon.lights import AmbientLight, EnvironmentLight, Light
-from ddrecon.march import Emission, march
-from ddrecon.medium import Medium, scaled_medium, unscaled_medium
-from ddrecon.moments import Moments, Vector
-from ddrecon.point_light import PointBeam
-from ddrecon.reduced import Beam, ambient_radiance, ambient_sky, reduced_light, scattered_sky, unscattered_sky
+from ddrecon.light.beam import Beam
+from ddrecon.light.environment import environment_radiance
+from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
+from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.point_light import PointBeam
+from ddrecon.light.reduced import ambient_radiance, reduced_light
+from ddrecon.light.sky import Sky, sources
+from ddrecon.light.skylight import ambient_sky, scattered_sky, unscattered_sky
+from ddrecon.march.integral import Emission, march
+from ddrecon.medium.coefficients import Medium, has_flux, scaled_medium, unscaled_medium
+from ddrecon.numerics.autodiff import is_varied, recomputed
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
-from ddrecon.sky import Sky, sources
-from ddrecon.world import Scene, View
 
 
 @dataclass(frozen=True)
@@ -102,11 +105,6 @@ def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
 def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
     kept = 1 - medium.forward_fraction
     return light.scaled(kept, kept * medium.mean_cosine)
-
-
-def has_flux(medium: Medium) -> bool:
-    """Whether light's direction matters to scattering: g is not 0, or is being differentiated."""
-    return is_varied(medium.g) or bool(medium.g.detach() != 0)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera
 from ddrecon.grid import Triple
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 
 def upright_axis(cameras: Sequence[Camera]) -> int:

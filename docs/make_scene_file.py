@@ -10,9 +10,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from ddrecon.scene import schema
-from ddrecon.scene.parameter_kinds import KINDS
+from ddrecon.scene_file import schema
 from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.variables.kinds import KINDS
 
 PAGE = Path(__file__).parent / "scene_file.md"
 KIND_NAMES = {

@@ -14,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 
 import ddrecon
-from ddrecon.io import srgb
-from ddrecon.io.volumes import read_field
-from ddrecon.reconstruct.previews import pixels
+from ddrecon.io.images import srgb
+from ddrecon.io.volumes.table import read_field
+from ddrecon.report.pictures import pixels
 
 ROOT = Path(__file__).parents[1]
 VIEW = "test_10"

@@ -15,14 +15,14 @@ from click.testing import CliRunner, Result
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
-from ddrecon.cli import main
+from ddrecon.cli.commands import main
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
-from ddrecon.io.volumes import FORMATS
-from ddrecon.lights import AmbientLight, DirectionalLight
-from ddrecon.medium import Volume
+from ddrecon.io.volumes.table import FORMATS
+from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.world import Scene, View
 
 os.environ["OMP_NUM_THREADS"] = "1"
 torch.set_num_threads(1)  # tests run side by side, one a core

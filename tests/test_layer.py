@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ddrecon.layer import VolumeRenderer
 from ddrecon.renderer import render
-from ddrecon.variables import value_of, with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
 

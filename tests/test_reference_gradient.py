@@ -14,13 +14,13 @@ import torch
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.io.volumes import read_field
-from ddrecon.lights import DirectionalLight
-from ddrecon.medium import Volume
+from ddrecon.io.volumes.table import read_field
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.medium.coefficients import Volume
 from ddrecon.renderer import render
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables import with_values
-from ddrecon.world import Scene, View
+from ddrecon.variables.values import with_values
 
 PLUME = Path(__file__).parents[1] / "data" / "plume"
 SIGMA_T, ALBEDO = 10.0, 0.9

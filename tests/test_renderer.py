@@ -16,9 +16,9 @@ from torch.autograd import forward_ad
 from ddrecon.cameras import Camera, rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.renderer import Components, render, solve_light, view_components
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 SHAPE = (5, 4, 6)
 BOTH = {"directional": (3.0, 2.0, 1.0), "ambient": (0.3, 0.4, 0.5)}

@@ -12,8 +12,8 @@ from torch import Tensor
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.renderer import render
+from ddrecon.scene import Scene
 from ddrecon.turntable import turned, turntable, upright_axis
-from ddrecon.world import Scene
 
 CENTER = (0.1, -0.2, 0.3)
 

@@ -20,7 +20,7 @@ from ddrecon.bench.variants import Variant, exactly, model_of
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.renderer import render_each
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 BLOCK = 4
 """Gradients are compared as sums over blocks of so many cells along each side."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from ddrecon.bench.measure import Shot, block_sums, blocks_of
 from ddrecon.reference.mitsuba_scene import LONGEST
 from ddrecon.reference.trace import Traced, Tracer, open_tracer
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 DENSITY = ".sigma_t.data"
 """How the name of the density ends among Mitsuba's parameters."""

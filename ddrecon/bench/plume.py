@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.lights import DirectionalLight
-from ddrecon.medium import Volume
-from ddrecon.world import Scene, View
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
 
 SIGMA_T, ALBEDO = 30.0, 0.95
 """About 8 optical depths across the plume where it is densest."""

@@ -17,12 +17,12 @@ from ddrecon.bench.plot import draw
 from ddrecon.bench.plume import plume_scene
 from ddrecon.bench.report import Row, rows_of, table, write_report
 from ddrecon.bench.variants import QUICK, Sweep, variants_of
+from ddrecon.cli.session import Session
 from ddrecon.errors import MissingExtraError, SceneError
-from ddrecon.io.json_file import write_json
+from ddrecon.io.files.json_file import write_json
 from ddrecon.reconstruct.levels import at_level
-from ddrecon.session import Session
+from ddrecon.scene import Scene
 from ddrecon.validate import hard
-from ddrecon.world import Scene
 
 TURNS = 2
 PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)

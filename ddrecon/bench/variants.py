@@ -10,8 +10,8 @@ from typing import Any
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.reconstruct.levels import at_level
+from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
-from ddrecon.world import Scene
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from functools import cached_property
 
 from torch import Tensor
 
-from ddrecon.autodiff import recomputed
 from ddrecon.diffusion.implicit import Solve, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductance, face_fluxes
-from ddrecon.medium import Medium
-from ddrecon.moments import Moments, Vector
+from ddrecon.light.moments import Moments, Vector
+from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import recomputed
 
 Closure = Callable[[Tensor], Tensor]
 

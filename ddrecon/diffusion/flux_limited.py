@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import keep
 from ddrecon.diffusion.conservative import axis_flux
 from ddrecon.diffusion.implicit import Solve, SolveRecord
 from ddrecon.diffusion.limiters import Limiter
@@ -24,8 +23,9 @@ from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_avera
 from ddrecon.diffusion.solvers.scaled import norm
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
-from ddrecon.medium import Medium
-from ddrecon.moments import Moments
+from ddrecon.light.moments import Moments
+from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import keep
 
 DAMPING = 0.7
 MAX_ITERATIONS = 1000

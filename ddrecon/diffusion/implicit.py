@@ -15,9 +15,9 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import keep
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.numerics.autodiff import keep
 
 Made = dict[Callable[[Operator], Any], Any]
 System = TypeVar("System")

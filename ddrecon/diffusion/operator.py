@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import keep
 from ddrecon.grid import Grid
+from ddrecon.numerics.autodiff import keep
 
 Made = TypeVar("Made")
 AXES = (1, 2, 3)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ddrecon.io.images import READERS, read_image
-from ddrecon.io.tiff import is_stack
-from ddrecon.io.volumes import FORMATS, field_names, read_field
+from ddrecon.io.images.table import READERS, read_image
+from ddrecon.io.images.tiff import is_stack
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field
 
 
 def describe(path: Path) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import solve_light, view_image
-from ddrecon.variables import VOLUME, with_values
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
+from ddrecon.variables.values import VOLUME, with_values
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
-from ddrecon.medium import Volume
-from ddrecon.world import Scene, View
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
 
 FEWEST_CELLS = 8
 FEWEST_PIXELS = 16

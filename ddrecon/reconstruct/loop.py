@@ -17,18 +17,18 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import DivergenceError, SceneError, SolveError
+from ddrecon.losses import image_loss, psnr
 from ddrecon.reconstruct.divergence import flawed_place, largest_place
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
-from ddrecon.reconstruct.losses import image_loss, psnr
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate, rate_at
 from ddrecon.reconstruct.tolerance import enough
 from ddrecon.reconstruct.views import chosen
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.variables import value_of, variable_names, with_values
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
+from ddrecon.settings import OptimizeSettings, ParameterSettings
+from ddrecon.variables.values import value_of, variable_names, with_values
 
 TEST_EVERY = 10
 """Test views are rendered every so many iterations, and at the last."""

@@ -9,10 +9,10 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from ddrecon.grid import Grid
+from ddrecon.losses import total_variation
 from ddrecon.reconstruct.levels import resampled
-from ddrecon.reconstruct.losses import total_variation
-from ddrecon.scene.parameter_kinds import KINDS, pattern_of
-from ddrecon.scene.schema import ParameterSettings
+from ddrecon.settings import ParameterSettings
+from ddrecon.variables.kinds import KINDS, pattern_of
 
 BETAS = (0.9, 0.99)
 """Decay of Adam's first and second moments; the second forgets sooner than customary, since runs are short."""

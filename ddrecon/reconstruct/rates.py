@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ddrecon.medium import Volume
-from ddrecon.scene.parameter_kinds import pattern_of
-from ddrecon.world import Scene
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene
+from ddrecon.variables.kinds import pattern_of
 
 HASTE = 0.1
 """Largest change of a density in one step, unless the scene says otherwise; densities are usually of order 1."""

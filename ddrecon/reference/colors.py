@@ -11,8 +11,8 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
-from ddrecon.world import Scene
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
+from ddrecon.scene import Scene
 
 
 def of_color(scene: Scene, color: int) -> Scene:

@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.io.images import write_picture, write_preview
-from ddrecon.io.json_file import write_json
-from ddrecon.reconstruct.losses import psnr
-from ddrecon.reconstruct.previews import comparison, diverging, pixels
+from ddrecon.io.files.json_file import write_json
+from ddrecon.io.images.table import write_picture, write_preview
+from ddrecon.losses import psnr
 from ddrecon.reference.mitsuba_scene import LONGEST
 from ddrecon.reference.trace import Traced, Tracer
 from ddrecon.renderer import solve_light, view_image
-from ddrecon.world import Scene, View
+from ddrecon.report.pictures import comparison, diverging, pixels
+from ddrecon.scene import Scene, View
 
 PASSES = 8
 """Passes an image is traced in, by whose scatter its noise is told; fewer where there are fewer paths a pixel than that."""

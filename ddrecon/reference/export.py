@@ -9,11 +9,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ddrecon.errors import SceneError
-from ddrecon.io.atomic import replacing
-from ddrecon.io.exr import write_exr
-from ddrecon.io.volumes import write_field
+from ddrecon.io.files.atomic import replacing
+from ddrecon.io.images.exr import write_exr
+from ddrecon.io.volumes.table import write_field
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 KINDS = {
     "volpath": "integrator",

@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.errors import SceneError
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 
 Color = tuple[float, float, float]
 

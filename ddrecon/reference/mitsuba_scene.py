@@ -21,9 +21,9 @@ from torch.nn.functional import interpolate
 from ddrecon.cameras import Camera, rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.medium import Volume
+from ddrecon.medium.coefficients import Volume
 from ddrecon.reference.mitsuba_lights import mitsuba_lights
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 LONGEST = 1024
 """Segments of the longest path. There is no Russian roulette: Mitsuba ends a twentieth of all paths at each scattering, whatever they

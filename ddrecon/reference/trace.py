@@ -14,7 +14,7 @@ import numpy as np
 from ddrecon.extras import load_extra
 from ddrecon.reference.colors import of_color
 from ddrecon.reference.mitsuba_scene import is_gray, mitsuba_scene, sensor_id
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ddrecon.io.atomic import replacing
+from ddrecon.io.files.atomic import replacing
 
 STYLE = """
 :root { color-scheme: light dark; --line: #8885; --soft: #8882; }

@@ -12,11 +12,10 @@ from torch import Tensor
 
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance, face_fluxes
-from ddrecon.medium import scaled_medium
-from ddrecon.reduced import ambient_radiance, reduced_light
-from ddrecon.renderer import has_flux
-from ddrecon.sky import sources
-from ddrecon.world import Scene
+from ddrecon.light.reduced import ambient_radiance, reduced_light
+from ddrecon.light.sky import sources
+from ddrecon.medium.coefficients import has_flux, scaled_medium
+from ddrecon.scene import Scene
 
 
 @dataclass(frozen=True)

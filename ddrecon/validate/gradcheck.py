@@ -14,10 +14,10 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from ddrecon.errors import SceneError
-from ddrecon.scene.problems import suggestion
+from ddrecon.scene import Scene
+from ddrecon.scene_file.problems import suggestion
 from ddrecon.validate.point import chosen_entries, entry_name, loss_at, random_like, starting_point, steps_of
-from ddrecon.variables import variable_names
-from ddrecon.world import Scene
+from ddrecon.variables.values import variable_names
 
 AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid, Triple
-from ddrecon.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.medium import Volume
+from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables import cross_sections
-from ddrecon.world import Scene, View
+from ddrecon.variables.values import cross_sections
 
 Shape = tuple[int, int, int]
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}

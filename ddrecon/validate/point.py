@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.reconstruct.losses import image_loss
+from ddrecon.losses import image_loss
 from ddrecon.renderer import render_each
-from ddrecon.scene.parameter_kinds import pattern_of
-from ddrecon.variables import component_names, value_of, with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.kinds import pattern_of
+from ddrecon.variables.values import component_names, value_of, with_values
 
 TOLERANCE = 1e-13
 """Relative residual of the solves."""

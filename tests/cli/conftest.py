@@ -12,7 +12,7 @@ import torch
 from click.testing import Result
 from small_scene import SCENE, contents
 
-from ddrecon.io.volumes import write_field
+from ddrecon.io.volumes.table import write_field
 
 Run = Callable[..., Result]
 

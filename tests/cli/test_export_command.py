@@ -13,7 +13,7 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.io.volumes import FORMATS, field_names, read_field, write_field
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]

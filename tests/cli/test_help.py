@@ -13,7 +13,7 @@ import torch
 from click.testing import CliRunner
 
 from ddrecon import __version__
-from ddrecon.cli import main
+from ddrecon.cli.commands import main
 
 README = (Path(__file__).parents[2] / "README.md").read_text()
 PROGRAM = [sys.executable, "-c", "from ddrecon.cli import main; main()"]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from click.testing import Result
 
-from ddrecon.io.volumes import write_field
+from ddrecon.io.volumes.table import write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]

@@ -12,7 +12,7 @@ import pytest
 import torch
 from click.testing import Result
 
-from ddrecon.io.volumes import write_field
+from ddrecon.io.volumes.table import write_field
 
 Refuse = Callable[..., list[str]]
 

@@ -13,7 +13,7 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.io.images import read_image
+from ddrecon.io.images.table import read_image
 
 Run = Callable[..., Result]
 RENDER = ["render", "scene.yaml", "-o", "out", "-q"]

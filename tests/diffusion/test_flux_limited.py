@@ -17,8 +17,8 @@ from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.renderer import render, solve_light
-from ddrecon.variables import with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.values import with_values
 
 each_limiter = pytest.mark.parametrize("limiter", LIMITERS)
 SHAPE = (3, 4, 3)

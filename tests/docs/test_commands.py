@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 
 from ddrecon.bench import run as bench_run
-from ddrecon.cli import main
+from ddrecon.cli.commands import main
 from ddrecon.reconstruct.levels import at_level
+from ddrecon.scene import Scene
 from ddrecon.validate.hard_cases import CASES
-from ddrecon.world import Scene
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -22,7 +22,7 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.renderer import render, solve_light, view_components
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 ALBEDOS = (0.5, 0.9, 0.99, 1.0)
 SUNS = (1.0, 0.6, 0.3)

@@ -13,9 +13,9 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.grid import Grid
-from ddrecon.lights import DirectionalLight
+from ddrecon.light.lights import DirectionalLight
 from ddrecon.renderer import solve_light, view_components
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 ONE, OTHER = (-2.0, -2.1, -1.0), (1.2, -0.3, -1.9)
 """Two directions (x, y, z) that are along no axis of the grid."""

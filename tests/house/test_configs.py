@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ddrecon.reconstruct.loop import optimize
-from ddrecon.scene.build import load_scene
+from ddrecon.scene_file.build import load_scene
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = [config for config in sorted((ROOT / "configs").glob("*.yaml")) if config.stem != "gradcheck_all"]

@@ -12,8 +12,8 @@ from pathlib import Path
 import click
 import pytest
 
-from ddrecon.cli import main
-from ddrecon.scene.load import read_scene
+from ddrecon.cli.commands import main
+from ddrecon.scene_file.load import read_scene
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from ddrecon.scene import schema
+from ddrecon.scene_file import schema
 
 DOCS = Path(__file__).parents[2] / "docs"
 ELSEWHERE = {schema.Constant, schema.Bounds, schema.PoseSection, schema.SceneTree}

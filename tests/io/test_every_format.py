@@ -8,8 +8,8 @@ import numpy as np
 import openvdb_python
 import pytest
 
-from ddrecon.io.field import Field
-from ddrecon.io.volumes import FORMATS, field_names, read_field, write_field
+from ddrecon.io.volumes.field import Field
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
 
 BOUNDS = np.array([[-1.0, -2.0, 8.0], [1.5, 2.5, 11.0]])
 PACKAGES = {".tif": "tifffile", ".tiff": "tifffile", ".nc": "netCDF4"}

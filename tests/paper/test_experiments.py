@@ -13,14 +13,14 @@ import torch
 from click.testing import CliRunner
 from torch import Tensor
 
-from ddrecon.cli import main
-from ddrecon.io.volumes import read_field
+from ddrecon.cli.commands import main
+from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.levels import at_level
 from ddrecon.reconstruct.loop import Result, optimize
 from ddrecon.renderer import render
-from ddrecon.scene.build import load_scene
-from ddrecon.variables import value_of, with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
+from ddrecon.variables.values import value_of, with_values
 
 ROOT = Path(__file__).parents[2]
 CONFIGS = {config.stem: config for config in sorted((ROOT / "configs" / "paper").glob("*.yaml"))}

@@ -12,9 +12,9 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.variables import value_of, with_values
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
+from ddrecon.settings import OptimizeSettings, ParameterSettings
+from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
 NAMES = ("density", "albedo", "g", "lights.0.irradiance", "lights.0.direction", "lights.1.radiance", "views.one.camera")

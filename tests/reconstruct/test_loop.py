@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from ddrecon.errors import FormatError, SceneError, SolveError
-from ddrecon.io.volumes import read_field
-from ddrecon.reconstruct.checkpoint import load_checkpoint, save_checkpoint
+from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction, optimize
-from ddrecon.world import Scene
+from ddrecon.run.checkpoint import load_checkpoint, save_checkpoint
+from ddrecon.scene import Scene
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
 
@@ -55,7 +55,7 @@ def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
 
 
 def test_brightness_of_the_light_does_not_matter(ball_scene: Scene) -> None:
-    from ddrecon.lights import AmbientLight, DirectionalLight
+    from ddrecon.light.lights import AmbientLight, DirectionalLight
 
     def brighter(light: DirectionalLight | AmbientLight) -> DirectionalLight | AmbientLight:
         if isinstance(light, DirectionalLight):

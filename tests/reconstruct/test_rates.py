@@ -9,8 +9,8 @@ import torch
 
 from ddrecon.reconstruct.rates import default_rate, rate_at
 from ddrecon.reconstruct.views import chosen
-from ddrecon.variables import value_of, variable_names
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, variable_names
 
 
 def test_rates_rise_then_fall_and_never_exceed_their_value() -> None:

@@ -12,14 +12,13 @@ from torch import Tensor
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight
-from ddrecon.medium import Volume
+from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.medium.coefficients import Volume
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.settings import DiffusionSettings
-from ddrecon.variables import value_of, with_values
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
+from ddrecon.settings import DiffusionSettings, OptimizeSettings, ParameterSettings
+from ddrecon.variables.values import value_of, with_values
 
 BLOBS = ((0.0, 0.0, 0.0, 0.3), (0.15, 0.1, 0.05, 0.2), (-0.2, -0.05, 0.1, 0.18), (0.0, 0.15, -0.15, 0.2))
 

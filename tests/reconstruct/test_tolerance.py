@@ -12,7 +12,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.tolerance import GRADIENT_ERROR, enough
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 
 def test_the_forward_solve_follows_the_misfit_and_the_adjoint_does_not():

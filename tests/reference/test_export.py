@@ -15,11 +15,11 @@ import pytest
 import torch
 
 from ddrecon.errors import SceneError
-from ddrecon.io.volumes import read_field
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.io.volumes.table import read_field
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.export import export_scene
 from ddrecon.reference.trace import Traced, Tracer, open_tracer
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
 COLOR = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)

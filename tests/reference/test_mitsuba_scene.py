@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ddrecon.cameras import rays
 from ddrecon.errors import SceneError
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
 from ddrecon.reference.colors import of_color
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 SHAPE = (3, 4, 5)
 

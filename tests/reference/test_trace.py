@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at, rays
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
 from ddrecon.renderer import render
+from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.world import Scene
 
 pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)")
 

@@ -23,8 +23,8 @@ from pathlib import Path
 import torch
 from tiny_scene import write_scene
 
-from ddrecon.cli import main
-from ddrecon.reconstruct import run_folder
+from ddrecon.cli.commands import main
+from ddrecon.run import run_folder
 
 SIGNALS = [*[signal.SIGKILL] * 10, signal.SIGTERM, signal.SIGINT]
 TOO_EARLY = "\nAborted!\n"

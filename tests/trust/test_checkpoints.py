@@ -14,9 +14,10 @@ import torch
 from click.testing import Result
 
 from ddrecon.errors import DataWarning
-from ddrecon.reconstruct import drive, loop
-from ddrecon.reconstruct.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
+from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.run import drive
+from ddrecon.run.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
 
 Run = Callable[..., Result]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o", "out"]
@@ -162,11 +163,11 @@ def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.Mon
         original(self, run)
 
     monkeypatch.setattr(drive.RunFolder, "save", save)
-    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SHARE", 1e9)
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e9)
     run(*OPTIMIZE, "--iterations", "4")
     assert saved == [0, 0, 1, 2, 3, 4]
     saved.clear()
-    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SHARE", 1e-9)
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e-9)
     run(*OPTIMIZE, "--iterations", "4", "--overwrite")
     assert saved == [0, 4]

@@ -12,12 +12,12 @@ import torch
 from tiny_scene import write_scene
 from torch import Tensor
 
-from ddrecon import march
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.march import integral as march
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.loop import optimize
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
+from ddrecon.scene_file.build import load_scene
 
 EQUAL = 1e-5
 """Relative difference that the number of threads may make."""

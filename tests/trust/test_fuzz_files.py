@@ -25,10 +25,10 @@ from deadline import deadline
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ddrecon.cli import main
+from ddrecon.cli.commands import main
 from ddrecon.errors import FormatError, MissingExtraError
-from ddrecon.io.images import READERS, read_image
-from ddrecon.io.volumes import FORMATS, field_names, read_field, write_field
+from ddrecon.io.images.table import READERS, read_image
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
 
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 VALUES = np.random.default_rng(0).random((4, 5, 6), np.float32)
@@ -68,11 +68,11 @@ def write_image(path: Path) -> None:
     elif path.suffix == ".hdr":
         path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 6 +X 8\n" + bytes(range(192)))
     elif path.suffix == ".exr":
-        from ddrecon.io.exr import write_exr
+        from ddrecon.io.images.exr import write_exr
 
         write_exr(path, PICTURE)
     elif path.suffix in (".tif", ".tiff"):
-        from ddrecon.io.tiff import write_tiff
+        from ddrecon.io.images.tiff import write_tiff
 
         write_tiff(path, PICTURE)
     else:
@@ -243,7 +243,7 @@ def test_what_is_too_large_is_refused_by_its_header(tmp_path: Path, monkeypatch:
         pytest.skip(f"no {suffix} can be written here")
     path = tmp_path / f"density{suffix}"
     path.write_bytes(good)
-    monkeypatch.setattr("ddrecon.io.arrays.MAX_BYTES", 100)
+    monkeypatch.setattr("ddrecon.io.files.arrays.MAX_BYTES", 100)
     with pytest.raises(FormatError, match="at most"):
         reader(is_volume)(path)
 

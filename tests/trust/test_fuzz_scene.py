@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from small_files import files_below
 from strange_scene import KEYS, NESTED, RING, SCENE, VALUES, WORDS
 
-from ddrecon.cli import main
-from ddrecon.io.volumes import write_field
-from ddrecon.scene.load import MAX_BYTES
+from ddrecon.cli.commands import main
+from ddrecon.io.volumes.table import write_field
+from ddrecon.scene_file.load import MAX_BYTES
 
 CASES = settings(
     derandomize=True, database=None, deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture]

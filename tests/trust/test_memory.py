@@ -11,12 +11,13 @@ import pytest
 import torch
 from click.testing import Result
 
-from ddrecon import memory, render_folder
-from ddrecon.io.volumes import write_field
+from ddrecon import memory
+from ddrecon.cli.check import memory_estimate
+from ddrecon.io.volumes.table import write_field
 from ddrecon.memory import Needs, is_shortage, memory_of
-from ddrecon.scene import build_volume
-from ddrecon.scene.build import load_scene
-from ddrecon.terms import memory_estimate
+from ddrecon.run import render_folder
+from ddrecon.scene_file import build_volume
+from ddrecon.scene_file.build import load_scene
 
 Run = Callable[..., Result]
 COMMANDS = {

@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch.autograd import Function
 
-from ddrecon import decay, sampling
 from ddrecon.diffusion import implicit
 from ddrecon.errors import SceneError
-from ddrecon.scene.build import load_scene
+from ddrecon.numerics import decay
+from ddrecon.numerics import interpolation as sampling
+from ddrecon.scene_file.build import load_scene
 from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.moments import Moments
+from ddrecon.light.moments import Moments
 from ddrecon.renderer import render
 from ddrecon.validate import hard
 from ddrecon.validate.balance import Balance, balance_of
