@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from traced import Traced, traced
 
-from ddrecon.cameras import Camera, look_at, rays
+from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, Light, PointLight
@@ -249,7 +249,7 @@ def rendered_ball(cells: int) -> tuple[Tensor, Tensor]:
 
 def gaussian_ball(steps: int = 1000) -> tuple[Tensor, Tensor]:
     """What `rendered_ball` approaches: depths of a Gaussian are error functions, and the one integral left is a fine sum."""
-    bundle, distance = rays(ball_camera()), torch.linspace(1.0, 4.0, steps, dtype=torch.float64)
+    bundle, distance = cast_rays(ball_camera()), torch.linspace(1.0, 4.0, steps, dtype=torch.float64)
     travel = torch.nn.functional.normalize(torch.tensor(SIDE, dtype=torch.float64), dim=0)
     origin, direction = bundle.origin.flip(-1)[:, None], bundle.direction.flip(-1)[:, None]
     point = origin + distance[:, None] * direction

@@ -18,10 +18,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, look_at, rays
+from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.march.box import cross_box
-from ddrecon.march.samplers import sampler_for
+from ddrecon.march.samplers import choose_sampler
 from ddrecon.march.slices import Slices
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.renderer import LightField, solve_light, view_image
@@ -52,14 +52,14 @@ class Case:
 
     def interpolated(self) -> None:
         """What every pixel's ray interpolates, there and back, and nothing else."""
-        grid, bundle = self.scene.volume.grid, rays(self.camera)
+        grid, bundle = self.scene.volume.grid, cast_rays(self.camera)
         crossing = cross_box(grid, bundle)
         fields = torch.cat([leaf.detach() for leaf in self.leaves])
-        sampler = sampler_for(fields, None, 0, grid, bundle, crossing, 1)
+        sampler = choose_sampler(fields, None, 0, grid, bundle, crossing, 1)
         if not isinstance(sampler, Slices):
             raise SystemExit("the view is not one by slices")
         for chunk in torch.arange(len(crossing.hit)).split((1 << 18) // sampler.nodes):
-            chosen = bundle.chosen(crossing.hit[chunk])
+            chosen = bundle.select(crossing.hit[chunk])
             distance = (sampler.planes[:, None] - chosen.origin[:, sampler.axis]) / chosen.direction[:, sampler.axis]
             places = chosen.origin + distance[..., None] * chosen.direction
             points = 2 * (places - places.new_tensor(grid.lower)) / places.new_tensor(grid.extent) - 1

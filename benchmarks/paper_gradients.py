@@ -103,7 +103,7 @@ def _replayed_once(change: Change, paths: int, seed: int) -> Array:
     import drjit
 
     scene = load_scene(CONFIG, overrides=[change.between])
-    (view,), (height, width) = scene.views, scene.views[0].camera.resized(LARGER).size
+    (view,), (height, width) = scene.views, scene.views[0].camera.resize(LARGER).size
     small = replace(view.camera, size=(1, 1), half_width=view.camera.half_width / width)
     replay, volume = Replay.of(replace(scene, views=[replace(view, camera=small)])), scene.volume
     names, image = [replay.name(ending) for ending in (DENSITY, ALBEDO)], np.zeros((height, width), np.float32)

@@ -16,7 +16,7 @@ from paper_page import CONFIGS, PICTURES, SHAPES, as_options, ddrecon, rewrite_t
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct.levels import resampled
+from ddrecon.reconstruct.levels import resample
 
 NAMES_13 = {
     "default": "default",
@@ -70,7 +70,7 @@ def shape(name: str, like: Array, field: str = "density") -> Array:
     grid = Grid(like.shape[:3], *(tuple(corner[::-1]) for corner in values.bounds))  # type: ignore[arg-type]
     found = torch.from_numpy(values.values)
     moved = found if found.ndim == 3 else found.movedim(-1, 0)
-    carried = resampled(moved, grid)
+    carried = resample(moved, grid)
     return (carried if found.ndim == 3 else carried.movedim(0, -1)).numpy()
 
 

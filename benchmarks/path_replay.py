@@ -19,7 +19,7 @@ from torch import Tensor
 from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.grid import Grid
 from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
-from ddrecon.reference.trace import load_mitsuba, translated
+from ddrecon.reference.trace import load_mitsuba, translate_errors
 from ddrecon.scene import Scene
 
 RING = 2
@@ -43,7 +43,7 @@ class Replay:
         """That of `scene`, on as many threads as torch has; `headroom` 1: as Mitsuba comes."""
         module = load_mitsuba(torch.get_num_threads())
         described = mitsuba_scene(scene, scene.views[:1]) | {MEDIUM: mitsuba_scene(_roomy_scene(scene, headroom), [])[MEDIUM]}
-        loaded = module.load_dict(translated(module, described))
+        loaded = module.load_dict(translate_errors(module, described))
         integrator = module.load_dict({"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST})
         return Replay(module, loaded, module.traverse(loaded), integrator, headroom)
 

@@ -27,7 +27,7 @@ from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import reduced_light
-from ddrecon.medium.coefficients import Volume, scaled_medium
+from ddrecon.medium.coefficients import Volume, scale_medium
 
 PLUME = Path(__file__).parents[1] / "data/plume/density.npz"
 
@@ -39,7 +39,7 @@ def system(density: Tensor, sigma_t: float, device: str) -> tuple[Operator, Tens
     grid = Grid((depth, height, width), (-half[0], -half[1], -half[2]), half)
     albedo = torch.tensor([0.999, 0.9, 0.8], device=device)
     volume = Volume(grid, density.to(device), sigma_t * (1 - albedo), sigma_t * albedo, torch.tensor(0.3, device=device))
-    medium = scaled_medium(volume)
+    medium = scale_medium(volume)
     light = DirectionalLight(torch.tensor([-2.0, -2.0, -1.0], device=device), torch.full((3,), 3.14, device=device))
     source = reduced_light(medium, [light], True).source
     outside = torch.zeros(1, 1, 1, 1, device=device)

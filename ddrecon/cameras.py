@@ -1,7 +1,7 @@
 """Cameras: which world ray belongs to which pixel.
 
 Row 0 of an image is its top; +x of the image is to the right of someone looking from origin to target with `up` up. World
-vectors here are (x, y, z); `rays` hands them on in array order.
+vectors here are (x, y, z); `cast_rays` hands them on in array order.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Camera:
     principal_point: tuple[float, float] = (0.5, 0.5)
     pixel_aspect: float = 1.0
 
-    def resized(self, factor: int) -> Camera:
+    def resize(self, factor: int) -> Camera:
         """The same camera, seeing the same, with `factor` times fewer pixels along each side (at least one)."""
         height, width = (max(1, side // factor) for side in self.size)
         aspect = self.pixel_aspect * (self.size[0] * width) / (self.size[1] * height)
         return replace(self, size=(height, width), pixel_aspect=aspect)
 
 
-def twisted(camera: Camera, twist: Tensor, pivot: Triple) -> Camera:
+def twist(camera: Camera, twist: Tensor, pivot: Triple) -> Camera:
     """`camera` moved by `twist` [6]: turned about `pivot` (x, y, z) by a rotation vector [rad], then shifted [u].
 
     Both vectors are in the camera's own axes (right, up, backward). With the pivot amid what the camera looks at, a turn shows another
@@ -79,12 +79,12 @@ class Rays:
     direction: Tensor
     eye: Tensor | None
 
-    def chosen(self, index: Tensor) -> Rays:
+    def select(self, index: Tensor) -> Rays:
         """The rays at `index`."""
         return Rays(self.origin[index], self.direction[index], self.eye)
 
     @staticmethod
-    def joined(bundles: Sequence[Rays]) -> Rays:
+    def join(bundles: Sequence[Rays]) -> Rays:
         """All rays of some `bundles` of one camera, bundle by bundle."""
         return Rays(torch.cat([b.origin for b in bundles]), torch.cat([b.direction for b in bundles]), bundles[0].eye)
 
@@ -109,7 +109,7 @@ def subpixel_offsets(samples: int) -> list[tuple[float, float]]:
     return [((i + 0.5) / rows, (j + 0.5) / columns) for i in range(rows) for j in range(columns)]
 
 
-def rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Rays:
+def cast_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Rays:
     """The rays through every pixel, row by row, at `offset` (row, column) within the pixel: R = height * width."""
     height, width = camera.size
     pose = camera.pose

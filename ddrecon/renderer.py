@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
+from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
 from ddrecon.diffusion import conservative, flux_limited
 from ddrecon.diffusion.closures import CLOSURES, smooth
 from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.paper import printed
-from ddrecon.diffusion.rounds.transport import transported
+from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
@@ -26,11 +26,11 @@ from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import ambient_radiance, reduced_light
-from ddrecon.light.sky import Sky, sources
-from ddrecon.light.skylight import ambient_sky, scattered_sky, unscattered_sky
+from ddrecon.light.sky import Sky, decompose_lights
+from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
 from ddrecon.march.integral import Emission, march
-from ddrecon.medium.coefficients import Medium, has_flux, scaled_medium, unscaled_medium
-from ddrecon.numerics.autodiff import is_varied, recomputed
+from ddrecon.medium.coefficients import Medium, has_flux, keep_medium, scale_medium
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
 
@@ -78,20 +78,20 @@ def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> lis
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     """The light inside the volume of `scene`: E4 and E5 on top of the reduced light, or that alone where nothing scatters twice."""
-    medium = scaled_medium(scene.volume)
+    medium = scale_medium(scene.volume)
     if not multiply_scatters(medium, scene.diffusion):
-        return unscattered_light(unscaled_medium(scene.volume), scene.lights)
-    lights = sources(scene.lights)
+        return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
+    lights = decompose_lights(scene.lights)
     reduced = reduced_light(medium, lights, has_flux(medium))
-    sky = unscattered_sky(medium, lights, has_flux(medium))
+    sky = sum_unscattered_sky(medium, lights, has_flux(medium))
     source = reduced.source.plus(sky.scaled(1.0, medium.mean_cosine))
     diffuse = solve_diffuse(medium, source, ambient_radiance(lights, medium.g), scene.diffusion, memory)
-    return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse.plus(sky)))
+    return LightField(medium, reduced.beams, _scatter_once_more(medium, diffuse.plus(sky)))
 
 
-def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
+def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
     """The light inside `medium` that has not been scattered: beams, and by quadrature over directions ambient light and skies."""
-    parts = sources(lights)
+    parts = decompose_lights(lights)
     beams = reduced_light(medium, parts, False).beams
     skies = tuple(part for part in parts if isinstance(part, Sky))
     if any(isinstance(part, AmbientLight) for part in parts):
@@ -99,10 +99,10 @@ def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
     nothing = Moments(torch.zeros_like(medium.extinction.value))
     if has_flux(medium):
         return LightField(medium, beams, nothing, skies)
-    return LightField(medium, beams, unscattered_sky(medium, skies, has_flux=False))
+    return LightField(medium, beams, sum_unscattered_sky(medium, skies, has_flux=False))
 
 
-def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
+def _scatter_once_more(medium: Medium, light: Moments) -> Moments:
     kept = 1 - medium.forward_fraction
     return light.scaled(kept, kept * medium.mean_cosine)
 
@@ -129,7 +129,7 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
         return flux_limited.diffuse_light(medium, LIMITERS[settings.limiter], source, outside, solve, has_flux(medium))
     problem = conservative.DiffusionProblem(medium, closure, source, outside, has_flux(medium))
     light = conservative.diffuse_light(problem, solve)
-    return transported(problem, light, solve, settings.transport_rounds, settings.transport_directions)
+    return run_rounds(problem, light, solve, settings.transport_rounds, settings.transport_directions)
 
 
 def view_image(light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all") -> Tensor:
@@ -139,7 +139,7 @@ def view_image(light_field: LightField, scene: Scene, camera: Camera, derivative
     `diffusion` (E3, with the ambient light in it). The image is the same.
     """
     if derivatives == "all":
-        emission = _emission(light_field, rays(camera))
+        emission = _emission(light_field, cast_rays(camera))
         return _image(emission, scene, camera)
     nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
     once, often = replace(light_field, outgoing=nothing), replace(light_field, beams=(), skies=())
@@ -161,7 +161,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     With forward scattering the image sees the delta-Eddington scaled medium; reduced and single radiance are those of the medium
     itself, and the difference, light scattered forward once or more, belongs to `multiple`.
     """
-    once = unscattered_light(unscaled_medium(scene.volume), scene.lights)
+    once = follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     image = view_image(light_field, scene, camera)
     single = view_image(once, _without_background(scene), camera)
     reduced = view_image(once, scene, camera) - single
@@ -171,7 +171,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
 def _image(emission: Emission, scene: Scene, camera: Camera) -> Tensor:
     """Radiance [3, h, w]: E1, averaged over the rays of each pixel."""
     offsets = subpixel_offsets(scene.render.samples_per_pixel)
-    bundle = Rays.joined([rays(camera, offset) for offset in offsets])
+    bundle = Rays.join([cast_rays(camera, offset) for offset in offsets])
     behind = _background(scene.lights if scene.render.background else [], bundle)
     scattered, clear = march(emission, bundle, scene.render, float(behind.detach().max()))
     radiance = (scattered + clear * behind).unflatten(-1, (len(offsets), -1)).mean(-2)
@@ -182,9 +182,9 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to."""
     medium = light_field.medium
     towards = _towards_camera(medium, bundle)
-    diffuse = recomputed(light_field.outgoing.positive_along, towards)
+    diffuse = recompute(light_field.outgoing.positive_along, towards)
     if light_field.skies:
-        diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
+        diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
     return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g, medium.peak)
 
 

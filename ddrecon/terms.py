@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
-from ddrecon.medium.coefficients import has_flux, scaled_medium
+from ddrecon.medium.coefficients import has_flux, scale_medium
 from ddrecon.renderer import multiply_scatters
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
@@ -14,7 +14,7 @@ from ddrecon.settings import DiffusionSettings
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
-    medium = scaled_medium(scene.volume)
+    medium = scale_medium(scene.volume)
     colors = medium.extinction.scale.shape[0]
     terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
     terms += _light_terms(scene.lights, multiply_scatters(medium, scene.diffusion))

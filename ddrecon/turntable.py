@@ -19,7 +19,7 @@ def upright_axis(cameras: Sequence[Camera]) -> int:
     return int(torch.stack([camera.pose[:, 1] for camera in cameras]).sum(0).abs().argmax())
 
 
-def turned(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
+def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
     """`camera` turned by `angle` [rad] about the line along `axis` (0, 1, 2: x, y, z) through `center` (x, y, z)."""
     middle = camera.pose.new_tensor(center)
     rotation = _rotation(axis, angle).to(camera.pose)
@@ -27,11 +27,11 @@ def turned(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
     return replace(camera, pose=torch.cat([rotation @ camera.pose[:, :3], origin[:, None]], 1))
 
 
-def turntable(scene: Scene, view: View, count: int) -> list[View]:
+def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
     """`count` >= 1 views, `ring_000` that of `view` and the others like it in equal steps once around the volume of `scene`."""
     axis, center = upright_axis([item.camera for item in scene.views]), scene.volume.grid.center_xyz
     steps = [2 * math.pi * index / count for index in range(count)]
-    return [View(f"ring_{index:03d}", turned(view.camera, axis, angle, center)) for index, angle in enumerate(steps)]
+    return [View(f"ring_{index:03d}", turn_camera(view.camera, axis, angle, center)) for index, angle in enumerate(steps)]
 
 
 def _rotation(axis: int, angle: float) -> Tensor:

@@ -38,7 +38,7 @@ def test_centers_against_explicit_indices():
 
 @given(st.tuples(*[st.integers(1, 40)] * 3), st.integers(1, 50))
 def test_a_coarsened_grid_fills_the_same_box(shape: tuple[int, int, int], factor: int):
-    coarse = Grid(shape, (0, 0, 0), (1, 2, 3)).coarsened(factor)
+    coarse = Grid(shape, (0, 0, 0), (1, 2, 3)).coarsen(factor)
     assert coarse.bounds_xyz == ((0, 0, 0), (3, 2, 1))
     for cells, fine in zip(coarse.shape, shape, strict=True):
         assert cells >= 1 and abs(cells - max(1, fine / factor)) <= 0.5

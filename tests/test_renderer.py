@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ddrecon.cameras import Camera, rays
+from ddrecon.cameras import Camera, cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
@@ -96,7 +96,7 @@ def ball(make_scene, make_camera, thickness: float, g: float) -> Scene:
 
 def misses(camera: Camera, radius: float) -> Tensor:
     """Which pixels' rays stay further than `radius` from the origin, [h, w]."""
-    bundle = rays(camera)
+    bundle = cast_rays(camera)
     along = (bundle.origin * bundle.direction).sum(1)
     return ((bundle.origin**2).sum(1) - along**2 > radius**2).view(camera.size)
 

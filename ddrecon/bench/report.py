@@ -100,7 +100,7 @@ def table(rows: Sequence[Row]) -> list[str]:
     return [f"| {' | '.join(line)} |" for line in (HEAD, ["---"] * len(HEAD), *cells(rows))]
 
 
-def write_report(path: Path, rows: Sequence[Row], remarks: Sequence[str], plot: bytes | None, environment: Mapping[str, Any]) -> None:
+def write_bench_report(path: Path, rows: Sequence[Row], remarks: Sequence[str], plot: bytes | None, environment: Mapping[str, Any]) -> None:
     """Writes the rows, `remarks` on them, the `plot` (a PNG) where there is one, and the versions as a page."""
     drawn = [section("Error against time", picture(plot, "numbers are those of the legend; the line joins the best", 1080))] if plot else []
     versions = [(key, " ".join(map(str, value)) if isinstance(value, list) else value) for key, value in environment.items()]

@@ -15,12 +15,12 @@ from ddrecon.bench.measure import Progress, blocks_of, exact_shots, measure, sho
 from ddrecon.bench.path_tracing import PathTracer, Truth
 from ddrecon.bench.plot import draw
 from ddrecon.bench.plume import plume_scene
-from ddrecon.bench.report import Row, rows_of, table, write_report
+from ddrecon.bench.report import Row, rows_of, table, write_bench_report
 from ddrecon.bench.variants import QUICK, Sweep, variants_of
 from ddrecon.cli.session import Session
 from ddrecon.errors import MissingExtraError, SceneError
 from ddrecon.io.files.json_file import write_json
-from ddrecon.reconstruct.levels import at_level
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.validate import hard
 
@@ -43,9 +43,9 @@ def bench_speed(session: Session, path: Path | None, is_quick: bool, output: Pat
     click.echo("\n".join([*table(rows), *remarks]))
     if output is not None:
         write_json(output / "bench.json", found)
-        click.echo(_drawn(rows, output))
+        click.echo(_draw(rows, output))
         plot = output / "bench.png"
-        write_report(output / "report.html", rows, remarks, plot.read_bytes() if plot.is_file() else None, session.environment())
+        write_bench_report(output / "report.html", rows, remarks, plot.read_bytes() if plot.is_file() else None, session.environment())
     if report is not None:
         write_json(report, found)
     return True
@@ -73,7 +73,7 @@ def quick(scene: Scene) -> Scene:
     factor = 1
     while scene.volume.grid.cells / factor**3 > QUICK_CELLS:
         factor += 1
-    return at_level(scene, factor)
+    return scene_at_level(scene, factor)
 
 
 def run_bench(scene: Scene, double: Scene, tracer: PathTracer | None, is_quick: bool, progress: Progress) -> tuple[list[Row], Truth | None]:
@@ -106,7 +106,7 @@ def against_path_tracing(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _drawn(rows: Sequence[Row], folder: Path) -> str:
+def _draw(rows: Sequence[Row], folder: Path) -> str:
     """Draws bench.png into `folder` where matplotlib is installed; what to tell the user."""
     try:
         draw(rows, folder / "bench.png")

@@ -9,7 +9,7 @@ from typing import Any
 
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.reconstruct.levels import at_level
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
 
@@ -95,7 +95,7 @@ def _marching(factor: str, value: object, **changes: Any) -> Variant:
 
 
 def _coarser(factor: int, scene: Scene) -> Scene:
-    return replace(at_level(scene, factor), views=scene.views)
+    return replace(scene_at_level(scene, factor), views=scene.views)
 
 
 def _is_same(changed: Scene, scene: Scene) -> bool:

@@ -48,7 +48,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             from ddrecon.cli.session import open_session
 
             printing = {"dtype": others.pop("dtype", "float64"), "as_json": others.pop("as_json", False)}
-            with shown_warnings():
+            with show_warnings():
                 command(session=open_session(overrides, device, threads, seed, quiet, verbose, **printing), **others)
         except DdreconError as error:
             if debug:
@@ -81,7 +81,7 @@ def require_folder_of(report: Path | None) -> None:
 
 
 @contextmanager
-def shown_warnings() -> Iterator[None]:
+def show_warnings() -> Iterator[None]:
     """Warnings about data become lines on stderr; those of libraries are for developers and stay unseen."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -52,7 +52,7 @@ def render(
     has_mp4: bool,
 ) -> None:
     """Render the views of SCENE, a scene file or the folder of a finished run."""
-    from ddrecon.io.files.folders import claimed_folder
+    from ddrecon.io.files.folders import claim_folder
     from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
     from ddrecon.run.render_folder import render_gradient_to_folder, render_to_folder, require_variation, write_ring
@@ -67,7 +67,7 @@ def render(
         loaded, views = session.without_targets(loaded, views, count)
     if parameter is not None:
         require_variation(loaded, parameter)
-    with claimed_folder(output, may_exist=overwrite):
+    with claim_folder(output, may_exist=overwrite):
         settings = views, output, components
         if parameter is None:
             report = render_to_folder(loaded, *settings, session.progress)
@@ -101,7 +101,7 @@ def optimize(
     has_events: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.run.drive import drive, opened_run
+    from ddrecon.run.drive import drive_run, open_run
     from ddrecon.run.events import require_tensorboard
 
     if has_events:
@@ -110,8 +110,8 @@ def optimize(
         session = session.overriding(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
-    with opened_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (run, folder):
-        summary = drive(run, folder, preview_every, session.is_quiet, has_events)
+    with open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (run, folder):
+        summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
     session.show(summary, session.summary_lines(summary, output))
 
 
@@ -155,9 +155,9 @@ def bench(
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     require_folder_of(report)
     from ddrecon.bench.run import bench_hard, bench_speed
-    from ddrecon.io.files.folders import claimed_folder
+    from ddrecon.io.files.folders import claim_folder
 
-    with nullcontext() if output is None else claimed_folder(output, may_exist=overwrite):
+    with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
         has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
     if not has_passed:
         sys.exit(1)
@@ -177,17 +177,17 @@ def reference(
     session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], samples: int, is_only_traced: bool
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
-    from ddrecon.io.files.folders import claimed_folder
-    from ddrecon.reference.compare import compare_to_folder, trace_to_folder, write_report
+    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.reference.compare import compare_to_folder, trace_to_folder, write_reference_report
     from ddrecon.reference.trace import open_tracer
 
     loaded = session.load(scene)
     views = session.chosen_views(loaded, names)
     tracer = open_tracer(loaded, views, threads=session.threads)
-    with claimed_folder(output, may_exist=overwrite):
+    with claim_folder(output, may_exist=overwrite):
         settings = output, samples, session.seed, session.progress
         found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
-        report = write_report(output, found, session.environment())
+        report = write_reference_report(output, found, session.environment())
     session.show(report, session.reference_lines(report, output))
 
 

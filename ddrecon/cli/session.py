@@ -24,7 +24,7 @@ from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import suggestion
-from ddrecon.turntable import turntable
+from ddrecon.turntable import place_turntable
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
@@ -73,7 +73,7 @@ class Session:
     @staticmethod
     def without_targets(scene: Scene, views: list[View], count: int | None) -> tuple[Scene, list[View]]:
         """`scene` and `views` as if there were no target images; with `count`, so many views around the volume from the first of them."""
-        plain = turntable(scene, views[0], count) if count is not None else [View(view.name, view.camera) for view in views]
+        plain = place_turntable(scene, views[0], count) if count is not None else [View(view.name, view.camera) for view in views]
         return replace(scene, views=plain), plain
 
     def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:

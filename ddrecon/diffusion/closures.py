@@ -46,7 +46,7 @@ def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
 
     Outside a sphere this is 1 / (distance to its center), exactly: Newton's shell theorem.
     """
-    coarse = grid.coarsened(math.ceil(max(grid.shape) / COARSE_CELLS))
+    coarse = grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
     mass = adaptive_avg_pool3d(weight, coarse.shape) + 3 * BACKGROUND / sum(grid.extent)
     potential = _potential(mass, coarse) / mass.sum((1, 2, 3), keepdim=True)
     return interpolate(potential[None], size=grid.shape, mode="trilinear")[0]

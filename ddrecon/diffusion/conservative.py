@@ -16,7 +16,7 @@ from ddrecon.diffusion.implicit import Solve, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductance, face_fluxes
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import recomputed
+from ddrecon.numerics.autodiff import recompute
 
 Closure = Callable[[Tensor], Tensor]
 
@@ -38,17 +38,17 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
-        return recomputed(_diffusion, self.medium, self.closure)
+        return recompute(_diffusion, self.medium, self.closure)
 
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E7."""
         flux_along = self._source_flux()
-        z, y, x = (recomputed(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
-        loss, right = recomputed(_loss_and_source, self.medium, self.diffusion, self.source.mean, self.outside)
+        z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
+        loss, right = recompute(_loss_and_source, self.medium, self.diffusion, self.source.mean, self.outside)
         for axis, flux in flux_along.items():
             if flux is not None:
-                right = right - recomputed(_divergence, self.medium, self.diffusion, flux, axis)
+                right = right - recompute(_divergence, self.medium, self.diffusion, flux, axis)
         return Operator((z, y, x), loss), right
 
     def flux(self, mean: Tensor) -> Vector | None:
@@ -56,7 +56,7 @@ class DiffusionProblem:
         if not self.has_flux:
             return None
         along = self._source_flux().items()
-        z, y, x = (recomputed(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis) for axis, flux in along)
+        z, y, x = (recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis) for axis, flux in along)
         return z, y, x
 
     def _source_flux(self) -> dict[int, Tensor | None]:

@@ -107,7 +107,7 @@ class _Solve(torch.autograd.Function):
             operator, right = balance.system(u, *coefficients)
             return solve.solver(operator, right - operator.apply(u), None, INNER_TOLERANCE).value
 
-        return iterate(solve, "forward", torch.zeros_like(coefficients[0]), correction)
+        return iterate_picard(solve, "forward", torch.zeros_like(coefficients[0]), correction)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -123,7 +123,7 @@ class _Solve(torch.autograd.Function):
         def correction(adjoint: Tensor) -> Tensor:
             return ctx.solve.solver(operator, u_bar - pull(adjoint)[0], None, INNER_TOLERANCE).value
 
-        adjoint = iterate(ctx.solve, "adjoint", torch.zeros_like(u), correction)
+        adjoint = iterate_picard(ctx.solve, "adjoint", torch.zeros_like(u), correction)
         return None, None, *pull(-adjoint)[1:]
 
     @staticmethod
@@ -139,10 +139,10 @@ class _Solve(torch.autograd.Function):
         def correction(d_u: Tensor) -> Tensor:
             return ctx.solve.solver(operator, -right - push((d_u, *still))[0], None, INNER_TOLERANCE).value
 
-        return iterate(ctx.solve, "tangent", torch.zeros_like(u), correction)
+        return iterate_picard(ctx.solve, "tangent", torch.zeros_like(u), correction)
 
 
-def iterate(solve: Solve[Operator], kind: str, start: Tensor, correction: Callable[[Tensor], Tensor]) -> Tensor:
+def iterate_picard(solve: Solve[Operator], kind: str, start: Tensor, correction: Callable[[Tensor], Tensor]) -> Tensor:
     """The u [C, z, y, x] whose `correction` vanishes, by damped steps from the last solution of this `kind`, or from `start`.
 
     Stops when a step's norm is below the tolerance of `solve` times that of u, for every color, and records the steps and the last such

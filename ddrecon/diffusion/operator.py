@@ -42,8 +42,8 @@ class Operator:
         """The diagonal of A [1/u]."""
         total = self.loss.clone()
         for axis, conductance in zip(AXES, self.conductances, strict=True):
-            lower(total, axis).add_(conductance)
-            upper(total, axis).add_(conductance)
+            lower_cells(total, axis).add_(conductance)
+            upper_cells(total, axis).add_(conductance)
         return total
 
     def apply(self, u: Tensor) -> Tensor:
@@ -57,26 +57,26 @@ class Operator:
         return self.made[make]
 
 
-def lower(u: Tensor, axis: int) -> Tensor:
+def lower_cells(u: Tensor, axis: int) -> Tensor:
     """The cells on the low side of every interior face along `axis` (a view)."""
     return u.narrow(axis, 0, u.shape[axis] - 1)
 
 
-def upper(u: Tensor, axis: int) -> Tensor:
+def upper_cells(u: Tensor, axis: int) -> Tensor:
     """The cells on the high side of every interior face along `axis` (a view)."""
     return u.narrow(axis, 1, u.shape[axis] - 1)
 
 
 def difference(u: Tensor, axis: int) -> Tensor:
     """G u along `axis`: high side minus low side of every interior face."""
-    return upper(u, axis) - lower(u, axis)
+    return upper_cells(u, axis) - lower_cells(u, axis)
 
 
 def subtract_neighbors(result: Tensor, u: Tensor, conductances: tuple[Tensor, ...], times: float = 1.0) -> Tensor:
     """`result` minus `times` conductance times neighbor, over all interior faces; `result` is changed in place and returned."""
     for axis, conductance in zip(AXES, conductances, strict=True):
-        lower(result, axis).addcmul_(conductance, upper(u, axis), value=-times)
-        upper(result, axis).addcmul_(conductance, lower(u, axis), value=-times)
+        lower_cells(result, axis).addcmul_(conductance, upper_cells(u, axis), value=-times)
+        upper_cells(result, axis).addcmul_(conductance, lower_cells(u, axis), value=-times)
     return result
 
 
@@ -105,7 +105,7 @@ class _HarmonicMean(torch.autograd.Function):
 
     @staticmethod
     def forward(u: Tensor, axis: int) -> Tensor:
-        return lower(u, axis).reciprocal().add_(upper(u, axis).reciprocal()).reciprocal_().mul_(2)
+        return lower_cells(u, axis).reciprocal().add_(upper_cells(u, axis).reciprocal()).reciprocal_().mul_(2)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: Tensor) -> None:
@@ -117,14 +117,14 @@ class _HarmonicMean(torch.autograd.Function):
         u, mean = ctx.saved_tensors
         half = 0.5 * mean_bar * mean * mean
         u_bar = torch.zeros_like(u)
-        for side in (lower, upper):
+        for side in (lower_cells, upper_cells):
             side(u_bar, ctx.axis).addcdiv_(half, side(u, ctx.axis) ** 2)
         return u_bar, None
 
     @staticmethod
     def jvp(ctx: Any, d_u: Tensor, _: None) -> Tensor:
         u, mean = ctx.saved_tensors
-        change = sum(side(d_u, ctx.axis) / side(u, ctx.axis) ** 2 for side in (lower, upper))
+        change = sum(side(d_u, ctx.axis) / side(u, ctx.axis) ** 2 for side in (lower_cells, upper_cells))
         return 0.5 * mean * mean * change
 
 
@@ -152,7 +152,7 @@ def face_fluxes(
         low, inside, high = -_first(radiance, axis), difference(radiance, axis) / -step, _last(radiance, axis)
     if source_flux is not None:
         low, high = (side + step / 2 * end(source_flux, axis) for side, end in ((low, _first), (high, _last)))
-        inside = inside + 0.5 * (lower(source_flux, axis) + upper(source_flux, axis))
+        inside = inside + 0.5 * (lower_cells(source_flux, axis) + upper_cells(source_flux, axis))
     if outside is not None:
         low, high = low + outside, high - outside
     into, out = (_escape(end(diffusion, axis), step) for end in (_first, _last))
@@ -161,7 +161,7 @@ def face_fluxes(
 
 def cell_average(faces: Tensor, axis: int) -> Tensor:
     """Half the sum of a cell's two faces along `axis`; `faces` is one entry longer there than the cells."""
-    return 0.5 * (lower(faces, axis) + upper(faces, axis))
+    return 0.5 * (lower_cells(faces, axis) + upper_cells(faces, axis))
 
 
 def _escape(diffusion: Tensor, step: float) -> Tensor:

@@ -11,10 +11,10 @@ from torch import Tensor
 from ddrecon.grid import array_order
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
-from ddrecon.light.shear import entered_mass
+from ddrecon.light.shear import sum_mass_to_cells
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import henyey_greenstein, peaked_phase_along
-from ddrecon.numerics.autodiff import recomputed
+from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.nodes import Nodes
 
 
@@ -40,11 +40,11 @@ class Beam:
         return nodes.integral(scattering * peaked_phase_along(peak, cosine, g)), 1.0
 
 
-def _beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
+def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
     """The beam of `light`, and the moments of E tau / (4 pi) averaged over each cell along the beam."""
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
-    entered, step = recomputed(entered_mass, medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound)
-    received = irradiance / (4 * math.pi) * recomputed(medium.extinction.mean_transmittance, entered, step)
+    entered, step = recompute(sum_mass_to_cells, medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound)
+    received = irradiance / (4 * math.pi) * recompute(medium.extinction.mean_transmittance, entered, step)
     beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
     return beam, beam_moments(received, direction, has_flux)

@@ -28,22 +28,22 @@ def environment_radiance(light: EnvironmentLight, direction: Tensor) -> Tensor:
     column = 0.5 + width * (turn - turn.detach().floor())
     row = (height - 1) * torch.atan2(across.sqrt(), y) / math.pi
     points = torch.stack([(2 * column + 1) / (width + 2), (2 * row + 1) / height], -1) - 1
-    return light.scale * sample_slices(_wrapped(light.radiance)[None], points[None])[0]
+    return light.scale * sample_slices(_wrap(light.radiance)[None], points[None])[0]
 
 
-def _wrapped(radiance: Tensor) -> Tensor:
+def _wrap(radiance: Tensor) -> Tensor:
     """The map with its last column repeated before the first, and its first after the last."""
     return torch.cat([radiance[..., -1:], radiance, radiance[..., :1]], -1)
 
 
-def turned(vector: Tensor, rotation: Tensor) -> Tensor:
+def turn_directions(vector: Tensor, rotation: Tensor) -> Tensor:
     """`vector` [..., 3] (x, y, z) of a map's own frame in the world, where the map is turned by `rotation` [degrees]."""
     cosine, sine = torch.cos(torch.deg2rad(rotation)), torch.sin(torch.deg2rad(rotation))
     x, y, z = vector.unbind(-1)
     return torch.stack([cosine * x + sine * z, y, cosine * z - sine * x], -1)
 
 
-def refined(radiance: Tensor, rows: int, columns: int) -> Tensor:
+def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:
     """The map `radiance` [C, h, w], the same function of direction, written with at least so many pixels."""
     height, width = radiance.shape[1:]
     times_down = math.ceil((rows - 1) / (height - 1))
@@ -51,7 +51,7 @@ def refined(radiance: Tensor, rows: int, columns: int) -> Tensor:
     if times_down > 1:
         radiance = _between(radiance, times_down, 0, times_down * (height - 1) + 1, 1)
     if times_across > 1:
-        radiance = _between(_wrapped(radiance), times_across, times_across - times_across // 2, times_across * width, 2)
+        radiance = _between(_wrap(radiance), times_across, times_across - times_across // 2, times_across * width, 2)
     return radiance
 
 

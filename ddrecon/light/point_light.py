@@ -19,7 +19,7 @@ from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import henyey_greenstein, peaked_phase
-from ddrecon.numerics.autodiff import recomputed
+from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.nodes import Nodes
 
@@ -58,7 +58,7 @@ class PointBeam:
         return nodes.integral(scattering * phase, angle / apart), 1.0
 
 
-def point_beam(medium: Medium, light: PointLight, has_flux: bool) -> tuple[PointBeam, Moments]:
+def follow_point_light(medium: Medium, light: PointLight, has_flux: bool) -> tuple[PointBeam, Moments]:
     """The beam of `light`, and the moments of I tau / (4 pi r^2) averaged over each cell along the light's ray."""
     grid, extinction = medium.grid, medium.extinction
     position, irradiance, least = array_order(light.position), light.intensity.view(-1, 1, 1, 1), _least_square(grid)
@@ -99,7 +99,7 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
 
     count = max(1, CHUNK_SAMPLES // (2 * pairs))
     chunks = zip(ends.split(count), distance.split(count), strict=True)
-    return torch.cat([recomputed(run, *chunk) for chunk in chunks], 1).unflatten(1, grid.shape)
+    return torch.cat([recompute(run, *chunk) for chunk in chunks], 1).unflatten(1, grid.shape)
 
 
 def _gauss_pairs(count: int) -> Tensor:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.light.beam import Beam, _beam
+from ddrecon.light.beam import Beam, follow_beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments
-from ddrecon.light.point_light import PointBeam, point_beam
+from ddrecon.light.point_light import PointBeam, follow_point_light
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
 
@@ -34,7 +34,9 @@ def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> R
     total = Moments(torch.zeros_like(medium.extinction.value))
     for light in lights:
         if isinstance(light, DirectionalLight | PointLight):
-            beam, received = _beam(medium, light, has_flux) if isinstance(light, DirectionalLight) else point_beam(medium, light, has_flux)
+            beam, received = (
+                follow_beam(medium, light, has_flux) if isinstance(light, DirectionalLight) else follow_point_light(medium, light, has_flux)
+            )
             beams.append(beam)
             total = total.plus(received)
     return ReducedLight(tuple(beams), total.scaled(1.0, 3 * medium.mean_cosine))

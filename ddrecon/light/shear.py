@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.numerics.autodiff import recomputed
+from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
-from ddrecon.numerics.third_order import Smooth
+from ddrecon.numerics.third_order import ThirdOrder
 
 
-def entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+def sum_mass_to_cells(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
     """The integral of `field` from the box to where a beam enters each cell's slice, and its path length within a slice [u].
 
     `field`: [K, z, y, x]; `direction`: [3], unit, array order, the way light travels. Slices are those across the axis along
@@ -24,13 +24,13 @@ def entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | f
     carried back to cells to third order, by corrections bounded by 1 / `bound`. Returns `[K, z, y, x]` and a scalar.
     """
     if field.shape[0] == 1:
-        return _entered_mass(field, grid, direction, bound)
-    each = [recomputed(_entered_mass, one, grid, direction, bound) for one in field.split(1)]
+        return _sum_mass(field, grid, direction, bound)
+    each = [recompute(_sum_mass, one, grid, direction, bound) for one in field.split(1)]
     return torch.cat([entered for entered, _ in each]), each[0][1]
 
 
-def _entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float) -> tuple[Tensor, Tensor]:
-    """What `entered_mass` returns, of one field [1, z, y, x]."""
+def _sum_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float) -> tuple[Tensor, Tensor]:
+    """What `sum_mass_to_cells` returns, of one field [1, z, y, x]."""
     speed = direction / direction.new_tensor(grid.spacing)
     axis = int(speed.detach().abs().argmax())
     order = [axis + 1, 0] + [1 + other for other in range(3) if other != axis]
@@ -44,7 +44,7 @@ def _entered_mass(field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | 
     centers, middles = shear.there(slices, 0.0), shear.there(0.5 * (slices[1:] + slices[:-1]), 0.5)
     bends = middles - 0.5 * (centers[1:] + centers[:-1])
     finer = running_sum(torch.cat([torch.zeros_like(centers[:1]), bends])) * (0.5 * step)
-    smooth = Smooth(0, 1, bound)
+    smooth = ThirdOrder(0, 1, bound)
     entered = shear.back((running_sum(centers) - centers) * step + smooth.bounded(finer), smooth)
     if is_reversed:
         entered = entered.flip(0)
@@ -74,7 +74,7 @@ class _Shear:
         rows, columns = (Weights.at(place, size, fades=True) for place, size in zip(places, self.size, strict=True))
         return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
 
-    def back(self, sheared: Tensor, smooth: Smooth) -> Tensor:
+    def back(self, sheared: Tensor, smooth: ThirdOrder) -> Tensor:
         """Slices of values `sheared` on the lattice, in cells again."""
         places = self._places(sheared, 0.0, self.size, self.lattice, -1)
         rows, columns = (Weights.at(place, size, is_smooth=True) for place, size in zip(places, self.lattice, strict=True))

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import array_order
-from ddrecon.light.environment import pixel_moments, refined, turned
+from ddrecon.light.environment import pixel_moments, refine_map, turn_directions
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 
 PIXELS_PER_REGION = 2
@@ -45,21 +45,21 @@ Source = DirectionalLight | AmbientLight | PointLight | Sky
 """What light comes from once environment maps have been taken apart."""
 
 
-def sources(lights: Sequence[Light]) -> list[Source]:
+def decompose_lights(lights: Sequence[Light]) -> list[Source]:
     """`lights`, with every environment map as the suns, the ambient light and the sky it amounts to."""
     found: list[Source] = []
     for light in lights:
-        found += taken_apart(light) if isinstance(light, EnvironmentLight) else [light]
+        found += decompose_map(light) if isinstance(light, EnvironmentLight) else [light]
     return found
 
 
-def taken_apart(light: EnvironmentLight) -> list[DirectionalLight | AmbientLight | Sky]:
+def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLight | Sky]:
     """The suns of `light`, its mean as ambient light, and how it differs from that, region by region."""
     rows = math.ceil(math.sqrt(PIXELS_PER_REGION / 2 * light.directions))
-    radiance = refined(light.scale * light.radiance, rows, 2 * rows)
+    radiance = refine_map(light.scale * light.radiance, rows, 2 * rows)
     regions = _regions(*radiance.shape[1:], light.directions)
     base = radiance.detach().amin((1, 2))
-    received = _integrated(radiance - base[:, None, None], regions)
+    received = _integrate(radiance - base[:, None, None], regions)
     geometry = regions.moments.to(received)[..., None]
     whole = received + base * geometry
     is_sun = _are_suns(whole[:, 0].sum(-1).detach(), regions)
@@ -67,14 +67,14 @@ def taken_apart(light: EnvironmentLight) -> list[DirectionalLight | AmbientLight
     rest = torch.where(is_sun[:, None, None], -base * geometry, received)
     excess = rest[:, 0].sum(0) / (4 * math.pi)
     deviation = rest - excess * geometry
-    travel = array_order(turned(-torch.nn.functional.normalize(geometry[:, 1:, 0], dim=-1), light.rotation))
-    vector = array_order(turned(-deviation[:, 1:].transpose(1, 2), light.rotation)).transpose(1, 2)
+    travel = array_order(turn_directions(-torch.nn.functional.normalize(geometry[:, 1:, 0], dim=-1), light.rotation))
+    vector = array_order(turn_directions(-deviation[:, 1:].transpose(1, 2), light.rotation)).transpose(1, 2)
     return [*suns, AmbientLight(base + excess), Sky(travel, deviation[:, 0], vector)]
 
 
 def count_suns(light: EnvironmentLight) -> tuple[int, int]:
     """How many regions of `light` are suns, and how many there are in all."""
-    parts = taken_apart(light)
+    parts = decompose_map(light)
     regions = sum(len(part.travel) for part in parts if isinstance(part, Sky))
     return sum(isinstance(part, DirectionalLight) for part in parts), regions
 
@@ -107,7 +107,7 @@ def fibonacci_sphere(count: int) -> np.ndarray:
     return np.stack([across * np.sin(turn), y, -across * np.cos(turn)], 1)
 
 
-def _integrated(radiance: Tensor, regions: _Regions) -> Tensor:
+def _integrate(radiance: Tensor, regions: _Regions) -> Tensor:
     """Integrals of the map `radiance` [C, h, w] times 1, x, y and z over every region, `[N, 4, C]`."""
     values, label = radiance.flatten(1), regions.label.to(radiance.device)
     weights = torch.from_numpy(pixel_moments(*radiance.shape[1:])).to(values).flatten(1)
@@ -125,4 +125,4 @@ def _are_suns(irradiance: Tensor, regions: _Regions) -> Tensor:
 
 def _sun(moments: Tensor, rotation: Tensor) -> DirectionalLight:
     """The directional light of a region with `moments` [4, C], from the direction that its light has on average."""
-    return DirectionalLight(turned(-moments[1:].sum(-1), rotation), moments[0])
+    return DirectionalLight(turn_directions(-moments[1:].sum(-1), rotation), moments[0])

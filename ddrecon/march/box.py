@@ -19,19 +19,19 @@ class Crossing:
     near: Tensor
     far: Tensor
 
-    def chosen(self, is_chosen: Tensor) -> Crossing:
+    def select(self, is_chosen: Tensor) -> Crossing:
         """Some of the rays that hit."""
         return Crossing(self.hit[is_chosen], self.near[is_chosen], self.far[is_chosen])
 
 
 def cross_box(grid: Grid, rays: Rays) -> Crossing:
     """Where `rays` run inside the box of `grid`, in front of the camera."""
-    near, far = through_box(grid, rays)
+    near, far = intersect_box(grid, rays)
     hit = (far > near).nonzero()[:, 0]
     return Crossing(hit, near[hit], far[hit])
 
 
-def through_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
+def intersect_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
     """Distances [u] at which each of `rays` enters the box of `grid`, in front of the camera, and leaves it: less far where it misses."""
     low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
     tiny = torch.finfo(rays.direction.dtype).tiny

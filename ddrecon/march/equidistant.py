@@ -10,7 +10,7 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.numerics.interpolation import sample_volume
-from ddrecon.numerics.third_order import Smooth
+from ddrecon.numerics.third_order import ThirdOrder
 
 CELLS_PER_NODE = 16
 """In large volumes rays at equal steps have at least a node for so many cells at a time: each time the backward pass fills an array of
@@ -20,7 +20,7 @@ all cells."""
 class Equidistant:
     """Values at equal steps along rays, wherever these run."""
 
-    def __init__(self, fields: Tensor, smooth: Smooth | None, grid: Grid, longest: float, steps: int):
+    def __init__(self, fields: Tensor, smooth: ThirdOrder | None, grid: Grid, longest: float, steps: int):
         self.smooth = smooth
         self.fields, self.lower, self.extent = fields, fields.new_tensor(grid.lower), fields.new_tensor(grid.extent)
         self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1

@@ -17,17 +17,17 @@ from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.box import Crossing, cross_box, through_box
+from ddrecon.march.box import Crossing, cross_box, intersect_box
 from ddrecon.march.equidistant import Equidistant
-from ddrecon.march.lattice import Lattice, is_rough, lattice_for, seen_between
-from ddrecon.march.samplers import sampler_for
+from ddrecon.march.lattice import Lattice, choose_lattice, interpolate_between, is_rough
+from ddrecon.march.samplers import choose_sampler
 from ddrecon.march.slices import Slices
 from ddrecon.medium.coefficients import Coefficient
-from ddrecon.numerics.autodiff import is_varied, recomputed
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.running_sum import running_sum
-from ddrecon.numerics.third_order import Smooth
+from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.settings import RenderSettings
 
 CHUNK_NODES = 1 << 18
@@ -67,9 +67,9 @@ def march(emission: Emission, rays: Rays, settings: RenderSettings, behind: floa
     grid, crossing = emission.grid, cross_box(emission.grid, rays)
     if crossing.hit.numel() == 0:
         return _seen(emission, rays, [])
-    sampler = sampler_for(*_packed(emission), grid, rays, crossing, settings.steps_per_voxel)
+    sampler = choose_sampler(*_packed(emission), grid, rays, crossing, settings.steps_per_voxel)
     if settings.tolerance > 0 and isinstance(sampler, Slices):
-        lattice = lattice_for(grid, sampler.axis, rays.chosen(crossing.hit))
+        lattice = choose_lattice(grid, sampler.axis, rays.select(crossing.hit))
         if lattice is not None:
             return _seen(emission, rays, _interpolated(emission, sampler, lattice, rays, crossing, settings.tolerance, behind))
     return _seen(emission, rays, [_march_rays(emission, sampler, rays, crossing)])
@@ -82,9 +82,9 @@ def _interpolated(
     values = _march_lattice(emission, slices, lattice)
     scattered, opacity = values.detach().split(emission.colors)
     most = tolerance * float((scattered + behind * (1 - opacity)).square().mean().sqrt())
-    places = lattice.places(rays.chosen(crossing.hit))
-    own = crossing.chosen(is_rough(torch.cat([scattered, behind * opacity]), most, places))
-    parts = [(crossing.hit, seen_between(values, places))]
+    places = lattice.places(rays.select(crossing.hit))
+    own = crossing.select(is_rough(torch.cat([scattered, behind * opacity]), most, places))
+    parts = [(crossing.hit, interpolate_between(values, places))]
     return [*parts, _march_rays(emission, slices, rays, own)] if len(own.hit) else parts
 
 
@@ -99,15 +99,15 @@ def _seen(emission: Emission, rays: Rays, parts: Sequence[tuple[Tensor, Tensor]]
 
 def _march_rays(emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing) -> tuple[Tensor, Tensor]:
     """Those of `rays` that are in `crossing`, in some order, and radiance and opacity [2 C, P] along them."""
-    hitting = rays.chosen(crossing.hit)
+    hitting = rays.select(crossing.hit)
 
     def run(chunk: Tensor, part: Slices | Equidistant) -> Tensor:
-        chosen = hitting.chosen(chunk)
+        chosen = hitting.select(chunk)
         values, distance = part.sample(chosen.origin, chosen.direction, crossing.near[chunk], crossing.far[chunk])
         return _integrate(emission, values, Nodes(chosen.origin, chosen.direction, distance))
 
     parts = sampler.parts(hitting, max(1, CHUNK_NODES // sampler.nodes))
-    values = torch.cat([recomputed(run, *part) for part in parts], 1)
+    values = torch.cat([recompute(run, *part) for part in parts], 1)
     return crossing.hit[torch.cat([chunk for chunk, _ in parts])], values
 
 
@@ -117,23 +117,23 @@ def _march_lattice(emission: Emission, slices: Slices, lattice: Lattice) -> Tens
 
     def run(rows: Tensor, part: Slices) -> Tensor:
         rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
-        near, far = through_box(grid, rays)
+        near, far = intersect_box(grid, rays)
         values, distance = part.sample_rows(lattice, rows, columns, rays)
         inside = torch.minimum(torch.maximum(distance, near), torch.maximum(near, far))
         return _integrate(emission, values, Nodes(rays.origin, rays.direction, inside))
 
     count = max(1, CHUNK_NODES // (slices.nodes * len(lattice.columns)))
-    return torch.cat([recomputed(run, *part) for part in slices.lattice_parts(lattice, count)], 1).unflatten(1, lattice.shape)
+    return torch.cat([recompute(run, *part) for part in slices.lattice_parts(lattice, count)], 1).unflatten(1, lattice.shape)
 
 
-def _packed(emission: Emission) -> tuple[Tensor, Smooth | None, int]:
+def _packed(emission: Emission) -> tuple[Tensor, ThirdOrder | None, int]:
     """All fields to interpolate [channels, z, y, x], which of them to third order, and how many of the first tell what is empty.
 
     None do where the medium is being varied: derivatives by the density of empty cells are wanted, and must be those of what is rendered.
     """
     first = emission.extinction.field.shape[0] + emission.diffuse.shape[0]
     last = first + sum(beam.mass.shape[0] for beam in emission.beams)
-    smooth = Smooth(first, last, emission.extinction.mass_bound) if emission.beams else None
+    smooth = ThirdOrder(first, last, emission.extinction.mass_bound) if emission.beams else None
     is_fixed = not (is_varied(emission.extinction.field) or is_varied(emission.scattering.field))
     return torch.cat(_fields(emission)), smooth, emission.extinction.field.shape[0] if is_fixed else 0
 

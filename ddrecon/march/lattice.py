@@ -18,7 +18,7 @@ from torch.nn.functional import max_pool2d, normalize
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.numerics.interpolation import sample_slices
-from ddrecon.numerics.third_order import Smooth, bend
+from ddrecon.numerics.third_order import ThirdOrder, second_difference
 
 MARGIN = 2
 """Lattice rays beyond the outermost pixels: interpolation reaches so far."""
@@ -77,7 +77,7 @@ class Lattice:
         return line + apart / (self.middle - self.eye[self.axis]) * (line - self.eye[axis])
 
 
-def lattice_for(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
+def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
     """The lattice across `axis` in place of rays of one camera, all `hitting` the box.
 
     None where these are no more work themselves, or the camera is not beyond the slices along `axis`.
@@ -104,11 +104,11 @@ def lattice_for(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
     return lattice(first, last) if FEWER * count <= len(places) else None
 
 
-def seen_between(values: Tensor, places: Tensor) -> Tensor:
+def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
     """`values` [K, r, c] of lattice rays, interpolated to third order at `places` [P, 2] (rows, columns), `[K, P]`, and held at zero."""
     sizes = places.new_tensor(values.shape[1:])
     points = ((2 * places + 1) / sizes - 1).flip(-1)
-    return sample_slices(values[None], points[None], Smooth(0, values.shape[0]))[0].clamp(min=0)
+    return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0].clamp(min=0)
 
 
 def is_rough(values: Tensor, most: float, places: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ def is_rough(values: Tensor, most: float, places: Tensor) -> Tensor:
     Judged by fourth differences, which are large at edges sharper than the lattice as well.
     """
     values = values.detach()
-    uneven = sum(bend(bend(values, axis), axis).abs() for axis in (1, 2))
+    uneven = sum(second_difference(second_difference(values, axis), axis).abs() for axis in (1, 2))
     cells = max_pool2d(torch.as_tensor(uneven).sum(0, keepdim=True), 2, 1)[0]
     rows, columns = places.detach().floor().long().unbind(-1)
     return DOUBT * cells[rows, columns] > most

@@ -10,14 +10,14 @@ from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing
 from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.slices import Slices
-from ddrecon.numerics.third_order import Smooth
+from ddrecon.numerics.third_order import ThirdOrder
 
 STEEPEST = 0.2
 """Smallest direction cosine, in units of cells and against the axis across the slices, of rays that are marched by slices."""
 
 
-def sampler_for(
-    fields: Tensor, smooth: Smooth | None, filled: int, grid: Grid, rays: Rays, crossing: Crossing, steps: int
+def choose_sampler(
+    fields: Tensor, smooth: ThirdOrder | None, filled: int, grid: Grid, rays: Rays, crossing: Crossing, steps: int
 ) -> Slices | Equidistant:
     """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps.
 

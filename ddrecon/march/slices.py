@@ -17,7 +17,7 @@ from ddrecon.grid import Grid
 from ddrecon.march.lattice import Lattice
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.separable import Weights, sample_lattice
-from ddrecon.numerics.third_order import Smooth, subdivided
+from ddrecon.numerics.third_order import ThirdOrder, subdivide
 
 BAND = 4
 """Rows of cells in a band of slices."""
@@ -38,13 +38,13 @@ class Slices:
     axis: int
     planes: Tensor
     bands: tuple[Tensor, ...]
-    smooth: Smooth | None
+    smooth: ThirdOrder | None
     spans: list[tuple[int, int] | None]
     first: int = 0
     before: int = 0
 
     @staticmethod
-    def of(fields: Tensor, smooth: Smooth | None, filled: int, grid: Grid, axis: int, is_reversed: bool, steps: int) -> Slices:
+    def of(fields: Tensor, smooth: ThirdOrder | None, filled: int, grid: Grid, axis: int, is_reversed: bool, steps: int) -> Slices:
         """Those of `fields` [channels, z, y, x], in the order that light meets them from below, or from above where `is_reversed`.
 
         Where the first `filled` channels are zero there is nothing to be seen; 0: anywhere something may be.
@@ -57,8 +57,8 @@ class Slices:
             index, planes = index.flip(0), planes.flip(0)
         row, column = (other for other in range(3) if other != axis)
         slices = fields.permute(1 + axis, 1 + row, 0, 1 + column).index_select(0, index).transpose(1, 2)
-        bands = subdivided(slices, steps, smooth).split(BAND, 2)
-        return Slices(grid, axis, subdivided(planes, steps), bands, smooth, _spans(bands, filled))
+        bands = subdivide(slices, steps, smooth).split(BAND, 2)
+        return Slices(grid, axis, subdivide(planes, steps), bands, smooth, _spans(bands, filled))
 
     @property
     def nodes(self) -> int:

@@ -90,12 +90,12 @@ class Medium:
         return self.absorption.value + (1 - self.g) * self.scattering.value
 
 
-def scaled_medium(volume: Volume) -> Medium:
+def scale_medium(volume: Volume) -> Medium:
     """The delta-Eddington scaled medium of `volume`, which the whole image is rendered by (docs/theory.md, section 5)."""
     return _medium(volume, forward_fraction(volume.g), scaled_mean_cosine(volume.g))
 
 
-def unscaled_medium(volume: Volume) -> Medium:
+def keep_medium(volume: Volume) -> Medium:
     """The medium of `volume` as it is, by which path tracing separates single from multiple scattering."""
     return _medium(volume, torch.zeros_like(volume.g), volume.g)
 

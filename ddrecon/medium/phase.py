@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.chebyshev import fitted, positive_part
+from ddrecon.numerics.chebyshev import evaluate_positive, fit_chebyshev
 from ddrecon.numerics.decay import decay_mean
 
 
@@ -50,7 +50,7 @@ def peaked_phase_along(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
 
     Exact at no depth, elsewhere off by no more than 0.007 up to g = 0.95, relative to the function's value or to 1 where that is less.
     """
-    return positive_part(fitted(lambda depths: _peaked(depths, cosine.double(), g.double()), depth), depth)
+    return evaluate_positive(fit_chebyshev(lambda depths: _peaked(depths, cosine.double(), g.double()), depth), depth)
 
 
 def _peaked(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ def keep(ctx: Any, *tensors: Tensor) -> None:
         ctx.save_for_forward(*tensors)
 
 
-def recomputed(function: Callable[..., T], *arguments: object) -> T:
+def recompute(function: Callable[..., T], *arguments: object) -> T:
     """`function(*arguments)`, which must not draw random numbers: the backward pass computes it again and keeps only the arguments.
 
     What `torch.utils.checkpoint` does, without importing torch's compiler, which takes two seconds of every run.

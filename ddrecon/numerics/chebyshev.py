@@ -23,7 +23,7 @@ DEEPEST = 1e6
 """Stands for infinite depth."""
 
 
-def fitted(function: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+def fit_chebyshev(function: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     """Coefficients `[COEFFICIENTS, R]` of the polynomial that equals `function` at Chebyshev's extrema, depth 0 and infinity among them.
 
     `function` takes depths [COEFFICIENTS, 1] and returns `[COEFFICIENTS, R]`, in double precision. Differentiable through its values.
@@ -34,7 +34,7 @@ def fitted(function: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     return found.to(like.dtype)
 
 
-def positive_part(coefficients: Tensor, depth: Tensor) -> Tensor:
+def evaluate_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
     """The polynomial of `coefficients` [COEFFICIENTS, R] at `depth` [N, C, R] >= 0, and 0 where it is negative."""
     value: Tensor = _PositivePart.apply(coefficients, depth)[0]
     return value

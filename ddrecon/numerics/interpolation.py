@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ddrecon.numerics.autodiff import keep
-from ddrecon.numerics.third_order import Smooth, bend, excess, less, on_kink
+from ddrecon.numerics.third_order import ThirdOrder, kink_width, second_difference, subtract_correction, third_order_weight
 
 _BACKWARD = {4: torch.ops.aten.grid_sampler_2d_backward, 5: torch.ops.aten.grid_sampler_3d_backward}
 _BORDER = 1
@@ -70,7 +70,7 @@ def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
     """`points`, or where some lie on kinks, those points shifted to both sides along the axes on which they do."""
     sizes = points.new_tensor(values.shape[:1:-1])
     place = ((points + 1) * sizes - 1) / 2
-    near = on_kink(points, 1) * sizes
+    near = kink_width(points, 1) * sizes
     is_on_kink = (place - place.round()).abs() < near
     if not bool(is_on_kink.any()):
         return (points,)
@@ -78,34 +78,36 @@ def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
     return points - shift, points + shift
 
 
-def sample_slices(slices: Tensor, points: Tensor, smooth: Smooth | None = None) -> Tensor:
+def sample_slices(slices: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
     """Bilinear values `[N, K, P]` of `slices` [N, K, H, W] at `points` [N, P, 2] (last array axis first, in [-1, 1]).
 
     Beyond the outermost cells' centers the value is theirs. Channels in `smooth` are interpolated to third order.
     """
-    return _interpolated(slices, points[:, :, None], smooth)[..., 0]
+    return _interpolate(slices, points[:, :, None], smooth)[..., 0]
 
 
-def sample_volume(volume: Tensor, points: Tensor, smooth: Smooth | None = None) -> Tensor:
+def sample_volume(volume: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
     """Trilinear values `[K, N, P]` of `volume` [K, D, H, W] at `points` [N, P, 3] (last array axis first, in [-1, 1])."""
-    return _interpolated(volume[None], points[None, None], smooth)[0, :, 0]
+    return _interpolate(volume[None], points[None, None], smooth)[0, :, 0]
 
 
-def _interpolated(values: Tensor, points: Tensor, smooth: Smooth | None) -> Tensor:
+def _interpolate(values: Tensor, points: Tensor, smooth: ThirdOrder | None) -> Tensor:
     """Linear values `[N, K, ...]` of `values` [N, K, ...] at `points`; channels `smooth` less a (1 - a) / 2 second differences an axis.
 
     a is how far a point has gone from one cell center to the next. Linear interpolation is off by that much where a field bends.
     """
     if smooth is None:
-        return _sampled(values, points)
+        return _sample(values, points)
     axes = range(2, values.ndim)
     chosen = values[:, smooth.channels]
-    found = _sampled(torch.cat([values, *(bend(chosen, axis) for axis in axes)], 1), points)
+    found = _sample(torch.cat([values, *(second_difference(chosen, axis) for axis in axes)], 1), points)
     plain, *bends = found.split([values.shape[1]] + [chosen.shape[1]] * len(axes), 1)
-    excesses = [excess(points[..., 1 - axis], values.shape[axis])[:, None] * bent for axis, bent in zip(axes, bends, strict=True)]
-    return less(plain, torch.stack(excesses).sum(0), smooth)
+    excesses = [
+        third_order_weight(points[..., 1 - axis], values.shape[axis])[:, None] * bent for axis, bent in zip(axes, bends, strict=True)
+    ]
+    return subtract_correction(plain, torch.stack(excesses).sum(0), smooth)
 
 
-def _sampled(values: Tensor, points: Tensor) -> Tensor:
+def _sample(values: Tensor, points: Tensor) -> Tensor:
     found: Tensor = _Sample.apply(values, points)
     return found

@@ -17,7 +17,7 @@ def running_sum(values: Tensor) -> Tensor:
 class _RunningSum(torch.autograd.Function):
     @staticmethod
     def forward(values: Tensor) -> Tensor:
-        return _summed(values, range(len(values)))
+        return _accumulate(values, range(len(values)))
 
     @staticmethod
     def setup_context(ctx: object, inputs: tuple[Tensor], output: Tensor) -> None:
@@ -25,14 +25,14 @@ class _RunningSum(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: object, total_bar: Tensor) -> Tensor:
-        return _summed(total_bar, range(len(total_bar) - 1, -1, -1))
+        return _accumulate(total_bar, range(len(total_bar) - 1, -1, -1))
 
     @staticmethod
     def jvp(ctx: object, d_values: Tensor) -> Tensor:
-        return _summed(d_values, range(len(d_values)))
+        return _accumulate(d_values, range(len(d_values)))
 
 
-def _summed(values: Tensor, order: range) -> Tensor:
+def _accumulate(values: Tensor, order: range) -> Tensor:
     """The sums so far of `values` along axis 0, taken in `order`."""
     total = values.clone(memory_format=torch.contiguous_format)
     for before, index in pairwise(order):

@@ -46,19 +46,19 @@ def differentiate(
         image = view_image(given, world, view.camera, derivatives)
         part = loss_of(view, image)
         if part.requires_grad:
-            totals = _added(totals, torch.autograd.grad(part, leaves, allow_unused=True))
+            totals = _add(totals, torch.autograd.grad(part, leaves, allow_unused=True))
         images.append(image.detach())
         loss = loss + part.detach()
     direct, bars = totals[: len(values)], totals[len(values) :]
     reached = [(tensor, bar) for tensor, bar in zip(held.tensors, bars, strict=True) if bar is not None]
     if reached:
         tensors, given_bars = zip(*reached, strict=True)
-        direct = _added(direct, torch.autograd.grad(tensors, list(values.values()), given_bars, allow_unused=True))
+        direct = _add(direct, torch.autograd.grad(tensors, list(values.values()), given_bars, allow_unused=True))
     gradients = {name: torch.zeros_like(values[name]) if bar is None else bar for name, bar in zip(values, direct, strict=True)}
     return Differentiated(images, loss, gradients)
 
 
-def _added(totals: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
+def _add(totals: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
     return [one if other is None else other if one is None else one + other for one, other in zip(totals, more, strict=True)]
 
 

@@ -18,13 +18,13 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import DivergenceError, SceneError, SolveError
 from ddrecon.losses import image_loss, psnr
-from ddrecon.reconstruct.divergence import flawed_place, largest_place
+from ddrecon.reconstruct.divergence import describe_flaw, describe_largest
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
-from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
+from ddrecon.reconstruct.levels import factors, resample, scene_at_level, stage_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate, rate_at
-from ddrecon.reconstruct.tolerance import enough
-from ddrecon.reconstruct.views import chosen
+from ddrecon.reconstruct.tolerance import solve_tolerances
+from ddrecon.reconstruct.views import pick_views
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.settings import OptimizeSettings, ParameterSettings
@@ -52,7 +52,7 @@ NOTHING = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0)
 """The sum of no rows."""
 
 
-def summed(total: Row, row: Row) -> Row:
+def sum_rows(total: Row, row: Row) -> Row:
     """`total` of the rows before `row`, and it: `row` itself, with all solver iterations so far and the last known PSNR of test views."""
     return replace(
         row,
@@ -159,14 +159,14 @@ class Reconstruction:
         test = self._test_psnr() if last % TEST_EVERY == 0 or last == self.settings.iterations else None
         seconds, cells = self.total.seconds + perf_counter() - start, self.train_level.volume.grid.cells
         row = Row(last, seconds, float(loss), quality, test, solves["forward"], solves["adjoint"], cells)
-        self.total = summed(self.total, row)
+        self.total = sum_rows(self.total, row)
         return row
 
     def current_scene(self) -> Scene:
         """The scene at full resolution, with everything as reconstructed so far."""
         with torch.no_grad():
             values = {
-                p.name: resampled(p.value.detach(), self.full.volume.grid).clone() if p.is_field else p.value.detach().clone()
+                p.name: resample(p.value.detach(), self.full.volume.grid).clone() if p.is_field else p.value.detach().clone()
                 for p in self.parameters
             }
             return with_values(self.full, values)
@@ -193,26 +193,26 @@ class Reconstruction:
 
     def _enter_stage(self, stage: int) -> None:
         self.stage = stage
-        self.train_level, self.test_level = (at_level(scene, self.factors[stage]) for scene in (self.train, self.test))
+        self.train_level, self.test_level = (scene_at_level(scene, self.factors[stage]) for scene in (self.train, self.test))
         grid = self.train_level.volume.grid
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
-        self.memory.last = {kind: resampled(field, grid) for kind, field in self.memory.last.items()}
+        self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
 
     def _values(self) -> dict[str, Tensor]:
         return {parameter.name: parameter.value for parameter in self.parameters}
 
     def _seen(self) -> list[View]:
         views = self.train_level.views
-        return [views[index] for index in chosen(len(views), self.settings.views_per_iteration, self.iteration, self.seed)]
+        return [views[index] for index in pick_views(len(views), self.settings.views_per_iteration, self.iteration, self.seed)]
 
     def _loss_of(self, views: list[View]) -> Callable[[View, Tensor], Tensor]:
         """What a view adds to the objective: its share, by weight, of the mean over `views`."""
         total = sum(view.weight for view in views)
 
         def loss_of(view: View, image: Tensor) -> Tensor:
-            ((_, target, mask),) = _compared([image], [view])
+            ((_, target, mask),) = _compare([image], [view])
             loss = view.weight / total * image_loss(self.settings.loss, image, target, mask)
             if not bool(torch.isfinite(loss)):
                 raise self._diverged(f"the loss of view {view.name} is not finite")
@@ -239,7 +239,7 @@ class Reconstruction:
             return _mean_psnr(render_each(level, level.views, self.memory), level.views)
 
     def _differentiated(self, seen: list[View]) -> Differentiated:
-        self.memory.enough = enough(self.misfit)
+        self.memory.enough = solve_tolerances(self.misfit)
         try:
             return differentiate(self.train_level, [view.name for view in seen], self._values(), self._loss_of(seen), self.memory)
         finally:
@@ -247,7 +247,7 @@ class Reconstruction:
 
     def _require_finite(self, gradients: dict[str, Tensor]) -> None:
         for parameter in self.parameters:
-            if place := flawed_place(parameter.name, gradients[parameter.name], parameter.is_field):
+            if place := describe_flaw(parameter.name, gradients[parameter.name], parameter.is_field):
                 raise self._diverged(f"the derivative of the loss with respect to {place} is not finite")
 
     def _unsolved(self, error: SolveError) -> DivergenceError:
@@ -257,7 +257,7 @@ class Reconstruction:
 
     def _diverged(self, what: str, residual: float = math.nan, advice: str = "") -> DivergenceError:
         """The error of the iteration being made; `advice` goes before that to lower learning rates."""
-        largest = "; ".join(largest_place(parameter.name, parameter.value, parameter.is_field) for parameter in self.parameters)
+        largest = "; ".join(describe_largest(parameter.name, parameter.value, parameter.is_field) for parameter in self.parameters)
         rates = " and ".join(f"optimize.parameters.{parameter.name}.lr (now {parameter.rate:.3g})" for parameter in self.parameters)
         return DivergenceError(self.iteration + 1, f"{what}; at most, {largest}", residual, f"{advice}lower {rates}")
 
@@ -274,7 +274,7 @@ def _require_usable(train: Scene, settings: OptimizeSettings) -> None:
     absent = [name for name in settings.parameters if name not in known]
     problems = [f"optimize.parameters.{name}: there is no training view of this name with an image" for name in absent]
     for view in train.views:
-        if view.image is not None and (place := flawed_place("the image", view.image, is_field=False)):
+        if view.image is not None and (place := describe_flaw("the image", view.image, is_field=False)):
             problems.append(f"views.{view.name}: {place} is not finite")
     if problems:
         raise SceneError(problems)
@@ -286,10 +286,10 @@ def _with_images(scene: Scene, is_test: bool) -> Scene:
 
 
 def _mean_psnr(images: list[Tensor], views: list[View]) -> float:
-    values = [psnr(*compared) for compared in _compared(images, views)]
+    values = [psnr(*compared) for compared in _compare(images, views)]
     return sum(values) / len(values)
 
 
-def _compared(images: list[Tensor], views: list[View]) -> list[tuple[Tensor, Tensor, Tensor | None]]:
+def _compare(images: list[Tensor], views: list[View]) -> list[tuple[Tensor, Tensor, Tensor | None]]:
     """Rendered image, target and mask of each view that has a target."""
     return [(image, view.image, view.mask) for image, view in zip(images, views, strict=True) if view.image is not None]

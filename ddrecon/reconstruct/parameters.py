@@ -10,7 +10,7 @@ from torch.optim.adam import adam
 
 from ddrecon.grid import Grid
 from ddrecon.losses import total_variation
-from ddrecon.reconstruct.levels import resampled
+from ddrecon.reconstruct.levels import resample
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import KINDS, pattern_of
 
@@ -75,8 +75,8 @@ class Parameter:
         self.grid = grid
         if not self.is_field:
             return
-        self.value = resampled(self.value.detach(), grid).clone().requires_grad_()
-        first, second = (resampled(moment, grid) for moment in self.moments)
+        self.value = resample(self.value.detach(), grid).clone().requires_grad_()
+        first, second = (resample(moment, grid) for moment in self.moments)
         self.moments = first * share, second * share**2
 
     def state(self) -> dict[str, Any]:

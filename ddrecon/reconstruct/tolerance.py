@@ -11,6 +11,6 @@ GRADIENT_ERROR = 0.01
 """The relative error that each of the two solves may make in the gradient."""
 
 
-def enough(misfit: float) -> dict[str, float]:
+def solve_tolerances(misfit: float) -> dict[str, float]:
     """By kind of solve, the tolerance [relative residual] that is enough at `misfit` >= 0, of the last images that were compared."""
     return {"forward": GRADIENT_ERROR * min(misfit, 1.0), "adjoint": GRADIENT_ERROR}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 
-def chosen(count: int, wanted: int, iteration: int, seed: int) -> list[int]:
+def pick_views(count: int, wanted: int, iteration: int, seed: int) -> list[int]:
     """Which of `count` views `iteration` looks at: `wanted` of them (0: all), every view once before any comes again, ordered by `seed`."""
     if not 0 < wanted < count:
         return list(range(count))

@@ -15,23 +15,23 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLigh
 from ddrecon.scene import Scene
 
 
-def of_color(scene: Scene, color: int) -> Scene:
+def pick_color(scene: Scene, color: int) -> Scene:
     """`scene` as seen in `color` (0, 1, 2 for red, green, blue) alone; views keep their cameras only."""
-    volume = replace(scene.volume, sigma_a=_picked(scene.volume.sigma_a, color), sigma_s=_picked(scene.volume.sigma_s, color))
+    volume = replace(scene.volume, sigma_a=_pick(scene.volume.sigma_a, color), sigma_s=_pick(scene.volume.sigma_s, color))
     return replace(scene, volume=volume, lights=[_light(light, color) for light in scene.lights])
 
 
 def _light(light: Light, color: int) -> Light:
     if isinstance(light, DirectionalLight):
-        return replace(light, irradiance=_picked(light.irradiance, color))
+        return replace(light, irradiance=_pick(light.irradiance, color))
     if isinstance(light, AmbientLight):
-        return replace(light, radiance=_picked(light.radiance, color))
+        return replace(light, radiance=_pick(light.radiance, color))
     if isinstance(light, EnvironmentLight):
-        return replace(light, radiance=_picked(light.radiance, color))
-    return replace(light, intensity=_picked(light.intensity, color))
+        return replace(light, radiance=_pick(light.radiance, color))
+    return replace(light, intensity=_pick(light.intensity, color))
 
 
-def _picked(value: Tensor, color: int) -> Tensor:
+def _pick(value: Tensor, color: int) -> Tensor:
     """The entry of `value` [C, ...] that belongs to `color`, still with a leading axis."""
     index = color % value.shape[0]
     return value[index : index + 1]

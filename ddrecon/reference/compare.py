@@ -64,7 +64,7 @@ def compare_to_folder(
     return report
 
 
-def write_report(folder: Path, report: dict[str, Any], environment: dict[str, Any]) -> dict[str, Any]:
+def write_reference_report(folder: Path, report: dict[str, Any], environment: dict[str, Any]) -> dict[str, Any]:
     """Writes `report` and the `environment` it was made in to `reference.json` in `folder`, and returns both together."""
     import mitsuba
 

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ddrecon.errors import SceneError
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.images.exr import write_exr
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
@@ -62,7 +62,7 @@ def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
         else:
             write_exr(file, array)
     ElementTree.indent(root, "    ")
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
     return written
 

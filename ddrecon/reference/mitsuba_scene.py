@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from ddrecon.cameras import Camera, rays
+from ddrecon.cameras import Camera, cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
@@ -163,7 +163,7 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
 
 def _starts_inside(name: str, camera: Camera, grid: Grid) -> bool:
     """Whether view rays start inside the box of `grid`; Mitsuba is told so once for all of them."""
-    start = rays(camera).origin.detach()
+    start = cast_rays(camera).origin.detach()
     lower, upper = (start.new_tensor(corner) for corner in (grid.lower, grid.upper))
     is_inside = ((start > lower) & (start < upper)).all(1)
     if bool(is_inside.any()) and not bool(is_inside.all()):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ddrecon.extras import load_extra
-from ddrecon.reference.colors import of_color
+from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import is_gray, mitsuba_scene, sensor_id
 from ddrecon.scene import Scene, View
 
@@ -40,8 +40,8 @@ def open_tracer(scene: Scene, views: Sequence[View], depth: int = -1, threads: i
     Colors whose extinctions differ are traced one by one. Raises MissingExtraError without Mitsuba, SceneError for what it cannot show.
     """
     module = load_mitsuba(threads)
-    scenes = [scene] if is_gray(scene.volume) else [of_color(scene, color) for color in range(3)]
-    return Tracer(module, tuple(module.load_dict(translated(module, mitsuba_scene(one, views, depth))) for one in scenes))
+    scenes = [scene] if is_gray(scene.volume) else [pick_color(scene, color) for color in range(3)]
+    return Tracer(module, tuple(module.load_dict(translate_errors(module, mitsuba_scene(one, views, depth))) for one in scenes))
 
 
 def load_mitsuba(threads: int | None = None) -> ModuleType:
@@ -59,10 +59,10 @@ def load_mitsuba(threads: int | None = None) -> ModuleType:
     return mitsuba
 
 
-def translated(module: ModuleType, value: Any) -> Any:
+def translate_errors(module: ModuleType, value: Any) -> Any:
     """A description by `mitsuba_scene` with Mitsuba's own objects in it."""
     if isinstance(value, dict):
-        return {key: translated(module, entry) for key, entry in value.items()}
+        return {key: translate_errors(module, entry) for key, entry in value.items()}
     if isinstance(value, tuple):
         return {"type": "rgb", "value": list(value)}
     if isinstance(value, np.ndarray):

@@ -16,12 +16,12 @@ MOST = 500
 """Points of a curve that are drawn."""
 
 
-def curve(title: str, series: Mapping[str, Sequence[Point]], across: str, is_logarithmic: bool = False) -> str:
+def draw_curve(title: str, series: Mapping[str, Sequence[Point]], across: str, is_logarithmic: bool = False) -> str:
     """The `series` of points (x, y) as lines, with a legend; `across` says what x is. `is_logarithmic`: y by its logarithm, if > 0.
 
     There must be at least one point; those that are not finite are left out.
     """
-    drawn = {name: _thinned([p for p in points if _is_shown(p[1], is_logarithmic)]) for name, points in series.items()}
+    drawn = {name: _thin([p for p in points if _is_shown(p[1], is_logarithmic)]) for name, points in series.items()}
     drawn = {name: points for name, points in drawn.items() if points}
     xs = [x for points in drawn.values() for x, _ in points] or [0.0]
     ys = [math.log10(y) if is_logarithmic else y for points in drawn.values() for _, y in points] or [0.0]
@@ -73,7 +73,7 @@ def _is_shown(y: float, is_logarithmic: bool) -> bool:
     return math.isfinite(y) and (y > 0 or not is_logarithmic)
 
 
-def _thinned(points: Sequence[Point]) -> list[Point]:
+def _thin(points: Sequence[Point]) -> list[Point]:
     """Every so many of `points` and the last, at most about `MOST`."""
     every = max(1, len(points) // MOST)
     return [*points[: len(points) - 1 : every], *points[-1:]]

@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 
 STYLE = """
 :root { color-scheme: light dark; --line: #8885; --soft: #8882; }
@@ -27,7 +27,7 @@ def write_page(path: Path, title: str, lead: str, sections: Sequence[str]) -> No
     """Writes the page of `sections` under `title`, with `lead`, a sentence, between them, to `path`."""
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
     body = f"<h1>{escape(title)}</h1>\n<p>{escape(lead)}</p>\n" + "\n".join(sections)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n'
         temporary.write_text(text, encoding="utf-8")
 
@@ -66,6 +66,6 @@ def picture(png: bytes, caption: str, width: int = 600) -> str:
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def folded(summary: str, text: str) -> str:
+def fold(summary: str, text: str) -> str:
     """`text` as it stands, shown when `summary` is clicked."""
     return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>"

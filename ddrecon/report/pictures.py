@@ -22,7 +22,7 @@ def pixels(image: Tensor) -> np.ndarray:
     return array
 
 
-def white_of(image: np.ndarray) -> float:
+def find_white(image: np.ndarray) -> float:
     """The radiance that is shown as white: that of the brightest pixels of `image` [h, w, 3], but for one in a thousand."""
     return max(float(np.quantile(image.max(-1), 0.999)), 1e-6)
 
@@ -30,9 +30,9 @@ def white_of(image: np.ndarray) -> float:
 def comparison(target: Tensor, image: Tensor) -> np.ndarray:
     """Target, render and enlarged difference side by side; brightness scaled so that the target's brightest pixels are just white."""
     wanted, got = pixels(target), pixels(image)
-    white = white_of(wanted)
+    white = find_white(wanted)
     difference = np.clip(0.5 + ENLARGED * (got - wanted) / (2 * white), 0, 1) ** 2.2
-    return beside([wanted / white, got / white, difference])
+    return place_beside([wanted / white, got / white, difference])
 
 
 def slices(field: Tensor) -> np.ndarray:
@@ -59,10 +59,10 @@ def _cells_of(field: Tensor) -> np.ndarray:
 def _three_sides(sides: list[np.ndarray], white: float) -> np.ndarray:
     """Sides [y, x], [z, y] and [z, x], each with colors, as pictures in a row: y to the top, or z where there is no y."""
     across_z, across_x, across_y = (side / white for side in sides)
-    return beside([across_z[::-1], across_x[:, ::-1].transpose(1, 0, 2), across_y[::-1]])
+    return place_beside([across_z[::-1], across_x[:, ::-1].transpose(1, 0, 2), across_y[::-1]])
 
 
-def reduced(image: Tensor, most: int) -> Tensor:
+def shrink(image: Tensor, most: int) -> Tensor:
     """`image` [3, h, w] with so many fewer pixels, means of squares of them, that neither side has more than `most`."""
     factor = -(-max(image.shape[1:]) // most)
     return image if factor == 1 else avg_pool2d(image, factor, ceil_mode=True)
@@ -77,7 +77,7 @@ def diverging(image: Tensor) -> tuple[np.ndarray, float]:
     return decode((1 - np.abs(part)) + np.abs(part) * strong), full
 
 
-def beside(pictures: list[np.ndarray]) -> np.ndarray:
+def place_beside(pictures: list[np.ndarray]) -> np.ndarray:
     """`pictures` in a row, top-aligned, on gray."""
     height = max(picture.shape[0] for picture in pictures)
     row = []

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ddrecon.errors import DataWarning, FormatError, SceneError
-from ddrecon.io.files.atomic import replacing_durably
+from ddrecon.io.files.atomic import replace_file_durably
 from ddrecon.run.differences import differences
 
 FORMAT = 3
@@ -22,7 +22,7 @@ LAST, PREVIOUS = "last.pt", "previous.pt"
 
 def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any]) -> None:
     """Writes `state`, and a description of the `scene` it belongs to, as the last checkpoint in `folder`."""
-    with replacing_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary, temporary.open("wb") as stream:
+    with replace_file_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary, temporary.open("wb") as stream:
         try:
             torch.save({"format": FORMAT, "scene": scene, "state": state}, stream)
         except RuntimeError as error:  # in which torch's writer wraps that the disk is full
@@ -38,11 +38,11 @@ def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, A
     if not last.exists() and not previous.exists():
         raise SceneError(f"{last}: there is no checkpoint to resume from; run without --resume")
     try:
-        return _checked(last, _load(last), scene), last
+        return _check(last, _load(last), scene), last
     except FormatError as error:
         if not previous.exists():
             raise
-        state = _checked(previous, _load(previous), scene)
+        state = _check(previous, _load(previous), scene)
         warnings.warn(f"{error.path}: {error.reason.partition(';')[0]}; going on from {previous}", DataWarning, 2)
         return state, previous
 
@@ -68,7 +68,7 @@ def _load(path: Path) -> dict[str, Any]:
     return content
 
 
-def _checked(path: Path, content: dict[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
+def _check(path: Path, content: dict[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
     if content.get("format") != FORMAT:
         written = content.get("format")
         raise FormatError(path, f"a checkpoint of format {written}; this version reads {FORMAT}; start anew with --overwrite")

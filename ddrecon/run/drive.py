@@ -13,7 +13,7 @@ from typing import Any
 from tqdm import tqdm
 
 from ddrecon.errors import DivergenceError, FormatError, SceneError
-from ddrecon.io.files.folders import claimed_folder
+from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.reconstruct.loop import Reconstruction, Row
 from ddrecon.run.checkpoint import LAST, load_checkpoint
@@ -26,7 +26,7 @@ from ddrecon.scene_file.load import SceneFile
 
 
 @contextmanager
-def opened_run(
+def open_run(
     scene: Scene, scene_file: SceneFile, path: Path, environment: dict[str, Any], *, may_exist: bool, resume: bool
 ) -> Iterator[tuple[Reconstruction, RunFolder]]:
     """A run of `scene` and its folder `path`, this process's alone until the block ends, with the resolved scene and environment in it.
@@ -40,7 +40,7 @@ def opened_run(
         raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
-    with claimed_folder(path, may_exist=may_exist or resume):
+    with claim_folder(path, may_exist=may_exist or resume):
         folder = RunFolder(path, scene_file, result_of, environment | {"seed": run.seed})
         if loaded is None:
             folder.start(run)
@@ -63,7 +63,9 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     return loaded
 
 
-def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool, has_events: bool = False) -> dict[str, Any]:
+def drive_run(
+    run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool, has_events: bool = False
+) -> dict[str, Any]:
     """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as well; returns the summary.
 
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint before it is passed on. So does a
@@ -72,7 +74,7 @@ def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_
     total = run.settings.iterations
     try:
         with (
-            deferred_interrupt() as asked,
+            defer_interrupt() as asked,
             event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
             tqdm(total=total, initial=run.iteration, desc="optimize", file=sys.stderr, disable=is_quiet) as bar,
         ):
@@ -97,7 +99,7 @@ def drive(run: Reconstruction, folder: RunFolder, preview_every: int | None, is_
 
 
 @contextmanager
-def deferred_interrupt() -> Iterator[list[int]]:
+def defer_interrupt() -> Iterator[list[int]]:
     """A list that fills when the process is asked to stop, so that an iteration is never torn; asked twice, it stops at once."""
     asked: list[int] = []
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.errors import DataWarning
-from ddrecon.io.files.atomic import flush, refusals, replacing
+from ddrecon.io.files.atomic import flush, refusals, replace_file
 from ddrecon.reconstruct.loop import Row
 
 COLUMNS = [field.name for field in fields(Row)]
@@ -49,7 +49,7 @@ class LossLog:
         return [Row(*(kind(cell) for kind, cell in zip(KINDS, row, strict=True))) for row in self._read()]
 
     def _write(self, rows: list[list[str]]) -> None:
-        with replacing(self.path) as temporary, temporary.open("w", newline="") as stream:
+        with replace_file(self.path) as temporary, temporary.open("w", newline="") as stream:
             csv.writer(stream).writerows([COLUMNS, *rows])
 
     def _read(self) -> list[list[str]]:

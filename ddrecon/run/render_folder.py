@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SceneError
-from ddrecon.io.images.movies import encoded, write_animation, write_mp4
+from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import psnr
 from ddrecon.renderer import LightField, solve_light, view_components, view_image
-from ddrecon.report.pictures import diverging, pixels, white_of
+from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.variables.tangents import render_tangent, variation
@@ -74,8 +74,8 @@ def render_gradient_to_folder(
 def write_ring(views: list[View], folder: Path, has_mp4: bool) -> dict[str, Any]:
     """Writes the images of `views` in `folder` as one movie, `ring.png` and where asked for `ring.mp4`; what the report says of it."""
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
-    white = max(map(white_of, images))
-    frames, written = encoded(images, white), ["ring.png"]
+    white = max(map(find_white, images))
+    frames, written = encode_frames(images, white), ["ring.png"]
     write_animation(folder / "ring.png", frames)
     if has_mp4:
         write_mp4(folder / "ring.mp4", frames)

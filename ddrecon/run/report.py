@@ -11,16 +11,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.io.images.movies import animation_of, encoded
+from ddrecon.io.images.movies import animation_of, encode_frames
 from ddrecon.io.images.table import png_of
 from ddrecon.reconstruct.loop import Row
 from ddrecon.renderer import LightField, view_image
-from ddrecon.report.curve import curve
-from ddrecon.report.page import folded, items, paragraph, picture, section, side_by_side, table, write_page
-from ddrecon.report.pictures import comparison, pixels, projections, reduced, slices, white_of
+from ddrecon.report.curve import draw_curve
+from ddrecon.report.page import fold, items, paragraph, picture, section, side_by_side, table, write_page
+from ddrecon.report.pictures import comparison, find_white, pixels, projections, shrink, slices
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
-from ddrecon.turntable import turntable
+from ddrecon.turntable import place_turntable
 from ddrecon.variables.values import VOLUME, value_of
 
 SHOWN = 12
@@ -45,7 +45,7 @@ class Findings:
     settings: str
 
 
-def write_report(path: Path, found: Findings) -> None:
+def write_run_report(path: Path, found: Findings) -> None:
     """Writes the report of what was `found` to `path`."""
     grid = found.scene.volume.grid
     cells = " x ".join(str(count) for count in reversed(grid.shape))
@@ -56,12 +56,12 @@ def write_report(path: Path, found: Findings) -> None:
     )
     sections = [
         section("Loss", side_by_side(*_curves(found.rows))),
-        section("Views", *_compared(found), _view_table(found)),
+        section("Views", *_compare(found), _view_table(found)),
         section("Volumes", *_volumes(found.scene)),
         section("Turntable", _turntable(found)),
         section("Timings", _timings(found.rows)),
         section("Physics", paragraph("What this scene needed, and so was computed:"), items(needed_terms(found.scene))),
-        section("Settings", folded("scene.yaml, all defaults filled in", found.settings)),
+        section("Settings", fold("scene.yaml, all defaults filled in", found.settings)),
         section("Versions", table(["", ""], [(key, _shown(value)) for key, value in found.environment.items()])),
     ]
     write_page(path, f"ddrecon: {path.absolute().parent.name}", lead, sections)
@@ -71,11 +71,11 @@ def _curves(rows: Sequence[Row]) -> list[str]:
     """Loss and PSNR by iteration."""
     quality = {"seen": [(float(row.iteration), row.psnr) for row in rows]}
     tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
-    loss = curve("loss", {"": [(float(row.iteration), row.loss) for row in rows]}, "iteration", is_logarithmic=True)
-    return [loss, curve("PSNR [dB]", quality | ({"held out": tests} if tests else {}), "iteration")]
+    loss = draw_curve("loss", {"": [(float(row.iteration), row.loss) for row in rows]}, "iteration", is_logarithmic=True)
+    return [loss, draw_curve("PSNR [dB]", quality | ({"held out": tests} if tests else {}), "iteration")]
 
 
-def _compared(found: Findings) -> list[str]:
+def _compare(found: Findings) -> list[str]:
     """Target, render and difference of the first views, those held out before the others."""
     views = sorted((view for view in found.scene.views if view.name in found.images), key=lambda view: not view.is_test)
     parts = [
@@ -89,7 +89,7 @@ def _compared(found: Findings) -> list[str]:
 
 def _comparison(view: View, image: Tensor, quality: Mapping[str, Any]) -> str:
     target = image if view.image is None else view.image
-    shown = comparison(reduced(target, LARGEST), reduced(image, LARGEST))
+    shown = comparison(shrink(target, LARGEST), shrink(image, LARGEST))
     return picture(png_of(shown), f"{view.name} ({quality['split']}): {quality['psnr']:.2f} dB")
 
 
@@ -118,12 +118,12 @@ def _volumes(scene: Scene) -> list[str]:
 
 def _turntable(found: Findings) -> str:
     first = found.scene.views[0]
-    small = View(first.name, first.camera.resized(-(-max(first.camera.size) // FRAME)))
+    small = View(first.name, first.camera.resize(-(-max(first.camera.size) // FRAME)))
     with torch.no_grad():
-        views = turntable(found.scene, small, FRAMES)
+        views = place_turntable(found.scene, small, FRAMES)
         images = [pixels(view_image(found.light_field, found.scene, view.camera)) for view in views]
-    white = max(map(white_of, images))
-    animation = animation_of(encoded(images, white))
+    white = max(map(find_white, images))
+    animation = animation_of(encode_frames(images, white))
     caption = f"Once around the upright axis, from {first.name}; radiance {white:.3g} is white. Larger: ddrecon render RUN --ring 60"
     return picture(animation, caption, 300)
 

@@ -40,11 +40,11 @@ def describe_result(scene_file: SceneFile, scene: Scene, found: Mapping[str, Any
             described["lights"][int(index)]["file" if isinstance(value, str) else attribute] = value
     for view, section in zip(scene.views, described["views"], strict=True):
         is_found = f"views.{view.name}.camera" in found
-        section["camera"] = _moved(section["camera"], view.camera.pose.tolist() if is_found else None, view.camera.size)
+        section["camera"] = _move_file(section["camera"], view.camera.pose.tolist() if is_found else None, view.camera.size)
     return described
 
 
-def _moved(camera: dict[str, Any], pose: list[list[float]] | None, size: tuple[int, int]) -> dict[str, Any]:
+def _move_file(camera: dict[str, Any], pose: list[list[float]] | None, size: tuple[int, int]) -> dict[str, Any]:
     """The section `camera` with its pixels said, and standing where `pose` [3, 4] says if that is given."""
     sized = camera | {"resolution": [size[1], size[0]]}
     if pose is None:

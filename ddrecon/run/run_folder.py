@@ -23,7 +23,7 @@ from ddrecon.renderer import LightField, solve_light, view_image
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.report import Findings, write_report
+from ddrecon.run.report import Findings, write_run_report
 from ddrecon.run.result import RESULT, describe_result, found_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
@@ -101,7 +101,7 @@ class RunFolder:
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
         findings = Findings(scene, light_field, images, quality, self.log.rows(), summary, self.environment, settings)
-        write_report(self.path / "report.html", findings)
+        write_run_report(self.path / "report.html", findings)
         return summary
 
     def _stored(self, scene: Scene, name: str) -> Any:

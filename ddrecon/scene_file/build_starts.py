@@ -47,7 +47,7 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     if isinstance(settings.init, FieldFile):
         value = _from_file(scene_file, f"{key}.init.file", name, settings.init, value)
     elif settings.init is not None:
-        value = _filled(scene_file, f"{key}.init", kind, settings.init, value)
+        value = _fill(scene_file, f"{key}.init", kind, settings.init, value)
     if kind.is_cellwise:
         value = _spread(scene_file, key, name, settings, value, scene.volume.grid.shape)
     if not bool(((value >= kind.low) & (value <= kind.high)).all()):
@@ -74,7 +74,7 @@ def _size(pixels: Tensor) -> str:
     return f"{pixels.shape[2]} x {pixels.shape[1]}"
 
 
-def _filled(scene_file: SceneFile, key: str, kind: Kind, init: float | tuple[float, ...], value: Tensor) -> Tensor:
+def _fill(scene_file: SceneFile, key: str, kind: Kind, init: float | tuple[float, ...], value: Tensor) -> Tensor:
     """`value` with every entry `init`, or every color its own."""
     if isinstance(init, float):
         if value.ndim == 1 and not kind.is_color:

@@ -16,7 +16,7 @@ from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import CameraSection, PerspectiveSection
-from ddrecon.scene_file.sight import blindness, sees_box
+from ddrecon.scene_file.sight import explain_blindness, sees_box
 
 
 def build_views(scene_file: SceneFile, grid: Grid | None, dtype: torch.dtype, device: torch.device) -> list[View]:
@@ -49,7 +49,7 @@ def _build_view(scene_file: SceneFile, index: int, grid: Grid | None, dtype: tor
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
             if grid is not None and not sees_box(camera, grid):
                 raise scene_file.refused(
-                    f"{key}.camera", f"no pixel of view {section.name!r} looks through the volume; {blindness(camera, grid)}"
+                    f"{key}.camera", f"no pixel of view {section.name!r} looks through the volume; {explain_blindness(camera, grid)}"
                 )
     problems.raise_any()
     camera = replace(camera, pose=camera.pose.to(device, dtype))

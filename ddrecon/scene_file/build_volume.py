@@ -31,7 +31,7 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     """The volume of the scene in `dtype` on `device`; raises SceneError with all its problems, or FormatError."""
     section = scene_file.tree.volume
     fields = _read_fields(scene_file)
-    grid = _agreed_grid(scene_file, fields)
+    grid = _agree_on_grid(scene_file, fields)
     if too_much := shortage(_needs(scene_file, fields, grid, dtype), device):
         raise scene_file.refused("volume.resolution", too_much)
 
@@ -103,7 +103,7 @@ def _read_quantity(path: Path, name: str, called: str) -> Field:
     return field
 
 
-def _agreed_grid(scene_file: SceneFile, fields: Fields) -> Grid:
+def _agree_on_grid(scene_file: SceneFile, fields: Fields) -> Grid:
     section, problems = scene_file.tree.volume, Problems()
     sizes: dict[str, tuple[int, int, int]] = {f"volume.{name}.file": field.resolution for name, field in fields.items()}
     boxes = {f"volume.{name}.file": _corners(field.bounds) for name, field in fields.items() if field.bounds is not None}

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.scalars import resolve
 
@@ -28,7 +28,7 @@ def dump_scene(scene_file: SceneFile, path: Path) -> None:
 def write_described(described: dict[str, Any], path: Path) -> None:
     """Writes a scene in plain values, as `describe` returns it, to `path`."""
     text = yaml.dump(described, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6, default_flow_style=None)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ddrecon.grid import Triple
-from ddrecon.scene_file.nodes import Node, found, shown
+from ddrecon.scene_file.nodes import Node, describe_found, show_value
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.schema import Color, Count, Matrix, Pair, Paths, Row, Size
 
@@ -52,28 +52,28 @@ def read_each(nodes: Sequence[Node], rule: Rule, read: Callable[[Node, Rule], T]
 def read_list(node: Node) -> list[Node]:
     """The entries of a list that has at least one."""
     if not isinstance(node.value, list) or not node.value:
-        raise node.refused(f"expected a list with at least one entry, found {found(node)}")
+        raise node.refused(f"expected a list with at least one entry, found {describe_found(node)}")
     return node.value
 
 
 def read_fraction_list(node: Node, rule: Rule) -> tuple[float, ...]:
     """A list of any number of numbers, also none."""
     if not isinstance(node.value, list):
-        raise node.refused(f"expected a list of numbers, found {found(node)}")
+        raise node.refused(f"expected a list of numbers, found {describe_found(node)}")
     return read_each(node.value, rule, read_number)
 
 
 def read_bool(node: Node, rule: Rule) -> bool:
     """True or false, and nothing else."""
     if not isinstance(node.value, bool):
-        raise node.refused(f"expected true or false, found {found(node)}")
+        raise node.refused(f"expected true or false, found {describe_found(node)}")
     return node.value
 
 
 def read_whole(node: Node, rule: Rule) -> int:
     """A whole number."""
     if isinstance(node.value, bool) or not isinstance(node.value, int):
-        raise node.refused(f"expected a whole number, found {found(node)}")
+        raise node.refused(f"expected a whole number, found {describe_found(node)}")
     _check_limits(node, node.value, rule.limits)
     choices = rule.limits.get("choices", (node.value,))
     if node.value not in choices:
@@ -84,9 +84,9 @@ def read_whole(node: Node, rule: Rule) -> int:
 def read_number(node: Node, rule: Rule) -> float:
     """A finite number that single precision can hold."""
     if isinstance(node.value, bool) or not isinstance(node.value, int | float):
-        raise node.refused(f"expected a number, found {found(node)}")
+        raise node.refused(f"expected a number, found {describe_found(node)}")
     if not math.isfinite(node.value) or abs(node.value) > LARGEST:
-        raise node.refused(f"expected a finite number of single precision, found {found(node)}")
+        raise node.refused(f"expected a finite number of single precision, found {describe_found(node)}")
     _check_limits(node, node.value, rule.limits)
     return float(node.value)
 
@@ -100,13 +100,13 @@ def _check_limits(node: Node, value: float, limits: Mapping[str, Any]) -> None:
 def read_text(node: Node, rule: Rule) -> str:
     """Text, one of the `choices` where there are such."""
     if not isinstance(node.value, str):
-        raise node.refused(f"expected text, found {found(node)}{_quoting(node)}")
+        raise node.refused(f"expected text, found {describe_found(node)}{_quoting(node)}")
     if not node.value or not node.value.isprintable():
-        raise node.refused(f"expected text that can be printed, found {found(node)}")
+        raise node.refused(f"expected text that can be printed, found {describe_found(node)}")
     choices = rule.limits.get("choices")
     if choices is not None and node.value not in choices:
         near = suggestion(node.value, choices) if len(choices) > 1 else ""
-        raise node.refused(f"expected one of {', '.join(choices)}, found {shown(node.value)}{near if 'did you' in near else ''}")
+        raise node.refused(f"expected one of {', '.join(choices)}, found {show_value(node.value)}{near if 'did you' in near else ''}")
     return node.value
 
 
@@ -144,13 +144,13 @@ def read_color(node: Node, rule: Rule) -> float | tuple[float, ...]:
     if isinstance(node.value, list):
         return read_vector(node, Rule(Triple, rule.limits, rule.folder))
     if isinstance(node.value, str | dict) or node.value is None:
-        raise node.refused(f"expected a number or [r, g, b], found {found(node)}")
+        raise node.refused(f"expected a number or [r, g, b], found {describe_found(node)}")
     return read_number(node, rule)
 
 
 def _entries(node: Node, count: int, what: str) -> list[Node]:
     if not isinstance(node.value, list) or len(node.value) != count:
-        raise node.refused(f"expected a list of {count} {what}, found {found(node)}")
+        raise node.refused(f"expected a list of {count} {what}, found {describe_found(node)}")
     return node.value
 
 

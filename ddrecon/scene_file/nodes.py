@@ -59,7 +59,7 @@ class Node:
             yield from child.walk()
 
 
-def found(node: Node) -> str:
+def describe_found(node: Node) -> str:
     """What `node` holds, in words, for an error message."""
     if isinstance(node.value, dict):
         return "a mapping"
@@ -69,10 +69,10 @@ def found(node: Node) -> str:
         return "nothing"
     if isinstance(node.value, bool):
         return str(node.value).lower()
-    return shown(node.value)
+    return show_value(node.value)
 
 
-def shown(value: Scalar) -> str:
+def show_value(value: Scalar) -> str:
     """`value` in one short line."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
@@ -84,7 +84,7 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     Raises SceneError where the text has no such tree: broken syntax, several documents, aliases, tags.
     """
     try:
-        return _parsed(text, locate, problems, key)
+        return _parse(text, locate, problems, key)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
@@ -97,7 +97,7 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
         raise SceneError(f"{where}: not YAML: the character {error.character!r} is not allowed") from error
 
 
-def _parsed(text: str, locate: Locate, problems: Problems, key: str) -> Node:
+def _parse(text: str, locate: Locate, problems: Problems, key: str) -> Node:
     found_now = Problems()
     try:
         root = _Composer(text, locate, found_now, FAST).document(key)
@@ -137,7 +137,7 @@ class _Composer:
         if depth > MAX_DEPTH:
             raise node.refused(f"nested more than {MAX_DEPTH} deep")
         if isinstance(event, yaml.ScalarEvent):
-            node.value = resolve(event.value) if not event.style else _joined(event.value)
+            node.value = resolve(event.value) if not event.style else _join(event.value)
         elif isinstance(event, yaml.SequenceStartEvent):
             node.value = list(self.items(node, depth))
         else:
@@ -168,6 +168,6 @@ class _Composer:
         return self.locate(mark.line + 1, mark.column + 1) if mark else self.locate(1, 1)
 
 
-def _joined(text: str) -> str:
+def _join(text: str) -> str:
     r"""`text` with the surrogate pairs that JSON writes as \ud83d\ude00 made one character each."""
     return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ddrecon.errors import SceneError
-from ddrecon.scene_file.nodes import MAX_DEPTH, Node, found, parse
+from ddrecon.scene_file.nodes import MAX_DEPTH, Node, describe_found, parse
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.variables.kinds import KINDS, pattern_of
 
@@ -29,7 +29,7 @@ def override(root: Node, text: str, problems: Problems) -> None:
         if not rest:
             _put(parent, name, _value(value, parent.child_key(name), where, problems))
             return
-        parent = _entered(parent, name, where)
+        parent = _enter(parent, name, where)
 
 
 def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
@@ -42,17 +42,21 @@ def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
                 return name, ".".join(parts[count:])
     elif isinstance(parent.value, list):
         if not (parts[0].isascii() and parts[0].isdigit() and int(parts[0]) < len(parent.value)):
-            raise SceneError(f"{where}: {parent.child_key(parts[0])}: no such entry: {parent.key} is {found(parent)}, counted from 0")
+            raise SceneError(
+                f"{where}: {parent.child_key(parts[0])}: no such entry: {parent.key} is {describe_found(parent)}, counted from 0"
+            )
     else:
-        raise SceneError(f"{where}: {parent.child_key(parts[0])}: {parent.key or 'the scene'} is {found(parent)}, not a mapping or list")
+        raise SceneError(
+            f"{where}: {parent.child_key(parts[0])}: {parent.key or 'the scene'} is {describe_found(parent)}, not a mapping or list"
+        )
     return parts[0], ".".join(parts[1:])
 
 
-def _entered(parent: Node, name: str, where: str) -> Node:
+def _enter(parent: Node, name: str, where: str) -> Node:
     if isinstance(parent.value, list):
         return parent.value[int(name)]
     if not isinstance(parent.value, dict):
-        raise parent.refused(f"expected a mapping, found {found(parent)}{suggestion(name, ())}")
+        raise parent.refused(f"expected a mapping, found {describe_found(parent)}{suggestion(name, ())}")
     return parent.value.setdefault(name, Node(parent.child_key(name), where, where, {}))
 
 

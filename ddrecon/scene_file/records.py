@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from ddrecon.scene_file.leaves import LEAVES, Rule, read_color, read_each, read_list, read_number, read_text
-from ddrecon.scene_file.nodes import Node, found
+from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.ring import ring_views
 from ddrecon.scene_file.schema import Constant, Density, Quantity, ViewSection, ViewSource
@@ -38,7 +38,7 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
         if problems.are_many:
             break
     problems.raise_any()
-    return _checked(node, kind(**values))
+    return _check(node, kind(**values))
 
 
 def read_value(node: Node, rule: Rule) -> Any:
@@ -58,7 +58,7 @@ def read_value(node: Node, rule: Rule) -> Any:
 
 def _mapping(node: Node) -> dict[str, Node]:
     if not isinstance(node.value, dict):
-        raise node.refused(f"expected a mapping, found {found(node)}")
+        raise node.refused(f"expected a mapping, found {describe_found(node)}")
     return node.value
 
 
@@ -77,7 +77,7 @@ def _absences(kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[s
     return wrong
 
 
-def _checked(node: Node, record: R) -> R:
+def _check(node: Node, record: R) -> R:
     """`record`, unless it breaks a rule about several of its values."""
     problems = Problems()
     for name, what in getattr(record, "problems", tuple)():
@@ -100,7 +100,7 @@ def _read_density(node: Node, rule: Rule) -> float | FieldFile:
     if isinstance(node.value, dict) and "constant" in node.value:
         return read_record(node, Constant, rule.folder).constant
     if node.value is None or isinstance(node.value, str | list | dict):
-        raise node.refused(f"expected a number, {{constant: number}} or {{file: path}}, found {found(node)}")
+        raise node.refused(f"expected a number, {{constant: number}} or {{file: path}}, found {describe_found(node)}")
     return read_number(node, rule)
 
 

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from ddrecon.cameras import Camera, Rays, rays
+from ddrecon.cameras import Camera, Rays, cast_rays
 from ddrecon.grid import Grid
 
 COARSER = 8
@@ -27,10 +27,10 @@ def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
 def sees_box(camera: Camera, grid: Grid) -> bool:
     """Whether any pixel of `camera` looks through the box of `grid`; a coarser image is tried first, because it is quick."""
     finer = max(1, math.ceil(math.sqrt(camera.size[0] * camera.size[1] / MOST_PIXELS)))
-    return any(bool(rays_hit_box(rays(image), grid).any()) for image in (camera.resized(COARSER * finer), camera.resized(finer)))
+    return any(bool(rays_hit_box(cast_rays(image), grid).any()) for image in (camera.resize(COARSER * finer), camera.resize(finer)))
 
 
-def blindness(camera: Camera, grid: Grid) -> str:
+def explain_blindness(camera: Camera, grid: Grid) -> str:
     """Why, most likely, `camera` does not see the box of `grid`."""
     (low, high), pose = grid.bounds_xyz, camera.pose.double()
     center = (pose.new_tensor(low) + pose.new_tensor(high)) / 2

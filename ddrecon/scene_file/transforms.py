@@ -16,7 +16,7 @@ from typing import Any
 from ddrecon.errors import FormatError
 from ddrecon.io.images.table import READERS
 from ddrecon.scene_file.leaves import Rule, read_each, read_list, read_path, read_text
-from ddrecon.scene_file.nodes import Node, found
+from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import ViewSection
 from ddrecon.scene_file.transforms_camera import Entries, read_camera
@@ -79,7 +79,7 @@ def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSect
     for frame, is_test in zip(frames, tests, strict=True):
         with problems.collecting():
             if not isinstance(frame.value, dict):
-                raise frame.refused(f"expected a mapping, found {found(frame)}")
+                raise frame.refused(f"expected a mapping, found {describe_found(frame)}")
             image, mask = _image(frame.value, rule), read_path(frame.value["mask_path"], rule) if frame.value.get("mask_path") else None
             camera = read_camera(frame, root.value | frame.value, rule)
             if image is None and camera.resolution is None:

@@ -13,8 +13,8 @@ from torch import Tensor
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance, face_fluxes
 from ddrecon.light.reduced import ambient_radiance, reduced_light
-from ddrecon.light.sky import sources
-from ddrecon.medium.coefficients import has_flux, scaled_medium
+from ddrecon.light.sky import decompose_lights
+from ddrecon.medium.coefficients import has_flux, scale_medium
 from ddrecon.scene import Scene
 
 
@@ -32,7 +32,7 @@ class Balance:
 
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
     """The balance of `solution`, L0 [C, z, y, x], in `scene`, whose lights are beams and ambient light."""
-    medium, grid, lights = scaled_medium(scene.volume), scene.volume.grid, sources(scene.lights)
+    medium, grid, lights = scale_medium(scene.volume), scene.volume.grid, decompose_lights(scene.lights)
     source = reduced_light(medium, lights, has_flux(medium)).source
     diffusion = CLOSURES[scene.diffusion.closure](medium.transport_extinction, grid, scene.diffusion.floor)
     escape = boundary_loss(diffusion, grid)

@@ -16,7 +16,7 @@ from torch import Tensor
 from ddrecon.errors import SceneError
 from ddrecon.scene import Scene
 from ddrecon.scene_file.problems import suggestion
-from ddrecon.validate.point import chosen_entries, entry_name, loss_at, random_like, starting_point, steps_of
+from ddrecon.validate.point import entry_name, loss_at, pick_entries, random_like, starting_point, steps_of
 from ddrecon.variables.values import variable_names
 
 AGREE_MODES = 1e-10
@@ -130,7 +130,7 @@ def _check(
     ways = [("a random direction", None, along, direction, fractions, 0.0)]
     for name, value in values.items() if samples else ():
         floor = NEGLIGIBLE * float(gradients[name].abs().max())
-        for index in chosen_entries(name, value, samples, generator):
+        for index in pick_entries(name, value, samples, generator):
             unit = torch.zeros_like(value)
             unit.view(-1)[index] = 1
             derivative = float(gradients[name].flatten()[index])

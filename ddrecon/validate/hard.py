@@ -99,7 +99,7 @@ def run_cases(device: torch.device, progress: Progress) -> list[HardResult | Uns
 def run_case(name: str, case: HardCase, device: torch.device) -> HardResult | Unsolved:
     """The result of `case`, called `name`, rendered in both precisions."""
     try:
-        single, double = (_rendered(case, dtype, device) for dtype in (torch.float32, torch.float64))
+        single, double = (_render(case, dtype, device) for dtype in (torch.float32, torch.float64))
     except SolveError as error:
         return Unsolved(name, str(error))
     brightest = float(single.image.max().clamp(min=torch.finfo(torch.float32).tiny))
@@ -132,7 +132,7 @@ def describe(results: Sequence[HardResult | Unsolved]) -> dict[str, Any]:
     return {"passed": all(case["passed"] for case in cases), "cases": cases}
 
 
-def _rendered(case: HardCase, dtype: torch.dtype, device: torch.device) -> Rendered:
+def _render(case: HardCase, dtype: torch.dtype, device: torch.device) -> Rendered:
     scene, memory = case.scene(dtype, device), SolveMemory()
     density = scene.volume.density.requires_grad_()
     image = render(scene, memory=memory)[0]

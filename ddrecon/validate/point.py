@@ -76,7 +76,7 @@ def steps_of(name: str, value: Tensor) -> tuple[float, ...]:
     return tuple(step * (largest if largest > 0 else 1.0) for step in steps)
 
 
-def chosen_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:
+def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:
     """Flat indices of `samples` random entries, of density half of them empty where enough are."""
     order = torch.randperm(value.numel(), generator=generator)
     if name != "density":

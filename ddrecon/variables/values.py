@@ -12,7 +12,7 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import twisted
+from ddrecon.cameras import twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
@@ -56,11 +56,11 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     if unknown:
         raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(known)}")
     lights = [
-        _replaced_light(light, {name: values[key] for name in _tensors(light) if (key := f"lights.{index}.{name}") in values})
+        _replace_light(light, {name: values[key] for name in _tensors(light) if (key := f"lights.{index}.{name}") in values})
         for index, light in enumerate(scene.lights)
     ]
-    views = [_replaced_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views]
-    volume = _replaced_volume(scene.volume, {name: values[name] for name in VOLUME if name in values})
+    views = [_replace_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views]
+    volume = _replace_volume(scene.volume, {name: values[name] for name in VOLUME if name in values})
     return replace(scene, volume=volume, lights=lights, views=views)
 
 
@@ -100,7 +100,7 @@ def _volume_value(volume: Volume, name: str) -> Tensor:
     return sigma_t if name == "sigma_t" else other / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
 
 
-def _replaced_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
+def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     density, g = values.get("density", volume.density), values.get("g", volume.g)
     sigma_a, sigma_s = values.get("sigma_a", volume.sigma_a), values.get("sigma_s", volume.sigma_s)
     if "sigma_t" in values or "albedo" in values:
@@ -109,12 +109,12 @@ def _replaced_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     return Volume(volume.grid, density.expand(volume.grid.shape) if density.ndim == 0 else density, sigma_a, sigma_s, g)
 
 
-def _replaced_light(light: Light, values: Mapping[str, Tensor]) -> Light:
+def _replace_light(light: Light, values: Mapping[str, Tensor]) -> Light:
     changed: Light = replace(light, **values)  # type: ignore[arg-type]
     return changed
 
 
-def _replaced_view(view: View, twist: Tensor | None, scene: Scene) -> View:
-    if twist is None:
+def _replace_view(view: View, change: Tensor | None, scene: Scene) -> View:
+    if change is None:
         return view
-    return replace(view, camera=twisted(view.camera, twist, scene.volume.grid.center_xyz))
+    return replace(view, camera=twist(view.camera, change, scene.volume.grid.center_xyz))

@@ -73,7 +73,7 @@ def test_the_adjoint_takes_what_the_forward_solve_made_of_the_operator(inputs, m
     def refuse(*_: object) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr(hierarchy, "coarsened", refuse)
+    monkeypatch.setattr(hierarchy, "coarsen", refuse)
     monkeypatch.setattr(hierarchy.Coarsest, "of", refuse)
     solve_diffusion(solve, operator, 2 * source)
     torch.autograd.grad(u.sum(), loss)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
-from ddrecon.diffusion.solvers.coarsening import coarsened
+from ddrecon.diffusion.solvers.coarsening import coarsen
 from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level
 from ddrecon.diffusion.solvers.multigrid import multigrid
@@ -85,7 +85,7 @@ def test_a_cycle_in_single_precision_is_symmetric_to_rounding(random):
 def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(axis: int, cells: int, random):
     shape = tuple(cells if a == axis else 3 for a in AXES)
     operator = patchy_box(random, shape)
-    way, coarse = coarsened(operator, axis)
+    way, coarse = coarsen(operator, axis)
     fine, u = random(2, *shape, seed=5), random(2, *coarse.loss.shape[1:], seed=6)
     torch.testing.assert_close((way.restrict(fine) * u).sum(), (fine * way.prolong(u)).sum(), rtol=1e-13, atol=0)
     torch.testing.assert_close(way.prolong(torch.ones_like(u)), torch.ones_like(fine), rtol=0, atol=0)
@@ -102,7 +102,7 @@ def test_along_one_axis_the_coarse_operator_is_that_of_its_interpolation(cells: 
     """In a row of resistors a current through a face between pairs has the same energy before and after."""
     faces = random(1, 1, 1, cells - 1) + 0.01
     none = torch.zeros(1, 0, 1, cells), torch.zeros(1, 1, 0, cells)
-    way, coarse = coarsened(Operator((*none, faces), torch.zeros(1, 1, 1, cells, dtype=torch.float64)), 3)
+    way, coarse = coarsen(Operator((*none, faces), torch.zeros(1, 1, 1, cells, dtype=torch.float64)), 3)
     step = torch.zeros_like(coarse.loss)
     step[..., 2:] = 1
     inner = way.prolong(step).diff(dim=-1)

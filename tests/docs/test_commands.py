@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from ddrecon.bench import run as bench_run
 from ddrecon.cli.commands import main
-from ddrecon.reconstruct.levels import at_level
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.validate.hard_cases import CASES
 
@@ -47,7 +47,7 @@ def quick(command: str) -> list[str]:
 
 
 def coarse(load: Callable[..., Scene]) -> Callable[..., Scene]:
-    return lambda *arguments: at_level(load(*arguments), 4)
+    return lambda *arguments: scene_at_level(load(*arguments), 4)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.grid import array_order
-from ddrecon.light.environment import environment_radiance, pixel_moments, refined, turned
+from ddrecon.light.environment import environment_radiance, pixel_moments, refine_map, turn_directions
 from ddrecon.light.lights import EnvironmentLight
 
 SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
@@ -66,7 +66,7 @@ def test_a_quarter_turn_rolls_the_map(random):
 def test_turning_the_map_is_turning_the_viewer(random):
     radiance, ways = random(3, 6, 8), directions(50)
     light = light_of(radiance, rotation=33.0)
-    found = environment_radiance(light, array_order(turned(ways, light.rotation)))
+    found = environment_radiance(light, array_order(turn_directions(ways, light.rotation)))
     torch.testing.assert_close(found, environment_radiance(light_of(radiance), array_order(ways)), rtol=1e-11, atol=1e-12)
 
 
@@ -119,7 +119,7 @@ def test_moments_integrate_the_bilinear_map(height: int, width: int, random):
 @pytest.mark.parametrize("size", [(9, 9), (24, 48), (25, 10)], ids=str)
 def test_a_refined_map_is_the_same_function(size: tuple[int, int], random):
     radiance, ways = random(2, 7, 5), array_order(directions(100))
-    fine = refined(radiance, *size)
+    fine = refine_map(radiance, *size)
     assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
     torch.testing.assert_close(
         environment_radiance(light_of(fine), ways), environment_radiance(light_of(radiance), ways), rtol=1e-11, atol=1e-12

@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import rays
+from ddrecon.cameras import cast_rays
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import DirectionalLight, PointLight
-from ddrecon.light.point_light import point_beam
+from ddrecon.light.point_light import follow_point_light
 from ddrecon.light.reduced import reduced_light
 from ddrecon.march.integral import Emission, march
-from ddrecon.medium.coefficients import Medium, Volume, scaled_medium
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -29,7 +29,7 @@ def light_at(position: tuple[float, ...], intensity: tuple[float, ...] = (2.0,),
 
 
 def medium_of(grid: Grid, density: Tensor, g: float = 0.4) -> Medium:
-    return scaled_medium(Volume(grid, density, density.new_tensor([0.5]), density.new_tensor([3.0]), density.new_tensor(g)))
+    return scale_medium(Volume(grid, density, density.new_tensor([0.5]), density.new_tensor([3.0]), density.new_tensor(g)))
 
 
 def offsets(grid: Grid, position: tuple[float, ...]) -> Tensor:
@@ -50,7 +50,7 @@ def cell_center(grid: Grid, z: int, y: int, x: int) -> tuple[float, float, float
 def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: tuple[float, ...], box):
     """Everywhere but in the light's own cell."""
     grid = box((10, 12, 9))
-    received = point_beam(medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64)), light_at(position), True)[1]
+    received = follow_point_light(medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64)), light_at(position), True)[1]
     offset = offsets(grid, position)
     distance = offset.norm(dim=-1)
     is_apart = distance > max(grid.spacing)
@@ -63,7 +63,7 @@ def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE, (0.0, 3.0, 0.0)], ids=str)
 def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...], box):
     grid = box((7, 6, 5))
-    beam = point_beam(medium_of(grid, torch.ones(grid.shape, dtype=torch.float64)), light_at(position), False)[0]
+    beam = follow_point_light(medium_of(grid, torch.ones(grid.shape, dtype=torch.float64)), light_at(position), False)[0]
     for z, y, x in ((0, 0, 0), (6, 5, 4), (3, 1, 2), (6, 0, 1)):
         end = cell_center(grid, z, y, x)[::-1]
         start, entered = position[::-1], 0.0
@@ -80,7 +80,7 @@ def test_the_depth_of_a_smooth_blob_converges_at_second_order(order):
         grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
         axes = grid.centers(torch.zeros(1, dtype=torch.float64))
         density = torch.exp(-sum(axis**2 for axis in axes) / (2 * width**2))
-        beam = point_beam(medium_of(grid, density), light_at(INSIDE), False)[0]
+        beam = follow_point_light(medium_of(grid, density), light_at(INSIDE), False)[0]
         start, offset = torch.tensor(INSIDE[::-1], dtype=torch.float64), offsets(grid, INSIDE)
         distance = offset.norm(dim=-1)
         along = (start * offset).sum(-1) / distance
@@ -94,7 +94,7 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form(make_ca
     """kappa_s I / (4 pi) times the integral of 1 / r^2 along a ray: I (angle subtended) / (distance of the ray)."""
     grid, position = Grid((40, 44, 36), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), (0.02, 0.31, 0.07)
     medium = medium_of(grid, torch.full(grid.shape, 1e-9, dtype=torch.float64), g=0.0)
-    bundle = rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
+    bundle = cast_rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
     beams = reduced_light(medium, [light_at(position)], False).beams
     dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
     emission = Emission(grid, medium.extinction, medium.scattering, beams, dark, medium.g, medium.peak)
@@ -185,7 +185,7 @@ def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where: str, make_sc
 def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere(box):
     """3 / R^2, the mean of 1 / r^2 over a sphere of one cell's volume around the light, and no flux: light leaves on all sides."""
     grid = box((5, 4, 6))
-    received = point_beam(medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64)), light_at(cell_center(grid, 2, 1, 3)), True)[1]
+    received = follow_point_light(medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64)), light_at(cell_center(grid, 2, 1, 3)), True)[1]
     radius = (0.75 / math.pi * math.prod(grid.spacing)) ** (1 / 3)
     assert received.mean[0, 2, 1, 3].item() == pytest.approx(2.0 / (4 * math.pi) * 3 / radius**2, rel=1e-12)
     assert max(abs(component[0, 2, 1, 3].item()) for component in received.flux) < 1e-12

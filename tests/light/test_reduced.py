@@ -14,9 +14,9 @@ from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import ReducedLight, ambient_radiance, reduced_light
-from ddrecon.light.shear import entered_mass
-from ddrecon.light.skylight import ambient_sky, unscattered_sky
-from ddrecon.medium.coefficients import Medium, Volume, scaled_medium
+from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.light.skylight import ambient_sky, sum_unscattered_sky
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 DIRECTIONS = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7), (1.0, 1.0, 1.0)]
@@ -29,7 +29,7 @@ def unit(direction: tuple[float, ...]) -> Tensor:
 
 def mass_to_centers(field: Tensor, grid: Grid, direction: Tensor) -> Tensor:
     """The integral of `field` [z, y, x] from the box to each cell's center."""
-    entered, step = entered_mass(field[None], grid, direction)
+    entered, step = sum_mass_to_cells(field[None], grid, direction)
     return entered[0] + 0.5 * step * field
 
 
@@ -60,7 +60,7 @@ def test_along_an_axis_depths_are_cumulative_sums(direction: tuple[float, ...], 
     """Exactly, cell by cell, on any field."""
     grid, field = box((4, 3, 5)), random(4, 3, 5)
     axis = max(range(3), key=lambda a: abs(direction[a]))
-    entered, step = entered_mass(field[None], grid, unit(direction))
+    entered, step = sum_mass_to_cells(field[None], grid, unit(direction))
     assert step.item() == pytest.approx(grid.spacing[axis], rel=1e-15)
     total = torch.zeros_like(field.select(axis, 0))
     indices = range(grid.shape[axis]) if direction[axis] > 0 else reversed(range(grid.shape[axis]))
@@ -119,8 +119,8 @@ def test_a_mirrored_or_turned_world_is_mirrored_or_turned(order_of_axes, signs, 
 
     upper = tuple(grid.extent[axis] for axis in order_of_axes)
     turned_direction = direction[list(order_of_axes)] * torch.tensor(signs)
-    expected, step = entered_mass(field[None], grid, direction)
-    found, turned_step = entered_mass(turned(field)[None], Grid(tuple(turned(field).shape), (0, 0, 0), upper), turned_direction)
+    expected, step = sum_mass_to_cells(field[None], grid, direction)
+    found, turned_step = sum_mass_to_cells(turned(field)[None], Grid(tuple(turned(field).shape), (0, 0, 0), upper), turned_direction)
     torch.testing.assert_close(found[0], turned(expected[0]), rtol=0, atol=1e-13)
     assert turned_step == pytest.approx(step.item(), rel=1e-14)
 
@@ -128,9 +128,9 @@ def test_a_mirrored_or_turned_world_is_mirrored_or_turned(order_of_axes, signs, 
 def test_entered_mass_is_linear_in_the_field(box, random):
     grid, direction = box((4, 3, 5)), unit((0.5, -0.3, 0.4))
     one, other = random(1, 4, 3, 5, seed=1), random(1, 4, 3, 5, seed=2)
-    together = entered_mass(one + 2 * other, grid, direction)[0]
+    together = sum_mass_to_cells(one + 2 * other, grid, direction)[0]
     torch.testing.assert_close(
-        together, entered_mass(one, grid, direction)[0] + 2 * entered_mass(other, grid, direction)[0], rtol=1e-13, atol=1e-15
+        together, sum_mass_to_cells(one, grid, direction)[0] + 2 * sum_mass_to_cells(other, grid, direction)[0], rtol=1e-13, atol=1e-15
     )
 
 
@@ -140,7 +140,7 @@ def test_mass_is_conserved(direction: tuple[float, ...], random):
     grid = Grid((6, 20, 20), (0, 0, 0), (1.2, 5.0, 4.0))
     field = torch.zeros(1, *grid.shape, dtype=torch.float64)
     field[:, :, 7:13, 7:13] = random(6, 6, 6)
-    entered, step = entered_mass(field, grid, unit(direction))
+    entered, step = sum_mass_to_cells(field, grid, unit(direction))
     last = -1 if direction[0] > 0 else 0
     before = field.sum() - field[:, last].sum()
     torch.testing.assert_close(entered[:, last].sum(), step * before, rtol=1e-13, atol=0)
@@ -150,16 +150,16 @@ def test_mass_is_conserved(direction: tuple[float, ...], random):
 def test_entered_mass_has_both_derivatives(direction: tuple[float, ...], box, half_empty):
     grid, field = box((3, 2, 3)), half_empty(1, 3, 2, 3).requires_grad_()
     heading = unit(direction)
-    assert torch.autograd.gradcheck(lambda f: entered_mass(f, grid, heading)[0], field, check_forward_ad=True)
+    assert torch.autograd.gradcheck(lambda f: sum_mass_to_cells(f, grid, heading)[0], field, check_forward_ad=True)
 
 
 def medium_in(grid: Grid, density: Tensor, g: float = 0.4, sigma=((0.5, 1.0), (3.0, 2.0))) -> Medium:
     sigma_a, sigma_s = (density.new_tensor(s) for s in sigma)
-    return scaled_medium(Volume(grid, density, sigma_a, sigma_s, density.new_tensor(g)))
+    return scale_medium(Volume(grid, density, sigma_a, sigma_s, density.new_tensor(g)))
 
 
 def unscattered_ambient(medium: Medium, radiance: Tensor) -> Moments:
-    return unscattered_sky(medium, [ambient_sky(radiance)], has_flux=True)
+    return sum_unscattered_sky(medium, [ambient_sky(radiance)], has_flux=True)
 
 
 def reduced(grid: Grid, density: Tensor, lights: list, **medium) -> ReducedLight:

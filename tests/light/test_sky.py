@@ -15,9 +15,9 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.environment import pixel_moments
 from ddrecon.light.lights import DirectionalLight, EnvironmentLight
-from ddrecon.light.sky import MAX_SUNS, Sky, count_suns, fibonacci_sphere, taken_apart
-from ddrecon.light.skylight import unscattered_sky
-from ddrecon.medium.coefficients import scaled_medium
+from ddrecon.light.sky import MAX_SUNS, Sky, count_suns, decompose_map, fibonacci_sphere
+from ddrecon.light.skylight import sum_unscattered_sky
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import render, solve_light, view_components
 from ddrecon.scene import Scene
 
@@ -68,7 +68,7 @@ def test_directions_are_spread_evenly(count: int):
 def test_power_and_first_moment_of_a_map_are_those_of_its_parts(size: tuple[int, int], directions: int, random):
     """All that a map without suns sends in, and the vector along which it goes."""
     light = light_of(random(3, *size), scale=1.3, rotation=25.0, directions=directions)
-    (ambient, sky) = taken_apart(light)
+    (ambient, sky) = decompose_map(light)
     moments = 1.3 * (torch.from_numpy(pixel_moments(*size)).flatten(1) @ light.radiance.flatten(1).T)
     torch.testing.assert_close(4 * math.pi * ambient.radiance + sky.irradiance.sum(0), moments[0], rtol=1e-12, atol=0)
     turn = math.radians(25.0)
@@ -80,7 +80,7 @@ def test_power_and_first_moment_of_a_map_are_those_of_its_parts(size: tuple[int,
 
 def test_with_a_sun_power_is_kept_and_the_sky_is_the_rest():
     light = light_of(uneven(16, 32))
-    sun, ambient, sky = taken_apart(light)
+    sun, ambient, sky = decompose_map(light)
     moments = torch.from_numpy(pixel_moments(16, 32)).flatten(1) @ light.radiance.flatten(1).T
     total = sun.irradiance + 4 * math.pi * ambient.radiance + sky.irradiance.sum(0)
     torch.testing.assert_close(total, moments[0], rtol=1e-12, atol=0)
@@ -96,7 +96,7 @@ def test_there_are_at_most_four_suns(random):
 @pytest.mark.parametrize("directions", [1, 2, 6, 48, 200])
 def test_a_constant_map_is_ambient_light_whatever_the_directions(directions: int):
     color = torch.tensor([0.7, 0.2, 0.0], dtype=torch.float64)
-    ambient, sky = taken_apart(light_of(color.view(3, 1, 1).expand(3, 6, 8), directions=directions))
+    ambient, sky = decompose_map(light_of(color.view(3, 1, 1).expand(3, 6, 8), directions=directions))
     assert torch.equal(ambient.radiance, color) and not sky.irradiance.any()
 
 
@@ -181,10 +181,10 @@ def saved_bytes(scene: Scene, directions: int) -> int:
 
     kept: list[Tensor] = []
     radiance = uneven(16, 32).requires_grad_()
-    medium = scaled_medium(replace(scene.volume, density=scene.volume.density.clone().requires_grad_()))
-    parts = taken_apart(light_of(radiance, directions=directions))
+    medium = scale_medium(replace(scene.volume, density=scene.volume.density.clone().requires_grad_()))
+    parts = decompose_map(light_of(radiance, directions=directions))
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        unscattered_sky(medium, parts, has_flux=True)
+        sum_unscattered_sky(medium, parts, has_flux=True)
     return sum(storages.values())
 
 
@@ -217,7 +217,7 @@ def test_the_sky_is_in_array_order():
     """Light from above travels along -y, from +x along -x."""
     radiance = torch.zeros(1, 33, 64, dtype=torch.float64)
     radiance[:, :16] = 1
-    sky = next(part for part in taken_apart(light_of(radiance)) if isinstance(part, Sky))
+    sky = next(part for part in decompose_map(light_of(radiance)) if isinstance(part, Sky))
     above = sky.travel[:, 1] < -0.5
     assert bool((sky.irradiance[above] > 0).all()) and float(sky.vector.sum((0, 2))[1]) < 0
     torch.testing.assert_close(array_order(array_order(sky.travel)), sky.travel)

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import rays
+from ddrecon.cameras import cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.march import integral as march_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.integral import march
-from ddrecon.march.lattice import Lattice, lattice_for
-from ddrecon.march.samplers import sampler_for
+from ddrecon.march.lattice import Lattice, choose_lattice
+from ddrecon.march.samplers import choose_sampler
 from ddrecon.march.slices import Slices
 from ddrecon.renderer import _emission, render, solve_light
 from ddrecon.scene import Scene
@@ -50,10 +50,10 @@ def scene_of(make_scene, make_camera, box):
 
 
 def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
-    bundle, grid = rays(scene.views[0].camera), scene.volume.grid
+    bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
-    slices = sampler_for(scene.volume.density[None], None, 0, grid, bundle, crossing, 1)
-    return lattice_for(grid, slices.axis, bundle.chosen(crossing.hit)), slices
+    slices = choose_sampler(scene.volume.density[None], None, 0, grid, bundle, crossing, 1)
+    return choose_lattice(grid, slices.axis, bundle.select(crossing.hit)), slices
 
 
 def images(scene: Scene) -> tuple[Tensor, Tensor]:
@@ -82,7 +82,7 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     lattice, _ = lattice_of(scene)
     bundle = lattice.rays(lattice.rows, 3.0)
     emission = _emission(solve_light(scene, SolveMemory()), bundle)
-    monkeypatch.setattr(march_module, "lattice_for", lambda *_: lattice)
+    monkeypatch.setattr(march_module, "choose_lattice", lambda *_: lattice)
     interpolated, own = march(emission, bundle, INTERPOLATED, 1.0), march(emission, bundle, OWN)
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))

@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, Rays, rays
+from ddrecon.cameras import Camera, Rays, cast_rays
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import reduced_light
 from ddrecon.march import integral as march_module
-from ddrecon.march import slices as view_rays
+from ddrecon.march import samplers, slices
 from ddrecon.march.integral import Emission, march
-from ddrecon.medium.coefficients import Volume, scaled_medium
+from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.renderer import render
@@ -36,7 +36,7 @@ each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys
 def emission_of(grid: Grid, density: Tensor, sigma_a: float = 0.5, sigma_s: tuple[float, ...] = (2.0, 3.0), g: float = 0.3) -> Emission:
     """A medium under one oblique beam and some smooth diffuse light that grows along x."""
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
-    medium = scaled_medium(Volume(grid, density, density.new_tensor([sigma_a]), density.new_tensor(sigma_s), density.new_tensor(g)))
+    medium = scale_medium(Volume(grid, density, density.new_tensor([sigma_a]), density.new_tensor(sigma_s), density.new_tensor(g)))
     diffuse = (1 + grid.centers(density)[2]).expand(len(sigma_s), *grid.shape)
     return Emission(grid, medium.extinction, medium.scattering, reduced_light(medium, [light], False).beams, diffuse, medium.g, medium.peak)
 
@@ -65,7 +65,7 @@ def chords(grid: Grid, bundle: Rays) -> Tensor:
 @each_camera
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int, box, make_camera):
-    grid, bundle = box((3, 5, 4)), rays(make_camera(size=(7, 6), **view))
+    grid, bundle = box((3, 5, 4)), cast_rays(make_camera(size=(7, 6), **view))
     emission = emission_of(grid, torch.full(grid.shape, 0.7, dtype=torch.float64))
     transmittance = march(emission, bundle, every_ray(steps))[1]
     lengths = chords(grid, bundle)
@@ -77,7 +77,7 @@ def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int, box, 
 @each_camera
 def test_rays_that_miss_the_box_see_nothing(view: dict, box, make_camera, random):
     grid = box((3, 5, 4))
-    bundle = rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
+    bundle = cast_rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
     scattered, transmittance = march(emission_of(grid, random(*grid.shape)), bundle, every_ray(1))
     is_miss = chords(grid, bundle) == 0
     assert bool(is_miss.any()) or view is CAMERAS["inside"]
@@ -86,7 +86,7 @@ def test_rays_that_miss_the_box_see_nothing(view: dict, box, make_camera, random
 
 
 def test_a_box_behind_the_camera_is_not_seen(box, make_camera, random):
-    grid, bundle = box((3, 5, 4)), rays(make_camera())
+    grid, bundle = box((3, 5, 4)), cast_rays(make_camera())
     away = Rays(bundle.origin, -bundle.direction, bundle.eye)
     scattered, transmittance = march(emission_of(grid, random(*grid.shape)), away, every_ray(1))
     assert not scattered.any() and bool((transmittance == 1).all())
@@ -96,7 +96,7 @@ def test_a_box_behind_the_camera_is_not_seen(box, make_camera, random):
 def test_chunks_do_not_matter(view: dict, box, make_camera, random, monkeypatch):
     """Nor do the bands of slices that they meet: neither to what is seen nor to its derivative."""
     density = random(9, 11, 10).requires_grad_()
-    bundle = rays(make_camera(size=(7, 6), **view))
+    bundle = cast_rays(make_camera(size=(7, 6), **view))
 
     def marched() -> list[Tensor]:
         seen = march(emission_of(box((9, 11, 10)), density), bundle, every_ray(2))
@@ -104,7 +104,7 @@ def test_chunks_do_not_matter(view: dict, box, make_camera, random, monkeypatch)
 
     whole = marched()
     monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
-    monkeypatch.setattr(view_rays, "BAND", 1)
+    monkeypatch.setattr(slices, "BAND", 1)
     for one, other in zip(whole, marched(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
@@ -114,7 +114,7 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, box, make
     """Nothing is left out where the density is being varied."""
     density = torch.zeros(20, 22, 21, dtype=torch.float64)
     density[6:9, 12:15, 8:12] = 1 + random(3, 3, 4)
-    bundle, integrated, nodes = rays(make_camera(size=(9, 8), **view)), march_module._integrate, []
+    bundle, integrated, nodes = cast_rays(make_camera(size=(9, 8), **view)), march_module._integrate, []
 
     def counting(emission: Emission, values: Tensor, places: Nodes) -> Tensor:
         nodes.append(values[:, 0].numel())
@@ -136,9 +136,9 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, box, make
 @pytest.mark.parametrize("view", ["perspective", "oblique", "orthographic"])
 def test_slices_and_equal_steps_agree_in_the_limit(view: str, box, make_camera, random, monkeypatch):
     """Both interpolate the same fields, along other nodes: their difference vanishes as steps grow."""
-    emission, bundle = emission_of(box((3, 5, 4)), random(3, 5, 4)), rays(make_camera(size=(7, 6), **CAMERAS[view]))
+    emission, bundle = emission_of(box((3, 5, 4)), random(3, 5, 4)), cast_rays(make_camera(size=(7, 6), **CAMERAS[view]))
     sliced = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
-    monkeypatch.setattr(view_rays, "STEEPEST", 1.0)
+    monkeypatch.setattr(samplers, "STEEPEST", 1.0)
     equal = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
     for field in (0, 1):
         coarse, fine = (float((a[field] - b[field]).norm() / a[field].norm()) for a, b in zip(sliced, equal, strict=True))
@@ -147,7 +147,7 @@ def test_slices_and_equal_steps_agree_in_the_limit(view: str, box, make_camera, 
 
 @each_camera
 def test_radiance_and_transmittance_have_both_derivatives(view: dict, box, make_camera, half_empty):
-    grid, bundle = box((2, 3, 2)), rays(make_camera(size=(2, 2), **view))
+    grid, bundle = box((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
     density = half_empty(*grid.shape, seed=3).requires_grad_()
     assert torch.autograd.gradcheck(lambda d: march(emission_of(grid, d), bundle, every_ray(1)), density, atol=1e-8, check_forward_ad=True)
 
@@ -163,10 +163,10 @@ def test_a_cross_section_may_be_a_field(has_fields: str, g: float, box, make_cam
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
     results = []
     for volume in (constant, varying):
-        medium = scaled_medium(volume)
+        medium = scale_medium(volume)
         beams = reduced_light(medium, [light], False).beams
         emission = Emission(grid, medium.extinction, medium.scattering, beams, random(3, *grid.shape, seed=4), medium.g, medium.peak)
-        results.append(torch.cat(march(emission, rays(camera), every_ray(1))))
+        results.append(torch.cat(march(emission, cast_rays(camera), every_ray(1))))
     torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=0)
 
 
@@ -214,7 +214,7 @@ def slow_single_scattering(camera: Camera, steps: int = 600) -> Tensor:
 
     The depth towards the light is the integral of a Gaussian along a line: an error function.
     """
-    bundle = rays(camera)
+    bundle = cast_rays(camera)
     distance = torch.linspace(1.0, 4.0, steps, dtype=torch.float64)
     travel = torch.nn.functional.normalize(torch.tensor(LIGHT, dtype=torch.float64), dim=0)
     pixels = []
@@ -247,7 +247,7 @@ def test_more_steps_and_samples_keep_a_homogeneous_transmittance(make_scene, box
     """Background light through an absorbing box: the average over a pixel of exp(-kappa chord)."""
     scene = make_scene(torch.ones(3, 5, 4, dtype=torch.float64), sigma_s=(0.0,), directional=None, ambient=(1.0,))
     image = render(replace(scene, render=RenderSettings(samples_per_pixel=4, steps_per_voxel=2)))[0]
-    bundles = [rays(scene.views[0].camera, offset) for offset in [(a, b) for a in (0.25, 0.75) for b in (0.25, 0.75)]]
+    bundles = [cast_rays(scene.views[0].camera, offset) for offset in [(a, b) for a in (0.25, 0.75) for b in (0.25, 0.75)]]
     for color, sigma in enumerate(scene.volume.sigma_a):
         expected = sum(torch.exp(-sigma * chords(box((3, 5, 4)), bundle)) for bundle in bundles) / 4
         torch.testing.assert_close(image[color].flatten(), expected, rtol=1e-12, atol=0)
@@ -256,7 +256,7 @@ def test_more_steps_and_samples_keep_a_homogeneous_transmittance(make_scene, box
 def test_the_transmittance_of_a_blob_converges_at_second_order(make_scene, make_camera, order):
     """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at distance b from its middle."""
     camera, counts, errors = make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1), [12, 24, 48], []
-    bundle = rays(camera)
+    bundle = cast_rays(camera)
     closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
     depth = SIGMA_A * DENSITY * WIDTH * math.sqrt(2 * math.pi) * torch.exp(-(closest**2) / (2 * WIDTH**2))
     expected = torch.exp(-depth).view(camera.size)

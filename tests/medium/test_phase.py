@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ddrecon.medium.coefficients import Volume, scaled_medium, unscaled_medium
+from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
 from ddrecon.medium.phase import forward_fraction, henyey_greenstein, peaked_phase, peaked_phase_along, scaled_mean_cosine
 
 MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
@@ -94,16 +94,16 @@ def test_scaling_leaves_the_transport_extinction_alone(g: float, random, box):
     density = random(2, 3, 4)
     volume = Volume(box((2, 3, 4)), density, sigma_a, sigma_s, scalar(g))
     exact = (sigma_a + (1 - g) * sigma_s).view(3, 1, 1, 1) * density
-    for medium in (scaled_medium(volume), unscaled_medium(volume)):
+    for medium in (scale_medium(volume), keep_medium(volume)):
         torch.testing.assert_close(medium.transport_extinction, exact, rtol=1e-14, atol=0)
         by_parts = medium.absorption.value + (1 - medium.mean_cosine) * medium.remaining_scattering
         torch.testing.assert_close(by_parts, exact, rtol=1e-13, atol=0)
         torch.testing.assert_close(medium.extinction.value, medium.absorption.value + medium.remaining_scattering, rtol=1e-14, atol=0)
-    removed = unscaled_medium(volume).extinction.value - scaled_medium(volume).extinction.value
+    removed = keep_medium(volume).extinction.value - scale_medium(volume).extinction.value
     torch.testing.assert_close(removed, max(g, 0) ** 2 * sigma_s.view(3, 1, 1, 1) * density, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("medium_of", [scaled_medium, unscaled_medium])
+@pytest.mark.parametrize("medium_of", [scale_medium, keep_medium])
 def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of, random, box):
     sigma_a, sigma_s, density, grid = random(3, seed=1), random(3, seed=2), random(2, 3, 4), box((2, 3, 4))
     fields = [sigma.view(3, 1, 1, 1).expand(3, *grid.shape) for sigma in (sigma_a, sigma_s)]

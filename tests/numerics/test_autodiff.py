@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.autodiff import recomputed
+from ddrecon.numerics.autodiff import recompute
 
 
 def curved(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
@@ -16,19 +16,19 @@ def curved(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def nested(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    one, other = recomputed(curved, x * y, y)
-    return recomputed(curved, one.sqrt(), other + x)
+    one, other = recompute(curved, x * y, y)
+    return recompute(curved, one.sqrt(), other + x)
 
 
 @pytest.mark.parametrize("function", [curved, nested])
 def test_derivatives_are_those_of_what_is_kept(function, random) -> None:
     x, y = (random(3, 4, 5, seed=seed).requires_grad_() for seed in (0, 1))
-    assert torch.autograd.gradcheck(lambda x, y: recomputed(function, x, y), (x, y), check_forward_ad=True)
+    assert torch.autograd.gradcheck(lambda x, y: recompute(function, x, y), (x, y), check_forward_ad=True)
 
 
 def test_the_backward_pass_may_be_made_twice(random) -> None:
     x, y = (random(3, 4, 5, seed=seed).requires_grad_() for seed in (0, 1))
-    total = sum(part.sum() for part in recomputed(nested, x, y))
+    total = sum(part.sum() for part in recompute(nested, x, y))
     first, second = (torch.autograd.grad(total, (x, y), retain_graph=True) for _ in range(2))
     for one, other in zip(first, second, strict=True):
         assert torch.equal(one, other)
@@ -43,7 +43,7 @@ def test_nothing_between_arguments_and_result_stays(random) -> None:
         return between * between
 
     x = random(3, 4, 5).requires_grad_()
-    result = recomputed(function, x)
+    result = recompute(function, x)
     assert [reference() for reference in seen] == [None]
     result.sum().backward()
     assert len(seen) == 2 and [reference() for reference in seen] == [None, None]

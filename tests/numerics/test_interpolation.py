@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.numerics.interpolation import sample_slices, sample_volume
-from ddrecon.numerics.third_order import Smooth, subdivided
+from ddrecon.numerics.third_order import ThirdOrder, subdivide
 
 
 def interior_points(random, count: int, shape: tuple[int, ...]) -> Tensor:
@@ -119,13 +119,13 @@ def test_sums_of_squares_are_exact_in_smooth_channels_alone(random):
     """In slices and volumes, away from the outermost cells; the other channels stay bilinear."""
     y, x = torch.meshgrid(centers(8), centers(10), indexing="ij")
     field, points = 3 * x * x - 2 * y * y + x, 0.6 * (2 * random(1, 20, 2) - 1)
-    found = sample_slices(torch.stack([field, field, field])[None], points, Smooth(1, 2))[0]
+    found = sample_slices(torch.stack([field, field, field])[None], points, ThirdOrder(1, 2))[0]
     wanted = 3 * points[0, :, 0] ** 2 - 2 * points[0, :, 1] ** 2 + points[0, :, 0]
     torch.testing.assert_close(found[1], wanted, rtol=0, atol=1e-14)
     assert torch.equal(found[0], found[2]) and float((found[0] - wanted).abs().max()) > 1e-3
     z, y, x = torch.meshgrid(centers(6), centers(8), centers(10), indexing="ij")
     places = 0.45 * (2 * random(1, 20, 3) - 1)
-    found = sample_volume((x * x - y * y + 2 * z * z)[None], places, Smooth(0, 1))[0, 0]
+    found = sample_volume((x * x - y * y + 2 * z * z)[None], places, ThirdOrder(0, 1))[0, 0]
     a, b, c = places[0].unbind(-1)
     torch.testing.assert_close(found, a * a - b * b + 2 * c * c, rtol=0, atol=1e-14)
 
@@ -134,7 +134,7 @@ def test_smooth_channels_converge_at_third_order(random, order):
     points, counts, errors = 0.5 * (2 * random(1, 400, 2) - 1), [12, 24, 48], []
     for count in counts:
         y, x = torch.meshgrid(centers(count), centers(count), indexing="ij")
-        found = sample_slices(torch.sin(3 * x + y)[None, None], points, Smooth(0, 1))[0, 0]
+        found = sample_slices(torch.sin(3 * x + y)[None, None], points, ThirdOrder(0, 1))[0, 0]
         errors.append(float((found - torch.sin(3 * points[0, :, 0] + points[0, :, 1])).norm()))
     assert order([1 / count for count in counts], errors) > 2.7
 
@@ -142,7 +142,7 @@ def test_smooth_channels_converge_at_third_order(random, order):
 def test_subdivided_squares_are_exact_in_smooth_channels(random):
     line = torch.arange(7, dtype=torch.float64)
     values = torch.stack([line * line, line * line], 1)
-    found = subdivided(values, 3, Smooth(1, 2))
+    found = subdivide(values, 3, ThirdOrder(1, 2))
     fine = torch.arange(19, dtype=torch.float64) / 3
     torch.testing.assert_close(found[3:-3, 1], (fine * fine)[3:-3], rtol=0, atol=1e-13)
     assert torch.equal(found[::3], values) and float((found[:, 0] - fine * fine).abs().max()) > 0.1
@@ -152,4 +152,4 @@ def test_subdivided_squares_are_exact_in_smooth_channels(random):
 def test_smooth_channels_have_both_derivatives(wanted: tuple[bool, bool], random):
     slices, points = random(2, 3, 4, 5), 1.6 * random(2, 7, 2, seed=1) - 0.8
     inputs = tuple(item.clone().requires_grad_(is_wanted) for item, is_wanted in zip((slices, points), wanted, strict=True))
-    assert torch.autograd.gradcheck(lambda s, p: sample_slices(s, p, Smooth(1, 3, 0.5)), inputs, check_forward_ad=True)
+    assert torch.autograd.gradcheck(lambda s, p: sample_slices(s, p, ThirdOrder(1, 3, 0.5)), inputs, check_forward_ad=True)

@@ -8,15 +8,15 @@ from torch import Tensor
 
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.separable import Weights, sample_lattice
-from ddrecon.numerics.third_order import Smooth
+from ddrecon.numerics.third_order import ThirdOrder
 
 
-def point_by_point(slices: Tensor, rows: Tensor, columns: Tensor, smooth: Smooth | None) -> Tensor:
+def point_by_point(slices: Tensor, rows: Tensor, columns: Tensor, smooth: ThirdOrder | None) -> Tensor:
     pairs = torch.broadcast_tensors(columns[:, None, :], rows[:, :, None])
     return sample_slices(slices, torch.stack(pairs, -1).flatten(1, 2), smooth)
 
 
-def by_matrices(slices: Tensor, rows: Tensor, columns: Tensor, smooth: Smooth | None) -> Tensor:
+def by_matrices(slices: Tensor, rows: Tensor, columns: Tensor, smooth: ThirdOrder | None) -> Tensor:
     down, along = (
         Weights.at(line, size, is_smooth=smooth is not None) for line, size in zip((rows, columns), slices.shape[2:], strict=True)
     )
@@ -31,8 +31,8 @@ def inputs(random) -> tuple[Tensor, Tensor, Tensor]:
     return random(2, 3, 4, 5), rows, columns
 
 
-@pytest.mark.parametrize("smooth", [None, Smooth(1, 2, 0.5)], ids=["linear", "third order"])
-def test_values_and_derivatives_are_those_of_points(smooth: Smooth | None, inputs, random):
+@pytest.mark.parametrize("smooth", [None, ThirdOrder(1, 2, 0.5)], ids=["linear", "third order"])
+def test_values_and_derivatives_are_those_of_points(smooth: ThirdOrder | None, inputs, random):
     results = []
     for sample in (by_matrices, point_by_point):
         leaves = [item.clone().requires_grad_() for item in inputs]
@@ -42,8 +42,8 @@ def test_values_and_derivatives_are_those_of_points(smooth: Smooth | None, input
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("smooth", [None, Smooth(1, 2, 0.5)], ids=["linear", "third order"])
-def test_both_modes_agree(smooth: Smooth | None, inputs, random):
+@pytest.mark.parametrize("smooth", [None, ThirdOrder(1, 2, 0.5)], ids=["linear", "third order"])
+def test_both_modes_agree(smooth: ThirdOrder | None, inputs, random):
     changes = tuple(random(*item.shape, seed=4) for item in inputs)
     found, tangent = torch.func.jvp(lambda *items: by_matrices(*items, smooth), inputs, changes)
     leaves, weight = [item.clone().requires_grad_() for item in inputs], random(*found.shape, seed=5)

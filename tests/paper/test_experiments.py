@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct.levels import at_level
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Result, optimize
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
@@ -112,7 +112,7 @@ def test_the_color_of_the_light_is_found() -> None:
 def test_g_is_found_where_the_pictures_are_our_own() -> None:
     """The paper's from 0.67 to -0.802, without the model's error: pictures rendered by ddrecon, in coarse cells."""
     overrides = ["optimize.iterations=80", "optimize.refine_at=[]", "optimize.parameters={g: {init: 0.67, lr: 0.1}}"]
-    scene = at_level(load_scene(CONFIGS["fig10"], overrides=overrides), 4)
+    scene = scene_at_level(load_scene(CONFIGS["fig10"], overrides=overrides), 4)
     with torch.no_grad():
         images = render(with_values(scene, {"g": torch.tensor(-0.802)}))
     scene = replace(scene, views=[replace(view, image=image) for view, image in zip(scene.views, images, strict=True)][:3:2])

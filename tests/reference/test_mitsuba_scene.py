@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import rays
+from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.reference.colors import of_color
+from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
 from ddrecon.scene import Scene
 
@@ -48,7 +48,7 @@ def test_the_box_and_its_volume_lie_where_the_grid_lies(make_scene, random) -> N
 def test_the_middle_of_a_films_edges_is_seen_along_our_rays(make_scene, make_camera, random, is_perspective: bool) -> None:
     camera = make_camera(size=(1, 2), half_width=0.4, is_perspective=is_perspective)
     sensor = described(make_scene(random(*SHAPE), camera=camera))["sensor_0"]
-    ours = rays(camera)
+    ours = cast_rays(camera)
     for ray, left in enumerate((0.5, -0.5)):
         if is_perspective:
             away = np.tan(np.radians(sensor["fov"] / 2)) * left
@@ -109,7 +109,7 @@ def test_one_color_of_a_scene_is_that_color(make_scene, random) -> None:
     scene = replace(make_scene(random(*SHAPE)), lights=every_light(random(1)))
     whole = described(scene)
     for color in range(3):
-        one = described(of_color(scene, color))
+        one = described(pick_color(scene, color))
         np.testing.assert_allclose(extinction(one["medium"])[..., 0], extinction(whole["medium"])[..., color], rtol=1e-6)
         assert one["medium"]["albedo"] == pytest.approx(whole["medium"]["albedo"][color])
         assert one["light_0"]["irradiance"] == (whole["light_0"]["irradiance"][color],) * 3

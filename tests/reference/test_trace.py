@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, look_at, rays
+from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
@@ -140,4 +140,4 @@ def test_an_off_center_camera_is_theirs(make_scene, make_camera, random) -> None
     theirs = mitsuba.load_dict(sensor)
     for corner, index in (((0.0, 0.0), 0), ((1.0, 1.0), -1)):
         ray, _ = theirs.sample_ray(0.0, 0.5, mitsuba.ScalarPoint2f(*corner), mitsuba.ScalarPoint2f(0.5))
-        np.testing.assert_allclose(np.array(ray.d).ravel(), rays(camera, corner).direction[index].flip(-1), atol=1e-6)
+        np.testing.assert_allclose(np.array(ray.d).ravel(), cast_rays(camera, corner).direction[index].flip(-1), atol=1e-6)

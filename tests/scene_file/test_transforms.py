@@ -14,7 +14,7 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.cameras import rays
+from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.dump import dump_scene
@@ -65,7 +65,7 @@ def test_rays_are_those_of_the_calibration(read: Read, tmp_path: Path) -> None:
     """Pixel centers, +y up and looking along -z; what maps the world into other programs' boxes changes nothing."""
     read(transforms(tmp_path / "transforms.json", frame(None), **NERFSTUDIO))
     (view,) = load_scene(tmp_path / "scene.yaml", dtype=torch.float64).views
-    bundle, pose = rays(view.camera), torch.tensor(POSE, dtype=torch.float64)
+    bundle, pose = cast_rays(view.camera), torch.tensor(POSE, dtype=torch.float64)
     assert view.camera.size == (6, 8)
     for row in range(6):
         for column in range(8):
@@ -237,7 +237,7 @@ def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
         assert other.image is not None and (one.name, one.split) == (other.name, other.split)
         assert other.image.resolve() == one.image and (other.mask and other.mask.resolve()) == one.mask
     for one, other in zip(before.views, build_scene(again, dtype=torch.float64).views, strict=True):
-        torch.testing.assert_close(rays(one.camera).direction, rays(other.camera).direction, rtol=0, atol=1e-14)
+        torch.testing.assert_close(cast_rays(one.camera).direction, cast_rays(other.camera).direction, rtol=0, atol=1e-14)
         assert torch.equal(one.camera.pose, other.camera.pose) and one.camera.size == other.camera.size
 
 

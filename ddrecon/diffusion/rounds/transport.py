@@ -18,24 +18,24 @@ from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.sweep import sweep
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import is_varied, recomputed
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 
-def transported(problem: DiffusionProblem, light: Moments, solve: Solve[Operator], rounds: int, directions: int) -> Moments:
+def run_rounds(problem: DiffusionProblem, light: Moments, solve: Solve[Operator], rounds: int, directions: int) -> Moments:
     """L0 and L1 after `rounds` of sweeps along so many `directions`, begun at `light`, the solution of `problem` (E12)."""
     if rounds == 0:
         return light
     operator, right = problem.system
     medium = problem.medium
     inflow = problem.outside if is_varied(problem.outside) or bool((problem.outside != 0).any()) else None
-    share = recomputed(_transport_share, medium, directions)
+    share = recompute(_transport_share, medium, directions)
     for turn in range(1, rounds + 1):
         swept = sweep(medium, light.scaled(1.0, medium.mean_cosine).plus(problem.source), inflow, directions)
         gain = swept.plus(Moments(light.mean, problem.flux(light.mean)).scaled(-1.0, -1.0)).scaled(share, share)
         source = medium.remaining_scattering * gain.mean
         if turn > 1:
-            source = source - share * recomputed(_imbalance, operator, right, light.mean)
+            source = source - share * recompute(_imbalance, operator, right, light.mean)
         spread = solve_diffusion(replace(solve, turn=turn, start=light.mean.detach()), operator, right + source)
         light = Moments(spread, problem.flux(spread)).plus(gain)
     return light

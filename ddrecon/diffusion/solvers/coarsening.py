@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, difference, lower, upper
+from ddrecon.diffusion.operator import AXES, Operator, difference, lower_cells, upper_cells
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class Coarsening:
         total = _sum_of_pairs(residual, self.axis)
         moved = self.below * _below(residual, self.axis)
         moved.addcmul_(self.above, _above(residual, self.axis), value=-1)
-        lower(total, self.axis).sub_(moved)
-        upper(total, self.axis).add_(moved)
+        lower_cells(total, self.axis).sub_(moved)
+        upper_cells(total, self.axis).add_(moved)
         return total
 
     def prolong(self, u: Tensor) -> Tensor:
@@ -49,12 +49,12 @@ class Coarsening:
         return result
 
 
-def coarsened(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
+def coarsen(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
     """`operator` on half as many cells along `axis`, and the way there and back."""
     along = operator.conductances[axis - 1]
-    half = _padded(0.5 / _first(along, axis), axis, (along.shape[axis] + 2) // 2)
-    resistance = lower(half, axis) + 1 / _second(along, axis) + upper(half, axis)
-    way = Coarsening(axis, along.shape[axis] + 1, lower(half, axis) / resistance, upper(half, axis) / resistance)
+    half = _pad(0.5 / _first(along, axis), axis, (along.shape[axis] + 2) // 2)
+    resistance = lower_cells(half, axis) + 1 / _second(along, axis) + upper_cells(half, axis)
+    way = Coarsening(axis, along.shape[axis] + 1, lower_cells(half, axis) / resistance, upper_cells(half, axis) / resistance)
     coarse = [_sum_of_pairs(c, axis) for c in operator.conductances]
     coarse[axis - 1] = _stiffened(1 / resistance, way, operator)
     z, y, x = coarse
@@ -73,8 +73,8 @@ def _stiffened(along: Tensor, way: Coarsening, operator: Operator) -> Tensor:
             conductance = operator.conductances[across - 1]
             energy = _below(conductance, way.axis) * difference(way.below, across) ** 2
             energy += _above(conductance, way.axis) * difference(way.above, across) ** 2
-            lower(along, across).add_(energy, alpha=0.5)
-            upper(along, across).add_(energy, alpha=0.5)
+            lower_cells(along, across).add_(energy, alpha=0.5)
+            upper_cells(along, across).add_(energy, alpha=0.5)
     return along
 
 
@@ -101,10 +101,10 @@ def _below(u: Tensor, axis: int) -> Tensor:
 
 def _above(u: Tensor, axis: int) -> Tensor:
     """The cells on the high side of every face between pairs (a view)."""
-    return upper(_first(u, axis), axis)
+    return upper_cells(_first(u, axis), axis)
 
 
-def _padded(u: Tensor, axis: int, size: int) -> Tensor:
+def _pad(u: Tensor, axis: int, size: int) -> Tensor:
     """`u` with zeros after it, to `size` entries along `axis`."""
     rest = u.new_zeros([size - n if other == axis else n for other, n in enumerate(u.shape)])
     return torch.cat([u, rest], axis)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, lower, upper
-from ddrecon.diffusion.solvers.coarsening import Coarsening, coarsened
+from ddrecon.diffusion.operator import AXES, Operator, lower_cells, upper_cells
+from ddrecon.diffusion.solvers.coarsening import Coarsening, coarsen
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 
 FEW_CELLS = 128
@@ -40,7 +40,7 @@ class Coarsest:
         number = torch.arange(math.prod(shape), device=operator.loss.device).view(1, *shape)
         matrix = torch.diag_embed(Operator(_double(operator.conductances), operator.loss.double()).diagonal.flatten(1))
         for axis, conductance in zip(AXES, operator.conductances, strict=True):
-            low, high = lower(number, axis).flatten(), upper(number, axis).flatten()
+            low, high = lower_cells(number, axis).flatten(), upper_cells(number, axis).flatten()
             matrix[:, low, high] = matrix[:, high, low] = -conductance.flatten(1).double()
         return Coarsest(torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L).to(operator.loss.dtype))
 
@@ -69,7 +69,7 @@ class Level:
         matrix, ways = operator.once(ScaledMatrix.of), []
         taken = matrix.scale * (operator.diagonal - operator.loss)
         for axis in _strong_axes(matrix):
-            way, operator = coarsened(operator, axis)
+            way, operator = coarsen(operator, axis)
             ways.append(way)
         has_few = operator.loss[0].numel() <= FEW_CELLS
         return Level(matrix, taken, tuple(ways), Coarsest.of(operator) if has_few else Level.of(operator))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, lower, subtract_neighbors, upper
+from ddrecon.diffusion.operator import AXES, Operator, lower_cells, subtract_neighbors, upper_cells
 from ddrecon.errors import SolveError
 
 
@@ -31,7 +31,7 @@ class ScaledMatrix:
     def of(operator: Operator) -> ScaledMatrix:
         """The scaled form of `operator`."""
         scale = operator.diagonal.rsqrt()
-        scaled = tuple(c * lower(scale, axis) * upper(scale, axis) for axis, c in zip(AXES, operator.conductances, strict=True))
+        scaled = tuple(c * lower_cells(scale, axis) * upper_cells(scale, axis) for axis, c in zip(AXES, operator.conductances, strict=True))
         return ScaledMatrix(scale, scaled)
 
     def apply(self, y: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replace_file(path: Path) -> Iterator[Path]:
     """A temporary name beside `path`, with its suffix, that becomes `path` when the block ends well and vanishes when not.
 
     Raises FormatError where the system refuses to write.
@@ -30,9 +30,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def replacing_durably(path: Path, kept_as: Path) -> Iterator[Path]:
-    """As `replacing`, but safe from a loss of power once it has ended; what `path` was until then is kept as `kept_as`."""
-    with replacing(path) as temporary:
+def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
+    """As `replace_file`, but safe from a loss of power once it has ended; what `path` was until then is kept as `kept_as`."""
+    with replace_file(path) as temporary:
         yield temporary
         flush(temporary)
         with suppress(FileNotFoundError):

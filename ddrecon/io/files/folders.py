@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ddrecon.errors import SceneError
-from ddrecon.io.files.lock import LOCK, locked
+from ddrecon.io.files.lock import LOCK, hold_lock
 
 
 @contextmanager
-def claimed_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
+def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
     """Makes the folder `path`, and keeps other processes out of it until the block ends.
 
     Raises SceneError where it is a file, where another process writes there, or where it holds something and `may_exist` is False.
@@ -22,7 +22,7 @@ def claimed_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SceneError(f"{path}: cannot be made: {error.strerror or error}") from error
-    with locked(path):
+    with hold_lock(path):
         if not may_exist and any(entry.name != LOCK for entry in path.iterdir()):
             raise SceneError(f"{path}: the folder is not empty; choose another, or say --overwrite")
         yield

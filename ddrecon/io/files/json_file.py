@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 
 
 def write_json(path: Path, content: Any) -> None:
     """Writes `content` to `path`, indented."""
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -23,7 +23,7 @@ MAX_BYTES = 4096
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def hold_lock(folder: Path) -> Iterator[None]:
     """Nobody else's `folder` until the block ends; raises SceneError while another process has it."""
     path = folder / LOCK
     _acquire(path)

@@ -15,7 +15,7 @@ KINDS = {stat.S_IFIFO: "a named pipe", stat.S_IFCHR: "a device", stat.S_IFBLK: "
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def guard_reading(path: Path) -> Iterator[None]:
     """Any error of the block, which reads the file (or folder of files) at `path`, becomes a FormatError.
 
     Raises FormatError, before the block, for what is neither: a pipe or a device is never opened.

@@ -9,7 +9,7 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 
 
 def has_exr() -> bool:
@@ -37,7 +37,7 @@ def write_exr(path: Path, pixels: np.ndarray) -> None:
     """Writes `pixels` [h, w, 3] as float32 RGB; raises FormatError where OpenEXR is not installed."""
     module = load_for_file("OpenEXR", path)
     header = {"compression": module.ZIP_COMPRESSION, "type": module.scanlineimage}
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         module.File(header, {"RGB": as_float32(pixels)}).write(str(temporary))
 
 

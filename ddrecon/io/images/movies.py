@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.extras import load_extra
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.images import srgb
 
 SECONDS = 4.0
 """How long a movie takes from its first frame back to it."""
 
 
-def encoded(frames: Sequence[np.ndarray], white: float) -> np.ndarray:
+def encode_frames(frames: Sequence[np.ndarray], white: float) -> np.ndarray:
     """`frames` [h, w, 3], linear, as 8-bit sRGB [n, h, w, 3]; radiance from `white` > 0 up is white."""
     return np.stack([np.round(255 * srgb.encode(np.clip(np.nan_to_num(frame / white), 0, 1))).astype(np.uint8) for frame in frames])
 
@@ -30,7 +30,7 @@ def animation_of(frames: np.ndarray) -> bytes:
 
 def write_animation(path: Path, frames: np.ndarray) -> None:
     """Writes `frames`, 8-bit [n, h, w, 3], as an animated PNG to `path`."""
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(animation_of(frames))
 
 
@@ -46,5 +46,5 @@ def write_mp4(path: Path, frames: np.ndarray) -> None:
     require_mp4()
     height, width = frames.shape[1:3]
     even = np.pad(frames, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         iio.imwrite(temporary, even, plugin="FFMPEG", extension=".mp4", fps=len(frames) / SECONDS, macro_block_size=2)

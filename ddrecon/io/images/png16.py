@@ -47,7 +47,7 @@ def read_deep_png(path: Path) -> np.ndarray:
     filtered = np.frombuffer(lines, np.uint8).reshape(height, 1 + row)
     if filtered[:, 0].max() > 4:
         raise FormatError(path, f"is damaged: there is no filter of type {filtered[:, 0].max()}")
-    pixels = _unfiltered(filtered[:, 0], filtered[:, 1:].reshape(height, width, -1))
+    pixels = _unfilter(filtered[:, 0], filtered[:, 1:].reshape(height, width, -1))
     return pixels.view(">u2").astype(np.uint16)
 
 
@@ -63,16 +63,16 @@ def _chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
         yield kind, content
 
 
-def _unfiltered(filters: np.ndarray, stored: np.ndarray) -> np.ndarray:
+def _unfilter(filters: np.ndarray, stored: np.ndarray) -> np.ndarray:
     """The bytes [h, w, b] that were stored less a prediction each, by the `filters` [h] of their rows; `BAND` rows at a time."""
     known = np.zeros((len(stored) + 1, *stored.shape[1:]), np.uint8)
     for top in range(0, len(stored), BAND):
         band = slice(top, top + BAND)
-        known[1:][band] = _unfiltered_band(filters[band], stored[band], known[top])
+        known[1:][band] = _unfilter_band(filters[band], stored[band], known[top])
     return known[1:]
 
 
-def _unfiltered_band(filters: np.ndarray, stored: np.ndarray, previous: np.ndarray) -> np.ndarray:
+def _unfilter_band(filters: np.ndarray, stored: np.ndarray, previous: np.ndarray) -> np.ndarray:
     """The same of rows below `previous` [w, b].
 
     A byte is predicted from those to its left, above, and above left, so all places of an antidiagonal are found at once. Arrays are

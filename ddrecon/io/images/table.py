@@ -14,8 +14,8 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import as_float32, check_size, read_npy
-from ddrecon.io.files.atomic import replacing
-from ddrecon.io.files.reading import reading
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images import srgb
 from ddrecon.io.images.exr import has_exr, read_exr, write_exr
 from ddrecon.io.images.hdr import read_hdr
@@ -63,14 +63,14 @@ def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
     suffix, write = (".exr", write_exr) if has_exr() else (".tif", write_tiff)
     picture, array = (stem.with_name(stem.name + ending) for ending in (suffix, ".npy"))
     write(picture, pixels)
-    with replacing(array) as temporary:
+    with replace_file(array) as temporary:
         np.save(temporary, as_float32(pixels), allow_pickle=False)
     return [picture, array]
 
 
 def write_preview(path: Path, pixels: np.ndarray) -> None:
     """Writes `pixels` [h, w, 3], linear, as an 8-bit sRGB .png at `path`, clipped to [0, 1]."""
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(png_of(pixels))
 
 
@@ -94,7 +94,7 @@ def _read_values(path: Path) -> np.ndarray:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"unknown image format {path.suffix!r}; known: {', '.join(READERS)}")
-    with reading(path):
+    with guard_reading(path):
         values = reader(path)
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or values.size == 0:
         raise FormatError(path, f"has shape {list(values.shape)}; expected [h, w], [h, w, 3] or [h, w, 4]")
@@ -125,7 +125,7 @@ def _read_encoded(path: Path) -> np.ndarray:
     if not any(start.startswith(beginning) and start.endswith(end) for beginning, end in BEGINNINGS):
         raise FormatError(path, "is no PNG, JPEG or WebP image")
     if has_deep_colors(path):
-        return _decoded(read_deep_png(path))
+        return _decode(read_deep_png(path))
     with Pillow.open(path) as picture:
         width, height = picture.size
     check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
@@ -133,10 +133,10 @@ def _read_encoded(path: Path) -> np.ndarray:
     stored = iio.imread(path, plugin="pillow", index=0)
     if mode not in {"1", "L", "LA", "P", "RGB", "RGBA"} and stored.dtype != np.uint16:
         raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
-    return _decoded(stored)
+    return _decode(stored)
 
 
-def _decoded(stored: np.ndarray) -> np.ndarray:
+def _decode(stored: np.ndarray) -> np.ndarray:
     """Linear values of `stored` [h, w] or [h, w, c], multiplied by the alpha that the last of 2 or 4 channels is."""
     values = stored / (1 if stored.dtype == bool else np.iinfo(stored.dtype).max)
     if values.ndim == 2 or values.shape[2] == 3:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import check_size
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 
 MARK = "bounds"
 """What the description of a stack that we wrote says, besides what ImageJ says."""
@@ -34,7 +34,7 @@ def write_tiff(path: Path, pixels: np.ndarray) -> None:
     data = np.ascontiguousarray(pixels, "<f4").tobytes()
     tags = {WIDTH: [width], HEIGHT: [height], BITS: [32] * samples, COMPRESSION: [1], PHOTOMETRIC: [1 if samples == 1 else 2]}
     tags |= {OFFSETS: [8], SAMPLES: [samples], ROWS: [height], COUNTS: [len(data)], PLANAR: [1], SAMPLE_FORMAT: [3] * samples}
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(struct.pack("<2sHI", b"II", 42, 8 + len(data)) + data + _directory(tags, 8 + len(data)))
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import as_float32, check_size
-from ddrecon.io.files.atomic import replacing
-from ddrecon.io.volumes.field import Field, Fields, checked_field, only_field
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.volumes.field import Field, Fields, check_field, require_only_field
 
 HEADER = struct.Struct("<3sB5i6f")
 MAGIC, VERSION, FLOAT32 = b"VOL", 3, 1
@@ -34,16 +34,16 @@ def read_vol(path: Path, name: str) -> Field:
     if min(x, y, z, colors) < 1 or len(data) != HEADER.size + 4 * x * y * z * colors:
         raise FormatError(path, f"is damaged: its header says {x} x {y} x {z} cells of {colors}, which is not the size of its data")
     values = np.frombuffer(data, "<f4", offset=HEADER.size).reshape(z, y, x, colors)
-    return checked_field(path, name, values[..., 0] if colors == 1 else values, np.array(corners, np.float64).reshape(2, 3))
+    return check_field(path, name, values[..., 0] if colors == 1 else values, np.array(corners, np.float64).reshape(2, 3))
 
 
 def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """Writes the one of `fields` [z, y, x] or [z, y, x, C] and `bounds` [2, 3] (x, y, z), both as float32; the format knows no names."""
-    values = only_field(path, fields)
+    values = require_only_field(path, fields)
     colors = values.shape[3] if values.ndim == 4 else 1
     z, y, x = values.shape[:3]
     header = HEADER.pack(MAGIC, VERSION, FLOAT32, x, y, z, colors, *np.asarray(bounds, np.float64).ravel())
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(header + as_float32(values).astype("<f4", copy=False).tobytes())
 
 

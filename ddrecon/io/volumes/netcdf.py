@@ -16,8 +16,8 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
-from ddrecon.io.files.atomic import replacing
-from ddrecon.io.volumes.field import Field, Fields, checked_field
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.volumes.field import Field, Fields, check_field
 
 COLOR = "color"
 NAMES = {"x": ("x", "west_east", "nx"), "y": ("y", "south_north", "ny"), "z": ("z", "height", "altitude", "bottom_top", "lev", "nz")}
@@ -31,7 +31,7 @@ def write_netcdf(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """Writes `fields`, [z, y, x] or [z, y, x, 3], as float32 variables, and `bounds` [2, 3] (x, y, z) as coordinates and their bounds."""
     netcdf = load_for_file("netCDF4", path)
     z, y, x = next(iter(fields.values())).shape[:3]
-    with replacing(path) as temporary, netcdf.Dataset(temporary, "w") as file:
+    with replace_file(path) as temporary, netcdf.Dataset(temporary, "w") as file:
         file.Conventions = "CF-1.11"
         for axis, count, low, high in zip("xyz", (x, y, z), *np.asarray(bounds, np.float64), strict=True):
             _write_axis(file, axis, np.linspace(low, high, count + 1))
@@ -54,27 +54,27 @@ def _write_axis(file: Any, axis: str, edges: np.ndarray) -> None:
 
 def netcdf_names(path: Path) -> list[str]:
     """The variables of the file at `path` that have axes x, y and z; raises FormatError when it cannot be read."""
-    with _opened(path) as file:
+    with _open(path) as file:
         return _names(file)
 
 
 def read_netcdf(path: Path, name: str) -> Field:
     """The variable `name` of the file at `path`; raises FormatError when it is damaged, absent, unevenly spaced or not a legal field."""
-    with _opened(path) as file:
+    with _open(path) as file:
         if name not in file.variables:
             raise FormatError(path, f"has no variable {name!r}; on axes x, y and z it has {', '.join(map(repr, _names(file))) or 'none'}")
         variable = file.variables[name]
         check_size(int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize, path, name)
-        values, axes = _arranged(path, file, variable)
+        values, axes = _arrange(path, file, variable)
         edges = [_edges(path, file, dimension) for dimension in axes]
     flips = tuple(slice(None, None, -1 if edge is not None and edge[0] > edge[1] else 1) for edge in edges)
     known = [sorted(edge) for edge in edges if edge is not None]
     bounds = np.array(known[::-1]).T if len(known) == 3 else None
-    return checked_field(path, name, values[flips], bounds)
+    return check_field(path, name, values[flips], bounds)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open(path: Path) -> Iterator[Any]:
     netcdf = load_for_file("netCDF4", path)
     try:
         path.stat()
@@ -100,7 +100,7 @@ def _names(file: Any) -> list[str]:
     return [name for name, variable in file.variables.items() if {"x", "y", "z"} <= {_axis_of(file, one) for one in variable.dimensions}]
 
 
-def _arranged(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str]]:
+def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str]]:
     """The values as [z, y, x] or [z, y, x, colors], and the names of the dimensions z, y and x; others must have one entry."""
     values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
     kept, places = [], {}

@@ -12,8 +12,8 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import read_npy
-from ddrecon.io.files.atomic import replacing
-from ddrecon.io.volumes.field import Field, Fields, checked_field
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.volumes.field import Field, Fields, check_field
 
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError)
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -21,23 +21,23 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 def read_npz(path: Path, name: str) -> Field:
     """The field `name` of the archive at `path`; raises FormatError when it is damaged, absent or not a legal field."""
-    with _opened(path) as archive:
+    with _open(path) as archive:
         names = _names(archive)
         if name not in names:
             raise FormatError(path, _absence(name, [other for other in names if other != "bounds"]))
         bounds = _read_entry(archive, "bounds", path) if "bounds" in names else None
         values = _read_entry(archive, name, path)
-    return checked_field(path, name, values, bounds)
+    return check_field(path, name, values, bounds)
 
 
 def npz_names(path: Path) -> list[str]:
     """The names of all arrays of the archive at `path` but `bounds`; raises FormatError when it is damaged."""
-    with _opened(path) as archive:
+    with _open(path) as archive:
         return [name for name in _names(archive) if name != "bounds"]
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+def _open(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
@@ -53,7 +53,7 @@ def _names(archive: zipfile.ZipFile) -> list[str]:
 
 def write_npz(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 under their names, with `bounds` [2, 3] (x, y, z), compressed."""
-    with replacing(path) as temporary, temporary.open("wb") as stream:
+    with replace_file(path) as temporary, temporary.open("wb") as stream:
         arrays = {name: np.asarray(values, np.float32) for name, values in fields.items()} | {"bounds": np.asarray(bounds, np.float64)}
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 

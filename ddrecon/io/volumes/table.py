@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.reading import reading
+from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import Field, Fields, name_from_file
 from ddrecon.io.volumes.mitsuba import read_vol, write_vol
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf, write_netcdf
@@ -42,14 +42,14 @@ FORMATS: dict[str, VolumeFormat] = {
 def field_names(path: Path) -> list[str]:
     """The fields that the volume file at `path` holds; raises FormatError when it cannot be read."""
     names = _format_of(path).names
-    with reading(path):
+    with guard_reading(path):
         return names(path)
 
 
 def read_field(path: Path, name: str) -> Field:
     """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`; raises FormatError when it cannot be used."""
     read = _format_of(path).read
-    with reading(path):
+    with guard_reading(path):
         return read(path, name)
 
 

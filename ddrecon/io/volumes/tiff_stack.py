@@ -16,22 +16,22 @@ import numpy as np
 from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.images.tiff import MARK
-from ddrecon.io.volumes.field import Field, Fields, checked_field, only_field
+from ddrecon.io.volumes.field import Field, Fields, check_field, require_only_field
 
 
 def write_stack(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     """Writes the one of `fields`, [z, y, x] or [z, y, x, 3], as float32, and `bounds` [2, 3] (x, y, z); the format knows no names."""
     tifffile = load_for_file("tifffile", path)
-    values = as_float32(only_field(path, fields))
+    values = as_float32(require_only_field(path, fields))
     low, high = np.asarray(bounds, np.float64)
     size = (high - low) / values.shape[2::-1]
     origin = {f"{axis}origin": float(number) for axis, number in zip("xyz", -low / size, strict=True)}
     facts: dict[str, Any] = {"axes": "TZCYXS", "spacing": float(size[2]), "unit": "u", **origin}
     facts[MARK] = json.dumps([low.tolist(), high.tolist()])
     pages = (values[:, None] if values.ndim == 3 else np.moveaxis(values, 3, 1))[None, ..., None]
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         tifffile.imwrite(temporary, pages, imagej=True, photometric="minisblack", resolution=tuple(1 / size[:2]), metadata=facts)
 
 
@@ -51,7 +51,7 @@ def read_stack(path: Path, name: str) -> Field:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     except Exception as error:  # decoders of damaged files raise whatever they like
         raise FormatError(path, f"not a TIFF stack that can be read: {error}") from error
-    return checked_field(path, name, values, bounds)
+    return check_field(path, name, values, bounds)
 
 
 def _slices(path: Path, values: np.ndarray, axes: str) -> np.ndarray:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.io.files.arrays import as_float32
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.volumes.field import Fields
 
 RESOLUTION = "ddrecon_resolution"
@@ -33,7 +33,7 @@ def write_vdb(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     data = header + _metadata({}) + struct.pack("<I", len(fields))
     for name, values in fields.items():
         data += _grid(name, as_float32(values), np.asarray(bounds, np.float64), len(data))
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(data)
 
 

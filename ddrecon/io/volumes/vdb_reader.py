@@ -11,7 +11,7 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import check_size
-from ddrecon.io.volumes.field import Field, checked_field
+from ddrecon.io.volumes.field import Field, check_field
 from ddrecon.io.volumes.vdb import RESOLUTION
 
 MODULES = ("openvdb", "pyopenvdb")
@@ -42,7 +42,7 @@ def read_vdb(path: Path, name: str) -> Field:
     check_size(4 * components * int(shape.prod(dtype=object)), path, name)
     values = np.zeros([*shape, components][: 3 if components == 1 else 4], np.float32)
     grid.copyToArray(values, ijk=tuple(low.tolist()))
-    return checked_field(path, name, values.swapaxes(0, 2), _bounds(grid, low, high))
+    return check_field(path, name, values.swapaxes(0, 2), _bounds(grid, low, high))
 
 
 def _grids(path: Path) -> dict[str, Any]:

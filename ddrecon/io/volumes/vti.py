@@ -17,8 +17,8 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import as_float32, check_size
-from ddrecon.io.files.atomic import replacing
-from ddrecon.io.volumes.field import Field, Fields, checked_field
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.volumes.field import Field, Fields, check_field
 
 APPENDED = re.compile(rb"<AppendedData[^>]*>\s*_")
 TYPES = {"Float32": "f4", "Float64": "f8"}
@@ -50,32 +50,32 @@ def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 </ImageData>
 <AppendedData encoding="raw">
 _"""
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         temporary.write_bytes(head.encode() + data + b"\n</AppendedData>\n</VTKFile>\n")
 
 
 def vti_names(path: Path) -> list[str]:
     """The names of the cell arrays of the file at `path`; raises FormatError when it is damaged."""
-    with _opened(path) as (root, _):
+    with _open(path) as (root, _):
         return list(_arrays(_piece(root)))
 
 
 def read_vti(path: Path, name: str) -> Field:
     """The cell array `name` of the file at `path`; raises FormatError when it is damaged, absent, compressed or not a legal field."""
-    with _opened(path) as (root, appended):
+    with _open(path) as (root, appended):
         values, bounds = _read(path, root, appended, name)
-    return checked_field(path, name, values, bounds)
+    return check_field(path, name, values, bounds)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[ElementTree.Element, bytes]]:
+def _open(path: Path) -> Iterator[tuple[ElementTree.Element, bytes]]:
     """The XML of the file at `path`, and the data appended to it."""
     try:
         check_size(path.stat().st_size, path, "the volume")
         content = path.read_bytes()
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    head, appended = _parted(content)
+    head, appended = _split(content)
     if b"<!DOCTYPE" in head:
         raise FormatError(path, f"has a document type, which may define entities without end; {ADVICE}")
     try:
@@ -84,7 +84,7 @@ def _opened(path: Path) -> Iterator[tuple[ElementTree.Element, bytes]]:
         raise FormatError(path, f"not VTK image data that can be read ({error}); {ADVICE}") from error
 
 
-def _parted(content: bytes) -> tuple[bytes, bytes]:
+def _split(content: bytes) -> tuple[bytes, bytes]:
     """What is XML, and the raw data appended to it, which are not."""
     mark = APPENDED.search(content)
     if mark is None:

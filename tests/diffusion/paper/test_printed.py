@@ -22,7 +22,7 @@ from ddrecon.diffusion.paper.stencils import Stencils, convolve, extend
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
-from ddrecon.medium.coefficients import Medium, Volume, unscaled_medium
+from ddrecon.medium.coefficients import Medium, Volume, keep_medium
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
 
@@ -119,7 +119,7 @@ def manufactured(position: list[Tensor]) -> tuple[Tensor, ...]:
 
 def absorbing(grid: Grid, absorption: Tensor) -> Medium:
     nothing = absorption.new_zeros(1)
-    return unscaled_medium(Volume(grid, torch.ones_like(absorption[0]), absorption, nothing, nothing[0]))
+    return keep_medium(Volume(grid, torch.ones_like(absorption[0]), absorption, nothing, nothing[0]))
 
 
 def errors_on(cells: int) -> tuple[float, float]:
@@ -322,7 +322,7 @@ def ball(make_scene) -> Callable[..., Scene]:
 
 
 def kappa_of(scene: Scene) -> Tensor:
-    return 3 * CLOSURES["smooth"](unscaled_medium(scene.volume).transport_extinction, scene.volume.grid, scene.diffusion.floor)[0]
+    return 3 * CLOSURES["smooth"](keep_medium(scene.volume).transport_extinction, scene.volume.grid, scene.diffusion.floor)[0]
 
 
 def test_a_soft_ball_in_empty_space_diverges_and_names_the_cell(ball):

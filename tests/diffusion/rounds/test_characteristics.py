@@ -14,7 +14,7 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.characteristics import Course, follow, radiance_along
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
-from ddrecon.medium.coefficients import Medium, Volume, scaled_medium
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 DIRECTIONS = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8), (-(3**-0.5),) * 3, (0.48, -0.36, 0.8), (-0.1, 0.7, -(0.5**0.5)))
 each_direction = pytest.mark.parametrize("direction", DIRECTIONS)
@@ -22,7 +22,7 @@ each_direction = pytest.mark.parametrize("direction", DIRECTIONS)
 
 def medium_of(density: Tensor, grid: Grid, albedo: float = 0.9, g: float = 0.0, colors: int = 1) -> Medium:
     extinction = 4 + 3 * torch.arange(colors, dtype=density.dtype)
-    return scaled_medium(Volume(grid, density, (1 - albedo) * extinction, albedo * extinction, density.new_tensor(g)))
+    return scale_medium(Volume(grid, density, (1 - albedo) * extinction, albedo * extinction, density.new_tensor(g)))
 
 
 def random_light(random, grid: Grid, colors: int = 1) -> Moments:
@@ -132,7 +132,7 @@ def test_derivatives_agree_with_differences_in_both_modes(random, half_empty, bo
 
     def radiance(density: Tensor, g: Tensor, mean: Tensor, z: Tensor, y: Tensor, x: Tensor, inflow: Tensor) -> Tensor:
         extinction = density.new_tensor([3.0, 9.0, 20.0][:colors])
-        medium = scaled_medium(Volume(grid, density, 0.1 * extinction, 0.9 * extinction, g))
+        medium = scale_medium(Volume(grid, density, 0.1 * extinction, 0.9 * extinction, g))
         return radiance_along(medium, Moments(mean, (z, y, x)), inflow, direction)
 
     assert torch.autograd.gradcheck(radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True)

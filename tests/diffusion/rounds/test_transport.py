@@ -15,7 +15,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.rounds.sweep import sweep
 from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import reduced_light
-from ddrecon.medium.coefficients import scaled_medium
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.numerics.quadrature import DEGREES
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
@@ -39,7 +39,7 @@ def light_after(scene: Scene, rounds: int) -> Tensor:
 
 def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left(make_scene):
     scene = make_scene(ball(), sigma_a=(0.0,), sigma_s=(3.0,), directional=(3.0,), tolerance=1e-10, transport_directions=26)
-    medium = scaled_medium(scene.volume)
+    medium = scale_medium(scene.volume)
     source = reduced_light(medium, scene.lights, False).source
     last = light_after(scene, 12)
     swept = sweep(medium, Moments(last).plus(source), None, 26).mean
@@ -107,7 +107,7 @@ def test_memory_does_not_grow_with_directions(make_scene):
 
     def peak(directions: int) -> int:
         scene = make_scene(ball(10).requires_grad_(), directional=(3.0,))
-        medium, light = scaled_medium(scene.volume), Moments(torch.ones(3, 10, 10, 10, dtype=torch.float64))
+        medium, light = scale_medium(scene.volume), Moments(torch.ones(3, 10, 10, 10, dtype=torch.float64))
         with ArrayCount(1000) as count:
             sweep(medium, light, None, directions).mean.sum().backward()
         return count.most

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 
 
 def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path: Path):
     path = tmp_path / "a.txt"
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".txt" and temporary != path
         temporary.write_text("new")
         assert not path.exists()
@@ -23,12 +23,12 @@ def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path: P
 def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, interruption: type[BaseException]):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(interruption), replacing(path) as temporary:
+    with pytest.raises(interruption), replace_file(path) as temporary:
         temporary.write_text("half")
         raise interruption
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):
-    with pytest.raises(FormatError, match="cannot be written"), replacing(tmp_path / "absent" / "a.txt") as temporary:
+    with pytest.raises(FormatError, match="cannot be written"), replace_file(tmp_path / "absent" / "a.txt") as temporary:
         temporary.write_text("x")

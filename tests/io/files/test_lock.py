@@ -13,8 +13,8 @@ import pytest
 from click.testing import Result
 
 from ddrecon.errors import SceneError
-from ddrecon.io.files.folders import claimed_folder
-from ddrecon.io.files.lock import LOCK, locked
+from ddrecon.io.files.folders import claim_folder
+from ddrecon.io.files.lock import LOCK, hold_lock
 
 Run = Callable[..., Result]
 COMMANDS = {
@@ -30,7 +30,7 @@ def holder(folder: Path) -> dict[str, object]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_second_run_is_refused(run: Run, command: str) -> None:
-    with claimed_folder(Path("out"), may_exist=False):
+    with claim_folder(Path("out"), may_exist=False):
         for more in ([], ["--overwrite"]):
             result = run(*COMMANDS[command], *more)
             line = f"out: process {os.getpid()} is writing there; wait for it, or choose another folder\n"
@@ -40,7 +40,7 @@ def test_a_second_run_is_refused(run: Run, command: str) -> None:
 
 
 def test_a_lock_goes_when_the_block_fails(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), locked(tmp_path):
+    with pytest.raises(RuntimeError), hold_lock(tmp_path):
         assert holder(tmp_path)["pid"] == os.getpid()
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
@@ -51,7 +51,7 @@ def test_the_lock_of_a_dead_process_is_stale(tmp_path: Path) -> None:
     script += "with locked(Path(sys.argv[1])): os._exit(9)"
     assert subprocess.run([sys.executable, "-c", script, tmp_path]).returncode == 9
     assert (tmp_path / LOCK).exists()
-    with locked(tmp_path):
+    with hold_lock(tmp_path):
         assert holder(tmp_path)["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
 
@@ -59,10 +59,10 @@ def test_the_lock_of_a_dead_process_is_stale(tmp_path: Path) -> None:
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="this system does not tell when a process started")
 @pytest.mark.parametrize("changed", [{"start": "1"}, {"boot": "another"}])
 def test_the_lock_of_a_process_whose_number_was_used_again_is_stale(tmp_path: Path, changed: dict[str, str]) -> None:
-    with locked(tmp_path):
+    with hold_lock(tmp_path):
         own = holder(tmp_path)
     (tmp_path / LOCK).write_text(json.dumps(own | changed))
-    with locked(tmp_path):
+    with hold_lock(tmp_path):
         assert holder(tmp_path) == own
 
 
@@ -71,6 +71,6 @@ def test_the_lock_of_a_process_whose_number_was_used_again_is_stale(tmp_path: Pa
 )
 def test_what_cannot_be_known_to_be_stale_is_kept(tmp_path: Path, content: str, what: str) -> None:
     (tmp_path / LOCK).write_text(content)
-    with pytest.raises(SceneError, match=what), locked(tmp_path):
+    with pytest.raises(SceneError, match=what), hold_lock(tmp_path):
         pass
     assert (tmp_path / LOCK).read_text() == content

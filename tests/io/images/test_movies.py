@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ddrecon.errors import MissingExtraError
-from ddrecon.io.images.movies import SECONDS, encoded, write_animation, write_mp4
+from ddrecon.io.images.movies import SECONDS, encode_frames, write_animation, write_mp4
 
 
 def frames() -> np.ndarray:
@@ -18,7 +18,7 @@ def frames() -> np.ndarray:
     pictures = [np.full((17, 23, 3), level) for level in np.linspace(0, 2.4, 7) * 0.9]
     for picture in pictures:
         picture[:4, :4] += 0.3
-    return encoded(pictures, 2.0)
+    return encode_frames(pictures, 2.0)
 
 
 def test_white_is_what_was_said() -> None:
