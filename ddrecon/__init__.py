@@ -1,7 +1,8 @@
 """ddrecon: density volumes from pictures of smoke and clouds, by differential diffusion.
 
-`load_scene(path) -> Scene`, `render(scene, view=None) -> Tensor [views, 3, h, w]`, `optimize(scene, ...) -> Result` and
-`VolumeRenderer`, the renderer as a layer. Names are imported when first used, so that `import ddrecon` costs nothing.
+`load_scene(path) -> Scene`, `render(scene, view=None) -> Tensor [views, 3, h, w]`, `optimize(scene,
+...) -> Result` and `VolumeRenderer`, the renderer as a layer. Names are imported when first used,
+so that `import ddrecon` costs nothing.
 """
 
 from importlib import import_module

@@ -1,6 +1,8 @@
-"""What a scene is once it is tensors: a volume, its lights and its views, with the settings they are rendered by.
+"""What a scene is once it is tensors: a volume, its lights and its views, with the settings they
+are rendered by.
 
-Records here are values the physics and the reconstruction read; how they are written in a file is `ddrecon.scene_file`'s business.
+Records here are values the physics and the reconstruction read; how they are written in a file is
+`ddrecon.scene_file`'s business.
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ if TYPE_CHECKING:
 class View:
     """One view: its camera, and its target `image` [3, h, w] (linear radiance) where it has one.
 
-    `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views are never optimized on;
-    `weight` > 0 is how much a training view counts.
+    `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views
+    are never optimized on; `weight` > 0 is how much a training view counts.
     """
 
     name: str
@@ -38,7 +40,8 @@ class View:
 
 @dataclass(eq=False)
 class Scene:
-    """A loaded scene. `optimize`, `starts` and `path` are what its file says of reconstruction, and where that file lies.
+    """A loaded scene. `optimize`, `starts` and `path` are what its file says of reconstruction, and
+    where that file lies.
 
     `starts` holds, for each optimized parameter, the value it starts from.
     """
@@ -57,4 +60,6 @@ class Scene:
         for view in self.views:
             if view.name == name:
                 return view
-        raise KeyError(f"no view {name!r}; the views are {', '.join(view.name for view in self.views)}")
+        raise KeyError(
+            f"no view {name!r}; the views are {', '.join(view.name for view in self.views)}"
+        )

@@ -21,11 +21,17 @@ def needed_terms(scene: Scene) -> list[str]:
     if multiply_scatters(medium, scene.diffusion) and bool(medium.g > 0):
         terms.append("delta-Eddington scaling of the forward peak (g > 0)")
     if multiply_scatters(medium, scene.diffusion):
-        terms.append(f"multiple scattering by {scene.diffusion.model} diffusion, {_how(scene.diffusion)}")
+        terms.append(
+            f"multiple scattering by {scene.diffusion.model} diffusion, {_how(scene.diffusion)}"
+        )
         if scene.diffusion.transport_rounds:
             rounds = _counted(scene.diffusion.transport_rounds, "transport round")
-            terms.append(f"{rounds} of sweeps along {scene.diffusion.transport_directions} directions, each with a diffusion solve")
-        terms.append("fluxes Q1 and L1 (g is not 0)" if has_flux(medium) else "no fluxes Q1 and L1 (g = 0)")
+            terms.append(
+                f"{rounds} of sweeps along {scene.diffusion.transport_directions} directions, each with a diffusion solve"
+            )
+        terms.append(
+            "fluxes Q1 and L1 (g is not 0)" if has_flux(medium) else "no fluxes Q1 and L1 (g = 0)"
+        )
     else:
         terms.append("no multiple scattering: no diffusion solve")
     return terms
@@ -45,10 +51,16 @@ def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
         count = sum(isinstance(light, kind) for light in lights)
         if count:
             terms.append(f"transmittance towards {_counted(count, name)}")
-    way = "as inflow of the diffusion through the box's faces" if is_diffuse else "by quadrature over 50 directions"
+    way = (
+        "as inflow of the diffusion through the box's faces"
+        if is_diffuse
+        else "by quadrature over 50 directions"
+    )
     if any(isinstance(light, AmbientLight) for light in lights):
         terms.append(f"ambient light, {way}")
-    return terms + [_environment_term(light, way) for light in lights if isinstance(light, EnvironmentLight)]
+    return terms + [
+        _environment_term(light, way) for light in lights if isinstance(light, EnvironmentLight)
+    ]
 
 
 def _environment_term(light: EnvironmentLight, way: str) -> str:

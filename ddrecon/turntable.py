@@ -1,4 +1,6 @@
-"""Cameras around a volume: one view's camera turned about the upright axis through the middle of the box."""
+"""Cameras around a volume: one view's camera turned about the upright axis through the middle of
+the box.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ def upright_axis(cameras: Sequence[Camera]) -> int:
 
 
 def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
-    """`camera` turned by `angle` [rad] about the line along `axis` (0, 1, 2: x, y, z) through `center` (x, y, z)."""
+    """`camera` turned by `angle` [rad] about the line along `axis` (0, 1, 2: x, y, z) through
+    `center` (x, y, z).
+    """
     middle = camera.pose.new_tensor(center)
     rotation = _rotation(axis, angle).to(camera.pose)
     origin = middle + rotation @ (camera.pose[:, 3] - middle)
@@ -28,14 +32,21 @@ def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Came
 
 
 def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
-    """`count` >= 1 views, `ring_000` that of `view` and the others like it in equal steps once around the volume of `scene`."""
+    """`count` >= 1 views, `ring_000` that of `view` and the others like it in equal steps once
+    around the volume of `scene`.
+    """
     axis, center = upright_axis([item.camera for item in scene.views]), scene.volume.grid.center_xyz
     steps = [2 * math.pi * index / count for index in range(count)]
-    return [View(f"ring_{index:03d}", turn_camera(view.camera, axis, angle, center)) for index, angle in enumerate(steps)]
+    return [
+        View(f"ring_{index:03d}", turn_camera(view.camera, axis, angle, center))
+        for index, angle in enumerate(steps)
+    ]
 
 
 def _rotation(axis: int, angle: float) -> Tensor:
-    """The matrix [3, 3] that turns by `angle` about `axis`, counterclockwise seen from its positive end."""
+    """The matrix [3, 3] that turns by `angle` about `axis`, counterclockwise seen from its positive
+    end.
+    """
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = torch.eye(3, dtype=torch.float64)
     matrix[first, first] = matrix[second, second] = math.cos(angle)

@@ -1,4 +1,6 @@
-"""Small random media, operators, cameras and scenes, as factories: every test states what matters to it and nothing else."""
+"""Small random media, operators, cameras and scenes, as factories: every test states what matters
+to it and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
 
 
 def _random(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(
+        dtype
+    )
 
 
 def _half_empty(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -53,7 +57,12 @@ def _camera(
 ) -> Camera:
     """A camera at `eye` (x, y, z) looking at the origin."""
     origin = torch.tensor(eye, dtype=kind.get("dtype", torch.float64))
-    return Camera(look_at(origin, torch.zeros_like(origin), origin.new_tensor([0.0, 1.0, 0.0])), size, half_width, is_perspective)
+    return Camera(
+        look_at(origin, torch.zeros_like(origin), origin.new_tensor([0.0, 1.0, 0.0])),
+        size,
+        half_width,
+        is_perspective,
+    )
 
 
 def _scene(
@@ -69,16 +78,26 @@ def _scene(
     grid: Grid | None = None,
     **diffusion: Any,
 ) -> Scene:
-    """A scene in the precision of `density`, solved as closely as that precision allows; lights that are None are left out."""
+    """A scene in the precision of `density`, solved as closely as that precision allows; lights
+    that are None are left out.
+    """
     grid = grid or _box((density.shape[0], density.shape[1], density.shape[2]))
     tensor = density.new_tensor
-    sigma_a, sigma_s = (sigma if isinstance(sigma, Tensor) else tensor(sigma) for sigma in (sigma_a, sigma_s))
-    lights: list[Any] = [DirectionalLight(tensor(travel), tensor(directional))] if directional else []
+    sigma_a, sigma_s = (
+        sigma if isinstance(sigma, Tensor) else tensor(sigma) for sigma in (sigma_a, sigma_s)
+    )
+    lights: list[Any] = (
+        [DirectionalLight(tensor(travel), tensor(directional))] if directional else []
+    )
     lights += [AmbientLight(tensor(ambient))] if ambient else []
     camera = camera or _camera(dtype=density.dtype)
     diffusion = {"tolerance": 1e-13 if density.dtype == torch.float64 else 1e-6} | diffusion
     return Scene(
-        Volume(grid, density, sigma_a, sigma_s, tensor(g)), lights, [View("view", camera)], RenderSettings(), DiffusionSettings(**diffusion)
+        Volume(grid, density, sigma_a, sigma_s, tensor(g)),
+        lights,
+        [View("view", camera)],
+        RenderSettings(),
+        DiffusionSettings(**diffusion),
     )
 
 
@@ -88,7 +107,9 @@ def _operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
 
 
 def _dense(operator: Operator) -> Tensor:
-    """The matrix `[C, n, n]` of `operator`, written with loops and flat indices: a slow twin that shares no code with it."""
+    """The matrix `[C, n, n]` of `operator`, written with loops and flat indices: a slow twin that
+    shares no code with it.
+    """
     colors, *shape = operator.loss.shape
     strides = (shape[1] * shape[2], shape[2], 1)
     matrix = torch.zeros(colors, math.prod(shape), math.prod(shape), dtype=operator.loss.dtype)
@@ -98,7 +119,10 @@ def _dense(operator: Operator) -> Tensor:
         for axis in range(3):
             if place[axis] + 1 == shape[axis]:
                 continue
-            conductance, neighbor = operator.conductances[axis][:, place[0], place[1], place[2]], cell + strides[axis]
+            conductance, neighbor = (
+                operator.conductances[axis][:, place[0], place[1], place[2]],
+                cell + strides[axis],
+            )
             matrix[:, cell, cell] += conductance
             matrix[:, neighbor, neighbor] += conductance
             matrix[:, cell, neighbor] -= conductance
@@ -108,7 +132,10 @@ def _dense(operator: Operator) -> Tensor:
 
 def _order(steps: list[float], errors: list[float]) -> float:
     """The slope of log error against log step: the order of convergence."""
-    x, y = torch.tensor(steps, dtype=torch.float64).log(), torch.tensor(errors, dtype=torch.float64).log()
+    x, y = (
+        torch.tensor(steps, dtype=torch.float64).log(),
+        torch.tensor(errors, dtype=torch.float64).log(),
+    )
     x = x - x.mean()
     return float((x * y).sum() / (x * x).sum())
 
@@ -133,7 +160,12 @@ def same_seed() -> None:
     torch.manual_seed(0)
 
 
-PACKAGES = {".vdb": ("openvdb", "pyopenvdb"), ".tif": ("tifffile",), ".tiff": ("tifffile",), ".nc": ("netCDF4",)}
+PACKAGES = {
+    ".vdb": ("openvdb", "pyopenvdb"),
+    ".tif": ("tifffile",),
+    ".tiff": ("tifffile",),
+    ".nc": ("netCDF4",),
+}
 """What reading a format needs: one of these."""
 
 
@@ -151,13 +183,17 @@ def readable_formats() -> list[str]:
 def suffix(request: pytest.FixtureRequest) -> str:
     """The suffix of each kind of volume file that can be read here."""
     if not _is_readable(request.param):
-        pytest.skip(f"reading {request.param} needs {' or '.join(PACKAGES[request.param])}, not installed here")
+        pytest.skip(
+            f"reading {request.param} needs {' or '.join(PACKAGES[request.param])}, not installed here"
+        )
     return request.param
 
 
 @pytest.fixture
 def run(folder: Path) -> Callable[..., Result]:
-    """Runs a command in the current folder, which the fixture `folder` of the tests has made; a bug's exception is not swallowed."""
+    """Runs a command in the current folder, which the fixture `folder` of the tests has made; a
+    bug's exception is not swallowed.
+    """
 
     def run_command(*arguments: str) -> Result:
         result = CliRunner().invoke(main, [os.fspath(argument) for argument in arguments])

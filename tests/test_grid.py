@@ -31,9 +31,12 @@ def test_centers_against_explicit_indices():
     z, y, x = torch.broadcast_tensors(*GRID.centers(torch.zeros(1, dtype=torch.float64)))
     for k, j, i in itertools.product(*map(range, GRID.shape)):
         place = [
-            low + (index + 0.5) * (high - low) / cells for index, low, high, cells in zip((i, j, k), LOWER, UPPER, RESOLUTION, strict=True)
+            low + (index + 0.5) * (high - low) / cells
+            for index, low, high, cells in zip((i, j, k), LOWER, UPPER, RESOLUTION, strict=True)
         ]
-        assert (x[k, j, i].item(), y[k, j, i].item(), z[k, j, i].item()) == pytest.approx(place, rel=1e-15)
+        assert (x[k, j, i].item(), y[k, j, i].item(), z[k, j, i].item()) == pytest.approx(
+            place, rel=1e-15
+        )
 
 
 @given(st.tuples(*[st.integers(1, 40)] * 3), st.integers(1, 50))
@@ -46,5 +49,7 @@ def test_a_coarsened_grid_fills_the_same_box(shape: tuple[int, int, int], factor
 
 def test_array_order_is_its_own_inverse(random):
     vector = random(4, 3)
-    assert torch.equal(array_order(vector), torch.stack([vector[:, 2], vector[:, 1], vector[:, 0]], 1))
+    assert torch.equal(
+        array_order(vector), torch.stack([vector[:, 2], vector[:, 1], vector[:, 0]], 1)
+    )
     assert torch.equal(array_order(array_order(vector)), vector)

@@ -13,7 +13,9 @@ from ddrecon.variables.values import with_values
 
 
 def memory_estimate(scene: Scene) -> int:
-    """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to be optimized, without torch itself."""
+    """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to
+    be optimized, without torch itself.
+    """
     volume, grid = scene.volume, scene.volume.grid
     fields = [start for start in scene.starts.values() if tuple(start.shape[-3:]) == grid.shape]
     needs = Needs(
@@ -24,13 +26,17 @@ def memory_estimate(scene: Scene) -> int:
         has_flux=bool(volume.g != 0) or "g" in scene.starts,
         has_rounds=scene.diffusion.transport_rounds > 0,
         is_limited=scene.diffusion.model == "flux_limited",
-        varied=None if scene.optimize is None else sum(field.numel() for field in fields) / grid.cells,
+        varied=None
+        if scene.optimize is None
+        else sum(field.numel() for field in fields) / grid.cells,
     )
     return memory_of(needs)
 
 
 def describe(scene: Scene) -> dict[str, Any]:
-    """What `ddrecon check` reports of `scene`: grid, views, physics and memory, where what it optimizes starts."""
+    """What `ddrecon check` reports of `scene`: grid, views, physics and memory, where what it
+    optimizes starts.
+    """
     scene = with_values(scene, scene.starts)
     grid = scene.volume.grid
     low, high = grid.bounds_xyz
@@ -40,7 +46,9 @@ def describe(scene: Scene) -> dict[str, Any]:
         "voxel": list(reversed(grid.spacing)),
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
-        "optimizes": {name: scene.starts[name].numel() for name in scene.optimize.parameters} if scene.optimize else {},
+        "optimizes": {name: scene.starts[name].numel() for name in scene.optimize.parameters}
+        if scene.optimize
+        else {},
         "memory_bytes": memory_estimate(scene),
     }
 

@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ddrecon.cli.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, in_session, require_folder_of, show_version
+from ddrecon.cli.command import (
+    AS_JSON,
+    DTYPE,
+    OUTPUT,
+    OVERWRITE,
+    REPORT,
+    SCENE,
+    in_session,
+    require_folder_of,
+    show_version,
+)
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -20,7 +30,12 @@ if TYPE_CHECKING:
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
-    "--version", is_flag=True, is_eager=True, expose_value=False, callback=show_version, help="Show versions and the device, and exit."
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=show_version,
+    help="Show versions and the device, and exit.",
 )
 def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
@@ -30,11 +45,34 @@ def main() -> None:
 @SCENE
 @OUTPUT
 @OVERWRITE
-@click.option("--view", "names", multiple=True, metavar="NAME", help="Render only this view; repeatable.")
-@click.option("--components", is_flag=True, help="Also write reduced, single and multiple radiance, which sum to the image.")
-@click.option("--gradient", "parameter", metavar="PARAM", help="Also write each image's derivative: density, g, lights.0.direction.x, ...")
-@click.option("--light", "lights", multiple=True, metavar="LIGHT", help="Light it by '{type: directional, ...}' instead; repeatable.")
-@click.option("--ring", "count", type=click.IntRange(min=2), metavar="N", help="N views around the volume instead, and ring.png of them.")
+@click.option(
+    "--view", "names", multiple=True, metavar="NAME", help="Render only this view; repeatable."
+)
+@click.option(
+    "--components",
+    is_flag=True,
+    help="Also write reduced, single and multiple radiance, which sum to the image.",
+)
+@click.option(
+    "--gradient",
+    "parameter",
+    metavar="PARAM",
+    help="Also write each image's derivative: density, g, lights.0.direction.x, ...",
+)
+@click.option(
+    "--light",
+    "lights",
+    multiple=True,
+    metavar="LIGHT",
+    help="Light it by '{type: directional, ...}' instead; repeatable.",
+)
+@click.option(
+    "--ring",
+    "count",
+    type=click.IntRange(min=2),
+    metavar="N",
+    help="N views around the volume instead, and ring.png of them.",
+)
 @click.option("--mp4", "has_mp4", is_flag=True, help="With --ring, also write ring.mp4.")
 @DTYPE
 @AS_JSON
@@ -55,7 +93,12 @@ def render(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
-    from ddrecon.run.render_folder import render_gradient_to_folder, render_to_folder, require_variation, write_ring
+    from ddrecon.run.render_folder import (
+        render_gradient_to_folder,
+        render_to_folder,
+        require_variation,
+        write_ring,
+    )
 
     if count is None and has_mp4:
         raise click.UsageError("--mp4 is a movie of --ring N")
@@ -83,10 +126,21 @@ def render(
 @SCENE
 @OUTPUT
 @OVERWRITE
-@click.option("--iterations", type=click.IntRange(min=1), help="Total number of iterations, also after --resume.")
+@click.option(
+    "--iterations",
+    type=click.IntRange(min=1),
+    help="Total number of iterations, also after --resume.",
+)
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
-@click.option("--preview-every", type=click.IntRange(min=1), metavar="K", help="Write pictures every K iterations.")
-@click.option("--tensorboard", "has_events", is_flag=True, help="Also write the loss log for TensorBoard.")
+@click.option(
+    "--preview-every",
+    type=click.IntRange(min=1),
+    metavar="K",
+    help="Write pictures every K iterations.",
+)
+@click.option(
+    "--tensorboard", "has_events", is_flag=True, help="Also write the loss log for TensorBoard."
+)
 @DTYPE
 @AS_JSON
 @in_session
@@ -110,18 +164,35 @@ def optimize(
         session = session.overriding(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
-    with open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (run, folder):
+    with open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
+        run,
+        folder,
+    ):
         summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
     session.show(summary, session.summary_lines(summary, output))
 
 
 @main.command()
 @SCENE
-@click.option("--parameter", "names", multiple=True, metavar="NAME", help="Check only this parameter; repeatable.")
-@click.option("--samples", type=click.IntRange(min=2), default=8, show_default=True, help="Cells checked one by one.")
+@click.option(
+    "--parameter",
+    "names",
+    multiple=True,
+    metavar="NAME",
+    help="Check only this parameter; repeatable.",
+)
+@click.option(
+    "--samples",
+    type=click.IntRange(min=2),
+    default=8,
+    show_default=True,
+    help="Cells checked one by one.",
+)
 @REPORT
 @in_session
-def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: int, report: Path | None) -> None:
+def gradcheck(
+    session: Session, scene: Path, names: tuple[str, ...], samples: int, report: Path | None
+) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
     from ddrecon.io.files.json_file import write_json
     from ddrecon.validate.gradcheck import check_parameters, describe
@@ -137,16 +208,32 @@ def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: in
 
 @main.command()
 @click.argument("scene", required=False, type=click.Path(path_type=Path))
-@click.option("--quick", "is_quick", is_flag=True, help="A small scene, or SCENE made coarser, measured once.")
-@click.option("--hard", "is_hard", is_flag=True, help="Instead: numerical stability on hard cases, in float32 against float64.")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Folder for the results: bench.json, bench.png and report.html, or hard.json."
+    "--quick", "is_quick", is_flag=True, help="A small scene, or SCENE made coarser, measured once."
+)
+@click.option(
+    "--hard",
+    "is_hard",
+    is_flag=True,
+    help="Instead: numerical stability on hard cases, in float32 against float64.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="Folder for the results: bench.json, bench.png and report.html, or hard.json.",
 )
 @OVERWRITE
 @REPORT
 @in_session
 def bench(
-    session: Session, scene: Path | None, is_quick: bool, is_hard: bool, output: Path | None, overwrite: bool, report: Path | None
+    session: Session,
+    scene: Path | None,
+    is_quick: bool,
+    is_hard: bool,
+    output: Path | None,
+    overwrite: bool,
+    report: Path | None,
 ) -> None:
     """Measure speed against error on SCENE, or on a plume of ddrecon's own."""
     if session.overrides and scene is None:
@@ -158,7 +245,11 @@ def bench(
     from ddrecon.io.files.folders import claim_folder
 
     with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
-        has_passed = bench_hard(session, output, report) if is_hard else bench_speed(session, scene, is_quick, output, report)
+        has_passed = (
+            bench_hard(session, output, report)
+            if is_hard
+            else bench_speed(session, scene, is_quick, output, report)
+        )
     if not has_passed:
         sys.exit(1)
 
@@ -167,14 +258,35 @@ def bench(
 @SCENE
 @OUTPUT
 @OVERWRITE
-@click.option("--view", "names", multiple=True, metavar="NAME", help="Trace only this view; repeatable.")
-@click.option("--spp", "samples", type=click.IntRange(min=4), default=256, show_default=True, metavar="N", help="Paths a pixel.")
-@click.option("--views", "is_only_traced", is_flag=True, help="Write the path-traced images alone, as NAME.*: targets for experiments.")
+@click.option(
+    "--view", "names", multiple=True, metavar="NAME", help="Trace only this view; repeatable."
+)
+@click.option(
+    "--spp",
+    "samples",
+    type=click.IntRange(min=4),
+    default=256,
+    show_default=True,
+    metavar="N",
+    help="Paths a pixel.",
+)
+@click.option(
+    "--views",
+    "is_only_traced",
+    is_flag=True,
+    help="Write the path-traced images alone, as NAME.*: targets for experiments.",
+)
 @DTYPE
 @AS_JSON
 @in_session
 def reference(
-    session: Session, scene: Path, output: Path, overwrite: bool, names: tuple[str, ...], samples: int, is_only_traced: bool
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    names: tuple[str, ...],
+    samples: int,
+    is_only_traced: bool,
 ) -> None:
     """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
     from ddrecon.io.files.folders import claim_folder
@@ -186,19 +298,33 @@ def reference(
     tracer = open_tracer(loaded, views, threads=session.threads)
     with claim_folder(output, may_exist=overwrite):
         settings = output, samples, session.seed, session.progress
-        found = trace_to_folder(tracer, views, *settings) if is_only_traced else compare_to_folder(tracer, loaded, views, *settings)
+        found = (
+            trace_to_folder(tracer, views, *settings)
+            if is_only_traced
+            else compare_to_folder(tracer, loaded, views, *settings)
+        )
         report = write_reference_report(output, found, session.environment())
     session.show(report, session.reference_lines(report, output))
 
 
 @main.command()
-@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SCENE | VOLUME...")
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FILE", help="Where it goes.")
+@click.argument(
+    "sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SCENE | VOLUME..."
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="FILE",
+    help="Where it goes.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
 @in_session
 def export(session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool) -> None:
-    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as NeRF's transforms.json), or all fields of
-    VOLUMEs in the format of FILE's suffix."""
+    """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as
+    NeRF's transforms.json), or all fields of VOLUMEs in the format of FILE's suffix.
+    """
     kind = output.suffix.lower()
     if kind in (".xml", ".json") and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
@@ -210,7 +336,9 @@ def export(session: Session, sources: tuple[Path, ...], output: Path, overwrite:
         from ddrecon.scene_file.export_transforms import export_transforms
 
         scene_file = session.read(sources[0])
-        written = export_transforms(session.build(scene_file), scene_file, output, may_exist=overwrite)
+        written = export_transforms(
+            session.build(scene_file), scene_file, output, may_exist=overwrite
+        )
     else:
         from ddrecon.io.volumes.convert import convert
 

@@ -1,4 +1,6 @@
-"""One command's surroundings: device, precision, threads, how scenes are loaded and how results are shown."""
+"""One command's surroundings: device, precision, threads, how scenes are loaded and how results are
+shown.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ class Session:
         return replace(self, overrides=self.overrides + overrides)
 
     def relit(self, lights: tuple[str, ...]) -> Session:
-        """The same session with `lights`, each as a scene file has it, instead of all of the scene's; without any, as it is."""
+        """The same session with `lights`, each as a scene file has it, instead of all of the
+        scene's; without any, as it is.
+        """
         return self.overriding(f"lights=[{', '.join(lights)}]") if lights else self
 
     def read(self, path: Path) -> SceneFile:
@@ -67,13 +71,23 @@ class Session:
         known = [view.name for view in scene.views]
         unknown = [name for name in names if name not in known]
         if unknown:
-            raise SceneError([f"--view {name}: no such view{suggestion(name, known)}" for name in unknown])
+            raise SceneError(
+                [f"--view {name}: no such view{suggestion(name, known)}" for name in unknown]
+            )
         return [view for view in scene.views if not names or view.name in names]
 
     @staticmethod
-    def without_targets(scene: Scene, views: list[View], count: int | None) -> tuple[Scene, list[View]]:
-        """`scene` and `views` as if there were no target images; with `count`, so many views around the volume from the first of them."""
-        plain = place_turntable(scene, views[0], count) if count is not None else [View(view.name, view.camera) for view in views]
+    def without_targets(
+        scene: Scene, views: list[View], count: int | None
+    ) -> tuple[Scene, list[View]]:
+        """`scene` and `views` as if there were no target images; with `count`, so many views around
+        the volume from the first of them.
+        """
+        plain = (
+            place_turntable(scene, views[0], count)
+            if count is not None
+            else [View(view.name, view.camera) for view in views]
+        )
         return replace(scene, views=plain), plain
 
     def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
@@ -95,7 +109,9 @@ class Session:
         if any(file.endswith(".tif") for files in report["files"].values() for file in files):
             lines.append(f"float .tif instead of .exr: EXR {advice('OpenEXR')}")
         if "ring" in report:
-            lines.append(f"around: {', '.join(report['ring']['files'])} (radiance {report['ring']['white']:.3g} is white)")
+            lines.append(
+                f"around: {', '.join(report['ring']['files'])} (radiance {report['ring']['white']:.3g} is white)"
+            )
         return [*lines, f"written to {folder}"]
 
     @staticmethod
@@ -107,9 +123,15 @@ class Session:
             if "error" in view:
                 least = view["noise"] / 3
                 error = f"{view['error']:.3f}" if view["error"] >= least else f"< {least:.3f}"
-                notes = [f"relative RMS error {error} (with the reference's noise, {view['noise']:.3f}: {view['distance']:.3f})"]
+                notes = [
+                    f"relative RMS error {error} (with the reference's noise, {view['noise']:.3f}: {view['distance']:.3f})"
+                ]
                 notes += [f"PSNR {view['psnr']:.1f} dB"]
-                notes += [f"brightness {view['brightness']:.3f} of the reference's"] if view["brightness"] is not None else []
+                notes += (
+                    [f"brightness {view['brightness']:.3f} of the reference's"]
+                    if view["brightness"] is not None
+                    else []
+                )
             times = ", ".join(f"{who} {seconds:.2f} s" for who, seconds in view["seconds"].items())
             lines.append(f"{name}: {', '.join(notes)} ({times})")
         settings = report["settings"]
@@ -122,10 +144,10 @@ class Session:
     @staticmethod
     def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         """What `optimize` prints when it is done."""
-        test = f", test PSNR {summary['test_psnr']:.2f} dB" if summary["test_psnr"] is not None else ""
-        line = (
-            f"{summary['iterations']} iterations in {summary['seconds']:.1f} s: loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
+        test = (
+            f", test PSNR {summary['test_psnr']:.2f} dB" if summary["test_psnr"] is not None else ""
         )
+        line = f"{summary['iterations']} iterations in {summary['seconds']:.1f} s: loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
         return [line + test, f"density and all else written to {folder}"]
 
     def environment(self) -> dict[str, Any]:
@@ -136,7 +158,9 @@ class Session:
             "torch": torch.__version__,
             "numpy": np.__version__,
             "platform": platform.platform(),
-            "device": torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",
+            "device": torch.cuda.get_device_name(self.device)
+            if self.device.type == "cuda"
+            else "cpu",
             "dtype": str(self.dtype).removeprefix("torch."),
             "threads": torch.get_num_threads(),
             "seed": self.seed,
@@ -146,7 +170,9 @@ class Session:
 
 
 def result_in(folder: Path) -> Path:
-    """The scene file that a run has left in its `folder` at its end; raises SceneError where there is none."""
+    """The scene file that a run has left in its `folder` at its end; raises SceneError where there
+    is none.
+    """
     path = folder / RESULT
     if not path.is_file():
         raise SceneError(
@@ -156,13 +182,24 @@ def result_in(folder: Path) -> Path:
 
 
 def open_session(
-    overrides: tuple[str, ...], device: str, threads: int | None, seed: int, is_quiet: bool, is_verbose: bool, dtype: str, as_json: bool
+    overrides: tuple[str, ...],
+    device: str,
+    threads: int | None,
+    seed: int,
+    is_quiet: bool,
+    is_verbose: bool,
+    dtype: str,
+    as_json: bool,
 ) -> Session:
     """Sets torch up as the options say; raises SceneError for a device that is not there."""
     if device == "cuda" and not torch.cuda.is_available():
-        raise SceneError("--device cuda: torch sees no CUDA device here; leave --device out, or install a CUDA build of torch")
+        raise SceneError(
+            "--device cuda: torch sees no CUDA device here; leave --device out, or install a CUDA build of torch"
+        )
     place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
-    threads = threads or (torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else os.cpu_count() or 1)
+    threads = threads or (
+        torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else os.cpu_count() or 1
+    )
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     return Session(overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json)

@@ -1,8 +1,10 @@
-"""Environment maps: the radiance that a latitude-longitude map sends from every direction, and the map's exact integrals.
+"""Environment maps: the radiance that a latitude-longitude map sends from every direction, and the
+map's exact integrals.
 
-The one convention, that of Mitsuba 3's `envmap`: a pixel's row runs from +y (row 0) to -y (the last row), rows being nodes on both poles;
-its column from -z over +x, +z and -x, columns being centers of equal sectors that wrap around. Between them radiance is bilinear. A
-`rotation` turns the map about +y, right-handed.
+The one convention, that of Mitsuba 3's `envmap`: a pixel's row runs from +y (row 0) to -y (the last
+row), rows being nodes on both poles; its column from -z over +x, +z and -x, columns being centers
+of equal sectors that wrap around. Between them radiance is bilinear. A `rotation` turns the map
+about +y, right-handed.
 """
 
 from __future__ import annotations
@@ -37,26 +39,34 @@ def _wrap(radiance: Tensor) -> Tensor:
 
 
 def turn_directions(vector: Tensor, rotation: Tensor) -> Tensor:
-    """`vector` [..., 3] (x, y, z) of a map's own frame in the world, where the map is turned by `rotation` [degrees]."""
+    """`vector` [..., 3] (x, y, z) of a map's own frame in the world, where the map is turned by
+    `rotation` [degrees].
+    """
     cosine, sine = torch.cos(torch.deg2rad(rotation)), torch.sin(torch.deg2rad(rotation))
     x, y, z = vector.unbind(-1)
     return torch.stack([cosine * x + sine * z, y, cosine * z - sine * x], -1)
 
 
 def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:
-    """The map `radiance` [C, h, w], the same function of direction, written with at least so many pixels."""
+    """The map `radiance` [C, h, w], the same function of direction, written with at least so many
+    pixels.
+    """
     height, width = radiance.shape[1:]
     times_down = math.ceil((rows - 1) / (height - 1))
     times_across = 2 * math.ceil((columns / width - 1) / 2) + 1
     if times_down > 1:
         radiance = _between(radiance, times_down, 0, times_down * (height - 1) + 1, 1)
     if times_across > 1:
-        radiance = _between(_wrap(radiance), times_across, times_across - times_across // 2, times_across * width, 2)
+        radiance = _between(
+            _wrap(radiance), times_across, times_across - times_across // 2, times_across * width, 2
+        )
     return radiance
 
 
 def _between(values: Tensor, times: int, start: int, count: int, dim: int) -> Tensor:
-    """`count` linear interpolations of `values` along `dim`, `times` a step, the first `start` / `times` steps after the first value."""
+    """`count` linear interpolations of `values` along `dim`, `times` a step, the first `start` /
+    `times` steps after the first value.
+    """
     place = (start + torch.arange(count, device=values.device)).to(values.dtype) / times
     low = place.long().clamp(max=values.shape[dim] - 2)
     part = (place - low).view([-1 if dim == other else 1 for other in range(3)])
@@ -65,17 +75,31 @@ def _between(values: Tensor, times: int, start: int, count: int, dim: int) -> Te
 
 
 def pixel_moments(height: int, width: int) -> np.ndarray:
-    """Integrals over the sphere of every pixel's share in the bilinear map: of 1, x, y and z, `[4, h, w]`; those of 1 sum to 4 pi."""
+    """Integrals over the sphere of every pixel's share in the bilinear map: of 1, x, y and z, `[4,
+    h, w]`; those of 1 sum to 4 pi.
+    """
     area, across, up = _row_moments(height)
     step = 2 * math.pi / width
     angle = step * (np.arange(width) + 0.5)
     chord = 2 * (1 - math.cos(step)) / step
-    columns = (np.full(width, step), chord * np.sin(angle), np.full(width, step), -chord * np.cos(angle))
-    return np.stack([np.outer(row, column) for row, column in zip((area, across, up, across), columns, strict=True)])
+    columns = (
+        np.full(width, step),
+        chord * np.sin(angle),
+        np.full(width, step),
+        -chord * np.cos(angle),
+    )
+    return np.stack(
+        [
+            np.outer(row, column)
+            for row, column in zip((area, across, up, across), columns, strict=True)
+        ]
+    )
 
 
 def _row_moments(height: int) -> tuple[np.ndarray, ...]:
-    """Integrals of sin, sin^2 and sin cos of the angle from +y, times each row's share: 1 on it, falling linearly to 0 on the next."""
+    """Integrals of sin, sin^2 and sin cos of the angle from +y, times each row's share: 1 on it,
+    falling linearly to 0 on the next.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(16)
     part, step = (nodes + 1) / 2, math.pi / (height - 1)
     angle = step * (np.arange(height - 1)[:, None] + part)

@@ -19,20 +19,28 @@ MARGIN = 0.01
 
 @dataclass(frozen=True)
 class Moments:
-    """`mean` [C, z, y, x] and `flux`, three tensors of that shape along z, y, x; None where light's direction does not matter."""
+    """`mean` [C, z, y, x] and `flux`, three tensors of that shape along z, y, x; None where light's
+    direction does not matter.
+    """
 
     mean: Tensor
     flux: Vector | None = None
 
     def scaled(self, mean: Tensor | float, flux: Tensor | float) -> Moments:
         """Each moment times its own factor."""
-        return Moments(mean * self.mean, None if self.flux is None else _vector(flux * component for component in self.flux))
+        return Moments(
+            mean * self.mean,
+            None if self.flux is None else _vector(flux * component for component in self.flux),
+        )
 
     def plus(self, other: Moments) -> Moments:
         """The sum of two lights; a flux that one of them lacks is zero there."""
         if self.flux is None or other.flux is None:
             return Moments(self.mean + other.mean, other.flux if self.flux is None else self.flux)
-        return Moments(self.mean + other.mean, _vector(a + b for a, b in zip(self.flux, other.flux, strict=True)))
+        return Moments(
+            self.mean + other.mean,
+            _vector(a + b for a, b in zip(self.flux, other.flux, strict=True)),
+        )
 
     def along(self, direction: Vector) -> Tensor:
         """Radiance along `direction`, whose components broadcast to `[C, z, y, x]`."""
@@ -42,7 +50,8 @@ class Moments:
         return radiance
 
     def positive_along(self, direction: Vector) -> Tensor:
-        """`along` held at zero: r where r >= m = MARGIN (|L0| + |L1.w|), m (1 + r/m)^2 / 4 from there to -m, and 0 below.
+        """`along` held at zero: r where r >= m = MARGIN (|L0| + |L1.w|), m (1 + r/m)^2 / 4 from
+        there to -m, and 0 below.
 
         E3 is negative where light is more directed than two terms in angle can say, and where g is not 0 so may L0 be: E4's source
         then has either sign. Both mean darkness. Without a flux E7's M-matrix keeps L0 >= 0, and what a solve leaves below it is cut off.
@@ -62,5 +71,9 @@ def _vector(components: Iterable[Tensor]) -> Vector:
 
 
 def beam_moments(radiance: Tensor, direction: Tensor, has_flux: bool) -> Moments:
-    """The moments of light that all travels along `direction` [3] (array order): `radiance` and `radiance` w."""
-    return Moments(radiance, _vector(radiance * component for component in direction) if has_flux else None)
+    """The moments of light that all travels along `direction` [3] (array order): `radiance` and
+    `radiance` w.
+    """
+    return Moments(
+        radiance, _vector(radiance * component for component in direction) if has_flux else None
+    )

@@ -1,8 +1,10 @@
-"""What an environment map sheds on a volume: suns, which are directional lights, a mean, which is ambient light, and the rest by regions.
+"""What an environment map sheds on a volume: suns, which are directional lights, a mean, which is
+ambient light, and the rest by regions.
 
-The sphere of the map's own frame is cut into regions, each pixel belonging to the nearest of some well spread directions. A region that
-sends much of all light is a sun. Of what remains, every region keeps its irradiance above or below the mean radiance, and its vector:
-the map's power and its first moment are kept exactly, and all but the suns' direction is linear in the map.
+The sphere of the map's own frame is cut into regions, each pixel belonging to the nearest of some
+well spread directions. A region that sends much of all light is a sun. Of what remains, every
+region keeps its irradiance above or below the mean radiance, and its vector: the map's power and
+its first moment are kept exactly, and all but the suns' direction is linear in the map.
 """
 
 from __future__ import annotations
@@ -21,10 +23,14 @@ from ddrecon.light.environment import pixel_moments, refine_map, turn_directions
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 
 PIXELS_PER_REGION = 2
-"""Maps with fewer are refined first; any more would smear a single bright pixel over several regions."""
+"""Maps with fewer are refined first; any more would smear a single bright pixel over several
+regions.
+"""
 MAX_SUNS = 4
 SUN_SHARE = 0.1
-"""Part of a map's irradiance that makes a region a sun, if it is also `SUN_CONTRAST` times as bright as the map's mean."""
+"""Part of a map's irradiance that makes a region a sun, if it is also `SUN_CONTRAST` times as
+bright as the map's mean.
+"""
 SUN_CONTRAST = 4.0
 
 
@@ -32,8 +38,8 @@ SUN_CONTRAST = 4.0
 class Sky:
     """Light above or below a mean, from N directions: `travel` [N, 3] is the way it goes, unit.
 
-    `irradiance` [N, C], the integral of radiance over each region, and `vector` [N, 3, C], that of radiance times its direction of travel,
-    may be negative. Directions are in array order.
+    `irradiance` [N, C], the integral of radiance over each region, and `vector` [N, 3, C], that of
+    radiance times its direction of travel, may be negative. Directions are in array order.
     """
 
     travel: Tensor
@@ -46,7 +52,9 @@ Source = DirectionalLight | AmbientLight | PointLight | Sky
 
 
 def decompose_lights(lights: Sequence[Light]) -> list[Source]:
-    """`lights`, with every environment map as the suns, the ambient light and the sky it amounts to."""
+    """`lights`, with every environment map as the suns, the ambient light and the sky it amounts
+    to.
+    """
     found: list[Source] = []
     for light in lights:
         found += decompose_map(light) if isinstance(light, EnvironmentLight) else [light]
@@ -54,7 +62,9 @@ def decompose_lights(lights: Sequence[Light]) -> list[Source]:
 
 
 def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLight | Sky]:
-    """The suns of `light`, its mean as ambient light, and how it differs from that, region by region."""
+    """The suns of `light`, its mean as ambient light, and how it differs from that, region by
+    region.
+    """
     rows = math.ceil(math.sqrt(PIXELS_PER_REGION / 2 * light.directions))
     radiance = refine_map(light.scale * light.radiance, rows, 2 * rows)
     regions = _regions(*radiance.shape[1:], light.directions)
@@ -67,8 +77,12 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
     rest = torch.where(is_sun[:, None, None], -base * geometry, received)
     excess = rest[:, 0].sum(0) / (4 * math.pi)
     deviation = rest - excess * geometry
-    travel = array_order(turn_directions(-torch.nn.functional.normalize(geometry[:, 1:, 0], dim=-1), light.rotation))
-    vector = array_order(turn_directions(-deviation[:, 1:].transpose(1, 2), light.rotation)).transpose(1, 2)
+    travel = array_order(
+        turn_directions(-torch.nn.functional.normalize(geometry[:, 1:, 0], dim=-1), light.rotation)
+    )
+    vector = array_order(
+        turn_directions(-deviation[:, 1:].transpose(1, 2), light.rotation)
+    ).transpose(1, 2)
     return [*suns, AmbientLight(base + excess), Sky(travel, deviation[:, 0], vector)]
 
 
@@ -81,7 +95,9 @@ def count_suns(light: EnvironmentLight) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class _Regions:
-    """`label` [h * w]: which region a pixel belongs to; `moments` [N, 4]: integrals over each region of 1, x, y and z, float64."""
+    """`label` [h * w]: which region a pixel belongs to; `moments` [N, 4]: integrals over each
+    region of 1, x, y and z, float64.
+    """
 
     label: Tensor
     moments: Tensor
@@ -89,18 +105,27 @@ class _Regions:
 
 @lru_cache(maxsize=4)
 def _regions(height: int, width: int, directions: int) -> _Regions:
-    """The regions of a map of this size around `directions` directions, those that have no pixel left out."""
+    """The regions of a map of this size around `directions` directions, those that have no pixel
+    left out.
+    """
     moments = pixel_moments(height, width).reshape(4, -1)
     centers = moments[1:] / np.linalg.norm(moments[1:], axis=0)
     axes = fibonacci_sphere(directions)
-    nearest = np.concatenate([(axes @ part).argmax(0) for part in np.array_split(centers, math.ceil(centers.shape[1] / 65536), axis=1)])
+    nearest = np.concatenate(
+        [
+            (axes @ part).argmax(0)
+            for part in np.array_split(centers, math.ceil(centers.shape[1] / 65536), axis=1)
+        ]
+    )
     _, label = np.unique(nearest, return_inverse=True)
     sums = np.stack([np.bincount(label, weights=row) for row in moments], 1)
     return _Regions(torch.from_numpy(label), torch.from_numpy(sums))
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """`count` unit directions `[count, 3]`, evenly spread: a spiral of equal steps in y turned by the golden angle each."""
+    """`count` unit directions `[count, 3]`, evenly spread: a spiral of equal steps in y turned by
+    the golden angle each.
+    """
     y = 1 - (2 * np.arange(count) + 1) / count
     turn = np.arange(count) * math.pi * (3 - math.sqrt(5))
     across = np.sqrt(1 - y * y)
@@ -124,5 +149,7 @@ def _are_suns(irradiance: Tensor, regions: _Regions) -> Tensor:
 
 
 def _sun(moments: Tensor, rotation: Tensor) -> DirectionalLight:
-    """The directional light of a region with `moments` [4, C], from the direction that its light has on average."""
+    """The directional light of a region with `moments` [4, C], from the direction that its light
+    has on average.
+    """
     return DirectionalLight(turn_directions(-moments[1:].sum(-1), rotation), moments[0])

@@ -18,14 +18,17 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 
 
 def ambient_sky(radiance: Tensor) -> Sky:
-    """Ambient light of `radiance` [C, 1, 1, 1] as light from the directions of a quadrature over the sphere."""
+    """Ambient light of `radiance` [C, 1, 1, 1] as light from the directions of a quadrature over
+    the sphere.
+    """
     directions, weights = sphere_quadrature(radiance)
     irradiance = 4 * math.pi * weights[:, None] * radiance.flatten()
     return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
 
 
 def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments:
-    """Light of all skies in `lights` not yet scattered, to first order in angle: int L_ri and 3 int L_ri w over the sphere, over 4 pi.
+    """Light of all skies in `lights` not yet scattered, to first order in angle: int L_ri and 3 int
+    L_ri w over the sphere, over 4 pi.
 
     One direction at a time, so that memory does not grow with their number.
     """
@@ -38,9 +41,11 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool
 
 
 def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
-    """What one scattering turns `towards` a camera (unit, its components broadcast to cells) of the light of `skies`, `[C, z, y, x]`.
+    """What one scattering turns `towards` a camera (unit, its components broadcast to cells) of the
+    light of `skies`, `[C, z, y, x]`.
 
-    Per unit length and kappa_s, by the exact phase function: sum of p E tau / (4 pi), one direction at a time.
+    Per unit length and kappa_s, by the exact phase function: sum of p E tau / (4 pi), one direction
+    at a time.
     """
     total = torch.zeros_like(medium.extinction.value)
     for sky in _lit_skies(skies):
@@ -52,19 +57,31 @@ def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor
 def _lit_skies(lights: Sequence[object]) -> list[Sky]:
     """The skies that differ from their mean, or may come to do so because they are being varied."""
     skies = [light for light in lights if isinstance(light, Sky)]
-    return [sky for sky in skies if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())]
+    return [
+        sky
+        for sky in skies
+        if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())
+    ]
 
 
-def _scatter_direction(medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector) -> Tensor:
+def _scatter_direction(
+    medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector
+) -> Tensor:
     visible = _attenuate_direction(medium, travel, irradiance, None).mean
     z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
     return visible * henyey_greenstein(z + y + x, medium.g)
 
 
-def _attenuate_direction(medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None) -> Moments:
-    """`irradiance` ([C] or scalar) and `vector` [3, C], each times the transmittance along `direction`, averaged over cells."""
+def _attenuate_direction(
+    medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None
+) -> Moments:
+    """`irradiance` ([C] or scalar) and `vector` [3, C], each times the transmittance along
+    `direction`, averaged over cells.
+    """
     visible = medium.extinction.mean_transmittance(
-        *sum_mass_to_cells(medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound)
+        *sum_mass_to_cells(
+            medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound
+        )
     )
     mean = visible * irradiance.view(-1, 1, 1, 1)
     if vector is None:

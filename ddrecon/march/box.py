@@ -13,7 +13,9 @@ from ddrecon.grid import Grid
 
 @dataclass(frozen=True)
 class Crossing:
-    """The part of each ray inside the box: where rays `hit` it (indices), and distances [u] to `near` and `far` there."""
+    """The part of each ray inside the box: where rays `hit` it (indices), and distances [u] to
+    `near` and `far` there.
+    """
 
     hit: Tensor
     near: Tensor
@@ -32,9 +34,13 @@ def cross_box(grid: Grid, rays: Rays) -> Crossing:
 
 
 def intersect_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
-    """Distances [u] at which each of `rays` enters the box of `grid`, in front of the camera, and leaves it: less far where it misses."""
+    """Distances [u] at which each of `rays` enters the box of `grid`, in front of the camera, and
+    leaves it: less far where it misses.
+    """
     low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
     tiny = torch.finfo(rays.direction.dtype).tiny
-    safe = torch.where(rays.direction.abs() < tiny, torch.full_like(rays.direction, tiny), rays.direction)
+    safe = torch.where(
+        rays.direction.abs() < tiny, torch.full_like(rays.direction, tiny), rays.direction
+    )
     one, other = (low - rays.origin) / safe, (high - rays.origin) / safe
     return torch.minimum(one, other).amax(-1).clamp(min=0), torch.maximum(one, other).amin(-1)

@@ -1,8 +1,10 @@
-"""View rays no closer together than a volume can tell: a lattice of rays, between which pixels are interpolated.
+"""View rays no closer together than a volume can tell: a lattice of rays, between which pixels are
+interpolated.
 
-The lattice is regular in the plane through the box's center, across the axis along which rays cross most cells. So it is in every slice,
-and interpolation there is a small matrix for rows and one for columns (the shear-warp factorization, doi:10.1145/192161.192283):
-products of matrices in place of gathers, and of scatters in the backward pass.
+The lattice is regular in the plane through the box's center, across the axis along which rays cross
+most cells. So it is in every slice, and interpolation there is a small matrix for rows and one for
+columns (the shear-warp factorization, doi:10.1145/192161.192283): products of matrices in place of
+gathers, and of scatters in the backward pass.
 """
 
 from __future__ import annotations
@@ -27,12 +29,15 @@ FEWER = 2
 RAYS_PER_VOXEL = 2
 """Lattice rays along the side of a voxel in the middle of the box."""
 DOUBT = 1 / 8
-"""Error of interpolation as a part of fourth differences: 3/128 in smooth places, up to 3/8 at a jump."""
+"""Error of interpolation as a part of fourth differences: 3/128 in smooth places, up to 3/8 at a
+jump.
+"""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Rays through `rows` x `columns` [u], places along the two axes `across`, in the plane across `axis` at `middle` [u].
+    """Rays through `rows` x `columns` [u], places along the two axes `across`, in the plane across
+    `axis` at `middle` [u].
 
     They come from the point `eye` [3], or where that is None are parallel to `direction` [3].
     """
@@ -66,11 +71,16 @@ class Lattice:
         distance = (self.middle - bundle.origin[:, self.axis]) / bundle.direction[:, self.axis]
         lines = []
         for axis, line in zip(self.across, (self.rows, self.columns), strict=True):
-            lines.append((bundle.origin[:, axis] + distance * bundle.direction[:, axis] - line[0]) / (line[1] - line[0]))
+            lines.append(
+                (bundle.origin[:, axis] + distance * bundle.direction[:, axis] - line[0])
+                / (line[1] - line[0])
+            )
         return torch.stack(lines, -1)
 
     def crossings(self, planes: Tensor, which: int, line: Tensor) -> Tensor:
-        """Where in `planes` [N] across `axis` rays through `line` [R] run, some rows (`which` = 0) or columns (1): `[N, R]` [u]."""
+        """Where in `planes` [N] across `axis` rays through `line` [R] run, some rows (`which` = 0)
+        or columns (1): `[N, R]` [u].
+        """
         apart, axis = planes[:, None] - self.middle, self.across[which]
         if self.eye is None:
             return line + apart * (self.direction[axis] / self.direction[self.axis])
@@ -80,15 +90,23 @@ class Lattice:
 def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
     """The lattice across `axis` in place of rays of one camera, all `hitting` the box.
 
-    None where these are no more work themselves, or the camera is not beyond the slices along `axis`.
+    None where these are no more work themselves, or the camera is not beyond the slices along
+    `axis`.
     """
     eye, direction = hitting.eye, hitting.direction[0]
-    if eye is not None and grid.lower[axis] - grid.spacing[axis] < float(eye[axis].detach()) < grid.upper[axis] + grid.spacing[axis]:
+    if (
+        eye is not None
+        and grid.lower[axis] - grid.spacing[axis]
+        < float(eye[axis].detach())
+        < grid.upper[axis] + grid.spacing[axis]
+    ):
         return None
     row, column = (other for other in range(3) if other != axis)
     middle = 0.5 * (grid.lower[axis] + grid.upper[axis])
     steps = [grid.spacing[other] / RAYS_PER_VOXEL for other in (row, column)]
-    starts = [grid.lower[other] + 0.5 * step for other, step in zip((row, column), steps, strict=True)]
+    starts = [
+        grid.lower[other] + 0.5 * step for other, step in zip((row, column), steps, strict=True)
+    ]
 
     def lattice(first: Sequence[int], last: Sequence[int]) -> Lattice:
         rows, columns = (
@@ -105,14 +123,17 @@ def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
 
 
 def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
-    """`values` [K, r, c] of lattice rays, interpolated to third order at `places` [P, 2] (rows, columns), `[K, P]`, and held at zero."""
+    """`values` [K, r, c] of lattice rays, interpolated to third order at `places` [P, 2] (rows,
+    columns), `[K, P]`, and held at zero.
+    """
     sizes = places.new_tensor(values.shape[1:])
     points = ((2 * places + 1) / sizes - 1).flip(-1)
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0].clamp(min=0)
 
 
 def is_rough(values: Tensor, most: float, places: Tensor) -> Tensor:
-    """Which of `places` [P, 2] lie where interpolation of `values` [K, r, c] may be off by more than `most` in all of them together.
+    """Which of `places` [P, 2] lie where interpolation of `values` [K, r, c] may be off by more
+    than `most` in all of them together.
 
     Judged by fourth differences, which are large at edges sharper than the lattice as well.
     """

@@ -13,13 +13,22 @@ from ddrecon.march.slices import Slices
 from ddrecon.numerics.third_order import ThirdOrder
 
 STEEPEST = 0.2
-"""Smallest direction cosine, in units of cells and against the axis across the slices, of rays that are marched by slices."""
+"""Smallest direction cosine, in units of cells and against the axis across the slices, of rays that
+are marched by slices.
+"""
 
 
 def choose_sampler(
-    fields: Tensor, smooth: ThirdOrder | None, filled: int, grid: Grid, rays: Rays, crossing: Crossing, steps: int
+    fields: Tensor,
+    smooth: ThirdOrder | None,
+    filled: int,
+    grid: Grid,
+    rays: Rays,
+    crossing: Crossing,
+    steps: int,
 ) -> Slices | Equidistant:
-    """Slices where every ray crosses them in one sense and steeply enough, from outside the box; else equal steps.
+    """Slices where every ray crosses them in one sense and steeply enough, from outside the box;
+    else equal steps.
 
     Slices leave out what is empty in the first `filled` of `fields`.
     """

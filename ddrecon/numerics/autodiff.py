@@ -1,4 +1,6 @@
-"""What the physics asks of automatic differentiation: whether a number is being varied, what to keep, recomputation instead of memory."""
+"""What the physics asks of automatic differentiation: whether a number is being varied, what to
+keep, recomputation instead of memory.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ T = TypeVar("T")
 
 
 def is_varied(tensor: Tensor) -> bool:
-    """Whether a derivative with respect to `tensor`, or something it was made from, is being taken, in either mode."""
+    """Whether a derivative with respect to `tensor`, or something it was made from, is being taken,
+    in either mode.
+    """
     return tensor.requires_grad or forward_ad.unpack_dual(tensor).tangent is not None
 
 
@@ -24,9 +28,11 @@ def is_forward() -> bool:
 
 
 def keep(ctx: Any, *tensors: Tensor) -> None:
-    """Saves `tensors` in the context of a custom function, for both modes; for forward mode only while it is on.
+    """Saves `tensors` in the context of a custom function, for both modes; for forward mode only
+    while it is on.
 
-    Unlike what is saved for the backward pass, what is saved for forward mode stays in memory where a backward pass is to recompute it.
+    Unlike what is saved for the backward pass, what is saved for forward mode stays in memory where
+    a backward pass is to recompute it.
     """
     ctx.save_for_backward(*tensors)
     if is_forward():
@@ -34,9 +40,11 @@ def keep(ctx: Any, *tensors: Tensor) -> None:
 
 
 def recompute(function: Callable[..., T], *arguments: object) -> T:
-    """`function(*arguments)`, which must not draw random numbers: the backward pass computes it again and keeps only the arguments.
+    """`function(*arguments)`, which must not draw random numbers: the backward pass computes it
+    again and keeps only the arguments.
 
-    What `torch.utils.checkpoint` does, without importing torch's compiler, which takes two seconds of every run.
+    What `torch.utils.checkpoint` does, without importing torch's compiler, which takes two seconds
+    of every run.
     """
     if not torch.is_grad_enabled():
         return function(*arguments)
@@ -46,7 +54,9 @@ def recompute(function: Callable[..., T], *arguments: object) -> T:
 
 
 class _Again:
-    """Numbers in place of the tensors that `function` saves for its backward pass, and these tensors when they are asked for."""
+    """Numbers in place of the tensors that `function` saves for its backward pass, and these
+    tensors when they are asked for.
+    """
 
     def __init__(self, function: Callable[[], object]):
         self.function = function
@@ -64,6 +74,9 @@ class _Again:
 
     def _make(self) -> None:
         made: list[Tensor] = []
-        with torch.enable_grad(), saved_tensors_hooks(lambda tensor: made.append(tensor.detach()), made.__getitem__):
+        with (
+            torch.enable_grad(),
+            saved_tensors_hooks(lambda tensor: made.append(tensor.detach()), made.__getitem__),
+        ):
             self.function()
         self.made = dict(enumerate(made))

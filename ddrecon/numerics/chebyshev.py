@@ -1,7 +1,8 @@
-"""Functions of a depth from 0 to infinity, as polynomials in x = (depth - s) / (depth + s): a few products where a closed form takes many.
+"""Functions of a depth from 0 to infinity, as polynomials in x = (depth - s) / (depth + s): a few
+products where a closed form takes many.
 
-By interpolation at Chebyshev's extrema (Trefethen 2019, Approximation Theory and Approximation Practice, chapter 2,
-doi:10.1137/1.9781611975949). They are differentiated by hand, in both modes.
+By interpolation at Chebyshev's extrema (Trefethen 2019, Approximation Theory and Approximation
+Practice, chapter 2, doi:10.1137/1.9781611975949). They are differentiated by hand, in both modes.
 """
 
 from __future__ import annotations
@@ -18,15 +19,19 @@ from ddrecon.numerics.autodiff import keep
 
 COEFFICIENTS = 10
 SCALE = 4.0
-"""The depth s, which is taken to the middle, x = 0; the phase function of a spread peak is fitted well with it."""
+"""The depth s, which is taken to the middle, x = 0; the phase function of a spread peak is fitted
+well with it.
+"""
 DEEPEST = 1e6
 """Stands for infinite depth."""
 
 
 def fit_chebyshev(function: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
-    """Coefficients `[COEFFICIENTS, R]` of the polynomial that equals `function` at Chebyshev's extrema, depth 0 and infinity among them.
+    """Coefficients `[COEFFICIENTS, R]` of the polynomial that equals `function` at Chebyshev's
+    extrema, depth 0 and infinity among them.
 
-    `function` takes depths [COEFFICIENTS, 1] and returns `[COEFFICIENTS, R]`, in double precision. Differentiable through its values.
+    `function` takes depths [COEFFICIENTS, 1] and returns `[COEFFICIENTS, R]`, in double precision.
+    Differentiable through its values.
     """
     places, inverse = _interpolation()
     depths = (SCALE * (1 + places) / (1 - places)).clamp(max=DEEPEST)
@@ -35,15 +40,21 @@ def fit_chebyshev(function: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
 
 
 def evaluate_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
-    """The polynomial of `coefficients` [COEFFICIENTS, R] at `depth` [N, C, R] >= 0, and 0 where it is negative."""
+    """The polynomial of `coefficients` [COEFFICIENTS, R] at `depth` [N, C, R] >= 0, and 0 where it
+    is negative.
+    """
     value: Tensor = _PositivePart.apply(coefficients, depth)[0]
     return value
 
 
 @functools.cache
 def _interpolation() -> tuple[Tensor, Tensor]:
-    """Chebyshev's extrema in [-1, 1], and the matrix from values there to coefficients of powers of x."""
-    places = -torch.cos(torch.arange(COEFFICIENTS, dtype=torch.float64) * (math.pi / (COEFFICIENTS - 1)))
+    """Chebyshev's extrema in [-1, 1], and the matrix from values there to coefficients of powers of
+    x.
+    """
+    places = -torch.cos(
+        torch.arange(COEFFICIENTS, dtype=torch.float64) * (math.pi / (COEFFICIENTS - 1))
+    )
     return places, torch.linalg.inv(torch.linalg.vander(places))
 
 
@@ -54,13 +65,17 @@ class _PositivePart(torch.autograd.Function):
         return _horner(coefficients, place).clamp_(min=0), place
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor]) -> None:
+    def setup_context(
+        ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor]
+    ) -> None:
         ctx.mark_non_differentiable(output[1])
         ctx.set_materialize_grads(False)
         keep(ctx, inputs[0], *output)
 
     @staticmethod
-    def backward(ctx: Any, value_bar: Tensor | None, _: None) -> tuple[Tensor | None, Tensor | None]:
+    def backward(
+        ctx: Any, value_bar: Tensor | None, _: None
+    ) -> tuple[Tensor | None, Tensor | None]:
         if value_bar is None:
             return None, None
         coefficients, value, place = ctx.saved_tensors
@@ -89,7 +104,9 @@ def _horner(coefficients: Tensor, place: Tensor) -> Tensor:
 def _slope(coefficients: Tensor, place: Tensor) -> Tensor:
     """The derivative by depth: dx / d depth = (1 - x)^2 / (2 s)."""
     powers = torch.arange(1, COEFFICIENTS, dtype=coefficients.dtype, device=coefficients.device)
-    return _horner(coefficients[1:] * powers[:, None], place) * ((1 - place).square_().div_(2 * SCALE))
+    return _horner(coefficients[1:] * powers[:, None], place) * (
+        (1 - place).square_().div_(2 * SCALE)
+    )
 
 
 def _coefficients_bar(bar: Tensor, place: Tensor) -> Tensor:

@@ -26,18 +26,19 @@ def decay_mean(depth: Tensor) -> Tensor:
 def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Tensor:
     """Sum over segments of `weight` times the mean of exp(-depth) there, `[C, R]`.
 
-    `begin`, `end`: [S, K, R] >= 0, what `scale` [C, 1] multiplies to give the depths at both ends of segment S, in either order;
-    `weight`: [S, K or C, R]. K is 1 or C.
+    `begin`, `end`: [S, K, R] >= 0, what `scale` [C, 1] multiplies to give the depths at both ends
+    of segment S, in either order; `weight`: [S, K or C, R]. K is 1 or C.
     """
     total: Tensor = _DecayedSum.apply(weight, begin, end, scale)[0]
     return total
 
 
 def decayed_line(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean over s in [0, 1] of (near + (far - near) s) exp(-depth s): what reaches the near end of a step from all along it.
+    """The mean over s in [0, 1] of (near + (far - near) s) exp(-depth s): what reaches the near end
+    of a step from all along it.
 
-    And 1 - exp(-depth), the part of what enters at its far end that is lost on it. `depth` [N, C, ...] >= 0; `near` and `far` have its
-    shape, or either has one channel where the other has C.
+    And 1 - exp(-depth), the part of what enters at its far end that is lost on it. `depth` [N, C,
+    ...] >= 0; `near` and `far` have its shape, or either has one channel where the other has C.
     """
     line, lost, *_ = _DecayedLine.apply(near, far, depth)
     return line, lost
@@ -55,7 +56,9 @@ def _psi(depth: Tensor, phi: Tensor) -> Tensor:
 
 def _psi_slope(depth: Tensor, phi: Tensor, psi: Tensor) -> Tensor:
     series = -1 / 6 + depth * (1 / 12 - depth * (1 / 40 - depth * (1 / 180 - depth / 1008)))
-    return torch.where(depth < SERIES_BELOW, series, (phi - 2 * psi).div_(depth.clamp(min=SERIES_BELOW)))
+    return torch.where(
+        depth < SERIES_BELOW, series, (phi - 2 * psi).div_(depth.clamp(min=SERIES_BELOW))
+    )
 
 
 class _DecayMean(torch.autograd.Function):
@@ -79,16 +82,22 @@ class _DecayMean(torch.autograd.Function):
 
 
 class _DecayedSum(torch.autograd.Function):
-    """The sum, and the two arrays its derivatives need again, which are not differentiated themselves."""
+    """The sum, and the two arrays its derivatives need again, which are not differentiated
+    themselves.
+    """
 
     @staticmethod
-    def forward(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         decay = torch.exp(torch.minimum(begin, end) * -scale)
         phi = _phi((end - begin).abs_() * scale)
         return (decay * phi).mul_(weight).sum(0), decay, phi
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
+    def setup_context(
+        ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor]
+    ) -> None:
         ctx.mark_non_differentiable(*output[1:])
         ctx.set_materialize_grads(False)
         keep(ctx, *inputs, *output[1:])
@@ -99,9 +108,13 @@ class _DecayedSum(torch.autograd.Function):
             return None, None, None, None
         weight, begin, end, scale, decay, phi = ctx.saved_tensors
         mean_bar = decay * phi * out_bar
-        weight_bar = mean_bar.sum(1, keepdim=True) if weight.shape[1] < mean_bar.shape[1] else mean_bar
+        weight_bar = (
+            mean_bar.sum(1, keepdim=True) if weight.shape[1] < mean_bar.shape[1] else mean_bar
+        )
         both_bar = mean_bar * weight
-        low_bar = _psi((end - begin).abs_() * scale, phi).mul_(decay).mul_(weight).mul_(out_bar).neg_()
+        low_bar = (
+            _psi((end - begin).abs_() * scale, phi).mul_(decay).mul_(weight).mul_(out_bar).neg_()
+        )
         high_bar = both_bar.add_(low_bar).neg_()
         is_rising = begin <= end
         scale_bar = None
@@ -109,17 +122,29 @@ class _DecayedSum(torch.autograd.Function):
             low, high = torch.minimum(begin, end), torch.maximum(begin, end)
             scale_bar = (low_bar * low + high_bar * high).sum((0, 2))[:, None]
         low_bar, high_bar = (_to_fields(bar.mul_(scale), begin) for bar in (low_bar, high_bar))
-        return weight_bar, torch.where(is_rising, low_bar, high_bar), torch.where(is_rising, high_bar, low_bar), scale_bar
+        return (
+            weight_bar,
+            torch.where(is_rising, low_bar, high_bar),
+            torch.where(is_rising, high_bar, low_bar),
+            scale_bar,
+        )
 
     @staticmethod
     def jvp(
-        ctx: Any, d_weight: Tensor | None, d_begin: Tensor | None, d_end: Tensor | None, d_scale: Tensor | None
+        ctx: Any,
+        d_weight: Tensor | None,
+        d_begin: Tensor | None,
+        d_end: Tensor | None,
+        d_scale: Tensor | None,
     ) -> tuple[Tensor, None, None]:
         weight, begin, end, scale, decay, phi = ctx.saved_tensors
         psi = _psi((end - begin).abs() * scale, phi)
         low_slope, high_slope = -decay * psi, decay * (psi - phi)
         is_rising = begin <= end
-        begin_slope, end_slope = torch.where(is_rising, low_slope, high_slope), torch.where(is_rising, high_slope, low_slope)
+        begin_slope, end_slope = (
+            torch.where(is_rising, low_slope, high_slope),
+            torch.where(is_rising, high_slope, low_slope),
+        )
         d_mean = torch.zeros_like(decay)
         for value, d_value, slope in ((begin, d_begin, begin_slope), (end, d_end, end_slope)):
             if d_value is not None:
@@ -131,7 +156,9 @@ class _DecayedSum(torch.autograd.Function):
 
 
 class _DecayedLine(torch.autograd.Function):
-    """far phi + (near - far) psi and depth phi; and phi and psi, which are not differentiated themselves."""
+    """far phi + (near - far) psi and depth phi; and phi and psi, which are not differentiated
+    themselves.
+    """
 
     @staticmethod
     def forward(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -140,13 +167,17 @@ class _DecayedLine(torch.autograd.Function):
         return torch.addcmul(far * phi, near - far, psi), depth * phi, phi, psi
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
+    def setup_context(
+        ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor, Tensor, Tensor]
+    ) -> None:
         ctx.mark_non_differentiable(*output[2:])
         ctx.set_materialize_grads(False)
         keep(ctx, *inputs, *output[1:])
 
     @staticmethod
-    def backward(ctx: Any, line_bar: Tensor | None, lost_bar: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, line_bar: Tensor | None, lost_bar: Tensor | None, *_: None
+    ) -> tuple[Tensor | None, ...]:
         near, far, depth, lost, phi, psi = ctx.saved_tensors
         depth_bar = None if lost_bar is None else lost_bar * (1 - lost)
         if line_bar is None:
@@ -154,17 +185,26 @@ class _DecayedLine(torch.autograd.Function):
         near_bar, slope = line_bar * psi, _line_slope(near, far, depth, phi, psi)
         far_bar = (line_bar * phi).sub_(near_bar)
         through = _to_fields(slope.mul_(line_bar), depth)
-        return _to_fields(near_bar, near), _to_fields(far_bar, far), through if depth_bar is None else depth_bar.add_(through)
+        return (
+            _to_fields(near_bar, near),
+            _to_fields(far_bar, far),
+            through if depth_bar is None else depth_bar.add_(through),
+        )
 
     @staticmethod
-    def jvp(ctx: Any, d_near: Tensor | None, d_far: Tensor | None, d_depth: Tensor | None) -> tuple[Tensor, Tensor, None, None]:
+    def jvp(
+        ctx: Any, d_near: Tensor | None, d_far: Tensor | None, d_depth: Tensor | None
+    ) -> tuple[Tensor, Tensor, None, None]:
         near, far, depth, lost, phi, psi = ctx.saved_tensors
         d_line, d_lost = torch.zeros_like(far * phi), torch.zeros_like(lost)
         for change, slope in ((d_near, psi), (d_far, phi - psi)):
             if change is not None:
                 d_line = d_line + change * slope
         if d_depth is not None:
-            d_line, d_lost = d_line + d_depth * _line_slope(near, far, depth, phi, psi), d_depth * (1 - lost)
+            d_line, d_lost = (
+                d_line + d_depth * _line_slope(near, far, depth, phi, psi),
+                d_depth * (1 - lost),
+            )
         return d_line, d_lost, None, None
 
 

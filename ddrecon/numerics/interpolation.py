@@ -1,8 +1,9 @@
 """Linear interpolation in slices and volumes, differentiable in both directions.
 
-torch's `grid_sample` has no forward-mode derivative; these two functions add it. And where points lie on cells' centers its slope is that
-of the side rounding picks: here it is the mean of both, as central differences have it. Coordinates are in torch's convention: -1 and
-1 are the outer faces of the first and last cell (`align_corners=False`), the last axis of the array comes first.
+torch's `grid_sample` has no forward-mode derivative; these two functions add it. And where points
+lie on cells' centers its slope is that of the side rounding picks: here it is the mean of both, as
+central differences have it. Coordinates are in torch's convention: -1 and 1 are the outer faces of
+the first and last cell (`align_corners=False`), the last axis of the array comes first.
 """
 
 from __future__ import annotations
@@ -14,7 +15,13 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ddrecon.numerics.autodiff import keep
-from ddrecon.numerics.third_order import ThirdOrder, kink_width, second_difference, subtract_correction, third_order_weight
+from ddrecon.numerics.third_order import (
+    ThirdOrder,
+    kink_width,
+    second_difference,
+    subtract_correction,
+    third_order_weight,
+)
 
 _BACKWARD = {4: torch.ops.aten.grid_sampler_2d_backward, 5: torch.ops.aten.grid_sampler_3d_backward}
 _BORDER = 1
@@ -24,7 +31,9 @@ _BORDER = 1
 class _Sample(torch.autograd.Function):
     @staticmethod
     def forward(values: Tensor, points: Tensor) -> Tensor:
-        return grid_sample(values, points, mode="bilinear", padding_mode="border", align_corners=False)
+        return grid_sample(
+            values, points, mode="bilinear", padding_mode="border", align_corners=False
+        )
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
@@ -46,7 +55,9 @@ class _Sample(torch.autograd.Function):
         values, points = ctx.saved_tensors
         out = values.new_zeros(values.shape[:2] + points.shape[1:-1])
         if d_values is not None:
-            out = out + grid_sample(d_values, points, mode="bilinear", padding_mode="border", align_corners=False)
+            out = out + grid_sample(
+                d_values, points, mode="bilinear", padding_mode="border", align_corners=False
+            )
         if d_points is not None:
             for channel in range(values.shape[1]):
                 one = torch.zeros_like(out)
@@ -55,19 +66,29 @@ class _Sample(torch.autograd.Function):
         return out
 
 
-def _adjoint(output_bar: Tensor, values: Tensor, points: Tensor, needs: tuple[bool, bool]) -> tuple[Tensor, Tensor]:
-    found: tuple[Tensor, Tensor] = _BACKWARD[values.ndim](output_bar.contiguous(), values, points, 0, _BORDER, False, list(needs))
+def _adjoint(
+    output_bar: Tensor, values: Tensor, points: Tensor, needs: tuple[bool, bool]
+) -> tuple[Tensor, Tensor]:
+    found: tuple[Tensor, Tensor] = _BACKWARD[values.ndim](
+        output_bar.contiguous(), values, points, 0, _BORDER, False, list(needs)
+    )
     return found
 
 
 def _slope(output_bar: Tensor, values: Tensor, points: Tensor) -> Tensor:
-    """The derivative by `points`: where a point lies on a kink, a cell's center along some axis, the mean of those on both sides."""
+    """The derivative by `points`: where a point lies on a kink, a cell's center along some axis,
+    the mean of those on both sides.
+    """
     sides = _sides(values, points)
-    return torch.stack([_adjoint(output_bar, values, side, (False, True))[1] for side in sides]).mean(0)
+    return torch.stack(
+        [_adjoint(output_bar, values, side, (False, True))[1] for side in sides]
+    ).mean(0)
 
 
 def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
-    """`points`, or where some lie on kinks, those points shifted to both sides along the axes on which they do."""
+    """`points`, or where some lie on kinks, those points shifted to both sides along the axes on
+    which they do.
+    """
     sizes = points.new_tensor(values.shape[:1:-1])
     place = ((points + 1) * sizes - 1) / 2
     near = kink_width(points, 1) * sizes
@@ -79,31 +100,40 @@ def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
 
 
 def sample_slices(slices: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
-    """Bilinear values `[N, K, P]` of `slices` [N, K, H, W] at `points` [N, P, 2] (last array axis first, in [-1, 1]).
+    """Bilinear values `[N, K, P]` of `slices` [N, K, H, W] at `points` [N, P, 2] (last array axis
+    first, in [-1, 1]).
 
-    Beyond the outermost cells' centers the value is theirs. Channels in `smooth` are interpolated to third order.
+    Beyond the outermost cells' centers the value is theirs. Channels in `smooth` are interpolated
+    to third order.
     """
     return _interpolate(slices, points[:, :, None], smooth)[..., 0]
 
 
 def sample_volume(volume: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
-    """Trilinear values `[K, N, P]` of `volume` [K, D, H, W] at `points` [N, P, 3] (last array axis first, in [-1, 1])."""
+    """Trilinear values `[K, N, P]` of `volume` [K, D, H, W] at `points` [N, P, 3] (last array axis
+    first, in [-1, 1]).
+    """
     return _interpolate(volume[None], points[None, None], smooth)[0, :, 0]
 
 
 def _interpolate(values: Tensor, points: Tensor, smooth: ThirdOrder | None) -> Tensor:
-    """Linear values `[N, K, ...]` of `values` [N, K, ...] at `points`; channels `smooth` less a (1 - a) / 2 second differences an axis.
+    """Linear values `[N, K, ...]` of `values` [N, K, ...] at `points`; channels `smooth` less a (1
+    - a) / 2 second differences an axis.
 
-    a is how far a point has gone from one cell center to the next. Linear interpolation is off by that much where a field bends.
+    a is how far a point has gone from one cell center to the next. Linear interpolation is off by
+    that much where a field bends.
     """
     if smooth is None:
         return _sample(values, points)
     axes = range(2, values.ndim)
     chosen = values[:, smooth.channels]
-    found = _sample(torch.cat([values, *(second_difference(chosen, axis) for axis in axes)], 1), points)
+    found = _sample(
+        torch.cat([values, *(second_difference(chosen, axis) for axis in axes)], 1), points
+    )
     plain, *bends = found.split([values.shape[1]] + [chosen.shape[1]] * len(axes), 1)
     excesses = [
-        third_order_weight(points[..., 1 - axis], values.shape[axis])[:, None] * bent for axis, bent in zip(axes, bends, strict=True)
+        third_order_weight(points[..., 1 - axis], values.shape[axis])[:, None] * bent
+        for axis, bent in zip(axes, bends, strict=True)
     ]
     return subtract_correction(plain, torch.stack(excesses).sum(0), smooth)
 

@@ -9,7 +9,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Nodes:
-    """N nodes on each of R rays: rays' `origin` and unit `direction` [R, 3] (array order), nodes' `distance` [N, R] from the origin [u]."""
+    """N nodes on each of R rays: rays' `origin` and unit `direction` [R, 3] (array order), nodes'
+    `distance` [N, R] from the origin [u].
+    """
 
     origin: Tensor
     direction: Tensor
@@ -21,5 +23,11 @@ class Nodes:
         return self.distance[1:] - self.distance[:-1]
 
     def integral(self, values: Tensor, measure: Tensor | None = None) -> Tensor:
-        """The integral over each segment of what is linear between `values` [N, channels, R], by length or another `measure` [N - 1, R]."""
-        return 0.5 * (values[:-1] + values[1:]) * (self.lengths if measure is None else measure)[:, None]
+        """The integral over each segment of what is linear between `values` [N, channels, R], by
+        length or another `measure` [N - 1, R].
+        """
+        return (
+            0.5
+            * (values[:-1] + values[1:])
+            * (self.lengths if measure is None else measure)[:, None]
+        )

@@ -1,4 +1,6 @@
-"""Sums along the first axis, slice by slice: `cumsum` strides through memory there, and turns arrays around in its backward pass."""
+"""Sums along the first axis, slice by slice: `cumsum` strides through memory there, and turns
+arrays around in its backward pass.
+"""
 
 from __future__ import annotations
 

@@ -8,14 +8,17 @@ import torch
 from torch import Tensor
 
 KINK = 16
-"""Units in the last place, of a coordinate counted in cells, within which a point counts as lying on a cell's center."""
+"""Units in the last place, of a coordinate counted in cells, within which a point counts as lying
+on a cell's center.
+"""
 
 
 @dataclass(frozen=True)
 class ThirdOrder:
     """Channels, `first` to before `last`, that are interpolated to third order rather than second.
 
-    What that adds to a value, x, is bounded smoothly, x / sqrt(1 + (`bound` x)^2), so that jumps of a field do no harm.
+    What that adds to a value, x, is bounded smoothly, x / sqrt(1 + (`bound` x)^2), so that jumps of
+    a field do no harm.
     """
 
     first: int
@@ -33,7 +36,9 @@ class ThirdOrder:
 
 
 def subdivide(values: Tensor, steps: int, smooth: ThirdOrder | None = None) -> Tensor:
-    """`values` along axis 0 with `steps` - 1 interpolated entries between each pair of neighbors; channels are axis 1."""
+    """`values` along axis 0 with `steps` - 1 interpolated entries between each pair of neighbors;
+    channels are axis 1.
+    """
     if steps == 1:
         return values
     low, high = values[:-1], values[1:]
@@ -42,7 +47,11 @@ def subdivide(values: Tensor, steps: int, smooth: ThirdOrder | None = None) -> T
         bent = second_difference(values[:, smooth.channels], 0)
         for i in range(1, steps):
             share = i / steps
-            parts[i] = subtract_correction(parts[i], 0.5 * share * (1 - share) * (bent[:-1] * (1 - share) + bent[1:] * share), smooth)
+            parts[i] = subtract_correction(
+                parts[i],
+                0.5 * share * (1 - share) * (bent[:-1] * (1 - share) + bent[1:] * share),
+                smooth,
+            )
     return torch.cat([torch.stack(parts, 1).flatten(0, 1), values[-1:]])
 
 
@@ -65,7 +74,9 @@ def kink_width(place: Tensor, size: int) -> float:
 
 
 def third_order_weight(coordinate: Tensor, size: int) -> Tensor:
-    """a (1 - a) / 2: 0 at cell centers, 1/8 midway, 0 beyond the outermost; on a kink its slope is the mean of both sides'."""
+    """a (1 - a) / 2: 0 at cell centers, 1/8 midway, 0 beyond the outermost; on a kink its slope is
+    the mean of both sides'.
+    """
     place = ((coordinate + 1) * size - 1) / 2
     apart = place - place.round()
     is_on_kink = apart.abs() < kink_width(place, size)

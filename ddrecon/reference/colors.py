@@ -1,8 +1,8 @@
 """One color of a scene as a gray scene.
 
-Paths that red, green and blue share are chosen by the extinction of one of them and weighted for the others. Where extinctions differ
-that makes five times the noise, and Mitsuba 3.9 drops samples whose weight comes out a rounding below zero, so there each color is traced
-by itself.
+Paths that red, green and blue share are chosen by the extinction of one of them and weighted for
+the others. Where extinctions differ that makes five times the noise, and Mitsuba 3.9 drops samples
+whose weight comes out a rounding below zero, so there each color is traced by itself.
 """
 
 from __future__ import annotations
@@ -16,8 +16,14 @@ from ddrecon.scene import Scene
 
 
 def pick_color(scene: Scene, color: int) -> Scene:
-    """`scene` as seen in `color` (0, 1, 2 for red, green, blue) alone; views keep their cameras only."""
-    volume = replace(scene.volume, sigma_a=_pick(scene.volume.sigma_a, color), sigma_s=_pick(scene.volume.sigma_s, color))
+    """`scene` as seen in `color` (0, 1, 2 for red, green, blue) alone; views keep their cameras
+    only.
+    """
+    volume = replace(
+        scene.volume,
+        sigma_a=_pick(scene.volume.sigma_a, color),
+        sigma_s=_pick(scene.volume.sigma_s, color),
+    )
     return replace(scene, volume=volume, lights=[_light(light, color) for light in scene.lights])
 
 

@@ -1,4 +1,6 @@
-"""Pages of HTML from headings, tables and pictures. Text is escaped here; parts made here are put together as they are."""
+"""Pages of HTML from headings, tables and pictures. Text is escaped here; parts made here are put
+together as they are.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ pre { overflow-x: auto; background: var(--soft); padding: 0.75rem; font-size: 0.
 
 
 def write_page(path: Path, title: str, lead: str, sections: Sequence[str]) -> None:
-    """Writes the page of `sections` under `title`, with `lead`, a sentence, between them, to `path`."""
+    """Writes the page of `sections` under `title`, with `lead`, a sentence, between them, to
+    `path`.
+    """
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
     body = f"<h1>{escape(title)}</h1>\n<p>{escape(lead)}</p>\n" + "\n".join(sections)
     with replace_file(path) as temporary:
@@ -62,7 +66,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 def picture(png: bytes, caption: str, width: int = 600) -> str:
     """The picture `png`, `width` pixels wide where there is room, above `caption`."""
     data = base64.b64encode(png).decode("ascii")
-    image = f'<img src="data:image/png;base64,{data}" alt="{escape(caption)}" style="width: {width}px">'
+    image = (
+        f'<img src="data:image/png;base64,{data}" alt="{escape(caption)}" style="width: {width}px">'
+    )
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
 
 

@@ -1,4 +1,6 @@
-"""Checkpoints: the state of a run in one file of tensors and plain values, never a pickle of anything else. The last two are kept."""
+"""Checkpoints: the state of a run in one file of tensors and plain values, never a pickle of
+anything else. The last two are kept.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,13 @@ LAST, PREVIOUS = "last.pt", "previous.pt"
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any]) -> None:
-    """Writes `state`, and a description of the `scene` it belongs to, as the last checkpoint in `folder`."""
-    with replace_file_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary, temporary.open("wb") as stream:
+    """Writes `state`, and a description of the `scene` it belongs to, as the last checkpoint in
+    `folder`.
+    """
+    with (
+        replace_file_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary,
+        temporary.open("wb") as stream,
+    ):
         try:
             torch.save({"format": FORMAT, "scene": scene, "state": state}, stream)
         except RuntimeError as error:  # in which torch's writer wraps that the disk is full
@@ -30,9 +37,11 @@ def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any
 
 
 def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
-    """The state in the last checkpoint in `folder`, or in the one before it where that is damaged, with a warning; and its file.
+    """The state in the last checkpoint in `folder`, or in the one before it where that is damaged,
+    with a warning; and its file.
 
-    Raises FormatError if neither can be used, SceneError if there is none, or it is not of this `scene`.
+    Raises FormatError if neither can be used, SceneError if there is none, or it is not of this
+    `scene`.
     """
     last, previous = folder / LAST, folder / PREVIOUS
     if not last.exists() and not previous.exists():
@@ -43,7 +52,11 @@ def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, A
         if not previous.exists():
             raise
         state = _check(previous, _load(previous), scene)
-        warnings.warn(f"{error.path}: {error.reason.partition(';')[0]}; going on from {previous}", DataWarning, 2)
+        warnings.warn(
+            f"{error.path}: {error.reason.partition(';')[0]}; going on from {previous}",
+            DataWarning,
+            2,
+        )
         return state, previous
 
 
@@ -54,7 +67,9 @@ def forget_checkpoints(folder: Path) -> None:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    """What is in the file at `path`: torch itself does not notice changed bytes, but they are in a zip archive with checksums."""
+    """What is in the file at `path`: torch itself does not notice changed bytes, but they are in a
+    zip archive with checksums.
+    """
     if not path.is_file():
         raise FormatError(path, "is missing; start anew with --overwrite")
     try:
@@ -71,7 +86,15 @@ def _load(path: Path) -> dict[str, Any]:
 def _check(path: Path, content: dict[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
     if content.get("format") != FORMAT:
         written = content.get("format")
-        raise FormatError(path, f"a checkpoint of format {written}; this version reads {FORMAT}; start anew with --overwrite")
+        raise FormatError(
+            path,
+            f"a checkpoint of format {written}; this version reads {FORMAT}; start anew with --overwrite",
+        )
     if changes := differences(content["scene"], scene):
-        raise SceneError([f"{path}: belongs to another scene: {change}; use another output folder" for change in changes])
+        raise SceneError(
+            [
+                f"{path}: belongs to another scene: {change}; use another output folder"
+                for change in changes
+            ]
+        )
     return dict(content["state"])

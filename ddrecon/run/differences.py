@@ -26,15 +26,22 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     Less what a resumed run may change: the number of iterations, and learning rates.
     """
     scene = describe(scene_file)
-    settings = {name: _without(given, "lr") for name, given in scene["optimize"]["parameters"].items()}
+    settings = {
+        name: _without(given, "lr") for name, given in scene["optimize"]["parameters"].items()
+    }
     scene["optimize"] = {**_without(scene["optimize"], "iterations"), "parameters": settings}
     contents = {f"the content of {path}": _digest(path) for path in referenced_files(scene_file)}
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 
 
 def differences(old: Any, new: Any) -> list[str]:
-    """One text a difference between two trees of mappings, lists and plain values: `key.path is A there, B now`."""
-    return [f"{key} is {_shown(before)} there, {_shown(after)} now" for key, before, after in _changes("", old, new)]
+    """One text a difference between two trees of mappings, lists and plain values: `key.path is A
+    there, B now`.
+    """
+    return [
+        f"{key} is {_shown(before)} there, {_shown(after)} now"
+        for key, before, after in _changes("", old, new)
+    ]
 
 
 def _changes(key: str, old: Any, new: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -44,11 +51,17 @@ def _changes(key: str, old: Any, new: Any) -> Iterator[tuple[str, Any, Any]]:
             yield key, old, new
         return
     for name in dict.fromkeys([*old_entries, *new_entries]):
-        yield from _changes(f"{key}.{name}" if key else str(name), old_entries.get(name, ABSENT), new_entries.get(name, ABSENT))
+        yield from _changes(
+            f"{key}.{name}" if key else str(name),
+            old_entries.get(name, ABSENT),
+            new_entries.get(name, ABSENT),
+        )
 
 
 def _entries(value: Any) -> Mapping[Any, Any] | None:
-    """The children of `value` by name or number; None if it has none, or is a list of numbers, which is shown whole."""
+    """The children of `value` by name or number; None if it has none, or is a list of numbers,
+    which is shown whole.
+    """
     if isinstance(value, Mapping):
         return value
     if isinstance(value, list) and any(isinstance(entry, Mapping) for entry in value):
@@ -70,7 +83,9 @@ def _without(entries: Mapping[str, Any], name: str) -> dict[str, Any]:
 def _digest(path: Path) -> str:
     """The SHA-256 of the file at `path`, or of those of all files in the folder `path`."""
     if path.is_dir():
-        return hashlib.sha256("".join(_digest(entry) for entry in sorted(path.iterdir())).encode()).hexdigest()
+        return hashlib.sha256(
+            "".join(_digest(entry) for entry in sorted(path.iterdir())).encode()
+        ).hexdigest()
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()

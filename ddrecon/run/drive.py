@@ -1,4 +1,6 @@
-"""Driving a reconstruction to its end: one progress line, the log, previews, and nothing lost on the way."""
+"""Driving a reconstruction to its end: one progress line, the log, previews, and nothing lost on
+the way.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +29,19 @@ from ddrecon.scene_file.load import SceneFile
 
 @contextmanager
 def open_run(
-    scene: Scene, scene_file: SceneFile, path: Path, environment: dict[str, Any], *, may_exist: bool, resume: bool
+    scene: Scene,
+    scene_file: SceneFile,
+    path: Path,
+    environment: dict[str, Any],
+    *,
+    may_exist: bool,
+    resume: bool,
 ) -> Iterator[tuple[Reconstruction, RunFolder]]:
-    """A run of `scene` and its folder `path`, this process's alone until the block ends, with the resolved scene and environment in it.
+    """A run of `scene` and its folder `path`, this process's alone until the block ends, with the
+    resolved scene and environment in it.
 
-    Raises SceneError for a folder that another process writes to or that is not empty, unless it may be or the run goes on from the
-    checkpoint in it.
+    Raises SceneError for a folder that another process writes to or that is not empty, unless it
+    may be or the run goes on from the checkpoint in it.
     """
     try:
         run = Reconstruction(scene)
@@ -59,24 +68,38 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise FormatError(loaded, "not a usable checkpoint; start anew with --overwrite") from error
     if run.iteration > run.settings.iterations:
-        raise SceneError(f"{path}: {run.iteration} iterations are made already; ask for more than that, in all, with --iterations")
+        raise SceneError(
+            f"{path}: {run.iteration} iterations are made already; ask for more than that, in all, with --iterations"
+        )
     return loaded
 
 
 def drive_run(
-    run: Reconstruction, folder: RunFolder, preview_every: int | None, is_quiet: bool, has_events: bool = False
+    run: Reconstruction,
+    folder: RunFolder,
+    preview_every: int | None,
+    is_quiet: bool,
+    has_events: bool = False,
 ) -> dict[str, Any]:
-    """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as well; returns the summary.
+    """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as
+    well; returns the summary.
 
-    An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint before it is passed on. So does a
-    divergence; any other failure leaves the checkpoints written so far.
+    An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
+    before it is passed on. So does a divergence; any other failure leaves the checkpoints written
+    so far.
     """
     total = run.settings.iterations
     try:
         with (
             defer_interrupt() as asked,
             event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
-            tqdm(total=total, initial=run.iteration, desc="optimize", file=sys.stderr, disable=is_quiet) as bar,
+            tqdm(
+                total=total,
+                initial=run.iteration,
+                desc="optimize",
+                file=sys.stderr,
+                disable=is_quiet,
+            ) as bar,
         ):
             while not run.is_done:
                 folder.save_in_time(run)
@@ -90,17 +113,23 @@ def drive_run(
                     folder.preview(run)
                 if asked:
                     folder.save(run)
-                    raise KeyboardInterrupt(f"after {run.iteration} iterations; go on with --resume")
+                    raise KeyboardInterrupt(
+                        f"after {run.iteration} iterations; go on with --resume"
+                    )
     except DivergenceError as error:
         folder.save(run)
         kept = folder.checkpoints / LAST
-        raise error.with_advice(f"the state after {run.iteration} iterations is kept in {kept}: go on from it with --resume") from error
+        raise error.with_advice(
+            f"the state after {run.iteration} iterations is kept in {kept}: go on from it with --resume"
+        ) from error
     return folder.finish(run)
 
 
 @contextmanager
 def defer_interrupt() -> Iterator[list[int]]:
-    """A list that fills when the process is asked to stop, so that an iteration is never torn; asked twice, it stops at once."""
+    """A list that fills when the process is asked to stop, so that an iteration is never torn;
+    asked twice, it stops at once.
+    """
     asked: list[int] = []
 
     def note(number: int, _: FrameType | None) -> None:
@@ -117,6 +146,8 @@ def defer_interrupt() -> Iterator[list[int]]:
 
 
 def progress_text(total: Row, row: Row) -> str:
-    """Loss, PSNR of training and (last known) test views, and solver iterations, for the progress line."""
+    """Loss, PSNR of training and (last known) test views, and solver iterations, for the progress
+    line.
+    """
     test = "" if total.test_psnr is None else f"/{total.test_psnr:.1f}"
     return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {row.forward_iterations}+{row.adjoint_iterations}"

@@ -14,7 +14,16 @@ from ddrecon.io.files.atomic import flush, refusals, replace_file
 from ddrecon.reconstruct.loop import Row
 
 COLUMNS = [field.name for field in fields(Row)]
-KINDS: list[Callable[[str], Any]] = [int, float, float, float, lambda text: float(text) if text else None, int, int, int]
+KINDS: list[Callable[[str], Any]] = [
+    int,
+    float,
+    float,
+    float,
+    lambda text: float(text) if text else None,
+    int,
+    int,
+    int,
+]
 """What the cells of a row are."""
 
 
@@ -29,10 +38,14 @@ class LossLog:
         self._write([])
 
     def cut(self, iteration: int) -> None:
-        """Takes rows after `iteration` away, where a resumed run goes on; warns where some before it are missing."""
+        """Takes rows after `iteration` away, where a resumed run goes on; warns where some before
+        it are missing.
+        """
         rows = self._read()[:iteration]
         if len(rows) < iteration:
-            warnings.warn(f"{self.path}: has {len(rows)} of the {iteration} iterations made", DataWarning, 2)
+            warnings.warn(
+                f"{self.path}: has {len(rows)} of the {iteration} iterations made", DataWarning, 2
+            )
         self._write(rows)
 
     def add(self, row: Row) -> None:
@@ -46,7 +59,10 @@ class LossLog:
 
     def rows(self) -> list[Row]:
         """What was written."""
-        return [Row(*(kind(cell) for kind, cell in zip(KINDS, row, strict=True))) for row in self._read()]
+        return [
+            Row(*(kind(cell) for kind, cell in zip(KINDS, row, strict=True)))
+            for row in self._read()
+        ]
 
     def _write(self, rows: list[list[str]]) -> None:
         with replace_file(self.path) as temporary, temporary.open("w", newline="") as stream:
@@ -59,10 +75,16 @@ class LossLog:
                 _, *rows = csv.reader(stream)
         except (OSError, ValueError, csv.Error):
             return []
-        count = next((i for i, row in enumerate(rows) if len(row) != len(COLUMNS) or row[0] != str(i + 1)), len(rows))
+        count = next(
+            (i for i, row in enumerate(rows) if len(row) != len(COLUMNS) or row[0] != str(i + 1)),
+            len(rows),
+        )
         return rows[:count]
 
 
 def _cells(row: Row) -> list[Any]:
     values = (getattr(row, name) for name in COLUMNS)
-    return ["" if value is None else f"{value:.8g}" if isinstance(value, float) else value for value in values]
+    return [
+        "" if value is None else f"{value:.8g}" if isinstance(value, float) else value
+        for value in values
+    ]

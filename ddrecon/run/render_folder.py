@@ -1,4 +1,6 @@
-"""Rendered views as files: linear pixels, previews, derivative images, and a report of what it took."""
+"""Rendered views as files: linear pixels, previews, derivative images, and a report of what it
+took.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ GRADIENT = "gradient"
 Progress = Callable[[list[View], str], Iterable[View]]
 
 
-def render_to_folder(scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Progress) -> dict[str, Any]:
+def render_to_folder(
+    scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Progress
+) -> dict[str, Any]:
     """Renders `views` of `scene` into `folder` and returns a report of it."""
     memory, files, seconds, quality = SolveMemory(), {}, {}, {}
     with torch.no_grad():
@@ -37,16 +41,29 @@ def render_to_folder(scene: Scene, views: list[View], folder: Path, has_componen
             start = perf_counter()
             images = _images(light_field, scene, view, has_components)
             seconds[view.name] = perf_counter() - start
-            files[view.name] = [path.name for name, image in images.items() for path in write_picture(folder / name, pixels(image))]
+            files[view.name] = [
+                path.name
+                for name, image in images.items()
+                for path in write_picture(folder / name, pixels(image))
+            ]
             if view.image is not None:
                 quality[view.name] = psnr(images[view.name], view.image, view.mask)
-    return _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {"psnr": quality}
+    return _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {
+        "psnr": quality
+    }
 
 
 def render_gradient_to_folder(
-    scene: Scene, views: list[View], folder: Path, has_components: bool, parameter: str, progress: Progress
+    scene: Scene,
+    views: list[View],
+    folder: Path,
+    has_components: bool,
+    parameter: str,
+    progress: Progress,
 ) -> dict[str, Any]:
-    """Renders `views` of `scene` and their derivatives with respect to `parameter`, which `require_variation` allows, into `folder`."""
+    """Renders `views` of `scene` and their derivatives with respect to `parameter`, which
+    `require_variation` allows, into `folder`.
+    """
     memory, scales = SolveMemory(), {}
     seconds: dict[str, Any] = {"views": {}}
     files: dict[str, list[str]] = {view.name: [] for view in views}
@@ -57,7 +74,10 @@ def render_gradient_to_folder(
         seconds["light"] = perf_counter() - start
         for view in progress([world.view(view.name) for view in views], "render"):
             begun = perf_counter()
-            images |= {(view.name, name): image for name, image in _images(light_field, world, view, has_components).items()}
+            images |= {
+                (view.name, name): image
+                for name, image in _images(light_field, world, view, has_components).items()
+            }
             seconds["views"][view.name] = perf_counter() - begun
         return images
 
@@ -66,13 +86,20 @@ def render_gradient_to_folder(
     for (view, name), (image, derivative) in rendered.items():
         derived = f"{view}.{GRADIENT}{name.removeprefix(view)}"
         picture, scales[derived] = diverging(derivative)
-        written = write_picture(folder / name, pixels(image)) + write_picture(folder / derived, pixels(derivative), picture)
+        written = write_picture(folder / name, pixels(image)) + write_picture(
+            folder / derived, pixels(derivative), picture
+        )
         files[view] += [path.name for path in written]
-    return _report(scene, memory, seconds, files) | {"psnr": {}, "gradient": {"parameter": parameter, "full_scale": scales}}
+    return _report(scene, memory, seconds, files) | {
+        "psnr": {},
+        "gradient": {"parameter": parameter, "full_scale": scales},
+    }
 
 
 def write_ring(views: list[View], folder: Path, has_mp4: bool) -> dict[str, Any]:
-    """Writes the images of `views` in `folder` as one movie, `ring.png` and where asked for `ring.mp4`; what the report says of it."""
+    """Writes the images of `views` in `folder` as one movie, `ring.png` and where asked for
+    `ring.mp4`; what the report says of it.
+    """
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
     frames, written = encode_frames(images, white), ["ring.png"]
@@ -91,14 +118,29 @@ def require_variation(scene: Scene, parameter: str) -> None:
         raise SceneError(f"--gradient {parameter}: {error.args[0]}") from None
 
 
-def _report(scene: Scene, memory: SolveMemory, seconds: dict[str, Any], files: dict[str, list[str]]) -> dict[str, Any]:
-    solves = [{"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds} for r in memory.records]
-    return {"seconds": seconds, "solves": solves, "physics": needed_terms(scene), "files": files, "preview": PREVIEW}
+def _report(
+    scene: Scene, memory: SolveMemory, seconds: dict[str, Any], files: dict[str, list[str]]
+) -> dict[str, Any]:
+    solves = [
+        {"kind": r.kind, "iterations": r.iterations, "residual": r.residual, "seconds": r.seconds}
+        for r in memory.records
+    ]
+    return {
+        "seconds": seconds,
+        "solves": solves,
+        "physics": needed_terms(scene),
+        "files": files,
+        "preview": PREVIEW,
+    }
 
 
-def _images(light_field: LightField, scene: Scene, view: View, has_components: bool) -> dict[str, Tensor]:
+def _images(
+    light_field: LightField, scene: Scene, view: View, has_components: bool
+) -> dict[str, Tensor]:
     if not has_components:
         return {view.name: view_image(light_field, scene, view.camera)}
     parts = view_components(light_field, scene, view.camera)
-    named = {f"{view.name}.{name}": getattr(parts, name) for name in ("reduced", "single", "multiple")}
+    named = {
+        f"{view.name}.{name}": getattr(parts, name) for name in ("reduced", "single", "multiple")
+    }
     return {view.name: parts.reduced + parts.single + parts.multiple, **named}

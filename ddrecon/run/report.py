@@ -16,7 +16,16 @@ from ddrecon.io.images.table import png_of
 from ddrecon.reconstruct.loop import Row
 from ddrecon.renderer import LightField, view_image
 from ddrecon.report.curve import draw_curve
-from ddrecon.report.page import fold, items, paragraph, picture, section, side_by_side, table, write_page
+from ddrecon.report.page import (
+    fold,
+    items,
+    paragraph,
+    picture,
+    section,
+    side_by_side,
+    table,
+    write_page,
+)
 from ddrecon.report.pictures import comparison, find_white, pixels, projections, shrink, slices
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
@@ -33,7 +42,9 @@ FRAMES, FRAME = 12, 96
 
 @dataclass(frozen=True)
 class Findings:
-    """What a report is made of: the `scene` as found, its `images` and PSNR of views with a target, the log, and plain values."""
+    """What a report is made of: the `scene` as found, its `images` and PSNR of views with a target,
+    the log, and plain values.
+    """
 
     scene: Scene
     light_field: LightField
@@ -49,7 +60,11 @@ def write_run_report(path: Path, found: Findings) -> None:
     """Writes the report of what was `found` to `path`."""
     grid = found.scene.volume.grid
     cells = " x ".join(str(count) for count in reversed(grid.shape))
-    test = "" if found.summary["test_psnr"] is None else f", {found.summary['test_psnr']:.2f} dB of those held out"
+    test = (
+        ""
+        if found.summary["test_psnr"] is None
+        else f", {found.summary['test_psnr']:.2f} dB of those held out"
+    )
     lead = (
         f"{cells} cells, {found.summary['iterations']} iterations in {found.summary['seconds']:.1f} s. "
         f"PSNR {found.summary['psnr']:.2f} dB of the views seen last{test}."
@@ -60,9 +75,16 @@ def write_run_report(path: Path, found: Findings) -> None:
         section("Volumes", *_volumes(found.scene)),
         section("Turntable", _turntable(found)),
         section("Timings", _timings(found.rows)),
-        section("Physics", paragraph("What this scene needed, and so was computed:"), items(needed_terms(found.scene))),
+        section(
+            "Physics",
+            paragraph("What this scene needed, and so was computed:"),
+            items(needed_terms(found.scene)),
+        ),
         section("Settings", fold("scene.yaml, all defaults filled in", found.settings)),
-        section("Versions", table(["", ""], [(key, _shown(value)) for key, value in found.environment.items()])),
+        section(
+            "Versions",
+            table(["", ""], [(key, _shown(value)) for key, value in found.environment.items()]),
+        ),
     ]
     write_page(path, f"ddrecon: {path.absolute().parent.name}", lead, sections)
 
@@ -71,17 +93,37 @@ def _curves(rows: Sequence[Row]) -> list[str]:
     """Loss and PSNR by iteration."""
     quality = {"seen": [(float(row.iteration), row.psnr) for row in rows]}
     tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
-    loss = draw_curve("loss", {"": [(float(row.iteration), row.loss) for row in rows]}, "iteration", is_logarithmic=True)
-    return [loss, draw_curve("PSNR [dB]", quality | ({"held out": tests} if tests else {}), "iteration")]
+    loss = draw_curve(
+        "loss",
+        {"": [(float(row.iteration), row.loss) for row in rows]},
+        "iteration",
+        is_logarithmic=True,
+    )
+    return [
+        loss,
+        draw_curve("PSNR [dB]", quality | ({"held out": tests} if tests else {}), "iteration"),
+    ]
 
 
 def _compare(found: Findings) -> list[str]:
     """Target, render and difference of the first views, those held out before the others."""
-    views = sorted((view for view in found.scene.views if view.name in found.images), key=lambda view: not view.is_test)
+    views = sorted(
+        (view for view in found.scene.views if view.name in found.images),
+        key=lambda view: not view.is_test,
+    )
     parts = [
-        paragraph("Target, render, and their difference four times enlarged around gray; the target's brightest pixels are just white.")
+        paragraph(
+            "Target, render, and their difference four times enlarged around gray; the target's brightest pixels are just white."
+        )
     ]
-    parts.append(side_by_side(*(_comparison(view, found.images[view.name], found.quality[view.name]) for view in views[:SHOWN])))
+    parts.append(
+        side_by_side(
+            *(
+                _comparison(view, found.images[view.name], found.quality[view.name])
+                for view in views[:SHOWN]
+            )
+        )
+    )
     if len(views) > SHOWN:
         parts.append(paragraph(f"{len(views) - SHOWN} more views are in previews/."))
     return parts
@@ -99,20 +141,41 @@ def _view_table(found: Findings) -> str:
         height, width = view.camera.size
         quality = found.quality.get(view.name, {})
         decibels = f"{quality['psnr']:.2f}" if quality else ""
-        rows.append((view.name, "test" if view.is_test else "train", f"{width} x {height}", f"{view.weight:g}", decibels))
+        rows.append(
+            (
+                view.name,
+                "test" if view.is_test else "train",
+                f"{width} x {height}",
+                f"{view.weight:g}",
+                decibels,
+            )
+        )
     return table(["view", "split", "pixels", "weight", "PSNR [dB]"], rows)
 
 
 def _volumes(scene: Scene) -> list[str]:
     """Slices and projections of every field."""
-    parts = [paragraph("Across z, x and y from left to right; y, or z, is up. The largest value is white.")]
+    parts = [
+        paragraph(
+            "Across z, x and y from left to right; y, or z, is up. The largest value is white."
+        )
+    ]
     for name in VOLUME:
         value = value_of(scene, name)
         if value.ndim >= 3:
             top = float(value.max())
             shown = [("middle slices", slices(value)), ("means along the axes", projections(value))]
-            captions = [f"{name}, {what} (the largest value of a cell is {top:.4g})" for what, _ in shown]
-            parts.append(side_by_side(*(picture(png_of(array), caption) for caption, (_, array) in zip(captions, shown, strict=True))))
+            captions = [
+                f"{name}, {what} (the largest value of a cell is {top:.4g})" for what, _ in shown
+            ]
+            parts.append(
+                side_by_side(
+                    *(
+                        picture(png_of(array), caption)
+                        for caption, (_, array) in zip(captions, shown, strict=True)
+                    )
+                )
+            )
     return parts
 
 
@@ -135,11 +198,30 @@ def _timings(rows: Sequence[Row]) -> str:
         stages.setdefault(row.cells, []).append((row, row.seconds - before))
     lines = []
     for cells, timed in stages.items():
-        solves = [mean(getattr(row, name) for row, _ in timed) for name in ("forward_iterations", "adjoint_iterations")]
+        solves = [
+            mean(getattr(row, name) for row, _ in timed)
+            for name in ("forward_iterations", "adjoint_iterations")
+        ]
         seconds = [taken for _, taken in timed]
-        lines.append((f"{cells:,}", len(timed), f"{median(seconds):.3f}", f"{sum(seconds):.1f}", *(f"{count:.1f}" for count in solves)))
+        lines.append(
+            (
+                f"{cells:,}",
+                len(timed),
+                f"{median(seconds):.3f}",
+                f"{sum(seconds):.1f}",
+                *(f"{count:.1f}" for count in solves),
+            )
+        )
     return table(
-        ["cells", "iterations", "seconds each (median)", "seconds", "forward solve, iterations", "adjoint solve, iterations"], lines
+        [
+            "cells",
+            "iterations",
+            "seconds each (median)",
+            "seconds",
+            "forward solve, iterations",
+            "adjoint solve, iterations",
+        ],
+        lines,
     )
 
 

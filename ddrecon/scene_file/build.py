@@ -25,15 +25,21 @@ def load_scene(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Scene:
-    """The scene in the file at `path`, with `overrides` (`key.path=value`), as tensors of `dtype` on `device`.
+    """The scene in the file at `path`, with `overrides` (`key.path=value`), as tensors of `dtype`
+    on `device`.
 
-    Raises SceneError with one line per problem of the scene, or FormatError for a file it names that cannot be used.
+    Raises SceneError with one line per problem of the scene, or FormatError for a file it names
+    that cannot be used.
     """
     return build_scene(read_scene(path, overrides), dtype=dtype, device=device)
 
 
-def build_scene(scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Scene:
-    """The scene of a file that was read, as tensors of `dtype` on `device`; raises as `load_scene` does."""
+def build_scene(
+    scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Scene:
+    """The scene of a file that was read, as tensors of `dtype` on `device`; raises as `load_scene`
+    does.
+    """
     place, tree, problems = torch.device(device), scene_file.tree, Problems()
     volume, grid = None, None
     with problems.collecting():
@@ -46,5 +52,7 @@ def build_scene(scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, de
         lights = build_lights(scene_file, dtype, place)
     require_start_files(scene_file, problems)
     problems.raise_any()
-    scene = Scene(volume, lights, views, tree.render, tree.diffusion, tree.optimize, {}, scene_file.path)
+    scene = Scene(
+        volume, lights, views, tree.render, tree.diffusion, tree.optimize, {}, scene_file.path
+    )
     return replace(scene, starts=build_starts(scene_file, scene))

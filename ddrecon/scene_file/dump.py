@@ -1,4 +1,6 @@
-"""Scenes written back: every default filled in and every path absolute, so that reading the result gives the same tree."""
+"""Scenes written back: every default filled in and every path absolute, so that reading the result
+gives the same tree.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,14 @@ def dump_scene(scene_file: SceneFile, path: Path) -> None:
 
 def write_described(described: dict[str, Any], path: Path) -> None:
     """Writes a scene in plain values, as `describe` returns it, to `path`."""
-    text = yaml.dump(described, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=10**6, default_flow_style=None)
+    text = yaml.dump(
+        described,
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        width=10**6,
+        default_flow_style=None,
+    )
     with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -35,7 +44,11 @@ def write_described(described: dict[str, Any], path: Path) -> None:
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         tag = {"type": value.type} if hasattr(value, "type") else {}
-        kept = {field.name: getattr(value, field.name) for field in fields(value) if field.name not in _left_out(value)}
+        kept = {
+            field.name: getattr(value, field.name)
+            for field in fields(value)
+            if field.name not in _left_out(value)
+        }
         return tag | {name: _plain(entry) for name, entry in kept.items() if entry is not None}
     if isinstance(value, Mapping):
         return {name: _plain(entry) for name, entry in value.items()}
@@ -55,7 +68,9 @@ class _Dumper(yaml.SafeDumper):
 
 
 def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if resolve(text) == text else '"')
+    return dumper.represent_scalar(
+        "tag:yaml.org,2002:str", text, style=None if resolve(text) == text else '"'
+    )
 
 
 _Dumper.add_representer(str, _represent_text)

@@ -12,11 +12,13 @@ from ddrecon.scene import Scene, View
 from ddrecon.scene_file.load import SceneFile
 
 
-def export_transforms(scene: Scene, scene_file: SceneFile, path: Path, *, may_exist: bool) -> list[Path]:
+def export_transforms(
+    scene: Scene, scene_file: SceneFile, path: Path, *, may_exist: bool
+) -> list[Path]:
     """Writes the views of `scene`, read from `scene_file`, to `path`, and returns what was written.
 
-    Images and masks are named relative to it; a view without an image has no `file_path`. Raises SceneError where `path` exists and
-    may not, and for views in parallel projection.
+    Images and masks are named relative to it; a view without an image has no `file_path`. Raises
+    SceneError where `path` exists and may not, and for views in parallel projection.
     """
     if path.exists() and not may_exist:
         raise SceneError(f"{path}: already there; choose another name, or say --overwrite")
@@ -25,7 +27,10 @@ def export_transforms(scene: Scene, scene_file: SceneFile, path: Path, *, may_ex
     frames = []
     for view, section in zip(scene.views, scene_file.tree.views, strict=True):
         files = {"file_path": section.image, "mask_path": section.mask}
-        frames.append({key: _relative(file, path) for key, file in files.items() if file is not None} | _camera(view))
+        frames.append(
+            {key: _relative(file, path) for key, file in files.items() if file is not None}
+            | _camera(view)
+        )
     write_json(path, {"camera_model": "PINHOLE", **_splits(scene.views, frames), "frames": frames})
     return [path]
 
@@ -37,10 +42,19 @@ def _relative(file: Path, path: Path) -> str:
 def _camera(view: View) -> dict[str, Any]:
     camera = view.camera
     if not camera.is_perspective:
-        raise SceneError(f"view {view.name!r}: an orthographic camera has no place in a transforms.json")
+        raise SceneError(
+            f"view {view.name!r}: an orthographic camera has no place in a transforms.json"
+        )
     (height, width), (x, y) = camera.size, camera.principal_point
     focal = width / 2 / camera.half_width
-    intrinsics = {"w": width, "h": height, "fl_x": focal, "fl_y": focal / camera.pixel_aspect, "cx": x * width, "cy": y * height}
+    intrinsics = {
+        "w": width,
+        "h": height,
+        "fl_x": focal,
+        "fl_y": focal / camera.pixel_aspect,
+        "cx": x * width,
+        "cy": y * height,
+    }
     return intrinsics | {"transform_matrix": [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
 
 
@@ -48,6 +62,10 @@ def _splits(views: list[View], frames: list[dict[str, Any]]) -> dict[str, list[s
     """Which images are trained on and which are not, where some are not, in nerfstudio's words."""
     if not any(view.is_test for view in views):
         return {}
-    named = [(frame["file_path"], view.is_test) for frame, view in zip(frames, views, strict=True) if "file_path" in frame]
+    named = [
+        (frame["file_path"], view.is_test)
+        for frame, view in zip(frames, views, strict=True)
+        if "file_path" in frame
+    ]
     train, test = ([name for name, is_test in named if is_test == kind] for kind in (False, True))
     return {"train_filenames": train, "val_filenames": test, "test_filenames": test}

@@ -13,7 +13,9 @@ T = TypeVar("T")
 
 
 def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[[Path], T]) -> T:
-    """What `read` makes of the file `path` named at `key`; raises SceneError if there is none, FormatError if it is unusable."""
+    """What `read` makes of the file `path` named at `key`; raises SceneError if there is none,
+    FormatError if it is unusable.
+    """
     require(scene_file, key, path)
     return read(path)
 
@@ -23,7 +25,9 @@ def require(scene_file: SceneFile, key: str, path: Path) -> None:
     try:
         is_file, exists = path.is_file(), path.exists()
     except OSError as error:
-        raise scene_file.refused(key, f"{path} cannot be reached: {error.strerror or error}") from error
+        raise scene_file.refused(
+            key, f"{path} cannot be reached: {error.strerror or error}"
+        ) from error
     if not is_file:
         raise scene_file.refused(key, f"{path} {'is not a file' if exists else 'does not exist'}")
 

@@ -1,4 +1,6 @@
-"""Reading the leaves of a scene: numbers, text, paths, vectors and colors, each within the limits its record declares."""
+"""Reading the leaves of a scene: numbers, text, paths, vectors and colors, each within the limits
+its record declares.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +88,9 @@ def read_number(node: Node, rule: Rule) -> float:
     if isinstance(node.value, bool) or not isinstance(node.value, int | float):
         raise node.refused(f"expected a number, found {describe_found(node)}")
     if not math.isfinite(node.value) or abs(node.value) > LARGEST:
-        raise node.refused(f"expected a finite number of single precision, found {describe_found(node)}")
+        raise node.refused(
+            f"expected a finite number of single precision, found {describe_found(node)}"
+        )
     _check_limits(node, node.value, rule.limits)
     return float(node.value)
 
@@ -106,7 +110,9 @@ def read_text(node: Node, rule: Rule) -> str:
     choices = rule.limits.get("choices")
     if choices is not None and node.value not in choices:
         near = suggestion(node.value, choices) if len(choices) > 1 else ""
-        raise node.refused(f"expected one of {', '.join(choices)}, found {show_value(node.value)}{near if 'did you' in near else ''}")
+        raise node.refused(
+            f"expected one of {', '.join(choices)}, found {show_value(node.value)}{near if 'did you' in near else ''}"
+        )
     return node.value
 
 
@@ -121,7 +127,11 @@ def read_path(node: Node, rule: Rule) -> Path:
 
 def read_paths(node: Node, rule: Rule) -> tuple[Path, ...]:
     """One path or a list of them."""
-    return read_each(read_list(node), rule, read_path) if isinstance(node.value, list) else (read_path(node, rule),)
+    return (
+        read_each(read_list(node), rule, read_path)
+        if isinstance(node.value, list)
+        else (read_path(node, rule),)
+    )
 
 
 def read_vector(node: Node, rule: Rule) -> tuple[float, ...]:
@@ -136,7 +146,9 @@ def read_counts(node: Node, rule: Rule) -> tuple[int, ...]:
 
 def read_matrix(node: Node, rule: Rule) -> tuple[tuple[float, ...], ...]:
     """Four rows of four numbers."""
-    return read_each(_entries(node, 4, "rows of 4 numbers"), Rule(Row, rule.limits, rule.folder), read_vector)
+    return read_each(
+        _entries(node, 4, "rows of 4 numbers"), Rule(Row, rule.limits, rule.folder), read_vector
+    )
 
 
 def read_color(node: Node, rule: Rule) -> float | tuple[float, ...]:

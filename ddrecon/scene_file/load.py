@@ -21,14 +21,18 @@ MAX_BYTES = 2**20
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene file that was read: its `tree`, its `path`, and for each key path in it the `file:line:column` of its value."""
+    """A scene file that was read: its `tree`, its `path`, and for each key path in it the
+    `file:line:column` of its value.
+    """
 
     tree: SceneTree
     path: Path
     marks: Mapping[str, str]
 
     def refused(self, key: str, what: str) -> SceneError:
-        """The error that says `what` is wrong with the value at `key`, or with the nearest one above it that was written."""
+        """The error that says `what` is wrong with the value at `key`, or with the nearest one
+        above it that was written.
+        """
         written = key
         while written and written not in self.marks:
             written = written.rpartition(".")[0]
@@ -36,7 +40,9 @@ class SceneFile:
 
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
-    """The scene file at `path` with `overrides` (`key.path=value`) put in; raises SceneError with one line per problem."""
+    """The scene file at `path` with `overrides` (`key.path=value`) put in; raises SceneError with
+    one line per problem.
+    """
     path = Path(path)
     problems = Problems()
     try:

@@ -1,6 +1,7 @@
 """YAML text as a tree of nodes that know their key path and where they were written.
 
-The strict part of YAML: one document of mappings, lists and scalars; no anchors, aliases, tags or repeated keys.
+The strict part of YAML: one document of mappings, lists and scalars; no anchors, aliases, tags or
+repeated keys.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ MAX_DEPTH = 32
 FAST = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """The parser in C, where it is there: some twenty times faster."""
 SHORT = 2**17
-"""What the parser in C refuses the other one looks at, if it has no more characters: its messages are better, and it takes all of JSON."""
+"""What the parser in C refuses the other one looks at, if it has no more characters: its messages
+are better, and it takes all of JSON.
+"""
 
 Locate = Callable[[int, int], str]
 """Tells where a 1-based line and column are: `file:line:column`, or the override they belong to."""
@@ -36,7 +39,9 @@ class Node:
 
     def refused(self, what: str) -> SceneError:
         """The error that says `what` is wrong with this value."""
-        return SceneError(f"{self.where}: {self.key}: {what}" if self.key else f"{self.where}: {what}")
+        return SceneError(
+            f"{self.where}: {self.key}: {what}" if self.key else f"{self.where}: {what}"
+        )
 
     def key_refused(self, what: str) -> SceneError:
         """The error that says `what` is wrong with the key of this value."""
@@ -79,22 +84,28 @@ def show_value(value: Scalar) -> str:
 
 
 def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
-    """The tree of the YAML (or JSON) document `text`, whose root is at `key`; repeated keys go to `problems`.
+    """The tree of the YAML (or JSON) document `text`, whose root is at `key`; repeated keys go to
+    `problems`.
 
-    Raises SceneError where the text has no such tree: broken syntax, several documents, aliases, tags.
+    Raises SceneError where the text has no such tree: broken syntax, several documents, aliases,
+    tags.
     """
     try:
         return _parse(text, locate, problems, key)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
-        raise SceneError(f"{where}: not YAML: {', '.join(filter(None, (error.context, error.problem)))}") from error
+        raise SceneError(
+            f"{where}: not YAML: {', '.join(filter(None, (error.context, error.problem)))}"
+        ) from error
     except UnicodeEncodeError as error:
         raise SceneError(f"{locate(1, 1)}: is not UTF-8 text") from error
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
         where = locate(before.count("\n") + 1, len(before) - before.rfind("\n"))
-        raise SceneError(f"{where}: not YAML: the character {error.character!r} is not allowed") from error
+        raise SceneError(
+            f"{where}: not YAML: the character {error.character!r} is not allowed"
+        ) from error
 
 
 def _parse(text: str, locate: Locate, problems: Problems, key: str) -> Node:
@@ -124,7 +135,9 @@ class _Composer:
         next(self.events)
         after = next(self.events)
         if not isinstance(after, yaml.StreamEndEvent):
-            raise SceneError(f"{self.where(after)}: a second document begins here; only one is allowed")
+            raise SceneError(
+                f"{self.where(after)}: a second document begins here; only one is allowed"
+            )
         return root
 
     def node(self, event: yaml.Event, key: str, key_where: str | None, depth: int) -> Node:
@@ -154,11 +167,17 @@ class _Composer:
         entries: dict[str, Node] = {}
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
-                raise SceneError(f"{self.where(event)}: {parent.child_key('?')}: a key must be plain text")
+                raise SceneError(
+                    f"{self.where(event)}: {parent.child_key('?')}: a key must be plain text"
+                )
             name = event.value if event.value.isprintable() else repr(event.value)
-            child = self.node(next(self.events), parent.child_key(name), self.where(event), depth + 1)
+            child = self.node(
+                next(self.events), parent.child_key(name), self.where(event), depth + 1
+            )
             if name in entries:
-                self.problems.note(child.key_refused(f"repeated key; it is already at {entries[name].key_where}"))
+                self.problems.note(
+                    child.key_refused(f"repeated key; it is already at {entries[name].key_where}")
+                )
             else:
                 entries[name] = child
         return entries

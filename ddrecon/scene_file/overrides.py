@@ -1,4 +1,6 @@
-"""`-D key.path=value`: values from the command line, put into the tree of a scene file before it is validated."""
+"""`-D key.path=value`: values from the command line, put into the tree of a scene file before it is
+validated.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,11 @@ PARAMETERS = "optimize.parameters"
 
 
 def override(root: Node, text: str, problems: Problems) -> None:
-    """Puts the value of `text` (`key.path=value`, the value in YAML) into the tree under `root`, making mappings as needed.
+    """Puts the value of `text` (`key.path=value`, the value in YAML) into the tree under `root`,
+    making mappings as needed.
 
-    A list is entered by index. Where keys themselves have dots, as those of parameters do, the longest one present or legal is taken.
-    Raises SceneError.
+    A list is entered by index. Where keys themselves have dots, as those of parameters do, the
+    longest one present or legal is taken. Raises SceneError.
     """
     where = f"-D {text}"
     key, separator, value = text.partition("=")
@@ -56,7 +59,9 @@ def _enter(parent: Node, name: str, where: str) -> Node:
     if isinstance(parent.value, list):
         return parent.value[int(name)]
     if not isinstance(parent.value, dict):
-        raise parent.refused(f"expected a mapping, found {describe_found(parent)}{suggestion(name, ())}")
+        raise parent.refused(
+            f"expected a mapping, found {describe_found(parent)}{suggestion(name, ())}"
+        )
     return parent.value.setdefault(name, Node(parent.child_key(name), where, where, {}))
 
 

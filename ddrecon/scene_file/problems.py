@@ -35,24 +35,32 @@ class Problems:
 
     @contextmanager
     def collecting(self) -> Iterator[None]:
-        """Notes the problems of an error raised inside the block, which ends there, and goes on after it."""
+        """Notes the problems of an error raised inside the block, which ends there, and goes on
+        after it.
+        """
         try:
             yield
         except (SceneError, FormatError) as error:
             self.note(error)
 
     def raise_any(self) -> None:
-        """Raises an error with every problem noted, each once, if there is one: FormatError where only files are to blame."""
+        """Raises an error with every problem noted, each once, if there is one: FormatError where
+        only files are to blame.
+        """
         files = list(dict.fromkeys(line for error in self.unusable for line in error.lines))
         if self.lines:
             lines = [*dict.fromkeys(self.lines), *files]
-            raise SceneError([*lines[:MOST], "and more: mend these first"] if len(lines) > MOST else lines)
+            raise SceneError(
+                [*lines[:MOST], "and more: mend these first"] if len(lines) > MOST else lines
+            )
         if self.unusable:
             first = self.unusable[0]
             raise FormatError(first.path, first.reason, files[1:])
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
-    """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them where none is near."""
+    """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them where none
+    is near.
+    """
     near = difflib.get_close_matches(name.lower(), known, n=1) if len(name) <= LONGEST else []
     return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"

@@ -1,4 +1,6 @@
-"""What a plain YAML scalar means, by the core schema of YAML 1.2 (section 10.3.2): `1e-3` is a number, `yes` is text."""
+"""What a plain YAML scalar means, by the core schema of YAML 1.2 (section 10.3.2): `1e-3` is a
+number, `yes` is text.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,11 @@ _WORDS: dict[str, Scalar] = {
     **dict.fromkeys(("true", "True", "TRUE"), True),
     **dict.fromkeys(("false", "False", "FALSE"), False),
     **dict.fromkeys((".nan", ".NaN", ".NAN"), math.nan),
-    **{sign + word: float(sign + "inf") for sign in ("", "+", "-") for word in (".inf", ".Inf", ".INF")},
+    **{
+        sign + word: float(sign + "inf")
+        for sign in ("", "+", "-")
+        for word in (".inf", ".Inf", ".INF")
+    },
 }
 _INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
 _HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,30}")

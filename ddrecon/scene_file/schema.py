@@ -1,8 +1,9 @@
 """What a scene file may say: one frozen record per section, with its defaults and legal values.
 
-Vectors are (x, y, z). A field's metadata holds the bounds `minimum`, `above`, `maximum`, `below` or the `choices` of each number or
-text in it; `ALTERNATIVES` are groups of keys of which exactly one is given; `problems` yields (key, what is wrong) for
-rules about several values at once. Defaults are here and in `ddrecon.settings`, and nowhere else.
+Vectors are (x, y, z). A field's metadata holds the bounds `minimum`, `above`, `maximum`, `below` or
+the `choices` of each number or text in it; `ALTERNATIVES` are groups of keys of which exactly one
+is given; `problems` yields (key, what is wrong) for rules about several values at once. Defaults
+are here and in `ddrecon.settings`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -115,7 +116,8 @@ class AmbientSection:
 
 @dataclass(frozen=True)
 class EnvironmentSection:
-    """A latitude-longitude map, +y up, its pixels times `scale`, turned by `rotation` [degrees] about +y.
+    """A latitude-longitude map, +y up, its pixels times `scale`, turned by `rotation` [degrees]
+    about +y.
 
     `directions`: how many directions its light on the volume is gathered into.
     """
@@ -143,7 +145,9 @@ LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointS
 
 @dataclass(frozen=True, kw_only=True)
 class PoseSection:
-    """Where a camera stands: `origin`, `target` and `up` [u], or `matrix`, camera to world with OpenGL axes; its pixels (w, h)."""
+    """Where a camera stands: `origin`, `target` and `up` [u], or `matrix`, camera to world with
+    OpenGL axes; its pixels (w, h).
+    """
 
     ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
 
@@ -163,7 +167,10 @@ def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-4:
         yield "matrix", "its last row must be [0, 0, 0, 1]"
     elif np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
-        yield "matrix", "must be rigid, but its first three columns are not of unit length and perpendicular"
+        yield (
+            "matrix",
+            "must be rigid, but its first three columns are not of unit length and perpendicular",
+        )
     elif np.linalg.det(turn) < 0:
         yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
@@ -172,8 +179,8 @@ def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
 class PerspectiveSection(PoseSection):
     """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
 
-    The axis meets the image at `principal_point`, parts of its width and height from the top left. `pixel_aspect`: height of a pixel over
-    its width.
+    The axis meets the image at `principal_point`, parts of its width and height from the top left.
+    `pixel_aspect`: height of a pixel over its width.
     """
 
     type: ClassVar[str] = "perspective"
@@ -197,7 +204,9 @@ CameraSection = PerspectiveSection | OrthographicSection
 
 @dataclass(frozen=True)
 class ViewSection:
-    """One view; `resolution` of its camera may be left out where there is an image. `weight`: how much it counts in the loss."""
+    """One view; `resolution` of its camera may be left out where there is an image. `weight`: how
+    much it counts in the loss.
+    """
 
     name: str
     camera: CameraSection
@@ -208,16 +217,24 @@ class ViewSection:
 
     def problems(self) -> Iterator[Problem]:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
-            yield "name", f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.', the last not at its start"
+            yield (
+                "name",
+                f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.', the last not at its start",
+            )
         if self.name.endswith(TAKEN):
-            yield "name", f"{self.name!r} ends as files of other views do; do not end it with {', '.join(TAKEN)}"
+            yield (
+                "name",
+                f"{self.name!r} ends as files of other views do; do not end it with {', '.join(TAKEN)}",
+            )
         if self.image is None and self.camera.resolution is None:
             yield "camera", "missing key 'resolution'; only a view with an image can go without"
 
 
 @dataclass(frozen=True)
 class RingSection:
-    """Cameras around `target`, in the horizontal plane `height` above it, the first towards +z and the next towards +x."""
+    """Cameras around `target`, in the horizontal plane `height` above it, the first towards +z and
+    the next towards +x.
+    """
 
     count: int = limited(minimum=1, maximum=10000)
     radius: float = limited(above=0)
@@ -230,10 +247,11 @@ class RingSection:
 
 @dataclass(frozen=True)
 class ViewSource:
-    """Views that are not listed one by one: from a ring, or from transforms.json files of NeRF, instant-ngp or nerfstudio.
+    """Views that are not listed one by one: from a ring, or from transforms.json files of NeRF,
+    instant-ngp or nerfstudio.
 
-    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every `test_every` views of files that
-    say nothing of it, the first is a test view.
+    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every
+    `test_every` views of files that say nothing of it, the first is a test view.
     """
 
     ALTERNATIVES: ClassVar = (("ring",), ("transforms",))
@@ -249,12 +267,17 @@ class ViewSource:
         if self.ring is None and self.images is not None:
             yield "images", "is for a ring; transforms name their images themselves"
         if self.ring is not None and self.test_every is not None:
-            yield "test_every", "is for transforms; list the views of a ring to keep some as test views"
+            yield (
+                "test_every",
+                "is for transforms; list the views of a ring to keep some as test views",
+            )
 
 
 @dataclass(frozen=True)
 class SceneTree:
-    """A whole scene file; a ring of views is already the views it stands for, and paths are absolute."""
+    """A whole scene file; a ring of views is already the views it stands for, and paths are
+    absolute.
+    """
 
     volume: VolumeSection
     lights: tuple[LightSection, ...]

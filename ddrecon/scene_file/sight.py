@@ -15,8 +15,14 @@ MOST_PIXELS = 2**18
 
 
 def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
-    """Which rays pass through the box of `grid` in front of their origin: bool [R], by the slab test (Kay and Kajiya 1986)."""
-    direction = torch.where(view_rays.direction == 0, torch.finfo(view_rays.direction.dtype).tiny ** 0.5, view_rays.direction)
+    """Which rays pass through the box of `grid` in front of their origin: bool [R], by the slab
+    test (Kay and Kajiya 1986).
+    """
+    direction = torch.where(
+        view_rays.direction == 0,
+        torch.finfo(view_rays.direction.dtype).tiny ** 0.5,
+        view_rays.direction,
+    )
     lower, upper = (view_rays.origin.new_tensor(corner) for corner in (grid.lower, grid.upper))
     first, second = (lower - view_rays.origin) / direction, (upper - view_rays.origin) / direction
     enter = torch.minimum(first, second).amax(dim=-1)
@@ -25,9 +31,14 @@ def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
 
 
 def sees_box(camera: Camera, grid: Grid) -> bool:
-    """Whether any pixel of `camera` looks through the box of `grid`; a coarser image is tried first, because it is quick."""
+    """Whether any pixel of `camera` looks through the box of `grid`; a coarser image is tried
+    first, because it is quick.
+    """
     finer = max(1, math.ceil(math.sqrt(camera.size[0] * camera.size[1] / MOST_PIXELS)))
-    return any(bool(rays_hit_box(cast_rays(image), grid).any()) for image in (camera.resize(COARSER * finer), camera.resize(finer)))
+    return any(
+        bool(rays_hit_box(cast_rays(image), grid).any())
+        for image in (camera.resize(COARSER * finer), camera.resize(finer))
+    )
 
 
 def explain_blindness(camera: Camera, grid: Grid) -> str:

@@ -1,4 +1,6 @@
-"""The camera of one frame of a `transforms.json`: a pinhole, whose intrinsics are in pixels, or an angle of view."""
+"""The camera of one frame of a `transforms.json`: a pinhole, whose intrinsics are in pixels, or an
+angle of view.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,16 @@ from ddrecon.scene_file.schema import Matrix, PerspectiveSection, Size
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 """Camera models that are pinholes where they have no distortion."""
-REMEDY = "undistort the pictures first (COLMAP: image_undistorter) and give the cameras of the results"
+REMEDY = (
+    "undistort the pictures first (COLMAP: image_undistorter) and give the cameras of the results"
+)
 Entries = Mapping[str, Node]
 
 
 def read_camera(frame: Node, entries: Entries, rule: Rule) -> PerspectiveSection:
-    """The camera that `entries` describe, those of `frame` and of its file; raises SceneError for what is wrong or distorted."""
+    """The camera that `entries` describe, those of `frame` and of its file; raises SceneError for
+    what is wrong or distorted.
+    """
     _require_pinhole(entries, rule)
     if "transform_matrix" not in entries:
         raise frame.refused("missing key 'transform_matrix'")
@@ -30,15 +36,21 @@ def read_camera(frame: Node, entries: Entries, rule: Rule) -> PerspectiveSection
 
 
 def _intrinsics(frame: Node, entries: Entries, rule: Rule) -> dict[str, Any]:
-    """`fov`, and where the size of the image is known, `resolution`, `principal_point` and `pixel_aspect`."""
-    angle_x, angle_y = (_number(entries, f"camera_angle_{axis}", rule, above=0, below=math.pi) for axis in "xy")
+    """`fov`, and where the size of the image is known, `resolution`, `principal_point` and
+    `pixel_aspect`.
+    """
+    angle_x, angle_y = (
+        _number(entries, f"camera_angle_{axis}", rule, above=0, below=math.pi) for axis in "xy"
+    )
     focal_x, focal_y = (_number(entries, f"fl_{axis}", rule, above=0) for axis in "xy")
     if focal_x is None and angle_x is None:
         raise frame.refused("has neither fl_x nor camera_angle_x")
     size = _size(entries, rule)
     if size is None:
         if needing := [name for name in ("fl_x", "fl_y", "cx", "cy") if name in entries]:
-            raise entries[needing[0]].refused("is in pixels, but w and h do not say how many there are")
+            raise entries[needing[0]].refused(
+                "is in pixels, but w and h do not say how many there are"
+            )
         return {"fov": math.degrees(angle_x or 0)}
     width, height = size
     focal_x = focal_x or width / 2 / math.tan((angle_x or 0) / 2)
@@ -46,7 +58,12 @@ def _intrinsics(frame: Node, entries: Entries, rule: Rule) -> dict[str, Any]:
     x, y = (_number(entries, name, rule) for name in ("cx", "cy"))
     middle = (0.5 if x is None else x / width, 0.5 if y is None else y / height)
     fov = 2 * math.degrees(math.atan(width / 2 / focal_x))
-    return {"fov": fov, "resolution": size, "principal_point": middle, "pixel_aspect": focal_x / focal_y}
+    return {
+        "fov": fov,
+        "resolution": size,
+        "principal_point": middle,
+        "pixel_aspect": focal_x / focal_y,
+    }
 
 
 def _number(entries: Entries, name: str, rule: Rule, **limits: float) -> float | None:
@@ -65,12 +82,19 @@ def _size(entries: Entries, rule: Rule) -> Size | None:
 
 def _require_pinhole(entries: Entries, rule: Rule) -> None:
     """Raises SceneError for cameras that are not pinholes."""
-    if "camera_model" in entries and read_text(entries["camera_model"], rule).upper() not in PINHOLES:
-        raise entries["camera_model"].refused(f"{entries['camera_model'].value} is no pinhole camera; {REMEDY}")
+    if (
+        "camera_model" in entries
+        and read_text(entries["camera_model"], rule).upper() not in PINHOLES
+    ):
+        raise entries["camera_model"].refused(
+            f"{entries['camera_model'].value} is no pinhole camera; {REMEDY}"
+        )
     if "is_fisheye" in entries and entries["is_fisheye"].value:
         raise entries["is_fisheye"].refused(f"a fisheye is no pinhole camera; {REMEDY}")
     terms = [entries[name] for name in DISTORTION if name in entries]
     terms += entries["distortion_params"].children() if "distortion_params" in entries else []
     for term in terms:
         if read_number(term, rule) != 0:
-            raise term.refused(f"{term.value:g} is a lens distortion, which is not modeled; {REMEDY}")
+            raise term.refused(
+                f"{term.value:g} is a lens distortion, which is not modeled; {REMEDY}"
+            )

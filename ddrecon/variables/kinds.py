@@ -1,4 +1,6 @@
-"""What can be optimized: for each kind of variable its legal values, and what a run assumes of it unless the scene says otherwise."""
+"""What can be optimized: for each kind of variable its legal values, and what a run assumes of it
+unless the scene says otherwise.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Kind:
-    """Values are kept within [`low`, `high`]; `is_color` if they may differ by color, `is_cellwise` if from cell to cell.
+    """Values are kept within [`low`, `high`]; `is_color` if they may differ by color, `is_cellwise`
+    if from cell to cell.
 
     `tv` is the weight of total variation where a scene gives none.
     """

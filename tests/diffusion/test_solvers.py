@@ -1,4 +1,6 @@
-"""Every solver reaches its tolerance on every system, agrees with a dense solve, and says so when it cannot."""
+"""Every solver reaches its tolerance on every system, agrees with a dense solve, and says so when
+it cannot.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +22,25 @@ each_dtype = pytest.mark.parametrize("dtype", TOLERANCES, ids=str)
 
 @pytest.fixture
 def system(box, random, make_operator):
-    """An operator whose first color has equal conductances everywhere and whose last spans `contrast`, and a source."""
+    """An operator whose first color has equal conductances everywhere and whose last spans
+    `contrast`, and a source.
+    """
 
     def make(dtype: torch.dtype, contrast: float = 1e3, colors: int = 2) -> tuple[Operator, Tensor]:
         spread = torch.linspace(0, 1, colors, dtype=torch.float64).view(-1, 1, 1, 1)
         diffusion = 0.1 * contrast ** -(spread * random(colors, *SHAPE, seed=1))
-        operator = make_operator(box(SHAPE), diffusion.to(dtype), (0.1 * random(colors, *SHAPE, seed=2)).to(dtype))
+        operator = make_operator(
+            box(SHAPE), diffusion.to(dtype), (0.1 * random(colors, *SHAPE, seed=2)).to(dtype)
+        )
         return operator, random(colors, *SHAPE, seed=3, dtype=dtype)
 
     return make
 
 
 def relative_residual(operator: Operator, u: Tensor, source: Tensor) -> float:
-    """The residual the solvers promise: scaled by diagonal^(-1/2), relative to the source, largest over colors; in float64."""
+    """The residual the solvers promise: scaled by diagonal^(-1/2), relative to the source, largest
+    over colors; in float64.
+    """
     operator = Operator(tuple(c.double() for c in operator.conductances), operator.loss.double())
     source, scale = source.double(), operator.diagonal.rsqrt()
     residual = (scale * (source - operator.apply(u.double()))).flatten(1).norm(dim=1)
@@ -61,7 +69,9 @@ def test_colors_do_not_mix(solve, system):
     together = solve(operator, source, None, 1e-11).value
     for c in range(3):
         one = Operator(tuple(k[c : c + 1] for k in operator.conductances), operator.loss[c : c + 1])
-        torch.testing.assert_close(solve(one, source[c : c + 1], None, 1e-11).value, together[c : c + 1], rtol=1e-8, atol=0)
+        torch.testing.assert_close(
+            solve(one, source[c : c + 1], None, 1e-11).value, together[c : c + 1], rtol=1e-8, atol=0
+        )
 
 
 @each_dtype
@@ -76,7 +86,10 @@ def test_starting_from_the_solution_takes_no_iteration(solve, dtype: torch.dtype
 def test_a_start_closer_by_takes_fewer_iterations(solve, system):
     operator, source = system(torch.float64)
     solved = solve(operator, source, None, 1e-11).value
-    assert solve(operator, source, solved * (1 + 1e-6), 1e-8).iterations < solve(operator, source, None, 1e-8).iterations
+    assert (
+        solve(operator, source, solved * (1 + 1e-6), 1e-8).iterations
+        < solve(operator, source, None, 1e-8).iterations
+    )
 
 
 @pytest.mark.parametrize("is_fitting", [True, False])
@@ -84,7 +97,9 @@ def test_a_useless_start_does_no_harm(solve, is_fitting: bool, system, random):
     """A guess that is worse than zero, or of another grid, is not used."""
     operator, source = system(torch.float64)
     guess = 1e9 * random(*source.shape) if is_fitting else random(2, 3, 3, 3)
-    assert torch.equal(solve(operator, source, guess, 1e-8).value, solve(operator, source, None, 1e-8).value)
+    assert torch.equal(
+        solve(operator, source, guess, 1e-8).value, solve(operator, source, None, 1e-8).value
+    )
 
 
 def test_no_source_no_light(solve, system):
@@ -101,7 +116,9 @@ def test_a_color_without_source_stays_dark_beside_another(solve, system):
 
 
 def test_a_source_makes_light_everywhere(solve, system):
-    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance of the solve."""
+    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance of
+    the solve.
+    """
     operator, source = system(torch.float64, contrast=10.0)
     source = torch.zeros_like(source)
     source[:, 0, 0, 0] = 1

@@ -1,4 +1,6 @@
-"""Light from one point of an infinite homogeneous medium: exp(-r / L) / (4 pi D r), L = sqrt(D / kappa_a)."""
+"""Light from one point of an infinite homogeneous medium: exp(-r / L) / (4 pi D r), L = sqrt(D /
+kappa_a).
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,15 @@ from ddrecon.grid import Grid
 
 DIFFUSION = 0.3
 LENGTH = 0.06
-"""L [u]: the faces of the unit box are so far away, in units of it, that the medium might as well have none."""
+"""L [u]: the faces of the unit box are so far away, in units of it, that the medium might as well
+have none.
+"""
 NEAR, FAR = 0.1, 0.22
 
 
-def error(cells: tuple[int, int, int], make_operator: Callable, solver: str = "conjugate_gradient") -> float:
+def error(
+    cells: tuple[int, int, int], make_operator: Callable, solver: str = "conjugate_gradient"
+) -> float:
     """The relative RMS error between NEAR and FAR of a source of power 1 in the middle cell."""
     grid = Grid(cells, (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     diffusion = torch.full((1, *cells), DIFFUSION, dtype=torch.float64)

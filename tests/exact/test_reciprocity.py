@@ -1,4 +1,6 @@
-"""Source and detector may change places: cell against cell to rounding, light against camera to the order of the discretization."""
+"""Source and detector may change places: cell against cell to rounding, light against camera to the
+order of the discretization.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,10 @@ def test_two_cells_send_each_other_the_same_light(solver: str, box, random, make
         return float(SOLVERS[solver](operator, power, None, 1e-13).value[detector])
 
     near, far = (0, 0, 1, 1), (0, 4, 3, 4)
-    assert received(near, far) == pytest.approx(received(far, near), rel=1e-9) and received(near, far) > 0
+    assert (
+        received(near, far) == pytest.approx(received(far, near), rel=1e-9)
+        and received(near, far) > 0
+    )
 
 
 def unlike_its_mirror(cells: int) -> torch.Tensor:
@@ -44,8 +49,12 @@ def unlike_its_mirror(cells: int) -> torch.Tensor:
     return hump * (1 + 0.8 * torch.sin(3 * z + 2 * y) * torch.cos(4 * x))
 
 
-def power_seen(scene: Scene, travel: tuple[float, float, float], towards: tuple[float, float, float]) -> tuple[float, float]:
-    """Light of irradiance 1 along `travel` that leaves the volume along `towards`: once scattered, and more often; area integrals."""
+def power_seen(
+    scene: Scene, travel: tuple[float, float, float], towards: tuple[float, float, float]
+) -> tuple[float, float]:
+    """Light of irradiance 1 along `travel` that leaves the volume along `towards`: once scattered,
+    and more often; area integrals.
+    """
     eye = torch.nn.functional.normalize(torch.tensor(towards, dtype=torch.float64), dim=0) * 3 + 0.5
     pose = look_at(eye, torch.full_like(eye, 0.5), eye.new_tensor([0.0, 1.0, 0.0]))
     camera = Camera(pose, (48, 48), 0.9, is_perspective=False)
@@ -55,7 +64,9 @@ def power_seen(scene: Scene, travel: tuple[float, float, float], towards: tuple[
 
 
 def asymmetry(make_scene: Callable[..., Scene], cells: int, g: float) -> tuple[float, float]:
-    """How much what goes from ONE to OTHER differs from what goes the reverse way, of single and of multiple scattering."""
+    """How much what goes from ONE to OTHER differs from what goes the reverse way, of single and of
+    multiple scattering.
+    """
     grid = Grid((cells,) * 3, (0.0,) * 3, (1.0,) * 3)
     scene = make_scene(unlike_its_mirror(cells), grid=grid, sigma_a=(1.0,), sigma_s=(12.0,), g=g)
     forth = power_seen(scene, ONE, OTHER)

@@ -11,7 +11,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.grid import array_order
-from ddrecon.light.environment import environment_radiance, pixel_moments, refine_map, turn_directions
+from ddrecon.light.environment import (
+    environment_radiance,
+    pixel_moments,
+    refine_map,
+    turn_directions,
+)
 from ddrecon.light.lights import EnvironmentLight
 
 SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
@@ -24,7 +29,9 @@ def light_of(radiance: Tensor, scale: float = 1.0, rotation: float = 0.0) -> Env
 def directions(count: int, seed: int = 0) -> Tensor:
     """Unit directions (x, y, z)."""
     generator = torch.Generator().manual_seed(seed)
-    return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+    return torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1
+    )
 
 
 def seen(light: EnvironmentLight, *direction: float) -> list[float]:
@@ -43,7 +50,9 @@ def center(row: int, column: int, height: int, width: int) -> tuple[float, float
 def test_a_pixel_is_seen_in_its_direction(height: int, width: int, random):
     light = light_of(random(2, height, width))
     for row, column in ((1, 0), (1, width - 1), (height - 2, 1)):
-        assert seen(light, *center(row, column, height, width)) == pytest.approx(light.radiance[:, row, column].tolist(), rel=1e-12)
+        assert seen(light, *center(row, column, height, width)) == pytest.approx(
+            light.radiance[:, row, column].tolist(), rel=1e-12
+        )
 
 
 def test_between_pixels_radiance_is_their_mean_also_across_the_seam(random):
@@ -53,38 +62,58 @@ def test_between_pixels_radiance_is_their_mean_also_across_the_seam(random):
 
 
 def test_straight_up_and_down_are_the_first_and_last_row(random):
-    light = light_of(torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64).view(1, 3, 1).expand(1, 3, 4))
-    assert seen(light, 0, 1, 0) == pytest.approx([2.0]) and seen(light, 0, -1, 0) == pytest.approx([3.0])
+    light = light_of(
+        torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64).view(1, 3, 1).expand(1, 3, 4)
+    )
+    assert seen(light, 0, 1, 0) == pytest.approx([2.0]) and seen(light, 0, -1, 0) == pytest.approx(
+        [3.0]
+    )
 
 
 def test_a_quarter_turn_rolls_the_map(random):
     radiance, ways = random(3, 6, 8), array_order(directions(50))
     expected = environment_radiance(light_of(radiance.roll(-2, 2)), ways)
-    torch.testing.assert_close(environment_radiance(light_of(radiance, rotation=90.0), ways), expected, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(
+        environment_radiance(light_of(radiance, rotation=90.0), ways),
+        expected,
+        rtol=1e-12,
+        atol=1e-13,
+    )
 
 
 def test_turning_the_map_is_turning_the_viewer(random):
     radiance, ways = random(3, 6, 8), directions(50)
     light = light_of(radiance, rotation=33.0)
     found = environment_radiance(light, array_order(turn_directions(ways, light.rotation)))
-    torch.testing.assert_close(found, environment_radiance(light_of(radiance), array_order(ways)), rtol=1e-11, atol=1e-12)
+    torch.testing.assert_close(
+        found, environment_radiance(light_of(radiance), array_order(ways)), rtol=1e-11, atol=1e-12
+    )
 
 
 def test_what_is_seen_is_linear_in_scale_and_radiance(random):
     one, other, ways = random(3, 4, 6, seed=1), random(3, 4, 6, seed=2), array_order(directions(20))
-    parts = 2 * environment_radiance(light_of(one), ways) + 6 * environment_radiance(light_of(other), ways)
-    torch.testing.assert_close(environment_radiance(light_of(one + 3 * other, scale=2.0), ways), parts, rtol=1e-12, atol=0)
+    parts = 2 * environment_radiance(light_of(one), ways) + 6 * environment_radiance(
+        light_of(other), ways
+    )
+    torch.testing.assert_close(
+        environment_radiance(light_of(one + 3 * other, scale=2.0), ways), parts, rtol=1e-12, atol=0
+    )
 
 
 @pytest.mark.parametrize("rotation", [0.0, 37.0, 90.0, -200.0])
 def test_maps_look_as_they_do_in_mitsuba(rotation: float, random):
-    mitsuba = pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)")
+    mitsuba = pytest.importorskip(
+        "mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)"
+    )
     mitsuba.set_variant("scalar_rgb")
     radiance, ways = random(3, 6, 10), directions(300)
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(radiance.permute(1, 2, 0).float().numpy()))
     turn = mitsuba.ScalarTransform4f().rotate([0, 1, 0], rotation)
     environment = mitsuba.load_dict(
-        {"type": "scene", "map": {"type": "envmap", "bitmap": bitmap, "scale": 1.5, "to_world": turn}}
+        {
+            "type": "scene",
+            "map": {"type": "envmap", "bitmap": bitmap, "scale": 1.5, "to_world": turn},
+        }
     ).environment()
     expected = []
     for way in ways.tolist():
@@ -92,13 +121,17 @@ def test_maps_look_as_they_do_in_mitsuba(rotation: float, random):
         interaction.wi = mitsuba.Vector3f(*(-component for component in way))
         expected.append(list(environment.eval(interaction)))
     found = environment_radiance(light_of(radiance, 1.5, rotation), array_order(ways))
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64).T, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        found, torch.tensor(expected, dtype=torch.float64).T, rtol=1e-5, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES, ids=str)
 def test_solid_angles_sum_to_the_sphere(height: int, width: int):
     area, *vector = pixel_moments(height, width).sum((1, 2))
-    assert area == pytest.approx(4 * math.pi, rel=1e-13) and vector == pytest.approx([0, 0, 0], abs=1e-13)
+    assert area == pytest.approx(4 * math.pi, rel=1e-13) and vector == pytest.approx(
+        [0, 0, 0], abs=1e-13
+    )
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:3], ids=str)
@@ -110,7 +143,12 @@ def test_moments_integrate_the_bilinear_map(height: int, width: int, random):
     around = 2 * math.pi * (torch.arange(columns, dtype=torch.float64) + 0.5) / columns
     down, around = (part.flatten() for part in torch.meshgrid(down, around, indexing="ij"))
     ways = torch.stack([down.sin() * around.sin(), down.cos(), -down.sin() * around.cos()], -1)
-    weight = environment_radiance(light, array_order(ways))[0] * down.sin() * (math.pi / rows) * (2 * math.pi / columns)
+    weight = (
+        environment_radiance(light, array_order(ways))[0]
+        * down.sin()
+        * (math.pi / rows)
+        * (2 * math.pi / columns)
+    )
     expected = torch.cat([weight.sum()[None], weight @ ways])
     found = (torch.from_numpy(pixel_moments(height, width)) * light.radiance).sum((1, 2))
     torch.testing.assert_close(found, expected, rtol=2e-4, atol=2e-4)
@@ -122,23 +160,39 @@ def test_a_refined_map_is_the_same_function(size: tuple[int, int], random):
     fine = refine_map(radiance, *size)
     assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
     torch.testing.assert_close(
-        environment_radiance(light_of(fine), ways), environment_radiance(light_of(radiance), ways), rtol=1e-11, atol=1e-12
+        environment_radiance(light_of(fine), ways),
+        environment_radiance(light_of(radiance), ways),
+        rtol=1e-11,
+        atol=1e-12,
     )
 
 
 @pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])
 def test_what_is_seen_has_both_derivatives(name: str, random):
-    values = {"radiance": random(2, 4, 5), "scale": random(), "rotation": 100 * random(seed=1), "direction": array_order(directions(6))}
+    values = {
+        "radiance": random(2, 4, 5),
+        "scale": random(),
+        "rotation": 100 * random(seed=1),
+        "direction": array_order(directions(6)),
+    }
 
     def look(value: Tensor) -> Tensor:
         parts = values | {name: value}
-        return environment_radiance(EnvironmentLight(parts["radiance"], parts["scale"], parts["rotation"]), parts["direction"])
+        return environment_radiance(
+            EnvironmentLight(parts["radiance"], parts["scale"], parts["rotation"]),
+            parts["direction"],
+        )
 
-    assert torch.autograd.gradcheck(look, values[name].clone().requires_grad_(), check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        look, values[name].clone().requires_grad_(), check_forward_ad=True
+    )
 
 
 def test_straight_up_has_finite_derivatives(random):
-    light, way = light_of(random(2, 4, 5)), torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    light, way = (
+        light_of(random(2, 4, 5)),
+        torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True),
+    )
     (slope,) = torch.autograd.grad(environment_radiance(light, way).sum(), way)
     with forward_ad.dual_level():
         dual = forward_ad.make_dual(way.detach(), torch.ones_like(way))

@@ -44,7 +44,9 @@ def test_radiance_rises_from_zero_without_a_jump_in_value_or_slope(dtype: torch.
     """Towards both ends of the bend, r = m and r = -m with m = MARGIN (1 + |flux|), mean 1."""
     ends = [-(1 - MARGIN) / (1 + MARGIN), -(1 + MARGIN) / (1 - MARGIN)]
     step = 1e-4
-    flux = fluxes(*(end + side * step for end in ends for side in (-1, 1)), dtype=dtype).requires_grad_()
+    flux = fluxes(
+        *(end + side * step for end in ends for side in (-1, 1)), dtype=dtype
+    ).requires_grad_()
     radiance = along_z(torch.ones_like(flux), flux)
     (slope,) = torch.autograd.grad(radiance.sum(), flux)
     inner, outer, dark, dim = radiance.detach().flatten().tolist()
@@ -60,7 +62,9 @@ def test_values_and_slopes_are_finite_whatever_the_unit(scale: float, dtype: tor
     mean = torch.full_like(flux, scale).detach().requires_grad_()
     radiance = along_z(mean, flux)
     slopes = torch.autograd.grad(radiance.sum(), (mean, flux))
-    assert bool((radiance >= 0).all()) and all(bool(slope.isfinite().all()) for slope in (radiance, *slopes))
+    assert bool((radiance >= 0).all()) and all(
+        bool(slope.isfinite().all()) for slope in (radiance, *slopes)
+    )
 
 
 def test_the_light_switched_on_from_nothing_counts_in_full():
@@ -73,4 +77,6 @@ def test_the_light_switched_on_from_nothing_counts_in_full():
 def test_both_modes_agree_with_differences_within_the_bend():
     flux = fluxes(-0.985, -0.995, -1.0, -1.01).requires_grad_()
     mean = torch.ones_like(flux).detach().requires_grad_()
-    assert torch.autograd.gradcheck(along_z, (mean, flux), eps=1e-7, atol=1e-5, check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        along_z, (mean, flux), eps=1e-7, atol=1e-5, check_forward_ad=True
+    )

@@ -40,11 +40,15 @@ def blob(grid: Grid) -> Tensor:
 
 @pytest.fixture
 def scene_of(make_scene, make_camera, box):
-    """A blob in a small grid, before light from behind, seen in many more pixels than rays can tell apart."""
+    """A blob in a small grid, before light from behind, seen in many more pixels than rays can tell
+    apart.
+    """
 
     def scene(view: dict, **changes) -> Scene:
         camera = make_camera(**({"size": (54, 60), "half_width": 0.3} | view))
-        return make_scene(blob(box((6, 8, 7))), ambient=(0.4,), camera=camera, **({"g": 0.3} | changes))
+        return make_scene(
+            blob(box((6, 8, 7))), ambient=(0.4,), camera=camera, **({"g": 0.3} | changes)
+        )
 
     return scene
 
@@ -66,18 +70,33 @@ def test_places_and_crossings_are_those_of_the_rays(view: dict, scene_of):
     lattice, slices = lattice_of(scene_of(view))
     chosen = lattice.rows[2:5]
     bundle = lattice.rays(chosen, 3.0)
-    rows, columns = torch.meshgrid(torch.arange(2, 5).double(), torch.arange(len(lattice.columns)).double(), indexing="ij")
-    torch.testing.assert_close(lattice.places(bundle), torch.stack([rows, columns], -1).flatten(0, 1), rtol=0, atol=1e-11)
-    down, along = lattice.crossings(slices.planes, 0, chosen), lattice.crossings(slices.planes, 1, lattice.columns)
-    distance = (slices.planes[:, None] - bundle.origin[:, lattice.axis]) / bundle.direction[:, lattice.axis]
+    rows, columns = torch.meshgrid(
+        torch.arange(2, 5).double(), torch.arange(len(lattice.columns)).double(), indexing="ij"
+    )
+    torch.testing.assert_close(
+        lattice.places(bundle), torch.stack([rows, columns], -1).flatten(0, 1), rtol=0, atol=1e-11
+    )
+    down, along = (
+        lattice.crossings(slices.planes, 0, chosen),
+        lattice.crossings(slices.planes, 1, lattice.columns),
+    )
+    distance = (slices.planes[:, None] - bundle.origin[:, lattice.axis]) / bundle.direction[
+        :, lattice.axis
+    ]
     points = (bundle.origin + distance[..., None] * bundle.direction).unflatten(1, rows.shape)
-    torch.testing.assert_close(points[..., lattice.across[0]], down[:, :, None].expand(-1, -1, rows.shape[1]))
-    torch.testing.assert_close(points[..., lattice.across[1]], along[:, None, :].expand(-1, rows.shape[0], -1))
+    torch.testing.assert_close(
+        points[..., lattice.across[0]], down[:, :, None].expand(-1, -1, rows.shape[1])
+    )
+    torch.testing.assert_close(
+        points[..., lattice.across[1]], along[:, None, :].expand(-1, rows.shape[0], -1)
+    )
 
 
 @each_camera
 def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
-    """The pixels of the lattice's own rays need no interpolation: they are what marching those rays gives."""
+    """The pixels of the lattice's own rays need no interpolation: they are what marching those rays
+    gives.
+    """
     scene = scene_of(view)
     lattice, _ = lattice_of(scene)
     bundle = lattice.rays(lattice.rows, 3.0)
@@ -98,7 +117,9 @@ def test_chunks_do_not_matter(view: dict, scene_of, monkeypatch):
 
 @each_camera
 def test_pixels_keep_to_the_tolerance(view: dict, scene_of):
-    """Fewer pixels are interpolated as the tolerance falls; what interpolation costs stays below it, in the image's root mean square."""
+    """Fewer pixels are interpolated as the tolerance falls; what interpolation costs stays below
+    it, in the image's root mean square.
+    """
     scene = scene_of(view)
     own, errors = render(replace(scene, render=OWN)), []
     for tolerance in (1.0, 0.03, 0.003):
@@ -111,20 +132,35 @@ def test_pixels_keep_to_the_tolerance(view: dict, scene_of):
 def test_subpixels_share_a_lattice(scene_of):
     settings = RenderSettings(tolerance=0.05, samples_per_pixel=4)
     scene = scene_of({"size": (36, 40)})
-    image, own = (render(replace(scene, render=replace(settings, tolerance=tolerance))) for tolerance in (0.05, 0.0))
+    image, own = (
+        render(replace(scene, render=replace(settings, tolerance=tolerance)))
+        for tolerance in (0.05, 0.0)
+    )
     assert not torch.equal(image, own)
     assert float((image - own).norm() / own.norm()) < settings.tolerance
 
 
 @pytest.mark.parametrize(
-    "view", [{"eye": (0.1, 0.2, 0.15), "half_width": 1.0}, {"eye": (0.9, 0.0, 0.1), "half_width": 4.0}, {"size": (4, 5)}], ids=str
+    "view",
+    [
+        {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
+        {"eye": (0.9, 0.0, 0.1), "half_width": 4.0},
+        {"size": (4, 5)},
+    ],
+    ids=str,
 )
-def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(view: dict, scene_of):
+def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
+    view: dict, scene_of
+):
     assert torch.equal(*images(scene_of(view)))
 
 
-@pytest.mark.parametrize("view", [CAMERAS["oblique"], CAMERAS["orthographic"]], ids=["perspective", "orthographic"])
-@pytest.mark.parametrize("name", ["density", "g", "views.view.camera.rotation_x", "views.view.camera.y"])
+@pytest.mark.parametrize(
+    "view", [CAMERAS["oblique"], CAMERAS["orthographic"]], ids=["perspective", "orthographic"]
+)
+@pytest.mark.parametrize(
+    "name", ["density", "g", "views.view.camera.rotation_x", "views.view.camera.y"]
+)
 def test_derivatives_are_those_of_the_interpolated_image(view: dict, name: str, scene_of, random):
     """In forward mode as by central differences, and in reverse as in forward mode."""
     scene = replace(scene_of(view), render=INTERPOLATED)
@@ -135,12 +171,16 @@ def test_derivatives_are_those_of_the_interpolated_image(view: dict, name: str, 
         change = torch.eye(6, dtype=value.dtype)[{"rotation_x": 0, "y": 4}[name.rpartition(".")[2]]]
     tangent = render_tangent(scene, name, lambda world: {"view": render(world)})["view"][1]
     step = 1e-6
-    plus, minus = (render(with_values(scene, {variable: value + sign * step * change})) for sign in (1, -1))
+    plus, minus = (
+        render(with_values(scene, {variable: value + sign * step * change})) for sign in (1, -1)
+    )
     difference = (plus - minus) / (2 * step)
     assert float((tangent - difference).norm()) < 1e-6 * float(difference.norm())
     leaf = value.clone().requires_grad_()
     weight = random(*tangent.shape)
-    (bar,) = torch.autograd.grad((render(with_values(scene, {variable: leaf})) * weight).sum(), leaf)
+    (bar,) = torch.autograd.grad(
+        (render(with_values(scene, {variable: leaf})) * weight).sum(), leaf
+    )
     torch.testing.assert_close((bar * change).sum(), (tangent * weight).sum(), rtol=1e-11, atol=0)
 
 

@@ -1,4 +1,6 @@
-"""View rays: what the box lets through and what it scatters towards the camera, in closed form where there is one."""
+"""View rays: what the box lets through and what it scatters towards the camera, in closed form
+where there is one.
+"""
 
 from __future__ import annotations
 
@@ -33,12 +35,34 @@ CAMERAS = {
 each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
 
 
-def emission_of(grid: Grid, density: Tensor, sigma_a: float = 0.5, sigma_s: tuple[float, ...] = (2.0, 3.0), g: float = 0.3) -> Emission:
+def emission_of(
+    grid: Grid,
+    density: Tensor,
+    sigma_a: float = 0.5,
+    sigma_s: tuple[float, ...] = (2.0, 3.0),
+    g: float = 0.3,
+) -> Emission:
     """A medium under one oblique beam and some smooth diffuse light that grows along x."""
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
-    medium = scale_medium(Volume(grid, density, density.new_tensor([sigma_a]), density.new_tensor(sigma_s), density.new_tensor(g)))
+    medium = scale_medium(
+        Volume(
+            grid,
+            density,
+            density.new_tensor([sigma_a]),
+            density.new_tensor(sigma_s),
+            density.new_tensor(g),
+        )
+    )
     diffuse = (1 + grid.centers(density)[2]).expand(len(sigma_s), *grid.shape)
-    return Emission(grid, medium.extinction, medium.scattering, reduced_light(medium, [light], False).beams, diffuse, medium.g, medium.peak)
+    return Emission(
+        grid,
+        medium.extinction,
+        medium.scattering,
+        reduced_light(medium, [light], False).beams,
+        diffuse,
+        medium.g,
+        medium.peak,
+    )
 
 
 def every_ray(steps: int) -> RenderSettings:
@@ -53,13 +77,18 @@ def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
         if d == 0 and not low < o < high:
             return 0.0
         if d != 0:
-            near, far = max(near, min((low - o) / d, (high - o) / d)), min(far, max((low - o) / d, (high - o) / d))
+            near, far = (
+                max(near, min((low - o) / d, (high - o) / d)),
+                min(far, max((low - o) / d, (high - o) / d)),
+            )
     return max(far - near, 0.0)
 
 
 def chords(grid: Grid, bundle: Rays) -> Tensor:
     pairs = zip(bundle.origin.tolist(), bundle.direction.tolist(), strict=True)
-    return torch.tensor([chord(grid, origin, direction) for origin, direction in pairs], dtype=torch.float64)
+    return torch.tensor(
+        [chord(grid, origin, direction) for origin, direction in pairs], dtype=torch.float64
+    )
 
 
 @each_camera
@@ -71,7 +100,9 @@ def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int, box, 
     lengths = chords(grid, bundle)
     assert bool((lengths > 0).any())
     extinction = emission.extinction.value[:, 0, 0, 0]
-    torch.testing.assert_close(transmittance, torch.exp(-extinction[:, None] * lengths), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        transmittance, torch.exp(-extinction[:, None] * lengths), rtol=1e-12, atol=0
+    )
 
 
 @each_camera
@@ -110,11 +141,17 @@ def test_chunks_do_not_matter(view: dict, box, make_camera, random, monkeypatch)
 
 
 @each_camera
-def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, box, make_camera, random, monkeypatch):
+def test_what_is_empty_is_left_out_and_makes_no_difference(
+    view: dict, box, make_camera, random, monkeypatch
+):
     """Nothing is left out where the density is being varied."""
     density = torch.zeros(20, 22, 21, dtype=torch.float64)
     density[6:9, 12:15, 8:12] = 1 + random(3, 3, 4)
-    bundle, integrated, nodes = cast_rays(make_camera(size=(9, 8), **view)), march_module._integrate, []
+    bundle, integrated, nodes = (
+        cast_rays(make_camera(size=(9, 8), **view)),
+        march_module._integrate,
+        [],
+    )
 
     def counting(emission: Emission, values: Tensor, places: Nodes) -> Tensor:
         nodes.append(values[:, 0].numel())
@@ -122,7 +159,10 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, box, make
 
     monkeypatch.setattr(march_module, "_integrate", counting)
     monkeypatch.setattr(march_module, "CHUNK_NODES", 200)
-    emissions = emission_of(box((20, 22, 21)), density), emission_of(box((20, 22, 21)), density.clone().requires_grad_())
+    emissions = (
+        emission_of(box((20, 22, 21)), density),
+        emission_of(box((20, 22, 21)), density.clone().requires_grad_()),
+    )
     seen, counts = [], []
     for emission in emissions:
         nodes.clear()
@@ -134,14 +174,22 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, box, make
 
 
 @pytest.mark.parametrize("view", ["perspective", "oblique", "orthographic"])
-def test_slices_and_equal_steps_agree_in_the_limit(view: str, box, make_camera, random, monkeypatch):
+def test_slices_and_equal_steps_agree_in_the_limit(
+    view: str, box, make_camera, random, monkeypatch
+):
     """Both interpolate the same fields, along other nodes: their difference vanishes as steps grow."""
-    emission, bundle = emission_of(box((3, 5, 4)), random(3, 5, 4)), cast_rays(make_camera(size=(7, 6), **CAMERAS[view]))
+    emission, bundle = (
+        emission_of(box((3, 5, 4)), random(3, 5, 4)),
+        cast_rays(make_camera(size=(7, 6), **CAMERAS[view])),
+    )
     sliced = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
     monkeypatch.setattr(samplers, "STEEPEST", 1.0)
     equal = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
     for field in (0, 1):
-        coarse, fine = (float((a[field] - b[field]).norm() / a[field].norm()) for a, b in zip(sliced, equal, strict=True))
+        coarse, fine = (
+            float((a[field] - b[field]).norm() / a[field].norm())
+            for a, b in zip(sliced, equal, strict=True)
+        )
         assert 0 < fine < 2e-3 and fine < coarse / 8, (coarse, fine)
 
 
@@ -149,23 +197,40 @@ def test_slices_and_equal_steps_agree_in_the_limit(view: str, box, make_camera, 
 def test_radiance_and_transmittance_have_both_derivatives(view: dict, box, make_camera, half_empty):
     grid, bundle = box((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
     density = half_empty(*grid.shape, seed=3).requires_grad_()
-    assert torch.autograd.gradcheck(lambda d: march(emission_of(grid, d), bundle, every_ray(1)), density, atol=1e-8, check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        lambda d: march(emission_of(grid, d), bundle, every_ray(1)),
+        density,
+        atol=1e-8,
+        check_forward_ad=True,
+    )
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6])
 @pytest.mark.parametrize("has_fields", ["absorption", "scattering"])
 def test_a_cross_section_may_be_a_field(has_fields: str, g: float, box, make_camera, random):
-    """The same numbers in every cell give the same image, but for bounds of third-order corrections, which colors share or do not."""
+    """The same numbers in every cell give the same image, but for bounds of third-order
+    corrections, which colors share or do not.
+    """
     grid, density, camera = box((3, 5, 4)), random(3, 5, 4), make_camera()
     constant = Volume(grid, density, random(3, seed=1), random(3, seed=2), density.new_tensor(g))
     field = {"absorption": "sigma_a", "scattering": "sigma_s"}[has_fields]
-    varying = replace(constant, **{field: getattr(constant, field).view(3, 1, 1, 1).expand(3, *grid.shape)})
+    varying = replace(
+        constant, **{field: getattr(constant, field).view(3, 1, 1, 1).expand(3, *grid.shape)}
+    )
     light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
     results = []
     for volume in (constant, varying):
         medium = scale_medium(volume)
         beams = reduced_light(medium, [light], False).beams
-        emission = Emission(grid, medium.extinction, medium.scattering, beams, random(3, *grid.shape, seed=4), medium.g, medium.peak)
+        emission = Emission(
+            grid,
+            medium.extinction,
+            medium.scattering,
+            beams,
+            random(3, *grid.shape, seed=4),
+            medium.g,
+            medium.peak,
+        )
         results.append(torch.cat(march(emission, cast_rays(camera), every_ray(1))))
     torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=0)
 
@@ -173,32 +238,62 @@ def test_a_cross_section_may_be_a_field(has_fields: str, g: float, box, make_cam
 THICKNESS, SIGMA_S, SIGMA_A = 1.5, 2.0, 0.5
 
 
-def slab(make_scene, make_camera, cells: int, g: float, travel: tuple[float, float, float]) -> Scene:
+def slab(
+    make_scene, make_camera, cells: int, g: float, travel: tuple[float, float, float]
+) -> Scene:
     """A homogeneous slab seen straight on, along z, by a parallel camera, under parallel light."""
     grid = Grid((cells, 2, 2), (-THICKNESS / 2, -9.0, -9.0), (THICKNESS / 2, 9.0, 9.0))
     camera = make_camera(eye=(0.0, 0.0, 5.0), size=(1, 1), half_width=0.1, is_perspective=False)
     density = torch.ones(grid.shape, dtype=torch.float64)
     return make_scene(
-        density, grid=grid, sigma_a=(SIGMA_A,), sigma_s=(SIGMA_S,), g=g, directional=(3.0,), travel=travel, camera=camera, model="none"
+        density,
+        grid=grid,
+        sigma_a=(SIGMA_A,),
+        sigma_s=(SIGMA_S,),
+        g=g,
+        directional=(3.0,),
+        travel=travel,
+        camera=camera,
+        model="none",
     )
 
 
 @pytest.mark.parametrize("g", [0.0, -0.6])
-@pytest.mark.parametrize("is_behind", [True, False], ids=["lit from behind the camera", "lit towards the camera"])
-def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: bool, make_scene, make_camera, order):
-    """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L); approached at second order."""
+@pytest.mark.parametrize(
+    "is_behind", [True, False], ids=["lit from behind the camera", "lit towards the camera"]
+)
+def test_single_scattering_of_a_slab_is_its_closed_form(
+    g: float, is_behind: bool, make_scene, make_camera, order
+):
+    """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L);
+    approached at second order.
+    """
     kappa = SIGMA_A + SIGMA_S
-    phase = henyey_greenstein(torch.tensor(-1.0 if is_behind else 1.0), torch.tensor(g, dtype=torch.float64)).item()
-    decayed = -math.expm1(-2 * kappa * THICKNESS) / (2 * kappa) if is_behind else THICKNESS * math.exp(-kappa * THICKNESS)
+    phase = henyey_greenstein(
+        torch.tensor(-1.0 if is_behind else 1.0), torch.tensor(g, dtype=torch.float64)
+    ).item()
+    decayed = (
+        -math.expm1(-2 * kappa * THICKNESS) / (2 * kappa)
+        if is_behind
+        else THICKNESS * math.exp(-kappa * THICKNESS)
+    )
     expected = SIGMA_S * phase * 3.0 / (4 * math.pi) * decayed
     cells, travel = [8, 16, 32], (0.0, 0.0, -1.0 if is_behind else 1.0)
-    errors = [abs(float(render(slab(make_scene, make_camera, n, g, travel)).mean()) / expected - 1) for n in cells]
+    errors = [
+        abs(float(render(slab(make_scene, make_camera, n, g, travel)).mean()) / expected - 1)
+        for n in cells
+    ]
     assert errors[-1] < 5e-3 and order([1 / n for n in cells], errors) >= 1.8, errors
 
 
 def test_forward_scattering_is_brightest_against_the_light(make_scene, make_camera):
     """Through a thin slab, where attenuation hardly matters: p(1) / p(-1) = ((1 + g) / (1 - g))^3."""
-    against, along = (float(render(with_density(slab(make_scene, make_camera, 8, 0.8, (0.0, 0.0, z)), 1e-6)).mean()) for z in (1.0, -1.0))
+    against, along = (
+        float(
+            render(with_density(slab(make_scene, make_camera, 8, 0.8, (0.0, 0.0, z)), 1e-6)).mean()
+        )
+        for z in (1.0, -1.0)
+    )
     assert against / along == pytest.approx(((1 + 0.8) / (1 - 0.8)) ** 3, rel=1e-4)
 
 
@@ -210,7 +305,8 @@ WIDTH, DENSITY, LIGHT = 0.1, 12.0, (1.0, -0.8, -0.5)
 
 
 def slow_single_scattering(camera: Camera, steps: int = 600) -> Tensor:
-    """Single scattering of a Gaussian ball in the origin, radiance of every pixel, by plain sums along each ray.
+    """Single scattering of a Gaussian ball in the origin, radiance of every pixel, by plain sums
+    along each ray.
 
     The depth towards the light is the integral of a Gaussian along a line: an error function.
     """
@@ -223,47 +319,99 @@ def slow_single_scattering(camera: Camera, steps: int = 600) -> Tensor:
         density = DENSITY * torch.exp(-(point**2).sum(1) / (2 * WIDTH**2))
         along = point @ travel
         across = torch.exp(-((point**2).sum(1) - along**2) / (2 * WIDTH**2))
-        to_light = DENSITY * across * WIDTH * math.sqrt(math.pi / 2) * (1 + torch.erf(along / WIDTH / math.sqrt(2)))
-        to_camera = torch.cat([torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(density, distance)])
+        to_light = (
+            DENSITY
+            * across
+            * WIDTH
+            * math.sqrt(math.pi / 2)
+            * (1 + torch.erf(along / WIDTH / math.sqrt(2)))
+        )
+        to_camera = torch.cat(
+            [torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(density, distance)]
+        )
         phase = henyey_greenstein(-(direction @ travel), torch.tensor(-0.3, dtype=torch.float64))
-        emitted = SIGMA_S * density * phase * 3.0 / (4 * math.pi) * torch.exp(-(SIGMA_A + SIGMA_S) * (to_camera + to_light))
+        emitted = (
+            SIGMA_S
+            * density
+            * phase
+            * 3.0
+            / (4 * math.pi)
+            * torch.exp(-(SIGMA_A + SIGMA_S) * (to_camera + to_light))
+        )
         pixels.append(torch.trapezoid(emitted, distance))
     return torch.stack(pixels).view(camera.size)
 
 
 @pytest.mark.parametrize("eye", [(0.3, 0.4, 2.5), (1.6, -1.2, 1.5)], ids=str)
-def test_single_scattering_of_a_blob_converges_at_second_order(eye: tuple[float, float, float], make_scene, make_camera, order):
+def test_single_scattering_of_a_blob_converges_at_second_order(
+    eye: tuple[float, float, float], make_scene, make_camera, order
+):
     camera, counts, errors = make_camera(eye=eye, size=(9, 9), half_width=0.1), [12, 18, 27, 40], []
     expected = slow_single_scattering(camera)
     for n in counts:
         grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
-        density = DENSITY * torch.exp(-sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2))
-        scene = make_scene(density, grid=grid, sigma_a=(SIGMA_A,), sigma_s=(SIGMA_S,), g=-0.3, travel=LIGHT, camera=camera, model="none")
+        density = DENSITY * torch.exp(
+            -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
+        )
+        scene = make_scene(
+            density,
+            grid=grid,
+            sigma_a=(SIGMA_A,),
+            sigma_s=(SIGMA_S,),
+            g=-0.3,
+            travel=LIGHT,
+            camera=camera,
+            model="none",
+        )
         errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
     assert order([1 / n for n in counts], errors) >= 1.8, errors
 
 
 def test_more_steps_and_samples_keep_a_homogeneous_transmittance(make_scene, box):
     """Background light through an absorbing box: the average over a pixel of exp(-kappa chord)."""
-    scene = make_scene(torch.ones(3, 5, 4, dtype=torch.float64), sigma_s=(0.0,), directional=None, ambient=(1.0,))
+    scene = make_scene(
+        torch.ones(3, 5, 4, dtype=torch.float64), sigma_s=(0.0,), directional=None, ambient=(1.0,)
+    )
     image = render(replace(scene, render=RenderSettings(samples_per_pixel=4, steps_per_voxel=2)))[0]
-    bundles = [cast_rays(scene.views[0].camera, offset) for offset in [(a, b) for a in (0.25, 0.75) for b in (0.25, 0.75)]]
+    bundles = [
+        cast_rays(scene.views[0].camera, offset)
+        for offset in [(a, b) for a in (0.25, 0.75) for b in (0.25, 0.75)]
+    ]
     for color, sigma in enumerate(scene.volume.sigma_a):
         expected = sum(torch.exp(-sigma * chords(box((3, 5, 4)), bundle)) for bundle in bundles) / 4
         torch.testing.assert_close(image[color].flatten(), expected, rtol=1e-12, atol=0)
 
 
 def test_the_transmittance_of_a_blob_converges_at_second_order(make_scene, make_camera, order):
-    """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at distance b from its middle."""
-    camera, counts, errors = make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1), [12, 24, 48], []
+    """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at
+    distance b from its middle.
+    """
+    camera, counts, errors = (
+        make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1),
+        [12, 24, 48],
+        [],
+    )
     bundle = cast_rays(camera)
     closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
-    depth = SIGMA_A * DENSITY * WIDTH * math.sqrt(2 * math.pi) * torch.exp(-(closest**2) / (2 * WIDTH**2))
+    depth = (
+        SIGMA_A
+        * DENSITY
+        * WIDTH
+        * math.sqrt(2 * math.pi)
+        * torch.exp(-(closest**2) / (2 * WIDTH**2))
+    )
     expected = torch.exp(-depth).view(camera.size)
     for n in counts:
         grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
-        density = DENSITY * torch.exp(-sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2))
-        absorbing = {"sigma_a": (SIGMA_A,), "sigma_s": (0.0,), "directional": None, "ambient": (1.0,)}
+        density = DENSITY * torch.exp(
+            -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
+        )
+        absorbing = {
+            "sigma_a": (SIGMA_A,),
+            "sigma_s": (0.0,),
+            "directional": None,
+            "ambient": (1.0,),
+        }
         scene = make_scene(density, grid=grid, camera=camera, **absorbing)
         errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
     assert errors[-1] < 2e-3 and order([1 / n for n in counts], errors) >= 1.8, errors

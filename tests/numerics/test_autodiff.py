@@ -23,7 +23,9 @@ def nested(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("function", [curved, nested])
 def test_derivatives_are_those_of_what_is_kept(function, random) -> None:
     x, y = (random(3, 4, 5, seed=seed).requires_grad_() for seed in (0, 1))
-    assert torch.autograd.gradcheck(lambda x, y: recompute(function, x, y), (x, y), check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        lambda x, y: recompute(function, x, y), (x, y), check_forward_ad=True
+    )
 
 
 def test_the_backward_pass_may_be_made_twice(random) -> None:

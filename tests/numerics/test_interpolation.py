@@ -1,4 +1,6 @@
-"""Interpolation: linear fields exactly, the same as explicit index arithmetic, and both derivatives."""
+"""Interpolation: linear fields exactly, the same as explicit index arithmetic, and both
+derivatives.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,19 @@ def interior_points(random, count: int, shape: tuple[int, ...]) -> Tensor:
 def linear_field(shape: tuple[int, ...], slope: Tensor) -> Tensor:
     """slope . position on cell centers, position in [-1, 1], last array axis first in `slope`."""
     axes = [(2 * torch.arange(cells, dtype=torch.float64) + 1) / cells - 1 for cells in shape]
-    return sum(s * axis for s, axis in zip(slope.flip(0), torch.meshgrid(*axes, indexing="ij"), strict=True))
+    return sum(
+        s * axis
+        for s, axis in zip(slope.flip(0), torch.meshgrid(*axes, indexing="ij"), strict=True)
+    )
 
 
 def interpolated(values: Tensor, point: Tensor) -> Tensor:
     """Multilinear interpolation of `values` [K, ...] at one point, corner by corner."""
     sizes = values.shape[1:]
-    place = [((point[len(sizes) - 1 - axis].item() + 1) * size - 1) / 2 for axis, size in enumerate(sizes)]
+    place = [
+        ((point[len(sizes) - 1 - axis].item() + 1) * size - 1) / 2
+        for axis, size in enumerate(sizes)
+    ]
     place = [min(max(p, 0), size - 1) for p, size in zip(place, sizes, strict=True)]
     total = torch.zeros_like(values[(slice(None), *[0] * len(sizes))])
     for corner in itertools.product((0, 1), repeat=len(sizes)):
@@ -43,14 +51,18 @@ def test_slices_against_explicit_corners(random):
     slices, points = random(2, 3, 4, 5), 2.6 * random(2, 9, 2, seed=1) - 1.3
     sampled = sample_slices(slices, points)
     for n, p in itertools.product(range(2), range(9)):
-        torch.testing.assert_close(sampled[n, :, p], interpolated(slices[n], points[n, p]), rtol=1e-13, atol=1e-14)
+        torch.testing.assert_close(
+            sampled[n, :, p], interpolated(slices[n], points[n, p]), rtol=1e-13, atol=1e-14
+        )
 
 
 def test_volumes_against_explicit_corners(random):
     volume, points = random(2, 3, 4, 5), 2.6 * random(1, 9, 3, seed=1) - 1.3
     sampled = sample_volume(volume, points)
     for p in range(9):
-        torch.testing.assert_close(sampled[:, 0, p], interpolated(volume, points[0, p]), rtol=1e-13, atol=1e-14)
+        torch.testing.assert_close(
+            sampled[:, 0, p], interpolated(volume, points[0, p]), rtol=1e-13, atol=1e-14
+        )
 
 
 def test_linear_fields_are_exact_in_slices(random):
@@ -70,14 +82,20 @@ def test_linear_fields_are_exact_in_volumes(random):
 @pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
 def test_slices_have_both_derivatives(wanted: tuple[bool, bool], random):
     slices, points = random(2, 2, 3, 4), 2.4 * random(2, 5, 2, seed=1) - 1.2
-    inputs = [tensor.requires_grad_(is_wanted) for tensor, is_wanted in zip((slices, points), wanted, strict=True)]
+    inputs = [
+        tensor.requires_grad_(is_wanted)
+        for tensor, is_wanted in zip((slices, points), wanted, strict=True)
+    ]
     assert torch.autograd.gradcheck(lambda s, p: sample_slices(s, p), inputs, check_forward_ad=True)
 
 
 @pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
 def test_volumes_have_both_derivatives(wanted: tuple[bool, bool], random):
     volume, points = random(2, 3, 2, 4), 2.4 * random(2, 3, 3, seed=1) - 1.2
-    inputs = [tensor.requires_grad_(is_wanted) for tensor, is_wanted in zip((volume, points), wanted, strict=True)]
+    inputs = [
+        tensor.requires_grad_(is_wanted)
+        for tensor, is_wanted in zip((volume, points), wanted, strict=True)
+    ]
     assert torch.autograd.gradcheck(sample_volume, inputs, check_forward_ad=True)
 
 
@@ -89,17 +107,26 @@ def test_the_slope_at_a_kink_is_the_mean_of_both_sides(random, dtype: torch.dtyp
     """At cell centers along one axis, between them along the other."""
     slices = random(1, 1, 5, 7, dtype=dtype)
     columns, row = torch.arange(1, 6, dtype=dtype), torch.tensor(1.3, dtype=dtype)
-    points = torch.stack([(2 * columns + 1) / 7 - 1, ((2 * row + 1) / 5 - 1).expand(5)], -1)[None].requires_grad_()
+    points = torch.stack([(2 * columns + 1) / 7 - 1, ((2 * row + 1) / 5 - 1).expand(5)], -1)[
+        None
+    ].requires_grad_()
     (bars,) = torch.autograd.grad(sample_slices(slices, points).sum(), points)
     line = 0.7 * slices[0, 0, 1] + 0.3 * slices[0, 0, 2]
-    torch.testing.assert_close(bars[0, :, 0], 7 / 2 * (line[2:] - line[:-2]) / 2, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(
+        bars[0, :, 0], 7 / 2 * (line[2:] - line[:-2]) / 2, rtol=1e-3, atol=1e-4
+    )
     across = slices[0, 0, 2, 1:6] - slices[0, 0, 1, 1:6]
     torch.testing.assert_close(bars[0, :, 1], 5 / 2 * across, rtol=1e-3, atol=1e-3)
 
 
 def test_both_modes_agree_at_kinks(random):
     slices, change = random(2, 3, 4, 5), random(2, 6, 2, seed=1)
-    points = torch.stack(torch.broadcast_tensors(torch.tensor([-0.4, 0.0]).double(), torch.tensor([[-0.25], [0.25], [0.1]]).double()), -1)
+    points = torch.stack(
+        torch.broadcast_tensors(
+            torch.tensor([-0.4, 0.0]).double(), torch.tensor([[-0.25], [0.25], [0.1]]).double()
+        ),
+        -1,
+    )
     points = points.reshape(1, 6, 2).expand(2, -1, -1).contiguous()
     _, tangent = torch.func.jvp(lambda moved: sample_slices(slices, moved), (points,), (change,))
     weight = random(*tangent.shape, seed=2)
@@ -151,5 +178,10 @@ def test_subdivided_squares_are_exact_in_smooth_channels(random):
 @pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)], ids=str)
 def test_smooth_channels_have_both_derivatives(wanted: tuple[bool, bool], random):
     slices, points = random(2, 3, 4, 5), 1.6 * random(2, 7, 2, seed=1) - 0.8
-    inputs = tuple(item.clone().requires_grad_(is_wanted) for item, is_wanted in zip((slices, points), wanted, strict=True))
-    assert torch.autograd.gradcheck(lambda s, p: sample_slices(s, p, ThirdOrder(1, 3, 0.5)), inputs, check_forward_ad=True)
+    inputs = tuple(
+        item.clone().requires_grad_(is_wanted)
+        for item, is_wanted in zip((slices, points), wanted, strict=True)
+    )
+    assert torch.autograd.gradcheck(
+        lambda s, p: sample_slices(s, p, ThirdOrder(1, 3, 0.5)), inputs, check_forward_ad=True
+    )

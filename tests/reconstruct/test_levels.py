@@ -31,7 +31,10 @@ def test_targets_are_averaged_over_the_larger_pixels(ball_scene) -> None:
 
 def test_a_coarser_camera_sees_the_same_frame(ball_scene) -> None:
     camera: Camera = ball_scene.views[0].camera
-    corners = cast_rays(camera, (0.0, 0.0)).direction[0], cast_rays(camera.resize(2), (0.0, 0.0)).direction[0]
+    corners = (
+        cast_rays(camera, (0.0, 0.0)).direction[0],
+        cast_rays(camera.resize(2), (0.0, 0.0)).direction[0],
+    )
     assert torch.allclose(*corners, atol=1e-6)
 
 

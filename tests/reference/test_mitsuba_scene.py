@@ -45,7 +45,9 @@ def test_the_box_and_its_volume_lie_where_the_grid_lies(make_scene, random) -> N
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_the_middle_of_a_films_edges_is_seen_along_our_rays(make_scene, make_camera, random, is_perspective: bool) -> None:
+def test_the_middle_of_a_films_edges_is_seen_along_our_rays(
+    make_scene, make_camera, random, is_perspective: bool
+) -> None:
     camera = make_camera(size=(1, 2), half_width=0.4, is_perspective=is_perspective)
     sensor = described(make_scene(random(*SHAPE), camera=camera))["sensor_0"]
     ours = cast_rays(camera)
@@ -55,23 +57,37 @@ def test_the_middle_of_a_films_edges_is_seen_along_our_rays(make_scene, make_cam
             start, along = (0.0, 0.0, 0.0), (away, 0.0, 1.0)
         else:
             start, along = (left, 0.0, 0.0), (left, 0.0, 1.0)
-        theirs = moved(sensor["to_world"], along) - moved(sensor["to_world"], (0, 0, 0) if is_perspective else start)
-        np.testing.assert_allclose(moved(sensor["to_world"], start), ours.origin[ray].flip(-1), atol=1e-12)
-        np.testing.assert_allclose(theirs / np.linalg.norm(theirs), ours.direction[ray].flip(-1), atol=1e-12)
+        theirs = moved(sensor["to_world"], along) - moved(
+            sensor["to_world"], (0, 0, 0) if is_perspective else start
+        )
+        np.testing.assert_allclose(
+            moved(sensor["to_world"], start), ours.origin[ray].flip(-1), atol=1e-12
+        )
+        np.testing.assert_allclose(
+            theirs / np.linalg.norm(theirs), ours.direction[ray].flip(-1), atol=1e-12
+        )
 
 
 def test_pixels_that_are_not_square_are_refused(make_scene, make_camera, random) -> None:
-    with pytest.raises(SceneError, match=r"pixels are square, those of this camera 1\.1 times as high as wide"):
+    with pytest.raises(
+        SceneError, match=r"pixels are square, those of this camera 1\.1 times as high as wide"
+    ):
         described(make_scene(random(*SHAPE), camera=replace(make_camera(), pixel_aspect=1.1)))
 
 
 @pytest.mark.parametrize("sigma", [(0.5,), (0.5, 1.0, 2.0)])
 def test_constant_cross_sections(make_scene, random, sigma: tuple[float, ...]) -> None:
-    scene = make_scene(random(*SHAPE), sigma_a=sigma, sigma_s=tuple(3 * value for value in reversed(sigma)))
+    scene = make_scene(
+        random(*SHAPE), sigma_a=sigma, sigma_s=tuple(3 * value for value in reversed(sigma))
+    )
     volume, medium = scene.volume, described(scene)["medium"]
     expected = (volume.sigma_a + volume.sigma_s).view(-1, 1, 1, 1) * volume.density
     np.testing.assert_allclose(extinction(medium), expected.permute(1, 2, 3, 0), rtol=1e-6)
-    np.testing.assert_allclose(np.array(medium["albedo"]), (volume.sigma_s / (volume.sigma_a + volume.sigma_s)).squeeze(), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.array(medium["albedo"]),
+        (volume.sigma_s / (volume.sigma_a + volume.sigma_s)).squeeze(),
+        rtol=1e-12,
+    )
 
 
 @pytest.mark.parametrize("absorbing", [(3, *SHAPE), (1, *SHAPE), (3, 1, 1, 1), (1, 1, 1, 1)])
@@ -80,15 +96,24 @@ def test_cross_sections_per_cell(make_scene, random, absorbing: tuple[int, ...])
     constant = sigma_a.flatten() if absorbing[1:] == (1, 1, 1) else sigma_a
     scene = make_scene(random(*SHAPE), sigma_a=constant, sigma_s=scattering)
     medium = described(scene)["medium"]
-    np.testing.assert_allclose(extinction(medium), ((sigma_a + scattering) * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-6)
+    np.testing.assert_allclose(
+        extinction(medium),
+        ((sigma_a + scattering) * scene.volume.density).permute(1, 2, 3, 0),
+        rtol=1e-6,
+    )
     found = extinction(medium) * medium["albedo"]["grid"][(slice(FINER // 2, None, FINER),) * 3]
-    np.testing.assert_allclose(found, (scattering * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-5)
+    np.testing.assert_allclose(
+        found, (scattering * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-5
+    )
 
 
 def test_nothing_scatters_where_nothing_is(make_scene, random) -> None:
     fields = dict.fromkeys(("sigma_a", "sigma_s"), torch.zeros(1, *SHAPE, dtype=torch.float64))
     assert not described(make_scene(random(*SHAPE), **fields))["medium"]["albedo"]["grid"].any()
-    assert described(make_scene(random(*SHAPE), sigma_a=(0.0,), sigma_s=(0.0,)))["medium"]["albedo"] == 0
+    assert (
+        described(make_scene(random(*SHAPE), sigma_a=(0.0,), sigma_s=(0.0,)))["medium"]["albedo"]
+        == 0
+    )
 
 
 def test_gray_is_told_through_rounding(make_scene, random) -> None:
@@ -102,7 +127,13 @@ def every_light(like: Tensor) -> list[Any]:
     values = like.new_tensor
     color = values([1.0, 2.0, 3.0])
     sky = EnvironmentLight(color.view(3, 1, 1).expand(3, 2, 3), values(2.0), values(30.0))
-    return [DirectionalLight(color, color), AmbientLight(values([0.5])), AmbientLight(color), sky, PointLight(color, color)]
+    return [
+        DirectionalLight(color, color),
+        AmbientLight(values([0.5])),
+        AmbientLight(color),
+        sky,
+        PointLight(color, color),
+    ]
 
 
 def test_one_color_of_a_scene_is_that_color(make_scene, random) -> None:
@@ -110,17 +141,25 @@ def test_one_color_of_a_scene_is_that_color(make_scene, random) -> None:
     whole = described(scene)
     for color in range(3):
         one = described(pick_color(scene, color))
-        np.testing.assert_allclose(extinction(one["medium"])[..., 0], extinction(whole["medium"])[..., color], rtol=1e-6)
+        np.testing.assert_allclose(
+            extinction(one["medium"])[..., 0], extinction(whole["medium"])[..., color], rtol=1e-6
+        )
         assert one["medium"]["albedo"] == pytest.approx(whole["medium"]["albedo"][color])
         assert one["light_0"]["irradiance"] == (whole["light_0"]["irradiance"][color],) * 3
         assert one["light_4"]["intensity"] == (whole["light_4"]["intensity"][color],) * 3
-        np.testing.assert_array_equal(one["around"]["bitmap"], np.repeat(whole["around"]["bitmap"][..., color, None], 3, -1))
+        np.testing.assert_array_equal(
+            one["around"]["bitmap"], np.repeat(whole["around"]["bitmap"][..., color, None], 3, -1)
+        )
 
 
 def test_ambient_light_is_part_of_an_environment_map(make_scene, random) -> None:
     scene = replace(make_scene(random(*SHAPE)), lights=every_light(random(1)))
-    np.testing.assert_allclose(described(scene)["around"]["bitmap"], np.broadcast_to([3.5, 6.5, 9.5], (2, 3, 3)), rtol=1e-6)
-    alone = replace(scene, lights=[light for light in scene.lights if isinstance(light, AmbientLight)])
+    np.testing.assert_allclose(
+        described(scene)["around"]["bitmap"], np.broadcast_to([3.5, 6.5, 9.5], (2, 3, 3)), rtol=1e-6
+    )
+    alone = replace(
+        scene, lights=[light for light in scene.lights if isinstance(light, AmbientLight)]
+    )
     assert described(alone)["around"] == {"type": "constant", "radiance": (1.5, 2.5, 3.5)}
 
 
@@ -132,8 +171,14 @@ def test_two_environment_maps_are_refused(make_scene, random) -> None:
 
 def test_a_camera_inside_the_volume_is_in_its_medium(make_scene, make_camera, random) -> None:
     inside, outside = ((0.1, 0.1, 0.2), (0.1, 0.1, 2.0))
-    assert "medium" in described(make_scene(random(*SHAPE), camera=make_camera(eye=inside)))["sensor_0"]
-    assert "medium" not in described(make_scene(random(*SHAPE), camera=make_camera(eye=outside)))["sensor_0"]
+    assert (
+        "medium"
+        in described(make_scene(random(*SHAPE), camera=make_camera(eye=inside)))["sensor_0"]
+    )
+    assert (
+        "medium"
+        not in described(make_scene(random(*SHAPE), camera=make_camera(eye=outside)))["sensor_0"]
+    )
 
 
 def test_rays_of_which_only_some_start_inside_are_refused(make_scene, make_camera, random) -> None:

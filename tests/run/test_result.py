@@ -1,4 +1,6 @@
-"""The result of a run is a scene file that renders as what was found does, whichever numbers were varied."""
+"""The result of a run is a scene file that renders as what was found does, whichever numbers were
+varied.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,10 @@ from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.load import read_scene
 
-CROSS_SECTIONS = {"sigma_a, sigma_s": "sigma_a: 0.5\n  sigma_s: [6, 5, 4]", "sigma_t, albedo": "sigma_t: 7\n  albedo: [0.9, 0.8, 0.7]"}
+CROSS_SECTIONS = {
+    "sigma_a, sigma_s": "sigma_a: 0.5\n  sigma_s: [6, 5, 4]",
+    "sigma_t, albedo": "sigma_t: 7\n  albedo: [0.9, 0.8, 0.7]",
+}
 SCENE = """\
 volume:
   bounds: {{min: [-0.5, -0.4, -0.5], max: [0.5, 0.5, 0.6]}}
@@ -42,7 +47,10 @@ VARIED = [
     ("sigma_a: {init: [0.5, 1, 2], field: true}, sigma_s: {}", ["sigma_a"]),
     ("albedo: {init: 0.8, field: true}, density: {}", ["density", "albedo"]),
     ("sigma_t: {}, g: {}", []),
-    ("lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}, lights.2.position: {}, lights.2.intensity: {}", []),
+    (
+        "lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}, lights.2.position: {}, lights.2.intensity: {}",
+        [],
+    ),
     ("lights.1.radiance: {}, lights.1.scale: {}, lights.1.rotation: {}", []),
     ("views.front.camera: {}", []),
 ]
@@ -50,7 +58,15 @@ VARIED = [
 
 def moved(value: Tensor) -> Tensor:
     """`value` a little larger, everywhere by another amount."""
-    return value * (1.1 + 0.1 * torch.rand(value.shape, generator=torch.Generator().manual_seed(0), dtype=value.dtype)) + 0.01
+    return (
+        value
+        * (
+            1.1
+            + 0.1
+            * torch.rand(value.shape, generator=torch.Generator().manual_seed(0), dtype=value.dtype)
+        )
+        + 0.01
+    )
 
 
 def finished(folder: Path, cross_sections: str, parameters: str) -> Any:
@@ -77,14 +93,20 @@ def finished(folder: Path, cross_sections: str, parameters: str) -> Any:
 
 
 @pytest.mark.parametrize("cross_sections", CROSS_SECTIONS.values(), ids=CROSS_SECTIONS)
-@pytest.mark.parametrize(("parameters", "fields"), VARIED, ids=[parameters.partition(":")[0] for parameters, _ in VARIED])
-def test_a_result_renders_as_what_was_found(tmp_path: Path, cross_sections: str, parameters: str, fields: Sequence[str]) -> None:
+@pytest.mark.parametrize(
+    ("parameters", "fields"), VARIED, ids=[parameters.partition(":")[0] for parameters, _ in VARIED]
+)
+def test_a_result_renders_as_what_was_found(
+    tmp_path: Path, cross_sections: str, parameters: str, fields: Sequence[str]
+) -> None:
     found = finished(tmp_path, cross_sections, parameters)
     again = load_scene(tmp_path / "out" / RESULT)
     assert again.optimize is None and [view.name for view in again.views] == ["front", "side"]
     for view in ("front", "side"):
         wanted = render(found, view)
-        assert torch.allclose(render(again, view), wanted, rtol=1e-4, atol=1e-5 * float(wanted.max()))
+        assert torch.allclose(
+            render(again, view), wanted, rtol=1e-4, atol=1e-5 * float(wanted.max())
+        )
     assert {"density", *fields} <= {path.stem for path in (tmp_path / "out" / "volumes").iterdir()}
 
 
@@ -95,11 +117,23 @@ def test_a_result_does_not_depend_on_where_its_folder_lies(tmp_path: Path) -> No
 
 
 def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
-    write_field(tmp_path / "start.npz", "density", np.full((4, 5, 6), 0.3), np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]]))
+    write_field(
+        tmp_path / "start.npz",
+        "density",
+        np.full((4, 5, 6), 0.3),
+        np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]]),
+    )
     text = CROSS_SECTIONS["sigma_t, albedo"]
     found = finished(tmp_path, text, "density: {}")
     scene = (
-        (tmp_path / "scene.yaml").read_text().replace("density: 0.4", "density: {file: start.npz}").replace("  resolution: [6, 5, 4]\n", "")
+        (tmp_path / "scene.yaml")
+        .read_text()
+        .replace("density: 0.4", "density: {file: start.npz}")
+        .replace("  resolution: [6, 5, 4]\n", "")
     )
     (tmp_path / "scene.yaml").write_text(scene)
-    assert load_scene(tmp_path / "scene.yaml").volume.grid == found.volume.grid == load_scene(tmp_path / "out" / RESULT).volume.grid
+    assert (
+        load_scene(tmp_path / "scene.yaml").volume.grid
+        == found.volume.grid
+        == load_scene(tmp_path / "out" / RESULT).volume.grid
+    )

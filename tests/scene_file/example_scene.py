@@ -6,7 +6,9 @@ from typing import Any
 
 import yaml
 
-CAMERA = "{type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], fov: 28, resolution: [8, 6]}"
+CAMERA = (
+    "{type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], fov: 28, resolution: [8, 6]}"
+)
 SCENE = f"""\
 volume:
   bounds: {{min: [-0.5, -0.75, -0.5], max: [0.5, 0.75, 0.5]}}
@@ -26,4 +28,6 @@ views:
 def changed(**sections: Any) -> str:
     """`SCENE` with whole sections replaced, or, where the value is None, left out."""
     tree = yaml.safe_load(SCENE) | sections
-    return yaml.safe_dump({name: value for name, value in tree.items() if value is not None}, sort_keys=False)
+    return yaml.safe_dump(
+        {name: value for name, value in tree.items() if value is not None}, sort_keys=False
+    )

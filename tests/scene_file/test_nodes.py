@@ -23,7 +23,17 @@ Refusal = Callable[..., list[str]]
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        *[("1e-3", 1e-3), ("1E5", 1e5), ("-.5", -0.5), ("+3.", 3.0), ("1e+05", 1e5), ("010", 10), ("0x1F", 31), ("0o17", 15), ("-7", -7)],
+        *[
+            ("1e-3", 1e-3),
+            ("1E5", 1e5),
+            ("-.5", -0.5),
+            ("+3.", 3.0),
+            ("1e+05", 1e5),
+            ("010", 10),
+            ("0x1F", 31),
+            ("0o17", 15),
+            ("-7", -7),
+        ],
         *[
             ("yes", "yes"),
             ("no", "no"),
@@ -34,7 +44,15 @@ Refusal = Callable[..., list[str]]
             (".", "."),
             ("2020-01-01", "2020-01-01"),
         ],
-        *[("true", True), ("False", False), ("null", None), ("~", None), ("", None), (".inf", math.inf), ("-.Inf", -math.inf)],
+        *[
+            ("true", True),
+            ("False", False),
+            ("null", None),
+            ("~", None),
+            ("", None),
+            (".inf", math.inf),
+            ("-.Inf", -math.inf),
+        ],
     ],
 )
 def test_plain_scalars_follow_yaml_1_2(text: str, value: object):
@@ -56,19 +74,38 @@ def value_of(text: str) -> object:
 
 
 def test_quoted_scalars_are_text():
-    assert value_of('"1e3"') == "1e3" and value_of("'true'") == "true" and value_of('"\\ud83d\\ude00"') == "\N{GRINNING FACE}"
+    assert (
+        value_of('"1e3"') == "1e3"
+        and value_of("'true'") == "true"
+        and value_of('"\\ud83d\\ude00"') == "\N{GRINNING FACE}"
+    )
 
 
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("a: &x 1\nb: *x\n", "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out"),
-        ("a: 1\nb: [*x]\n", "scene.yaml:2:5: b.0: anchors and aliases are not supported; write the value out"),
-        ("a: &x [*x]\n", "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out"),
-        ("a: !!python/name:os.system x\n", "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:python/name:os.system' are not supported"),
+        (
+            "a: &x 1\nb: *x\n",
+            "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out",
+        ),
+        (
+            "a: 1\nb: [*x]\n",
+            "scene.yaml:2:5: b.0: anchors and aliases are not supported; write the value out",
+        ),
+        (
+            "a: &x [*x]\n",
+            "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out",
+        ),
+        (
+            "a: !!python/name:os.system x\n",
+            "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:python/name:os.system' are not supported",
+        ),
         ("a: 1\n---\nb: 2\n", "scene.yaml:2:1: a second document begins here; only one is allowed"),
         ("? [a]\n: 1\n", "scene.yaml:1:3: ?: a key must be plain text"),
-        ("a: [1,\n", "scene.yaml:2:1: not YAML: while parsing a flow node, expected the node content, but found '<stream end>'"),
+        (
+            "a: [1,\n",
+            "scene.yaml:2:1: not YAML: while parsing a flow node, expected the node content, but found '<stream end>'",
+        ),
         (
             "a: 1\n\tb: 2\n",
             "scene.yaml:2:1: not YAML: while scanning for the next token, found character '\\t' that cannot start any token",
@@ -101,7 +138,9 @@ def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
             read_scene(path)
         return str(caught.value)
 
-    assert problem(tmp_path / "a.yaml").endswith("a.yaml: cannot be read: No such file or directory")
+    assert problem(tmp_path / "a.yaml").endswith(
+        "a.yaml: cannot be read: No such file or directory"
+    )
     assert "cannot be read" in problem(tmp_path)
     (tmp_path / "b.yaml").write_bytes(b"a: b\n" + b"\n" * MAX_BYTES)
     start = time.perf_counter()

@@ -32,15 +32,23 @@ Refusal = Callable[..., list[str]]
 
 
 def test_a_ring_is_the_ring_of_the_reference_views():
-    cameras = ring_cameras(RingSection(count=10, radius=3.2, fov=28, height=0.3, resolution=(128, 128)))
+    cameras = ring_cameras(
+        RingSection(count=10, radius=3.2, fov=28, height=0.3, resolution=(128, 128))
+    )
     for camera, origin in zip(cameras, ORIGINS, strict=True):
         assert camera.origin == pytest.approx(origin, abs=1e-12)
-        assert camera == PerspectiveSection(origin=camera.origin, target=(0, 0, 0), up=(0, 1, 0), fov=28, resolution=(128, 128))
+        assert camera == PerspectiveSection(
+            origin=camera.origin, target=(0, 0, 0), up=(0, 1, 0), fov=28, resolution=(128, 128)
+        )
 
 
 def test_a_ring_goes_around_its_target():
     first, second = ring_cameras(RingSection(count=2, radius=2, fov=30, target=(1, 2, 3)))
-    assert first.origin == pytest.approx((1, 2, 5)) and second.origin == pytest.approx((1, 2, 1)) and first.target == (1, 2, 3)
+    assert (
+        first.origin == pytest.approx((1, 2, 5))
+        and second.origin == pytest.approx((1, 2, 1))
+        and first.target == (1, 2, 3)
+    )
 
 
 def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path):
@@ -58,7 +66,9 @@ def test_images_are_sorted_and_relative_to_the_scene(read: Read, tmp_path: Path)
     (tmp_path / "targets" / "t_d.exr").mkdir()
     ring = {name: value for name, value in RING.items() if name != "resolution"}
     views = read(changed(views={"ring": ring, "images": "targets/t_*.exr"})).tree.views
-    assert [view.image for view in views] == [tmp_path / "targets" / f"t_{name}.exr" for name in "abc"]
+    assert [view.image for view in views] == [
+        tmp_path / "targets" / f"t_{name}.exr" for name in "abc"
+    ]
 
 
 def test_as_many_images_as_cameras(refusal: Refusal, tmp_path: Path):

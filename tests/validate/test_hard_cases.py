@@ -1,4 +1,6 @@
-"""Scenes at the edges of what is allowed: images and gradients stay finite, and single precision follows double."""
+"""Scenes at the edges of what is allowed: images and gradients stay finite, and single precision
+follows double.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ SHAPE = (6, 5, 7)
 BOTH = {"directional": (3.0,), "ambient": (0.5,)}
 PRECISION = 1e-3
 NO_DIRECTION = "eye at the center of a cell"
-"""There the direction from the cell towards the camera is nothing but rounding, and g makes the gradient depend on it."""
+"""There the direction from the cell towards the camera is nothing but rounding, and g makes the
+gradient depend on it.
+"""
 
 
 def empty(shape: tuple[int, int, int]) -> Tensor:
@@ -25,7 +29,9 @@ def empty(shape: tuple[int, int, int]) -> Tensor:
 
 
 def half_full(shape: tuple[int, int, int]) -> Tensor:
-    return (2 * torch.rand(shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 1).clamp(min=0)
+    return (
+        2 * torch.rand(shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 1
+    ).clamp(min=0)
 
 
 def hot_voxel(shape: tuple[int, int, int]) -> Tensor:
@@ -46,9 +52,19 @@ CASES: dict[str, dict[str, Any]] = {
     "albedo 0": {"sigma_a": (8.0,), "sigma_s": (0.0,)},
     "vacuum of cross sections": {"sigma_a": (0.0,), "sigma_s": (0.0,)},
     "hot voxel": {"density": hot_voxel, "sigma_a": (0.1,), "sigma_s": (0.9,)},
-    "hot voxel, albedo 1, forward": {"density": hot_voxel, "sigma_a": (0.0,), "sigma_s": (1.0,), "g": 0.7},
+    "hot voxel, albedo 1, forward": {
+        "density": hot_voxel,
+        "sigma_a": (0.0,),
+        "sigma_s": (1.0,),
+        "g": 0.7,
+    },
     "checkerboard": {"density": checkerboard, "sigma_a": (0.1,), "sigma_s": (0.9,)},
-    "checkerboard, backward": {"density": checkerboard, "sigma_a": (0.1,), "sigma_s": (0.9,), "g": -0.5},
+    "checkerboard, backward": {
+        "density": checkerboard,
+        "sigma_a": (0.1,),
+        "sigma_s": (0.9,),
+        "g": -0.5,
+    },
     "g = 0.95": {"g": 0.95},
     "g = -0.95": {"g": -0.95},
     "one cell along z": {"shape": (1, 5, 7), "g": 0.4},
@@ -58,8 +74,13 @@ CASES: dict[str, dict[str, Any]] = {
     "light along x": {"travel": (1.0, 0.0, 0.0)},
     "light along -y": {"travel": (0.0, -1.0, 0.0), "g": 0.4},
     "light along z": {"travel": (0.0, 0.0, 1.0), "g": -0.4},
-    "view along an axis": {"view": {"eye": (0.0, 0.0, 2.5), "size": (5, 5)}, "travel": (0.0, 0.0, -1.0)},
-    "view along an axis, parallel": {"view": {"eye": (0.0, 0.0, 2.5), "size": (5, 5), "is_perspective": False}},
+    "view along an axis": {
+        "view": {"eye": (0.0, 0.0, 2.5), "size": (5, 5)},
+        "travel": (0.0, 0.0, -1.0),
+    },
+    "view along an axis, parallel": {
+        "view": {"eye": (0.0, 0.0, 2.5), "size": (5, 5), "is_perspective": False}
+    },
     NO_DIRECTION: {"view": {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}, "g": 0.4},
     "eye on a face": {"view": {"eye": (0.0, 0.0, 0.5)}},
 }
@@ -74,7 +95,10 @@ def rendered(make_scene, make_camera) -> Callable[[str, torch.dtype], tuple[Tens
     @cache
     def make(name: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         options = {"sigma_a": (0.5,), "sigma_s": (7.0,), **BOTH} | CASES[name]
-        density, view = options.pop("density", half_full)(options.pop("shape", SHAPE)), options.pop("view", {})
+        density, view = (
+            options.pop("density", half_full)(options.pop("shape", SHAPE)),
+            options.pop("view", {}),
+        )
         density = density.to(dtype).requires_grad_()
         image = render(make_scene(density, camera=make_camera(dtype=dtype, **view), **options))
         return image.detach(), torch.autograd.grad(image.sum(), density)[0]
@@ -107,14 +131,20 @@ def test_single_precision_follows_double(name: str, rendered):
 @pytest.mark.parametrize("name", [name for name in CASES if name != NO_DIRECTION])
 def test_gradients_in_single_precision_follow_double(name: str, rendered):
     single, double = (rendered(name, dtype)[1].double() for dtype in (torch.float32, torch.float64))
-    error = float((single - double).norm() / double.norm().clamp(min=torch.finfo(torch.float32).tiny))
+    error = float(
+        (single - double).norm() / double.norm().clamp(min=torch.finfo(torch.float32).tiny)
+    )
     assert error < PRECISION, f"{error:.1e}"
 
 
 @pytest.mark.parametrize("density", [half_full, hot_voxel, checkerboard])
 @pytest.mark.parametrize(("sigma_a", "sigma_s"), [(10.0, 2.0), (0.5, 8.0), (0.0, 8.0)])
-def test_isotropic_light_is_never_negative_in_the_dark(density: Callable[..., Tensor], sigma_a: float, sigma_s: float, make_scene):
-    """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either sign, and L0 may dip below zero."""
+def test_isotropic_light_is_never_negative_in_the_dark(
+    density: Callable[..., Tensor], sigma_a: float, sigma_s: float, make_scene
+):
+    """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either
+    sign, and L0 may dip below zero.
+    """
     scene = make_scene(density(SHAPE), sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
     mean = solve_light(scene, SolveMemory()).outgoing.mean
     assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0

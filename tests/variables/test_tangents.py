@@ -1,4 +1,6 @@
-"""Derivative images: equal to central differences of the image, component by component, and to what closed forms say."""
+"""Derivative images: equal to central differences of the image, component by component, and to what
+closed forms say.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,12 @@ def scene(make_scene: Callable[..., Scene], random: Callable[..., Tensor]) -> Sc
 
 def images_of(scene: Scene) -> dict[str, Tensor]:
     parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
-    return {"image": render(scene)[0], "reduced": parts.reduced, "single": parts.single, "multiple": parts.multiple}
+    return {
+        "image": render(scene)[0],
+        "reduced": parts.reduced,
+        "single": parts.single,
+        "multiple": parts.multiple,
+    }
 
 
 NAMES = [
@@ -45,11 +52,18 @@ NAMES += ["views.view.camera.rotation_y", "views.view.camera.z"]
 def test_a_derivative_image_is_the_central_difference_of_the_image(scene: Scene, name: str) -> None:
     variable, change = variation(scene, name)
     found = render_tangent(scene, name, images_of)
-    high, low = (images_of(with_values(scene, {variable: value_of(scene, variable) + way * STEP * change})) for way in (1, -1))
+    high, low = (
+        images_of(with_values(scene, {variable: value_of(scene, variable) + way * STEP * change}))
+        for way in (1, -1)
+    )
     for key, (image, derivative) in found.items():
         difference = (high[key] - low[key]) / (2 * STEP)
-        assert (derivative - difference).abs().max() <= 1e-6 * max(1e-2, float(difference.abs().max())), key
-        assert torch.equal(image, images_of(scene)[key]) or torch.allclose(image, images_of(scene)[key], rtol=1e-11)
+        assert (derivative - difference).abs().max() <= 1e-6 * max(
+            1e-2, float(difference.abs().max())
+        ), key
+        assert torch.equal(image, images_of(scene)[key]) or torch.allclose(
+            image, images_of(scene)[key], rtol=1e-11
+        )
 
 
 def test_components_of_a_derivative_sum_to_it(scene: Scene) -> None:

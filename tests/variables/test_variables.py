@@ -24,16 +24,37 @@ def scene(make_scene: Callable[..., Scene], random: Callable[..., Tensor]) -> Sc
 def test_every_name_has_a_value_and_putting_it_back_changes_nothing(scene: Scene) -> None:
     image = render(scene)
     for name in variable_names(scene):
-        torch.testing.assert_close(render(with_values(scene, {name: value_of(scene, name)})), image, rtol=1e-12, atol=1e-15)
+        torch.testing.assert_close(
+            render(with_values(scene, {name: value_of(scene, name)})), image, rtol=1e-12, atol=1e-15
+        )
 
 
-@pytest.mark.parametrize("name", ["density", "sigma_a", "sigma_s", "g", "lights.0.irradiance", "lights.0.direction", "lights.1.radiance"])
-def test_a_value_that_is_put_in_comes_out_and_the_scene_keeps_its_own(scene: Scene, name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [
+        "density",
+        "sigma_a",
+        "sigma_s",
+        "g",
+        "lights.0.irradiance",
+        "lights.0.direction",
+        "lights.1.radiance",
+    ],
+)
+def test_a_value_that_is_put_in_comes_out_and_the_scene_keeps_its_own(
+    scene: Scene, name: str
+) -> None:
     before = value_of(scene, name).clone()
     changed = with_values(scene, {name: before + 0.1})
-    assert torch.equal(value_of(changed, name), before + 0.1) and torch.equal(value_of(scene, name), before)
+    assert torch.equal(value_of(changed, name), before + 0.1) and torch.equal(
+        value_of(scene, name), before
+    )
     follows = {"sigma_t", "albedo"} if name.startswith("sigma") else set()
-    moved = {other for other in variable_names(scene) if not torch.equal(value_of(changed, other), value_of(scene, other))}
+    moved = {
+        other
+        for other in variable_names(scene)
+        if not torch.equal(value_of(changed, other), value_of(scene, other))
+    }
     assert moved == {name} | follows
 
 
@@ -46,7 +67,9 @@ def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(
     values = {name: value_of(changed, name) for name in ("sigma_t", "albedo")}
     again = with_values(scene, values)
     for name in ("sigma_a", "sigma_s"):
-        torch.testing.assert_close(value_of(again, name), value_of(changed, name), rtol=1e-13, atol=1e-15)
+        torch.testing.assert_close(
+            value_of(again, name), value_of(changed, name), rtol=1e-13, atol=1e-15
+        )
 
 
 def test_a_field_and_a_constant_mix(scene: Scene, random: Callable[..., Tensor]) -> None:
@@ -58,7 +81,9 @@ def test_a_field_and_a_constant_mix(scene: Scene, random: Callable[..., Tensor])
 
 def test_the_albedo_of_nothing_is_nothing(scene: Scene) -> None:
     nothing = torch.zeros(3, dtype=torch.float64)
-    assert torch.equal(value_of(with_values(scene, {"sigma_a": nothing, "sigma_s": nothing}), "albedo"), nothing)
+    assert torch.equal(
+        value_of(with_values(scene, {"sigma_a": nothing, "sigma_s": nothing}), "albedo"), nothing
+    )
 
 
 def test_one_density_fills_the_grid(scene: Scene) -> None:
@@ -67,7 +92,15 @@ def test_one_density_fills_the_grid(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["depth", "lights.2.radiance", "lights.0.radiance", "lights.x.radiance", "views.none.camera", "views.view"]
+    "name",
+    [
+        "depth",
+        "lights.2.radiance",
+        "lights.0.radiance",
+        "lights.x.radiance",
+        "views.none.camera",
+        "views.view",
+    ],
 )
 def test_what_a_scene_does_not_have_is_refused(scene: Scene, name: str) -> None:
     with pytest.raises(KeyError):

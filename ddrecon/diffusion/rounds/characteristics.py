@@ -1,9 +1,12 @@
-"""Radiance along one direction through the whole grid, by short characteristics: w . grad I + kappa_t I = kappa_s (q + q1 . w) (E11).
+"""Radiance along one direction through the whole grid, by short characteristics: w . grad I +
+kappa_t I = kappa_s (q + q1 . w) (E11).
 
-Slices across the axis along which the direction crosses most cells are visited in the order light does. A ray reaches each cell's center
-from the slice before, where it crossed between centers; depth and scattering depth of the step are those of the mean of its ends, and
-what scatters into the ray is linear in depth between them. Radiance is never negative where that is not, and a white furnace exact.
-All steps are made at once but for the one recurrence I_k = passed_k I_{k-1} + source_k, differentiated by hand in both modes.
+Slices across the axis along which the direction crosses most cells are visited in the order light
+does. A ray reaches each cell's center from the slice before, where it crossed between centers;
+depth and scattering depth of the step are those of the mean of its ends, and what scatters into the
+ray is linear in depth between them. Radiance is never negative where that is not, and a white
+furnace exact. All steps are made at once but for the one recurrence I_k = passed_k I_{k-1} +
+source_k, differentiated by hand in both modes.
 """
 
 from __future__ import annotations
@@ -25,12 +28,15 @@ SLICES, ROWS, COLUMNS = 0, 2, 3
 Direction = tuple[float, float, float]
 """A unit vector in array order, the way light travels."""
 NEARLY = 1e-9
-"""Drifts this near to none or to a whole cell are taken as that: no interpolation is needed then."""
+"""Drifts this near to none or to a whole cell are taken as that: no interpolation is needed then.
+"""
 
 
 @dataclass(frozen=True)
 class Course:
-    """How a direction crosses a grid: `order` of array axes that puts slices first, drifts [cells a slice] with their signs, `step` [u]."""
+    """How a direction crosses a grid: `order` of array axes that puts slices first, drifts [cells a
+    slice] with their signs, `step` [u].
+    """
 
     order: tuple[int, int, int, int]
     forward: int
@@ -40,7 +46,9 @@ class Course:
     @staticmethod
     def of(grid: Grid, direction: Direction) -> Course:
         """The course of unit `direction` (array order) through `grid`."""
-        speed = [component / spacing for component, spacing in zip(direction, grid.spacing, strict=True)]
+        speed = [
+            component / spacing for component, spacing in zip(direction, grid.spacing, strict=True)
+        ]
         axis = max(range(3), key=lambda a: abs(speed[a]))
         rows, columns = (a for a in range(3) if a != axis)
         drifts = (speed[rows] / abs(speed[axis]), speed[columns] / abs(speed[axis]))
@@ -57,22 +65,33 @@ class Course:
         return values.permute([self.order.index(dim) for dim in range(4)])
 
     def before(self, values: Tensor, is_repeated: bool) -> Tensor:
-        """`values` where rays were one slice earlier; beyond the edges of the box those at its edge, or zero."""
+        """`values` where rays were one slice earlier; beyond the edges of the box those at its
+        edge, or zero.
+        """
         values = _moved(values, COLUMNS, self.drift[1], is_repeated)
-        return _moved(_moved(values, ROWS, self.drift[0], is_repeated), SLICES, self.forward, is_repeated)
+        return _moved(
+            _moved(values, ROWS, self.drift[0], is_repeated), SLICES, self.forward, is_repeated
+        )
 
 
-def radiance_along(medium: Medium, light: Moments, inflow: Tensor | None, direction: Direction) -> Tensor:
-    """I [C, z, y, x] at cell centers along unit `direction` of travel (array order), of what `light` scatters into it (E11).
+def radiance_along(
+    medium: Medium, light: Moments, inflow: Tensor | None, direction: Direction
+) -> Tensor:
+    """I [C, z, y, x] at cell centers along unit `direction` of travel (array order), of what
+    `light` scatters into it (E11).
 
-    `light`: the moments q and q1 of all light that scatters, to which `medium` gives (1 - f) kappa_s; `inflow` [C, 1, 1, 1]: the radiance
-    that enters the box, None for none.
+    `light`: the moments q and q1 of all light that scatters, to which `medium` gives (1 - f)
+    kappa_s; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none.
     """
     course = Course.of(medium.grid, direction)
     z, y, x = light.mean.new_tensor(direction)
     here = course.lay(light.along((z, y, x)))
     mass = _crossed(medium.extinction, course)
-    scattering = mass if medium.scattering.field is medium.extinction.field else _crossed(medium.scattering, course)
+    scattering = (
+        mass
+        if medium.scattering.field is medium.extinction.field
+        else _crossed(medium.scattering, course)
+    )
     depth = mass * _scale(medium.extinction)
     line, lost = decayed_line(here, course.before(here, is_repeated=True), depth)
     source = line * (scattering * ((1 - medium.forward_fraction) * _scale(medium.scattering)))
@@ -82,7 +101,8 @@ def radiance_along(medium: Medium, light: Moments, inflow: Tensor | None, direct
 
 
 def follow(passed: Tensor, source: Tensor, course: Course) -> Tensor:
-    """I [slices, C, rows, columns] with I_k = `passed`_k (I_{k-1} where rays were then) + `source`_k, zero before the first slice.
+    """I [slices, C, rows, columns] with I_k = `passed`_k (I_{k-1} where rays were then) +
+    `source`_k, zero before the first slice.
 
     `passed` may have one channel where `source` has C.
     """
@@ -91,7 +111,9 @@ def follow(passed: Tensor, source: Tensor, course: Course) -> Tensor:
 
 
 def _crossed(coefficient: Coefficient, course: Course) -> Tensor:
-    """The integral of the coefficient's field over the step to each cell, as linear between its ends; no medium beyond the box."""
+    """The integral of the coefficient's field over the step to each cell, as linear between its
+    ends; no medium beyond the box.
+    """
     field = course.lay(coefficient.field)
     return (field + course.before(field, is_repeated=False)) * (0.5 * course.step)
 
@@ -101,7 +123,9 @@ def _scale(coefficient: Coefficient) -> Tensor:
 
 
 def _moved(values: Tensor, dim: int, drift: float, is_repeated: bool) -> Tensor:
-    """`values` at a place `drift` cells, at most one, before each along `dim`, linear between cells."""
+    """`values` at a place `drift` cells, at most one, before each along `dim`, linear between
+    cells.
+    """
     if drift == 0:
         return values
     edge = values.narrow(dim, 0 if drift > 0 else values.shape[dim] - 1, 1)
@@ -127,7 +151,11 @@ class _Follow(torch.autograd.Function):
         passed, out = ctx.saved_tensors
         source_bar = _recur_transposed(passed, out_bar, ctx.course)
         passed_bar = source_bar * ctx.course.before(out, is_repeated=False)
-        return passed_bar if passed.shape == out.shape else passed_bar.sum(1, keepdim=True), source_bar, None
+        return (
+            passed_bar if passed.shape == out.shape else passed_bar.sum(1, keepdim=True),
+            source_bar,
+            None,
+        )
 
     @staticmethod
     def jvp(ctx: Any, d_passed: Tensor | None, d_source: Tensor | None, _: None) -> Tensor:
@@ -162,18 +190,26 @@ def _in_order(count: int, forward: int) -> range:
 
 
 class _Shift:
-    """`_moved` along rows and columns with zeros beyond the edges, in place: slices are many and small."""
+    """`_moved` along rows and columns with zeros beyond the edges, in place: slices are many and
+    small.
+    """
 
     def __init__(self, like: Tensor, drift: tuple[float, float]):
         channels, height, width = like.shape
         rows, columns = (abs(d) for d in drift)
-        padded, self.between = like.new_zeros(channels, height + 1, width + 1), like.new_empty(channels, height, width + 1)
+        padded, self.between = (
+            like.new_zeros(channels, height + 1, width + 1),
+            like.new_empty(channels, height, width + 1),
+        )
         self.result = torch.empty_like(like)
         low, left = int(drift[0] > 0), int(drift[1] > 0)
         self.inner = padded[:, low : low + height, left : left + width]
         self.weights = rows, columns
         self.row_ends = padded[:, low : low + height], padded[:, 1 - low : 1 - low + height]
-        self.column_ends = self.between[:, :, left : left + width], self.between[:, :, 1 - left : 1 - left + width]
+        self.column_ends = (
+            self.between[:, :, left : left + width],
+            self.between[:, :, 1 - left : 1 - left + width],
+        )
 
     def apply(self, values: Tensor) -> Tensor:
         """`values` moved; the same buffer at every call."""

@@ -16,7 +16,8 @@ TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
 
 @contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`, with its suffix, that becomes `path` when the block ends well and vanishes when not.
+    """A temporary name beside `path`, with its suffix, that becomes `path` when the block ends well
+    and vanishes when not.
 
     Raises FormatError where the system refuses to write.
     """
@@ -31,7 +32,9 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
-    """As `replace_file`, but safe from a loss of power once it has ended; what `path` was until then is kept as `kept_as`."""
+    """As `replace_file`, but safe from a loss of power once it has ended; what `path` was until
+    then is kept as `kept_as`.
+    """
     with replace_file(path) as temporary:
         yield temporary
         flush(temporary)
@@ -48,7 +51,9 @@ def remove_temporaries(folder: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """Has the system put the file or folder at `path` on its disk; raises FormatError where it cannot."""
+    """Has the system put the file or folder at `path` on its disk; raises FormatError where it
+    cannot.
+    """
     with refusals(path):
         handle = os.open(path, os.O_RDONLY)
         try:

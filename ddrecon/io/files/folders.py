@@ -1,4 +1,6 @@
-"""Output folders: nothing that is there is ever overwritten without being asked to, and only one process writes."""
+"""Output folders: nothing that is there is ever overwritten without being asked to, and only one
+process writes.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from ddrecon.io.files.lock import LOCK, hold_lock
 def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
     """Makes the folder `path`, and keeps other processes out of it until the block ends.
 
-    Raises SceneError where it is a file, where another process writes there, or where it holds something and `may_exist` is False.
+    Raises SceneError where it is a file, where another process writes there, or where it holds
+    something and `may_exist` is False.
     """
     if path.exists() and not path.is_dir():
         raise SceneError(f"{path}: is a file; name a folder for the output")

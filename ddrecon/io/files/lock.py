@@ -1,6 +1,8 @@
-"""One process at a time in a folder: a lock file that says which, and that is seen to be stale once the process is gone.
+"""One process at a time in a folder: a lock file that says which, and that is seen to be stale once
+the process is gone.
 
-A process is known by its number and by when it started, since numbers are used again. Of processes on other machines nothing is known.
+A process is known by its number and by when it started, since numbers are used again. Of processes
+on other machines nothing is known.
 """
 
 from __future__ import annotations
@@ -68,9 +70,15 @@ def _discard_stale(path: Path) -> None:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """What the lock at `path` says; None where it is gone, {} where it says nothing that can be understood."""
+    """What the lock at `path` says; None where it is gone, {} where it says nothing that can be
+    understood.
+    """
     try:
-        content = json.loads(path.read_bytes()) if path.stat().st_size <= MAX_BYTES and path.is_file() else None
+        content = (
+            json.loads(path.read_bytes())
+            if path.stat().st_size <= MAX_BYTES and path.is_file()
+            else None
+        )
     except FileNotFoundError:
         return None
     except (OSError, ValueError):
@@ -83,15 +91,23 @@ def _require_stale(path: Path, holder: dict[str, Any] | None) -> None:
         return
     pid, host = holder.get("pid"), holder.get("host")
     if not isinstance(pid, int) or not isinstance(host, str):
-        raise SceneError(f"{path}: a lock that does not say whose it is; if nothing writes to {path.parent}, remove it")
+        raise SceneError(
+            f"{path}: a lock that does not say whose it is; if nothing writes to {path.parent}, remove it"
+        )
     if host != socket.gethostname():
-        raise SceneError(f"{path.parent}: process {pid} on {host!r} is writing there; if it is not, remove {path}")
+        raise SceneError(
+            f"{path.parent}: process {pid} on {host!r} is writing there; if it is not, remove {path}"
+        )
     if _identity(pid) == holder:
-        raise SceneError(f"{path.parent}: process {pid} is writing there; wait for it, or choose another folder")
+        raise SceneError(
+            f"{path.parent}: process {pid} is writing there; wait for it, or choose another folder"
+        )
 
 
 def _identity(pid: int) -> dict[str, Any] | None:
-    """Who process `pid` of this machine is: its number, and when it started where the system tells; None if there is no such process."""
+    """Who process `pid` of this machine is: its number, and when it started where the system tells;
+    None if there is no such process.
+    """
     identity = {"pid": pid, "host": socket.gethostname()}
     try:
         state, *numbers = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -100,7 +116,15 @@ def _identity(pid: int) -> dict[str, Any] | None:
     except OSError:
         return identity
     is_over = state in "ZX"
-    return None if is_over else {**identity, "boot": Path("/proc/sys/kernel/random/boot_id").read_text().strip(), "start": numbers[18]}
+    return (
+        None
+        if is_over
+        else {
+            **identity,
+            "boot": Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
+            "start": numbers[18],
+        }
+    )
 
 
 def _is_running(pid: int) -> bool:

@@ -1,4 +1,6 @@
-"""OpenEXR images, through the `OpenEXR` module of the extra `exr`. Linear; alpha, where present, is premultiplied by convention."""
+"""OpenEXR images, through the `OpenEXR` module of the extra `exr`. Linear; alpha, where present, is
+premultiplied by convention.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +24,16 @@ def has_exr() -> bool:
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4]; raises FormatError when it cannot be used."""
+    """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4]; raises FormatError
+    when it cannot be used.
+    """
     module = load_for_file("OpenEXR", path)
     try:
         _check_window(module.File(str(path), header_only=True).header(), path)
-        channels = {name: channel.pixels for name, channel in module.File(str(path), separate_channels=True).channels().items()}
+        channels = {
+            name: channel.pixels
+            for name, channel in module.File(str(path), separate_channels=True).channels().items()
+        }
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise FormatError(path, f"not a complete OpenEXR image: {error}") from error
     planes = [as_float32(channels[name]) for name in _chosen(list(channels), path)]
@@ -56,4 +63,7 @@ def _chosen(names: list[str], path: Path) -> list[str]:
         return names
     if set(names) == {"Y", "A"}:
         return ["Y", "Y", "Y", "A"]
-    raise FormatError(path, f"has the channels {', '.join(names)}; expected R, G, B, optionally A, or a single one")
+    raise FormatError(
+        path,
+        f"has the channels {', '.join(names)}; expected R, G, B, optionally A, or a single one",
+    )

@@ -1,4 +1,6 @@
-"""The sRGB transfer curve (IEC 61966-2-1), between linear radiance and what 8-bit files store, both in [0, 1]."""
+"""The sRGB transfer curve (IEC 61966-2-1), between linear radiance and what 8-bit files store, both
+in [0, 1].
+"""
 
 from __future__ import annotations
 

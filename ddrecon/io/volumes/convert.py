@@ -13,9 +13,11 @@ from ddrecon.io.volumes.table import field_names, read_field, require_format, wr
 
 
 def convert(sources: Sequence[Path], output: Path, *, may_exist: bool) -> list[Path]:
-    """Writes all fields of the volumes `sources` to `output`, in the format of its suffix; returns what was written.
+    """Writes all fields of the volumes `sources` to `output`, in the format of its suffix; returns
+    what was written.
 
-    Raises SceneError where `output` is there and may not be, FormatError for volumes of different cells or boxes, and for none at all.
+    Raises SceneError where `output` is there and may not be, FormatError for volumes of different
+    cells or boxes, and for none at all.
     """
     require_format(output)
     if output.exists() and not may_exist:
@@ -29,7 +31,11 @@ def convert(sources: Sequence[Path], output: Path, *, may_exist: bool) -> list[P
             _require_same_cells(path, fields[name], next(iter(fields.values())))
     if not fields:
         raise FormatError(sources[0], "has no fields")
-    write_fields(output, {name: field.values for name, field in fields.items()}, _bounds(sources[0], next(iter(fields.values()))))
+    write_fields(
+        output,
+        {name: field.values for name, field in fields.items()},
+        _bounds(sources[0], next(iter(fields.values()))),
+    )
     return [output]
 
 
@@ -38,10 +44,15 @@ def _require_same_cells(path: Path, field: Field, first: Field) -> None:
         ours, theirs = (" x ".join(map(str, each.resolution)) for each in (field, first))
         raise FormatError(path, f"has {ours} cells (x, y, z), the first field {theirs}")
     if not np.array_equal(_bounds(path, field), _bounds(path, first)):
-        raise FormatError(path, f"lies in the box {_bounds(path, field).tolist()}, the first field in {_bounds(path, first).tolist()}")
+        raise FormatError(
+            path,
+            f"lies in the box {_bounds(path, field).tolist()}, the first field in {_bounds(path, first).tolist()}",
+        )
 
 
 def _bounds(path: Path, field: Field) -> np.ndarray:
     if field.bounds is None:
-        raise FormatError(path, 'says no box; add an array "bounds", [[xmin, ymin, zmin], [xmax, ymax, zmax]]')
+        raise FormatError(
+            path, 'says no box; add an array "bounds", [[xmin, ymin, zmin], [xmax, ymax, zmax]]'
+        )
     return field.bounds

@@ -1,4 +1,6 @@
-"""Volumes as NumPy archives: each field under its own name, with `bounds` [[xmin, ymin, zmin], [xmax, ymax, zmax]] beside it."""
+"""Volumes as NumPy archives: each field under its own name, with `bounds` [[xmin, ymin, zmin],
+[xmax, ymax, zmax]] beside it.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,22 @@ from ddrecon.io.files.arrays import read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.volumes.field import Field, Fields, check_field
 
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, NotImplementedError, RuntimeError)
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    OSError,
+    ValueError,
+    NotImplementedError,
+    RuntimeError,
+)
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def read_npz(path: Path, name: str) -> Field:
-    """The field `name` of the archive at `path`; raises FormatError when it is damaged, absent or not a legal field."""
+    """The field `name` of the archive at `path`; raises FormatError when it is damaged, absent or
+    not a legal field.
+    """
     with _open(path) as archive:
         names = _names(archive)
         if name not in names:
@@ -31,7 +43,9 @@ def read_npz(path: Path, name: str) -> Field:
 
 
 def npz_names(path: Path) -> list[str]:
-    """The names of all arrays of the archive at `path` but `bounds`; raises FormatError when it is damaged."""
+    """The names of all arrays of the archive at `path` but `bounds`; raises FormatError when it is
+    damaged.
+    """
     with _open(path) as archive:
         return [name for name in _names(archive) if name != "bounds"]
 
@@ -42,7 +56,9 @@ def _open(path: Path) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(path) as archive:
             yield archive
     except zipfile.BadZipFile as error:
-        raise FormatError(path, f"not a complete .npz archive: {error}; write it with numpy.savez_compressed") from error
+        raise FormatError(
+            path, f"not a complete .npz archive: {error}; write it with numpy.savez_compressed"
+        ) from error
     except _DAMAGE as error:
         raise FormatError(path, f"cannot be read: {error}") from error
 
@@ -52,16 +68,23 @@ def _names(archive: zipfile.ZipFile) -> list[str]:
 
 
 def write_npz(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 under their names, with `bounds` [2, 3] (x, y, z), compressed."""
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 under their names, with `bounds`
+    [2, 3] (x, y, z), compressed.
+    """
     with replace_file(path) as temporary, temporary.open("wb") as stream:
-        arrays = {name: np.asarray(values, np.float32) for name, values in fields.items()} | {"bounds": np.asarray(bounds, np.float64)}
+        arrays = {name: np.asarray(values, np.float32) for name, values in fields.items()} | {
+            "bounds": np.asarray(bounds, np.float64)
+        }
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str, path: Path) -> np.ndarray:
     entry = archive.getinfo(f"{name}.npy")
     if entry.compress_type not in _METHODS:
-        raise FormatError(path, f"{name} is compressed by method {entry.compress_type}; write it with numpy.savez_compressed")
+        raise FormatError(
+            path,
+            f"{name} is compressed by method {entry.compress_type}; write it with numpy.savez_compressed",
+        )
     with archive.open(entry) as stream:
         return read_npy(stream, entry.file_size, path, name)
 

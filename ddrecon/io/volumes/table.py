@@ -22,7 +22,9 @@ from ddrecon.io.volumes.vti import read_vti, vti_names, write_vti
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """How one kind of volume file is read and written: `names(path)`, `read(path, name)`, `write(path, fields, bounds)`."""
+    """How one kind of volume file is read and written: `names(path)`, `read(path, name)`,
+    `write(path, fields, bounds)`.
+    """
 
     names: Callable[[Path], list[str]]
     read: Callable[[Path, str], Field]
@@ -47,19 +49,25 @@ def field_names(path: Path) -> list[str]:
 
 
 def read_field(path: Path, name: str) -> Field:
-    """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`; raises FormatError when it cannot be used."""
+    """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`; raises FormatError
+    when it cannot be used.
+    """
     read = _format_of(path).read
     with guard_reading(path):
         return read(path, name)
 
 
 def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
-    """Writes `values` [z, y, x] or [z, y, x, 3] and `bounds` [2, 3] (x, y, z) in the format of `path`'s suffix, as float32."""
+    """Writes `values` [z, y, x] or [z, y, x, 3] and `bounds` [2, 3] (x, y, z) in the format of
+    `path`'s suffix, as float32.
+    """
     write_fields(path, {name: values}, bounds)
 
 
 def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes several fields of the same cells, by name, each as `write_field`; raises FormatError where the format holds but one."""
+    """Writes several fields of the same cells, by name, each as `write_field`; raises FormatError
+    where the format holds but one.
+    """
     _format_of(path).write(path, fields, bounds)
 
 
@@ -72,4 +80,6 @@ def _format_of(path: Path) -> VolumeFormat:
     try:
         return FORMATS[path.suffix.lower()]
     except KeyError:
-        raise FormatError(path, f"unknown volume format {path.suffix!r}; known: {', '.join(FORMATS)}") from None
+        raise FormatError(
+            path, f"unknown volume format {path.suffix!r}; known: {', '.join(FORMATS)}"
+        ) from None

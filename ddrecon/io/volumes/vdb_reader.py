@@ -1,4 +1,6 @@
-"""Reading OpenVDB files, through the module `openvdb` (`pyopenvdb` before OpenVDB 11), which Debian and Blender have but pip has not."""
+"""Reading OpenVDB files, through the module `openvdb` (`pyopenvdb` before OpenVDB 11), which Debian
+and Blender have but pip has not.
+"""
 
 from __future__ import annotations
 
@@ -23,18 +25,24 @@ COMPONENTS = {"float": 1, "double": 1, "half": 1, "vec3s": 3, "vec3d": 3}
 
 
 def vdb_names(path: Path) -> list[str]:
-    """The names of the scalar and vector grids of the file at `path`; raises FormatError when it cannot be read."""
+    """The names of the scalar and vector grids of the file at `path`; raises FormatError when it
+    cannot be read.
+    """
     return list(_grids(path))
 
 
 def read_vdb(path: Path, name: str) -> Field:
-    """The grid `name` of the file at `path`, over the cells it was written with or else the active voxels of all such grids together.
+    """The grid `name` of the file at `path`, over the cells it was written with or else the active
+    voxels of all such grids together.
 
-    Raises FormatError when it cannot be read, is absent, turned against the axes, or not a legal field.
+    Raises FormatError when it cannot be read, is absent, turned against the axes, or not a legal
+    field.
     """
     grids = _grids(path)
     if name not in grids:
-        raise FormatError(path, f"has no grid {name!r}; it has {', '.join(map(repr, grids)) or 'none'}")
+        raise FormatError(
+            path, f"has no grid {name!r}; it has {', '.join(map(repr, grids)) or 'none'}"
+        )
     grid = grids[name]
     low, high = _cells(path, grid, list(grids.values()))
     components = COMPONENTS[grid.valueTypeName]
@@ -69,8 +77,14 @@ def _module(path: Path) -> ModuleType:
 
 def _cells(path: Path, grid: Any, others: list[Any]) -> tuple[np.ndarray, np.ndarray]:
     """The indices (x, y, z) of the first and the last cell."""
-    active = [other for other in others if other.activeVoxelCount() and np.array_equal(_map(path, other), _map(path, grid))]
-    boxes = np.array([other.evalActiveVoxelBoundingBox() for other in active], int).reshape(-1, 2, 3)
+    active = [
+        other
+        for other in others
+        if other.activeVoxelCount() and np.array_equal(_map(path, other), _map(path, grid))
+    ]
+    boxes = np.array([other.evalActiveVoxelBoundingBox() for other in active], int).reshape(
+        -1, 2, 3
+    )
     written = np.array(grid.metadata.get(RESOLUTION, (0, 0, 0)))
     if ((boxes >= 0) & (boxes < written)).all():
         low, high = np.zeros(3, int), written - 1
@@ -82,14 +96,24 @@ def _cells(path: Path, grid: Any, others: list[Any]) -> tuple[np.ndarray, np.nda
 
 
 def _map(path: Path, grid: Any) -> np.ndarray:
-    """Index to world as [[scale], [shift]], both (x, y, z); raises FormatError unless cells lie along the axes."""
-    origin, *ends = (np.array(grid.transform.indexToWorld(tuple(place))) for place in np.vstack([np.zeros(3), np.eye(3)]))
+    """Index to world as [[scale], [shift]], both (x, y, z); raises FormatError unless cells lie
+    along the axes.
+    """
+    origin, *ends = (
+        np.array(grid.transform.indexToWorld(tuple(place)))
+        for place in np.vstack([np.zeros(3), np.eye(3)])
+    )
     turn = np.stack(ends) - origin
     scale = np.diagonal(turn)
     if (np.abs(turn - np.diag(scale)) > 1e-6 * np.abs(scale).max()).any() or (scale <= 0).any():
-        raise FormatError(path, f"grid {grid.name!r} is turned, mirrored or in perspective; resample it along the axes first")
+        raise FormatError(
+            path,
+            f"grid {grid.name!r} is turned, mirrored or in perspective; resample it along the axes first",
+        )
     return np.stack([scale, origin])
 
 
 def _bounds(grid: Any, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    return np.array([grid.transform.indexToWorld(tuple(corner.tolist())) for corner in (low - 0.5, high + 0.5)])
+    return np.array(
+        [grid.transform.indexToWorld(tuple(corner.tolist())) for corner in (low - 0.5, high + 0.5)]
+    )

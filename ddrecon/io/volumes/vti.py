@@ -1,6 +1,8 @@
-"""Volumes as VTK image data (.vti), which ParaView opens: each field a cell array of its own name, three components for colors.
+"""Volumes as VTK image data (.vti), which ParaView opens: each field a cell array of its own name,
+three components for colors.
 
-Written as float32, appended raw. Read: uncompressed cell arrays of float32 or float64, appended raw or inline in base64 ("binary").
+Written as float32, appended raw. Read: uncompressed cell arrays of float32 or float64, appended raw
+or inline in base64 ("binary").
 """
 
 from __future__ import annotations
@@ -28,16 +30,21 @@ ADVICE = 'save it uncompressed, cell data as Float32, encoded "Appended raw" or 
 
 
 def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and `bounds` [2, 3] (x, y, z) as origin and spacing."""
-    cells, (low, high) = np.array(next(iter(fields.values())).shape[2::-1]), np.asarray(bounds, np.float64)
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and `bounds` [2, 3] (x, y,
+    z) as origin and spacing.
+    """
+    cells, (low, high) = (
+        np.array(next(iter(fields.values())).shape[2::-1]),
+        np.asarray(bounds, np.float64),
+    )
     extent = " ".join(f"0 {count}" for count in cells)
-    origin, spacing = (" ".join(repr(float(number)) for number in line) for line in (low, (high - low) / cells))
+    origin, spacing = (
+        " ".join(repr(float(number)) for number in line) for line in (low, (high - low) / cells)
+    )
     arrays, data = "", b""
     for name, values in fields.items():
         components = values.shape[3] if values.ndim == 4 else 1
-        arrays += (
-            f'<DataArray type="Float32" Name={quoteattr(name)} NumberOfComponents="{components}" format="appended" offset="{len(data)}"/>\n'
-        )
+        arrays += f'<DataArray type="Float32" Name={quoteattr(name)} NumberOfComponents="{components}" format="appended" offset="{len(data)}"/>\n'
         block = as_float32(values).astype("<f4", copy=False).tobytes()
         data += np.array(len(block), "<u8").tobytes() + block
     head = f"""<?xml version="1.0"?>
@@ -61,7 +68,9 @@ def vti_names(path: Path) -> list[str]:
 
 
 def read_vti(path: Path, name: str) -> Field:
-    """The cell array `name` of the file at `path`; raises FormatError when it is damaged, absent, compressed or not a legal field."""
+    """The cell array `name` of the file at `path`; raises FormatError when it is damaged, absent,
+    compressed or not a legal field.
+    """
     with _open(path) as (root, appended):
         values, bounds = _read(path, root, appended, name)
     return check_field(path, name, values, bounds)
@@ -77,11 +86,15 @@ def _open(path: Path) -> Iterator[tuple[ElementTree.Element, bytes]]:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     head, appended = _split(content)
     if b"<!DOCTYPE" in head:
-        raise FormatError(path, f"has a document type, which may define entities without end; {ADVICE}")
+        raise FormatError(
+            path, f"has a document type, which may define entities without end; {ADVICE}"
+        )
     try:
         yield ElementTree.fromstring(head), appended
     except (ElementTree.ParseError, ValueError, KeyError, OverflowError) as error:
-        raise FormatError(path, f"not VTK image data that can be read ({error}); {ADVICE}") from error
+        raise FormatError(
+            path, f"not VTK image data that can be read ({error}); {ADVICE}"
+        ) from error
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:
@@ -92,19 +105,24 @@ def _split(content: bytes) -> tuple[bytes, bytes]:
     return content[: mark.start()] + b"</VTKFile>", content[mark.end() :]
 
 
-def _read(path: Path, root: ElementTree.Element, appended: bytes, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _read(
+    path: Path, root: ElementTree.Element, appended: bytes, name: str
+) -> tuple[np.ndarray, np.ndarray]:
     if "compressor" in root.attrib:
         raise ValueError("compressed")
     image = _only(root, "ImageData")
     extent = [int(number) for number in image.attrib["WholeExtent"].split()]
     x, y, z = (last - first for first, last in zip(extent[::2], extent[1::2], strict=True))
     origin, spacing = (
-        np.array([float(number) for number in image.get(key, one).split()]) for key, one in (("Origin", "0 0 0"), ("Spacing", "1 1 1"))
+        np.array([float(number) for number in image.get(key, one).split()])
+        for key, one in (("Origin", "0 0 0"), ("Spacing", "1 1 1"))
     )
     low = origin + spacing * extent[::2]
     arrays = _arrays(_piece(root))
     if name not in arrays:
-        raise FormatError(path, f"has no cell array {name!r}; it has {', '.join(map(repr, arrays)) or 'none'}")
+        raise FormatError(
+            path, f"has no cell array {name!r}; it has {', '.join(map(repr, arrays)) or 'none'}"
+        )
     array = arrays[name]
     order = ORDERS[root.get("byte_order", "LittleEndian")]
     header = np.dtype(order + HEADERS[root.get("header_type", "UInt32")])

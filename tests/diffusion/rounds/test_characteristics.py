@@ -1,4 +1,6 @@
-"""Radiance along one direction: closed forms, a slow twin, symmetry under reversal, and derivatives in both modes."""
+"""Radiance along one direction: closed forms, a slow twin, symmetry under reversal, and derivatives
+in both modes.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,24 @@ from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
-DIRECTIONS = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8), (-(3**-0.5),) * 3, (0.48, -0.36, 0.8), (-0.1, 0.7, -(0.5**0.5)))
+DIRECTIONS = (
+    (0.0, 0.0, 1.0),
+    (0.0, -1.0, 0.0),
+    (0.6, 0.0, -0.8),
+    (-(3**-0.5),) * 3,
+    (0.48, -0.36, 0.8),
+    (-0.1, 0.7, -(0.5**0.5)),
+)
 each_direction = pytest.mark.parametrize("direction", DIRECTIONS)
 
 
-def medium_of(density: Tensor, grid: Grid, albedo: float = 0.9, g: float = 0.0, colors: int = 1) -> Medium:
+def medium_of(
+    density: Tensor, grid: Grid, albedo: float = 0.9, g: float = 0.0, colors: int = 1
+) -> Medium:
     extinction = 4 + 3 * torch.arange(colors, dtype=density.dtype)
-    return scale_medium(Volume(grid, density, (1 - albedo) * extinction, albedo * extinction, density.new_tensor(g)))
+    return scale_medium(
+        Volume(grid, density, (1 - albedo) * extinction, albedo * extinction, density.new_tensor(g))
+    )
 
 
 def random_light(random, grid: Grid, colors: int = 1) -> Moments:
@@ -31,7 +44,9 @@ def random_light(random, grid: Grid, colors: int = 1) -> Moments:
 
 
 def at_previous(values: Tensor, point: list[float], edge: float | None) -> float:
-    """`values` [z, y, x] at a fractional cell index, at least one of which is whole; beyond the box `edge`, or the nearest cell's."""
+    """`values` [z, y, x] at a fractional cell index, at least one of which is whole; beyond the box
+    `edge`, or the nearest cell's.
+    """
     total = 0.0
     for corner in product((0, 1), repeat=3):
         cell, weight = [math.floor(p) + c for p, c in zip(point, corner, strict=True)], 1.0
@@ -53,13 +68,17 @@ def by_cells(medium: Medium, scatters: Tensor, direction: tuple[float, float, fl
     step = 1 / abs(speed[axis])
     radiance = torch.zeros_like(extinction)
     s, weights = (torch.from_numpy(array) for array in np.polynomial.legendre.leggauss(30))
-    for cell in sorted(product(*(range(n) for n in extinction.shape)), key=lambda c: c[axis] * speed[axis]):
+    for cell in sorted(
+        product(*(range(n) for n in extinction.shape)), key=lambda c: c[axis] * speed[axis]
+    ):
         point = [round(i - v * step, 12) for i, v in zip(cell, speed, strict=True)]
         depth = 0.5 * step * (float(extinction[cell]) + at_previous(extinction, point, 0.0))
         scattered = 0.5 * step * (float(scattering[cell]) + at_previous(scattering, point, 0.0))
         line = 0.5 * ((1 - s) * scatters[cell] + (1 + s) * at_previous(scatters, point, None))
         arriving = at_previous(radiance, point, 0.0) * math.exp(-depth)
-        radiance[cell] = arriving + scattered * float(0.5 * weights @ (line * torch.exp(-0.5 * depth * (1 + s))))
+        radiance[cell] = arriving + scattered * float(
+            0.5 * weights @ (line * torch.exp(-0.5 * depth * (1 + s)))
+        )
     return radiance
 
 
@@ -68,7 +87,12 @@ def test_slices_at_once_are_cells_one_by_one(random, box, direction):
     grid = box((3, 4, 5))
     medium, light = medium_of(4 * random(3, 4, 5), grid), random_light(random, grid)
     scatters = light.along(tuple(torch.tensor(c, dtype=torch.float64) for c in direction))[0]
-    torch.testing.assert_close(radiance_along(medium, light, None, direction)[0], by_cells(medium, scatters, direction), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        radiance_along(medium, light, None, direction)[0],
+        by_cells(medium, scatters, direction),
+        rtol=1e-12,
+        atol=0,
+    )
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -77,10 +101,19 @@ def test_along_an_axis_a_uniform_medium_follows_the_closed_form(box, axis: int, 
     grid, albedo = box((4, 5, 6)), 0.9
     medium = medium_of(torch.full((4, 5, 6), 0.7, dtype=torch.float64), grid, albedo)
     direction = tuple(float(sign * (a == axis)) for a in range(3))
-    found = radiance_along(medium, Moments(torch.full((1, 4, 5, 6), 2.0, dtype=torch.float64)), None, direction)
+    found = radiance_along(
+        medium, Moments(torch.full((1, 4, 5, 6), 2.0, dtype=torch.float64)), None, direction
+    )
     crossed = (torch.arange(grid.shape[axis], dtype=torch.float64) + 0.5) * grid.spacing[axis]
-    crossed = (crossed if sign > 0 else crossed.flip(0)).view([-1 if a == axis else 1 for a in range(3)])
-    torch.testing.assert_close(found[0], (2 * albedo * (1 - torch.exp(-4 * 0.7 * crossed))).expand(grid.shape), rtol=1e-12, atol=0)
+    crossed = (crossed if sign > 0 else crossed.flip(0)).view(
+        [-1 if a == axis else 1 for a in range(3)]
+    )
+    torch.testing.assert_close(
+        found[0],
+        (2 * albedo * (1 - torch.exp(-4 * 0.7 * crossed))).expand(grid.shape),
+        rtol=1e-12,
+        atol=0,
+    )
 
 
 @each_direction
@@ -96,14 +129,20 @@ def test_a_white_medium_in_a_white_room_stays_white(half_empty, box, direction):
 def test_turning_grid_and_direction_around_turns_the_radiance(random, box, direction):
     grid = box((4, 5, 3))
     medium, light = medium_of(random(4, 5, 3), grid), random_light(random, grid)
-    turned = replace(light, mean=light.mean.flip(1, 2, 3), flux=tuple(-part.flip(1, 2, 3) for part in light.flux))
+    turned = replace(
+        light, mean=light.mean.flip(1, 2, 3), flux=tuple(-part.flip(1, 2, 3) for part in light.flux)
+    )
     opposite = tuple(-c for c in direction)
     found = radiance_along(medium_of(random(4, 5, 3).flip(0, 1, 2), grid), turned, None, opposite)
-    torch.testing.assert_close(found.flip(1, 2, 3), radiance_along(medium, light, None, direction), rtol=1e-13, atol=0)
+    torch.testing.assert_close(
+        found.flip(1, 2, 3), radiance_along(medium, light, None, direction), rtol=1e-13, atol=0
+    )
 
 
 @each_direction
-def test_radiance_is_never_negative_where_nothing_that_scatters_is(random, half_empty, box, direction):
+def test_radiance_is_never_negative_where_nothing_that_scatters_is(
+    random, half_empty, box, direction
+):
     grid = box((6, 5, 4))
     for seed, thickness in enumerate((1e-6, 1.0, 1e3, 1e6)):
         medium = medium_of(thickness * half_empty(6, 5, 4, seed=seed), grid)
@@ -114,30 +153,48 @@ def test_radiance_is_never_negative_where_nothing_that_scatters_is(random, half_
 @each_direction
 def test_following_backward_is_the_adjoint_of_following(random, box, direction):
     course = Course.of(box((4, 5, 6)), direction)
-    laid = [course.lay(random(colors, 4, 5, 6, seed=seed)) for seed, colors in ((0, 1), (1, 3), (2, 3))]
+    laid = [
+        course.lay(random(colors, 4, 5, 6, seed=seed)) for seed, colors in ((0, 1), (1, 3), (2, 3))
+    ]
     passed, source, received = laid[0], laid[1].requires_grad_(), laid[2]
     found = follow(passed, source, course)
     (source_bar,) = torch.autograd.grad(found, source, received)
-    assert (source_bar * source).sum().item() == pytest.approx((found * received).sum().item(), rel=1e-13)
+    assert (source_bar * source).sum().item() == pytest.approx(
+        (found * received).sum().item(), rel=1e-13
+    )
 
 
 @each_direction
 @pytest.mark.parametrize("colors", [1, 3])
-def test_derivatives_agree_with_differences_in_both_modes(random, half_empty, box, direction, colors: int):
+def test_derivatives_agree_with_differences_in_both_modes(
+    random, half_empty, box, direction, colors: int
+):
     grid = box((3, 2, 4))
     density = (5 * half_empty(3, 2, 4)).requires_grad_()
-    inputs = [random_light(random, grid, colors).mean, *random_light(random, grid, colors).flux, random(colors, 1, 1, 1)]
+    inputs = [
+        random_light(random, grid, colors).mean,
+        *random_light(random, grid, colors).flux,
+        random(colors, 1, 1, 1),
+    ]
     inputs = [tensor.clone().requires_grad_() for tensor in inputs]
     g = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
 
-    def radiance(density: Tensor, g: Tensor, mean: Tensor, z: Tensor, y: Tensor, x: Tensor, inflow: Tensor) -> Tensor:
+    def radiance(
+        density: Tensor, g: Tensor, mean: Tensor, z: Tensor, y: Tensor, x: Tensor, inflow: Tensor
+    ) -> Tensor:
         extinction = density.new_tensor([3.0, 9.0, 20.0][:colors])
         medium = scale_medium(Volume(grid, density, 0.1 * extinction, 0.9 * extinction, g))
         return radiance_along(medium, Moments(mean, (z, y, x)), inflow, direction)
 
-    assert torch.autograd.gradcheck(radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        radiance, (density, g, *inputs), check_forward_ad=True, fast_mode=True
+    )
 
 
 def test_steps_across_flat_cells_are_counted_in_cells():
     course = Course.of(Grid((8, 4, 4), (0.0, 0.0, 0.0), (0.8, 4.0, 4.0)), (0.6, 0.8, 0.0))
-    assert course.order[0] == 1 and course.step == pytest.approx(0.1 / 0.6) and course.drift == (pytest.approx(0.8 / 0.6 * 0.1), 0)
+    assert (
+        course.order[0] == 1
+        and course.step == pytest.approx(0.1 / 0.6)
+        and course.drift == (pytest.approx(0.8 / 0.6 * 0.1), 0)
+    )

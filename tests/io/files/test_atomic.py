@@ -20,7 +20,9 @@ def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path: P
 
 
 @pytest.mark.parametrize("interruption", [ValueError, KeyboardInterrupt])
-def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, interruption: type[BaseException]):
+def test_an_interrupted_write_leaves_the_old_file(
+    tmp_path: Path, interruption: type[BaseException]
+):
     path = tmp_path / "a.txt"
     path.write_text("old")
     with pytest.raises(interruption), replace_file(path) as temporary:
@@ -30,5 +32,8 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, interruption: 
 
 
 def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):
-    with pytest.raises(FormatError, match="cannot be written"), replace_file(tmp_path / "absent" / "a.txt") as temporary:
+    with (
+        pytest.raises(FormatError, match="cannot be written"),
+        replace_file(tmp_path / "absent" / "a.txt") as temporary,
+    ):
         temporary.write_text("x")

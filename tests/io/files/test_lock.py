@@ -56,9 +56,13 @@ def test_the_lock_of_a_dead_process_is_stale(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="this system does not tell when a process started")
+@pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="this system does not tell when a process started"
+)
 @pytest.mark.parametrize("changed", [{"start": "1"}, {"boot": "another"}])
-def test_the_lock_of_a_process_whose_number_was_used_again_is_stale(tmp_path: Path, changed: dict[str, str]) -> None:
+def test_the_lock_of_a_process_whose_number_was_used_again_is_stale(
+    tmp_path: Path, changed: dict[str, str]
+) -> None:
     with hold_lock(tmp_path):
         own = holder(tmp_path)
     (tmp_path / LOCK).write_text(json.dumps(own | changed))
@@ -67,7 +71,11 @@ def test_the_lock_of_a_process_whose_number_was_used_again_is_stale(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("content", "what"), [('{"pid": 1, "host": "elsewhere"}', "'elsewhere' is writing"), ("", "does not say whose it is")]
+    ("content", "what"),
+    [
+        ('{"pid": 1, "host": "elsewhere"}', "'elsewhere' is writing"),
+        ("", "does not say whose it is"),
+    ],
 )
 def test_what_cannot_be_known_to_be_stale_is_kept(tmp_path: Path, content: str, what: str) -> None:
     (tmp_path / LOCK).write_text(content)

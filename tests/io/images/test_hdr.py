@@ -1,4 +1,6 @@
-"""Radiance pictures: every encoding and orientation comes back bit for bit, and damage is told, whatever it is."""
+"""Radiance pictures: every encoding and orientation comes back bit for bit, and damage is told,
+whatever it is.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,20 @@ def random_bytes(height: int, width: int, seed: int = 0, *, has_runs: bool = Tru
     pixels[..., 1] |= 128
     if has_runs:
         pixels[generator.random((height, width)) < 0.1] = 0
-        pixels = np.take_along_axis(pixels, np.sort(generator.integers(0, width, (height, width)), axis=1)[..., None], axis=1)
+        pixels = np.take_along_axis(
+            pixels,
+            np.sort(generator.integers(0, width, (height, width)), axis=1)[..., None],
+            axis=1,
+        )
     return pixels
 
 
 def decoded(pixels: np.ndarray) -> np.ndarray:
     """The definition, one number at a time."""
-    values = [[m * 2.0 ** (int(p[3]) - 136) if p[3] else 0.0 for m in p[:3].tolist()] for p in pixels.reshape(-1, 4)]
+    values = [
+        [m * 2.0 ** (int(p[3]) - 136) if p[3] else 0.0 for m in p[:3].tolist()]
+        for p in pixels.reshape(-1, 4)
+    ]
     return np.array(values, np.float32).reshape(*pixels.shape[:2], 3)
 
 
@@ -41,7 +50,11 @@ def flat(pixels: np.ndarray) -> bytes:
 
 def run_length(pixels: np.ndarray) -> bytes:
     """New-style scanlines: runs of 3 and more as such, the rest literally."""
-    return b"".join(bytes([2, 2, len(row) >> 8, len(row) & 255]) + b"".join(packets(plane.tobytes()) for plane in row.T) for row in pixels)
+    return b"".join(
+        bytes([2, 2, len(row) >> 8, len(row) & 255])
+        + b"".join(packets(plane.tobytes()) for plane in row.T)
+        for row in pixels
+    )
 
 
 def packets(plane: bytes) -> bytes:
@@ -51,7 +64,10 @@ def packets(plane: bytes) -> bytes:
         while end < len(plane) and plane[end] == plane[start] and end - start < 127:
             end += 1
         if end - start >= 3:
-            encoded, literal = encoded + literals(literal) + bytes([128 + end - start, plane[start]]), b""
+            encoded, literal = (
+                encoded + literals(literal) + bytes([128 + end - start, plane[start]]),
+                b"",
+            )
         else:
             literal += plane[start:end]
         start = end
@@ -59,11 +75,15 @@ def packets(plane: bytes) -> bytes:
 
 
 def literals(values: bytes) -> bytes:
-    return b"".join(bytes([len(values[i : i + 128])]) + values[i : i + 128] for i in range(0, len(values), 128))
+    return b"".join(
+        bytes([len(values[i : i + 128])]) + values[i : i + 128] for i in range(0, len(values), 128)
+    )
 
 
 def old_run_length(pixels: np.ndarray) -> bytes:
-    """Old-style scanlines: a pixel, then (1, 1, 1, n) for n more of it, base 256 with the lowest digit first."""
+    """Old-style scanlines: a pixel, then (1, 1, 1, n) for n more of it, base 256 with the lowest
+    digit first.
+    """
     encoded = b""
     for row in pixels.reshape(len(pixels), -1, 4):
         breaks = [0, *(np.flatnonzero((row[1:] != row[:-1]).any(axis=1)) + 1), len(row)]
@@ -85,10 +105,20 @@ def save(folder: Path, body: bytes, size: str, header: bytes = HEADER) -> Path:
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 @settings(max_examples=30, deadline=None)
-@given(height=st.integers(1, 4), width=st.one_of(st.integers(1, 20), st.integers(120, 700)), seed=st.integers(0, 2**32 - 1))
-def test_every_encoding_comes_back_bit_for_bit(tmp_path_factory: pytest.TempPathFactory, encoder: str, height: int, width: int, seed: int):
+@given(
+    height=st.integers(1, 4),
+    width=st.one_of(st.integers(1, 20), st.integers(120, 700)),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_every_encoding_comes_back_bit_for_bit(
+    tmp_path_factory: pytest.TempPathFactory, encoder: str, height: int, width: int, seed: int
+):
     pixels = random_bytes(height, max(width, 8) if encoder == "run_length" else width, seed)
-    path = save(tmp_path_factory.mktemp("hdr"), ENCODERS[encoder](pixels), f"-Y {height} +X {pixels.shape[1]}")
+    path = save(
+        tmp_path_factory.mktemp("hdr"),
+        ENCODERS[encoder](pixels),
+        f"-Y {height} +X {pixels.shape[1]}",
+    )
     found = read_hdr(path)
     assert found.dtype == np.float32 and np.array_equal(found, decoded(pixels))
 
@@ -102,29 +132,44 @@ def test_the_registered_reader_is_this_one(tmp_path: Path):
 
 def test_all_exponents_and_mantissas_are_exact(tmp_path: Path):
     """Down to numbers below float32's normal range, and up to its largest."""
-    pixels = np.stack(np.broadcast_arrays(255, np.arange(256)[None], 128, np.arange(256)[:, None]), -1).astype(np.uint8)
-    assert np.array_equal(read_hdr(save(tmp_path, run_length(pixels), "-Y 256 +X 256")), decoded(pixels))
+    pixels = np.stack(
+        np.broadcast_arrays(255, np.arange(256)[None], 128, np.arange(256)[:, None]), -1
+    ).astype(np.uint8)
+    assert np.array_equal(
+        read_hdr(save(tmp_path, run_length(pixels), "-Y 256 +X 256")), decoded(pixels)
+    )
 
 
 def test_long_old_runs(tmp_path: Path):
     pixels = np.tile(np.array([3, 200, 9, 130], np.uint8), (2, 65536, 1))
     body = old_run_length(pixels)
     assert len(body) == 2 * 12
-    assert np.array_equal(read_hdr(save(tmp_path, body, "-Y 2 +X 65536")), decoded(pixels[:1, :1]) + np.zeros((2, 65536, 1), np.float32))
+    assert np.array_equal(
+        read_hdr(save(tmp_path, body, "-Y 2 +X 65536")),
+        decoded(pixels[:1, :1]) + np.zeros((2, 65536, 1), np.float32),
+    )
 
 
 @pytest.mark.parametrize("first", ["-Y", "+Y", "-X", "+X"])
 @pytest.mark.parametrize("second", ["-", "+"])
 def test_every_orientation(tmp_path: Path, first: str, second: str):
-    """Row 0 is the top, +Y points up, +X to the right: the pixel stored first lies at the corner its signs name."""
+    """Row 0 is the top, +Y points up, +X to the right: the pixel stored first lies at the corner
+    its signs name.
+    """
     pixels = random_bytes(2, 9, has_runs=False)
-    image = read_hdr(save(tmp_path, run_length(pixels), f"{first} 2 {second}{'X' if first[1] == 'Y' else 'Y'} 9"))
+    image = read_hdr(
+        save(tmp_path, run_length(pixels), f"{first} 2 {second}{'X' if first[1] == 'Y' else 'Y'} 9")
+    )
     signs = {first[1]: first[0], "X" if first[1] == "Y" else "Y": second}
     assert image.shape[:2] == ((2, 9) if first[1] == "Y" else (9, 2))
     row, column = (0 if signs["Y"] == "-" else -1), (0 if signs["X"] == "+" else -1)
     assert np.array_equal(image[row, column], decoded(pixels)[0, 0])
     assert np.array_equal(image[-1 - row, -1 - column], decoded(pixels)[-1, -1])
-    beside = image[row, 1 if column == 0 else -2] if first[1] == "Y" else image[1 if row == 0 else -2, column]
+    beside = (
+        image[row, 1 if column == 0 else -2]
+        if first[1] == "Y"
+        else image[1 if row == 0 else -2, column]
+    )
     assert np.array_equal(beside, decoded(pixels)[0, 1])
 
 
@@ -135,7 +180,14 @@ def test_exposure_and_color_correction_are_divided_out(tmp_path: Path):
     assert np.array_equal(found, decoded(pixels) / np.array([2, 4, 8], np.float32))
 
 
-@pytest.mark.parametrize("header", [b"#?RGBE\n", b"#?RADIANCE\r\nFORMAT=32-bit_rle_rgbe\r\n", b"#?AUTOPANO\nFORMAT = 32-bit_rle_rgbe\n"])
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"#?RGBE\n",
+        b"#?RADIANCE\r\nFORMAT=32-bit_rle_rgbe\r\n",
+        b"#?AUTOPANO\nFORMAT = 32-bit_rle_rgbe\n",
+    ],
+)
 def test_other_headers_are_understood(tmp_path: Path, header: bytes):
     pixels = random_bytes(2, 9)
     path = save(tmp_path, run_length(pixels), "-Y 2 +X 9", header + b"\r" * (b"\r" in header))
@@ -149,7 +201,10 @@ def test_line_ends_among_pixels_do_not_end_the_header(tmp_path: Path):
 
 HEADERS = {
     "another format": (b"P6\n", "not a Radiance picture"),
-    "XYZE": (b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n", "32-bit_rle_xyze.*save it as 32-bit_rle_rgbe"),
+    "XYZE": (
+        b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n",
+        "32-bit_rle_xyze.*save it as 32-bit_rle_rgbe",
+    ),
     "no exposure": (HEADER + b"EXPOSURE=bright\n", "'bright' is no exposure"),
     "zero exposure": (HEADER + b"EXPOSURE=0\n", "no exposure"),
     "infinite exposure": (HEADER + b"EXPOSURE=inf\n", "no exposure"),
@@ -165,7 +220,18 @@ def test_headers_that_cannot_be_used(tmp_path: Path, case: str):
 
 
 @pytest.mark.parametrize(
-    "size", ["", "-Y 2", "-Y 2 -Y 9", "-Y two +X 9", "-Y -2 +X 9", "Y 2 X 9", "-Y 0 +X 9", "-Y 2 +X 70000", f"-Y 2 +X {'9' * 40}"]
+    "size",
+    [
+        "",
+        "-Y 2",
+        "-Y 2 -Y 9",
+        "-Y two +X 9",
+        "-Y -2 +X 9",
+        "Y 2 X 9",
+        "-Y 0 +X 9",
+        "-Y 2 +X 70000",
+        f"-Y 2 +X {'9' * 40}",
+    ],
 )
 def test_sizes_that_are_none(tmp_path: Path, size: str):
     with pytest.raises(FormatError, match=r"is no size such as|of each are read"):
@@ -178,7 +244,9 @@ def test_a_header_that_does_not_end(tmp_path: Path):
         read_hdr(tmp_path / "a.hdr")
 
 
-def test_a_size_beyond_memory_is_refused_and_one_beyond_the_file_takes_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_size_beyond_memory_is_refused_and_one_beyond_the_file_takes_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     with pytest.raises(FormatError, match="GiB"):
         read_hdr(save(tmp_path, bytes(100), "-Y 65536 +X 65536"))
     taken: list[int] = []
@@ -218,7 +286,9 @@ def test_a_file_cut_anywhere_is_damaged(tmp_path: Path, encoder: str):
 
 @settings(max_examples=200, deadline=None)
 @given(body=st.binary(max_size=120), width=st.integers(1, 40))
-def test_garbage_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, body: bytes, width: int):
+def test_garbage_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, body: bytes, width: int
+):
     path = save(tmp_path_factory.mktemp("hdr"), body, f"-Y 2 +X {width}")
     try:
         assert read_hdr(path).shape == (2, width, 3)

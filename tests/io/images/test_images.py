@@ -36,7 +36,9 @@ WRITERS = {".exr": write_exr, ".tif": write_tiff, ".tiff": write_tiff, ".npy": w
 @pytest.mark.parametrize("suffix", WRITERS)
 @settings(max_examples=15, deadline=None)
 @given(size=SIZES, seed=st.integers(0, 2**32 - 1))
-def test_float_images_come_back_bit_for_bit(tmp_path_factory: pytest.TempPathFactory, suffix: str, size: tuple[int, int], seed: int):
+def test_float_images_come_back_bit_for_bit(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, size: tuple[int, int], seed: int
+):
     path = tmp_path_factory.mktemp("image") / f"a{suffix.upper()}"
     pixels = pixels_of(seed, *size, 3)
     WRITERS[suffix](path.with_suffix(suffix), pixels)
@@ -71,10 +73,17 @@ def test_every_compression_of_exr_is_read(tmp_path: Path, compression: str, dtyp
     module = pytest.importorskip("OpenEXR")
     x, y = np.meshgrid(np.linspace(0.1, 1, 50), np.linspace(0.2, 1, 40))
     pixels = np.stack([x * y, 5 * x, y**2], -1).astype(dtype)
-    header = {"compression": getattr(module, f"{compression}_COMPRESSION"), "type": module.scanlineimage}
+    header = {
+        "compression": getattr(module, f"{compression}_COMPRESSION"),
+        "type": module.scanlineimage,
+    }
     module.File(header, {"RGB": pixels}).write(str(tmp_path / "a.exr"))
     found = read_image(tmp_path / "a.exr").pixels
-    assert np.array_equal(found, pixels) if compression in EXACT else np.allclose(found, pixels, rtol=0.01, atol=0.01)
+    assert (
+        np.array_equal(found, pixels)
+        if compression in EXACT
+        else np.allclose(found, pixels, rtol=0.01, atol=0.01)
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
@@ -131,11 +140,15 @@ def test_truncated_files_are_refused(tmp_path: Path, suffix: str, part: float):
 
 @pytest.mark.parametrize("suffix", WRITERS)
 @pytest.mark.parametrize(("value", "what"), [(np.nan, "NaN"), (-np.inf, "infinite")])
-def test_flawed_pixels_are_located_and_counted(tmp_path: Path, suffix: str, value: float, what: str):
+def test_flawed_pixels_are_located_and_counted(
+    tmp_path: Path, suffix: str, value: float, what: str
+):
     pixels = np.zeros((4, 5, 3), np.float32)
     pixels[1, 2, 1] = pixels[3, 0] = value
     WRITERS[suffix](tmp_path / f"a{suffix}", pixels)
-    with pytest.raises(FormatError, match=rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"):
+    with pytest.raises(
+        FormatError, match=rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
+    ):
         read_image(tmp_path / f"a{suffix}")
 
 
@@ -157,7 +170,9 @@ def test_unknown_suffix_lists_the_known(tmp_path: Path):
         read_image(tmp_path / "a.bmp")
 
 
-def test_without_openexr_the_extra_is_named_and_tiff_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_openexr_the_extra_is_named_and_tiff_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     (tmp_path / "a.exr").write_bytes(b"")
     with pytest.raises(FormatError, match=r'pip install "ddrecon\[exr\]"'):
@@ -171,7 +186,9 @@ def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
     pytest.importorskip("OpenEXR")
     pixels = pixels_of(5, 2, 3, 3).astype(np.float64)
     paths = write_linear(tmp_path / "front.single", pixels)
-    assert paths == [tmp_path / "front.single.exr", tmp_path / "front.single.npy"] and set(tmp_path.iterdir()) == set(paths)
+    assert paths == [tmp_path / "front.single.exr", tmp_path / "front.single.npy"] and set(
+        tmp_path.iterdir()
+    ) == set(paths)
     assert np.load(paths[1]).dtype == np.float32
     assert all(np.array_equal(read_image(path).pixels, pixels.astype(np.float32)) for path in paths)
 
@@ -196,7 +213,9 @@ def test_preview_is_8_bit_srgb_and_clipped(tmp_path: Path):
 def test_8_bit_colors_are_decoded_from_srgb(tmp_path: Path, suffix: str):
     stored = np.arange(0, 240, 5, dtype=np.uint8).reshape(4, 4, 3)
     Pillow.fromarray(stored).save(tmp_path / f"a{suffix}", lossless=True)
-    assert np.allclose(read_image(tmp_path / f"a{suffix}").pixels, srgb.decode(stored / 255), atol=1e-6)
+    assert np.allclose(
+        read_image(tmp_path / f"a{suffix}").pixels, srgb.decode(stored / 255), atol=1e-6
+    )
 
 
 def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
@@ -204,7 +223,9 @@ def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
     stored[0, :, 3] = 0, 51, 255
     iio.imwrite(tmp_path / "a.png", stored)
     image = read_image(tmp_path / "a.png")
-    assert image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1]) and image.coverage is not None
+    assert (
+        image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1]) and image.coverage is not None
+    )
     assert image.coverage[0].tolist() == pytest.approx([0, 0.2, 1])
 
 
@@ -219,7 +240,9 @@ def test_gray_with_alpha_palette_and_single_bits_are_read(tmp_path: Path):
 def test_16_bit_gray_uses_its_whole_range(tmp_path: Path):
     stored = np.array([[0, 30000, 65535]], np.uint16)
     iio.imwrite(tmp_path / "a.png", stored)
-    assert np.allclose(read_image(tmp_path / "a.png").pixels[..., 0], srgb.decode(stored / 65535), atol=1e-6)
+    assert np.allclose(
+        read_image(tmp_path / "a.png").pixels[..., 0], srgb.decode(stored / 65535), atol=1e-6
+    )
 
 
 def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
@@ -229,7 +252,9 @@ def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
 
 
 def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
-    stored = np.array([[[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]], np.uint8)
+    stored = np.array(
+        [[[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]], np.uint8
+    )
     iio.imwrite(tmp_path / "m.png", stored)
     mask = read_mask(tmp_path / "m.png")
     assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]

@@ -19,8 +19,16 @@ COLOR_TYPES = {2: 4, 3: 2, 4: 6}
 
 
 def filtered(pixels: np.ndarray, filters: list[int]) -> bytes:
-    """The bytes of `pixels` [h, w, c], row by row, by loops: each less its prediction by the filter of its row."""
-    rows = pixels.astype(f">u{pixels.itemsize}").view(np.uint8).reshape(len(pixels), -1).astype(int).tolist()
+    """The bytes of `pixels` [h, w, c], row by row, by loops: each less its prediction by the filter
+    of its row.
+    """
+    rows = (
+        pixels.astype(f">u{pixels.itemsize}")
+        .view(np.uint8)
+        .reshape(len(pixels), -1)
+        .astype(int)
+        .tolist()
+    )
     step, lines = pixels.shape[2] * pixels.itemsize, b""
     for y, (row, kind) in enumerate(zip(rows, filters, strict=True)):
         line = [kind]
@@ -35,10 +43,20 @@ def filtered(pixels: np.ndarray, filters: list[int]) -> bytes:
 
 def encoded(pixels: np.ndarray, filters: list[int], interlace: int = 0) -> bytes:
     height, width, channels = pixels.shape
-    header = struct.pack(">IIBBBBB", width, height, 8 * pixels.itemsize, COLOR_TYPES[channels], 0, 0, interlace)
+    header = struct.pack(
+        ">IIBBBBB", width, height, 8 * pixels.itemsize, COLOR_TYPES[channels], 0, 0, interlace
+    )
     body = zlib.compress(filtered(pixels, filters))
-    parts = [(b"IHDR", header), (b"gAMA", bytes(4)), (b"IDAT", body[:9]), (b"IDAT", body[9:]), (b"IEND", b"")]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts)
+    parts = [
+        (b"IHDR", header),
+        (b"gAMA", bytes(4)),
+        (b"IDAT", body[:9]),
+        (b"IDAT", body[9:]),
+        (b"IEND", b""),
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts
+    )
 
 
 def deep(channels: int) -> np.ndarray:
@@ -57,7 +75,11 @@ def test_all_sixteen_bits_are_kept(tmp_path: Path, channels: int) -> None:
     linear = srgb.decode(stored[..., : channels - (channels != 3)] / 65535)
     alpha = stored[..., -1:] / 65535 if channels != 3 else np.ones(1)
     np.testing.assert_allclose(image.pixels, np.broadcast_to(linear * alpha, (7, 5, 3)), atol=1e-6)
-    assert (image.coverage is None) if channels == 3 else np.allclose(image.coverage, alpha[..., 0], atol=1e-6)
+    assert (
+        (image.coverage is None)
+        if channels == 3
+        else np.allclose(image.coverage, alpha[..., 0], atol=1e-6)
+    )
 
 
 @pytest.mark.parametrize("channels", COLOR_TYPES)
@@ -68,7 +90,9 @@ def test_the_encoder_of_these_tests_is_right(tmp_path: Path, channels: int) -> N
     assert np.array_equal(np.array(Pillow.open(tmp_path / "a.png")), stored)
 
 
-def test_bands_of_rows_follow_from_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bands_of_rows_follow_from_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stored = deep(3)
     for band in (1, 2, 3, 100):
         monkeypatch.setattr(png16, "BAND", band)

@@ -28,26 +28,53 @@ def test_what_pillow_writes_is_read(tmp_path: Path):
 
 def test_big_endian_strips_are_read(tmp_path: Path):
     rows = np.arange(12, dtype=">f4").reshape(2, 2, 3)
-    tags = [(256, 2), (257, 2), (258, 32), (259, 1), (262, 2), (277, 3), (278, 2), (273, 8), (279, 48), (339, 3)]
+    tags = [
+        (256, 2),
+        (257, 2),
+        (258, 32),
+        (259, 1),
+        (262, 2),
+        (277, 3),
+        (278, 2),
+        (273, 8),
+        (279, 48),
+        (339, 3),
+    ]
     entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in sorted(tags))
-    data = struct.pack(">2sHI", b"MM", 42, 56) + rows.tobytes() + struct.pack(">H", len(tags)) + entries + bytes(4)
+    data = (
+        struct.pack(">2sHI", b"MM", 42, 56)
+        + rows.tobytes()
+        + struct.pack(">H", len(tags))
+        + entries
+        + bytes(4)
+    )
     (tmp_path / "a.tif").write_bytes(data)
     assert np.array_equal(tiff.read_tiff(tmp_path / "a.tif"), rows)
 
 
 @pytest.mark.parametrize(
-    ("compression", "mode", "what"), [("tiff_lzw", "F", "compressed"), (None, "RGB", "8-bit"), ("jpeg", "RGB", "compressed")]
+    ("compression", "mode", "what"),
+    [("tiff_lzw", "F", "compressed"), (None, "RGB", "8-bit"), ("jpeg", "RGB", "compressed")],
 )
-def test_other_kinds_are_refused_by_name(tmp_path: Path, compression: str | None, mode: str, what: str):
+def test_other_kinds_are_refused_by_name(
+    tmp_path: Path, compression: str | None, mode: str, what: str
+):
     Pillow.new(mode, (8, 8)).save(tmp_path / "a.tif", compression=compression)
     with pytest.raises(FormatError, match=f"{what}.*uncompressed 32-bit float"):
         tiff.read_tiff(tmp_path / "a.tif")
 
 
-@pytest.mark.parametrize(("tag", "value", "what"), [(284, 2, "planes"), (274, 3, "turned"), (262, 0, "photometric"), (339, 1, "format 1")])
-def test_other_layouts_are_refused(tmp_path: Path, tag: int, value: int, what: str, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("tag", "value", "what"),
+    [(284, 2, "planes"), (274, 3, "turned"), (262, 0, "photometric"), (339, 1, "format 1")],
+)
+def test_other_layouts_are_refused(
+    tmp_path: Path, tag: int, value: int, what: str, monkeypatch: pytest.MonkeyPatch
+):
     original = tiff._directory
-    monkeypatch.setattr(tiff, "_directory", lambda tags, start: original(tags | {tag: [value]}, start))
+    monkeypatch.setattr(
+        tiff, "_directory", lambda tags, start: original(tags | {tag: [value]}, start)
+    )
     tiff.write_tiff(tmp_path / "a.tif", np.ones((2, 2), np.float32))
     with pytest.raises(FormatError, match=what):
         tiff.read_tiff(tmp_path / "a.tif")
@@ -59,6 +86,8 @@ def test_every_flipped_byte_is_read_or_refused_but_never_a_crash(tmp_path: Path)
     data = path.read_bytes()
     for position in range(len(data)):
         for flip in (0x01, 0xFF):
-            path.write_bytes(data[:position] + bytes([data[position] ^ flip]) + data[position + 1 :])
+            path.write_bytes(
+                data[:position] + bytes([data[position] ^ flip]) + data[position + 1 :]
+            )
             with contextlib.suppress(FormatError):
                 tiff.read_tiff(path)

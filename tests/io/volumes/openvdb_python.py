@@ -1,4 +1,6 @@
-"""A Python that has the module `openvdb`: this one, or else the system's, where apt-get has put Debian's python3-openvdb."""
+"""A Python that has the module `openvdb`: this one, or else the system's, where apt-get has put
+Debian's python3-openvdb.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,10 @@ np.savez(path.with_suffix(".found.npz"), **arrays)
 def require() -> str:
     """The path of that Python; the test is skipped where there is none."""
     for python in CANDIDATES:
-        if Path(python).exists() and subprocess.run([python, "-c", IMPORT], capture_output=True).returncode == 0:
+        if (
+            Path(python).exists()
+            and subprocess.run([python, "-c", IMPORT], capture_output=True).returncode == 0
+        ):
             return python
     pytest.skip("no Python here has the module openvdb: apt-get install python3-openvdb")
 
@@ -36,7 +41,12 @@ def require() -> str:
 def run(code: str, *arguments: object) -> str:
     """What `code` prints there; raises AssertionError with its last line of stderr where it fails."""
     environment = {"PYTHONPATH": str(Path(ddrecon.__file__).parents[1])}
-    done = subprocess.run([require(), "-c", code, *map(str, arguments)], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [require(), "-c", code, *map(str, arguments)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -50,8 +60,13 @@ def read_all(path: Path) -> dict[str, Field]:
 
 
 def described(code: str, path: Path) -> object:
-    """What the expression `code` about `grids`, the grids of the file at `path` by name, is, once it has been JSON."""
+    """What the expression `code` about `grids`, the grids of the file at `path` by name, is, once
+    it has been JSON.
+    """
     names = "try: import openvdb as vdb\nexcept ImportError: import pyopenvdb as vdb\n"
     return json.loads(
-        run(f"import json, sys\n{names}grids = {{g.name: g for g in vdb.readAll(sys.argv[1])[0]}}\nprint(json.dumps({code}))", path)
+        run(
+            f"import json, sys\n{names}grids = {{g.name: g for g in vdb.readAll(sys.argv[1])[0]}}\nprint(json.dumps({code}))",
+            path,
+        )
     )

@@ -15,9 +15,13 @@ BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]])
 VALUES = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
 
 
-@pytest.mark.parametrize("values", [VALUES, np.stack([VALUES, 2 * VALUES, 3 * VALUES], -1)], ids=["gray", "colors"])
+@pytest.mark.parametrize(
+    "values", [VALUES, np.stack([VALUES, 2 * VALUES, 3 * VALUES], -1)], ids=["gray", "colors"]
+)
 def test_mitsuba_reads_and_writes_the_same_files(tmp_path: Path, values: np.ndarray) -> None:
-    mitsuba = pytest.importorskip("mitsuba", reason="the comparison needs Mitsuba 3 (the extra `reference`)")
+    mitsuba = pytest.importorskip(
+        "mitsuba", reason="the comparison needs Mitsuba 3 (the extra `reference`)"
+    )
     mitsuba.set_variant("scalar_rgb")
     ours, theirs = tmp_path / "ours.vol", tmp_path / "theirs.vol"
     write_field(ours, "density", values, BOUNDS)
@@ -48,7 +52,9 @@ def altered(path: Path, offset: int, layout: str, value: int | bytes) -> Path:
         (24, "<f", 7.0, "bounds must be"),
     ],
 )
-def test_a_damaged_file_is_refused(tmp_path: Path, offset: int, layout: str, value: int | bytes, reason: str) -> None:
+def test_a_damaged_file_is_refused(
+    tmp_path: Path, offset: int, layout: str, value: int | bytes, reason: str
+) -> None:
     with pytest.raises(FormatError, match=reason):
         read_field(altered(tmp_path / "f.vol", offset, layout, value), "density")
 

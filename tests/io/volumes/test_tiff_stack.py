@@ -1,4 +1,6 @@
-"""TIFF stacks: what Fiji and napari are told of ours, what theirs become, and stacks told from images."""
+"""TIFF stacks: what Fiji and napari are told of ours, what theirs become, and stacks told from
+images.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,11 @@ def test_imagej_is_told_where_voxels_lie(tmp_path: Path) -> None:
     write_field(tmp_path / "smoke.tif", "density", VALUES[..., 0], BOUNDS)
     with tifffile.TiffFile(tmp_path / "smoke.tif") as file:
         facts, tags = file.imagej_metadata, file.pages[0].tags
-        assert len(file.pages) == 3 and file.series[0].axes == "ZYX" and np.array_equal(file.pages[1].asarray(), VALUES[1, :, :, 0])
+        assert (
+            len(file.pages) == 3
+            and file.series[0].axes == "ZYX"
+            and np.array_equal(file.pages[1].asarray(), VALUES[1, :, :, 0])
+        )
         per_unit = [np.divide(*tags[f"{axis}Resolution"].value) for axis in "XY"]
     size = [1 / per_unit[0], 1 / per_unit[1], facts["spacing"]]
     low = [-facts[f"{axis}origin"] * side for axis, side in zip("xyz", size, strict=True)]
@@ -34,9 +40,21 @@ def test_imagej_is_told_where_voxels_lie(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kept", [("spacing", "xorigin", "yorigin", "zorigin"), ("spacing",), ()])
-def test_stacks_of_fiji_have_the_box_of_their_calibration(tmp_path: Path, kept: tuple[str, ...]) -> None:
-    facts = {name: value for name, value in {"spacing": 1.0, "xorigin": 2.0, "yorigin": 0.5, "zorigin": -4}.items() if name in kept}
-    tifffile.imwrite(tmp_path / "f.tif", VALUES[..., 0], imagej=True, resolution=(2.0, 4.0), metadata={"axes": "ZYX", **facts})
+def test_stacks_of_fiji_have_the_box_of_their_calibration(
+    tmp_path: Path, kept: tuple[str, ...]
+) -> None:
+    facts = {
+        name: value
+        for name, value in {"spacing": 1.0, "xorigin": 2.0, "yorigin": 0.5, "zorigin": -4}.items()
+        if name in kept
+    }
+    tifffile.imwrite(
+        tmp_path / "f.tif",
+        VALUES[..., 0],
+        imagej=True,
+        resolution=(2.0, 4.0),
+        metadata={"axes": "ZYX", **facts},
+    )
     field = read_field(tmp_path / "f.tif", "density")
     assert np.array_equal(field.values, VALUES[..., 0])
     expected = {4: [[-1, -0.125, 4], [1, 1.125, 7]], 1: [[0, 0, 0], [2, 1.25, 3]]}
@@ -54,9 +72,13 @@ def test_stacks_of_fiji_have_the_box_of_their_calibration(tmp_path: Path, kept: 
     ],
     ids=["rgb", "plain pages", "compressed BigTIFF", "big-endian double", "8 bits"],
 )
-def test_stacks_of_other_programs(tmp_path: Path, pages: np.ndarray, options: dict[str, object]) -> None:
+def test_stacks_of_other_programs(
+    tmp_path: Path, pages: np.ndarray, options: dict[str, object]
+) -> None:
     tifffile.imwrite(tmp_path / "f.tif", pages, **options)
-    assert np.array_equal(read_field(tmp_path / "f.tif", "density").values, pages.astype(np.float32))
+    assert np.array_equal(
+        read_field(tmp_path / "f.tif", "density").values, pages.astype(np.float32)
+    )
     assert describe(tmp_path / "f.tif")["resolution"] == [4, 5, 3]
 
 
@@ -81,7 +103,9 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
     assert "No such file" in refusal(path)
     path.write_bytes(b"hello")
     assert "not a TIFF stack that can be read" in refusal(path)
-    tifffile.imwrite(path, np.ones((2, 3, 4, 5), np.float32), imagej=True, metadata={"axes": "TZYX"})
+    tifffile.imwrite(
+        path, np.ones((2, 3, 4, 5), np.float32), imagej=True, metadata={"axes": "TZYX"}
+    )
     assert "has the axes TZYX; expected slices" in refusal(path)
     tifffile.imwrite(path, np.ones((2, 3, 4), np.complex64), photometric="minisblack")
     assert "holds values of type complex64" in refusal(path)

@@ -20,9 +20,15 @@ BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]])
 
 
 @settings(max_examples=20, deadline=None)
-@given(shape=st.tuples(*[st.integers(1, 4)] * 3), colors=st.booleans(), seed=st.integers(0, 2**32 - 1))
+@given(
+    shape=st.tuples(*[st.integers(1, 4)] * 3), colors=st.booleans(), seed=st.integers(0, 2**32 - 1)
+)
 def test_fields_come_back_as_written(
-    tmp_path_factory: pytest.TempPathFactory, suffix: str, shape: tuple[int, int, int], colors: bool, seed: int
+    tmp_path_factory: pytest.TempPathFactory,
+    suffix: str,
+    shape: tuple[int, int, int],
+    colors: bool,
+    seed: int,
 ):
     path = tmp_path_factory.mktemp("field") / f"f{suffix}"
     values = np.random.default_rng(seed).random(shape + (3,) * colors).astype(np.float32)
@@ -91,7 +97,10 @@ def test_a_missing_name_lists_what_there_is(tmp_path: Path):
 
 def test_a_single_other_name_says_which_to_use(tmp_path: Path):
     path = saved(tmp_path / "f.npz", arr_0=np.ones((2, 2, 2)), bounds=BOUNDS)
-    assert refusal(path) == "has no field 'density', only 'arr_0'; save that array as 'density', or say name: arr_0 beside file"
+    assert (
+        refusal(path)
+        == "has no field 'density', only 'arr_0'; save that array as 'density', or say name: arr_0 beside file"
+    )
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 2), (2, 2, 2, 2), (2, 2, 2, 3, 1), (0, 2, 2)])
@@ -100,7 +109,9 @@ def test_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]):
 
 
 def test_objects_are_refused_unopened(tmp_path: Path):
-    assert "Python objects" in refusal(saved(tmp_path / "f.npz", density=np.array([[[{}]]], dtype=object)))
+    assert "Python objects" in refusal(
+        saved(tmp_path / "f.npz", density=np.array([[[{}]]], dtype=object))
+    )
 
 
 def test_complex_and_text_are_refused(tmp_path: Path):
@@ -109,7 +120,13 @@ def test_complex_and_text_are_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("value", "what"), [(np.nan, "NaN or infinite"), (np.inf, "NaN or infinite"), (1e300, "infinite"), (-0.5, "negative")]
+    ("value", "what"),
+    [
+        (np.nan, "NaN or infinite"),
+        (np.inf, "NaN or infinite"),
+        (1e300, "infinite"),
+        (-0.5, "negative"),
+    ],
 )
 def test_illegal_values_are_named_by_cell_in_world_order(tmp_path: Path, value: float, what: str):
     values = np.zeros((2, 3, 4))
@@ -120,12 +137,16 @@ def test_illegal_values_are_named_by_cell_in_world_order(tmp_path: Path, value: 
 
 @pytest.mark.parametrize("bounds", [BOUNDS[::-1], BOUNDS[:1], np.full((2, 3), np.nan), BOUNDS.T])
 def test_illegal_bounds_are_refused(tmp_path: Path, bounds: np.ndarray):
-    assert "bounds must be" in refusal(saved(tmp_path / "f.npz", density=np.ones((1, 1, 1)), bounds=bounds))
+    assert "bounds must be" in refusal(
+        saved(tmp_path / "f.npz", density=np.ones((1, 1, 1)), bounds=bounds)
+    )
 
 
 def header(shape: tuple[int, ...]) -> bytes:
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        stream, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
     return stream.getvalue()
 
 

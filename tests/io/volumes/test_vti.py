@@ -1,4 +1,6 @@
-"""VTK image data: laid out as VTK has it, read in its other plain encoding too, and damaged files are refused with advice."""
+"""VTK image data: laid out as VTK has it, read in its other plain encoding too, and damaged files
+are refused with advice.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def written(path: Path, values: np.ndarray, name: str = "density") -> Path:
 
 
 def inline(values: np.ndarray, kind: str, order: str, header: str) -> bytes:
-    """The same as another program may write it: base64 inside the element, an extent that does not begin at 0."""
+    """The same as another program may write it: base64 inside the element, an extent that does not
+    begin at 0.
+    """
     prefix = {"LittleEndian": "<", "BigEndian": ">"}[order]
     data = values.astype(prefix + {"Float32": "f4", "Float64": "f8"}[kind]).tobytes()
     count = np.array(len(data), prefix + {"UInt32": "u4", "UInt64": "u8"}[header]).tobytes()
@@ -64,7 +68,10 @@ def refusal(path: Path, name: str = "density") -> str:
 
 
 def test_a_missing_array_lists_what_there_is(tmp_path: Path) -> None:
-    assert refusal(written(tmp_path / "f.vti", corner(), "lwc")) == "has no cell array 'density'; it has 'lwc'"
+    assert (
+        refusal(written(tmp_path / "f.vti", corner(), "lwc"))
+        == "has no cell array 'density'; it has 'lwc'"
+    )
 
 
 def test_no_file(tmp_path: Path) -> None:
@@ -75,7 +82,11 @@ def test_no_file(tmp_path: Path) -> None:
     ("old", "new", "why"),
     [
         (b'type="ImageData"', b'type="PolyData"', "of type PolyData"),
-        (b'header_type="UInt64"', b'header_type="UInt64" compressor="vtkZLibDataCompressor"', "compressed"),
+        (
+            b'header_type="UInt64"',
+            b'header_type="UInt64" compressor="vtkZLibDataCompressor"',
+            "compressed",
+        ),
         (b'format="appended"', b'format="ascii"', "format ascii"),
         (b'Piece Extent="0 2', b'Piece Extent="0 1', "several pieces"),
         (b'type="Float32"', b'type="Int8"', "Int8"),
@@ -84,7 +95,9 @@ def test_no_file(tmp_path: Path) -> None:
         (b"\x18\0\0\0\0\0\0\0", b"\xff\xff\xff\xff\xff\xff\xff\x7f", "cut short"),
     ],
 )
-def test_what_cannot_be_read_is_refused_with_advice(tmp_path: Path, old: bytes, new: bytes, why: str) -> None:
+def test_what_cannot_be_read_is_refused_with_advice(
+    tmp_path: Path, old: bytes, new: bytes, why: str
+) -> None:
     path = tmp_path / "f.vti"
     write_field(path, "density", np.ones((3, 1, 2), np.float32), BOUNDS)
     content = path.read_bytes()
@@ -97,7 +110,9 @@ def test_what_cannot_be_read_is_refused_with_advice(tmp_path: Path, old: bytes, 
 def test_every_flipped_byte_is_read_or_refused_but_never_a_crash(tmp_path: Path) -> None:
     data = written(tmp_path / "f.vti", corner(3)).read_bytes()
     for position in range(0, len(data), 3):
-        (tmp_path / "f.vti").write_bytes(data[:position] + bytes([data[position] ^ 0x5A]) + data[position + 1 :])
+        (tmp_path / "f.vti").write_bytes(
+            data[:position] + bytes([data[position] ^ 0x5A]) + data[position + 1 :]
+        )
         with contextlib.suppress(FormatError):
             read_field(tmp_path / "f.vti", "density")
 
