@@ -18,6 +18,7 @@ _HOMES = {
     "Scene": "ddrecon.scene",
     "DdreconError": "ddrecon.errors",
     "SceneError": "ddrecon.errors",
+    "UsageError": "ddrecon.errors",
     "FormatError": "ddrecon.errors",
     "SolveError": "ddrecon.errors",
 }

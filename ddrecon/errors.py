@@ -30,16 +30,23 @@ class DdreconError(Exception):
     exit_code = 2
 
 
-class SceneError(DdreconError):
-    """A scene that cannot be used: one line per problem, `file:line:column: key.path: what is
-    wrong`.
-    """
+class _ProblemsError(DdreconError):
+    """One line for each of `problems`."""
 
     def __init__(self, problems: str | Sequence[str]):
-        self.problems = [
-            one_line(problem) for problem in ([problems] if isinstance(problems, str) else problems)
-        ]
+        each = [problems] if isinstance(problems, str) else problems
+        self.problems = [one_line(problem) for problem in each]
         super().__init__("\n".join(self.problems))
+
+
+class SceneError(_ProblemsError):
+    """A scene that cannot be used; a problem reads `file:line:column: key.path: what is wrong`."""
+
+
+class UsageError(_ProblemsError):
+    """A command that cannot be carried out as it was given: an output that is there already, a
+    locked folder, a device or a checkpoint that is missing.
+    """
 
 
 class FormatError(DdreconError):
