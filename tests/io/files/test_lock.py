@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.lock import LOCK, hold_lock
 
@@ -46,39 +47,68 @@ def test_a_lock_goes_when_the_block_fails(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_lock_of_a_dead_process_is_stale(tmp_path: Path) -> None:
-    script = "import os, sys; from pathlib import Path; from ddrecon.io.lock import locked\n"
-    script += "with locked(Path(sys.argv[1])): os._exit(9)"
-    assert subprocess.run([sys.executable, "-c", script, tmp_path]).returncode == 9
-    assert (tmp_path / LOCK).exists()
+def test_a_killed_process_blocks_nobody(tmp_path: Path) -> None:
+    script = "import os, sys; from pathlib import Path; from ddrecon.io.files.lock import hold_lock\n"
+    script += "with hold_lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", script, tmp_path]).returncode == -9
+    assert holder(tmp_path)["pid"] != os.getpid()
     with hold_lock(tmp_path):
         assert holder(tmp_path)["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(
-    not Path("/proc/self/stat").exists(), reason="this system does not tell when a process started"
-)
-@pytest.mark.parametrize("changed", [{"start": "1"}, {"boot": "another"}])
-def test_the_lock_of_a_process_whose_number_was_used_again_is_stale(
-    tmp_path: Path, changed: dict[str, str]
-) -> None:
-    with hold_lock(tmp_path):
-        own = holder(tmp_path)
-    (tmp_path / LOCK).write_text(json.dumps(own | changed))
-    with hold_lock(tmp_path):
-        assert holder(tmp_path) == own
-
-
-@pytest.mark.parametrize(
-    ("content", "what"),
-    [
-        ('{"pid": 1, "host": "elsewhere"}', "'elsewhere' is writing"),
-        ("", "does not say whose it is"),
-    ],
-)
-def test_what_cannot_be_known_to_be_stale_is_kept(tmp_path: Path, content: str, what: str) -> None:
+@pytest.mark.parametrize("content", ["", "{}", "[1]", "hello"])
+def test_a_file_that_nobody_holds_blocks_nobody(tmp_path: Path, content: str) -> None:
     (tmp_path / LOCK).write_text(content)
-    with pytest.raises(SceneError, match=what), hold_lock(tmp_path):
+    with hold_lock(tmp_path):
+        assert holder(tmp_path)["pid"] == os.getpid()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_several_processes_that_ask_at_once_one_goes_in(tmp_path: Path) -> None:
+    """Each counts those inside, over and over; never is there another."""
+    script = """
+import os, sys
+from pathlib import Path
+from ddrecon.errors import UsageError
+from ddrecon.io.files.lock import hold_lock
+folder, inside = Path(sys.argv[1]), Path(sys.argv[2])
+entered = 0
+while entered < 200:
+    try:
+        with hold_lock(folder):
+            os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
+            inside.unlink()
+            entered += 1
+    except UsageError as error:
+        assert "is writing there" in str(error), error
+"""
+    (tmp_path / "shared").mkdir()
+    command = [sys.executable, "-c", script, tmp_path / "shared", tmp_path / "inside"]
+    processes = [subprocess.Popen(command) for _ in range(3)]
+    assert [process.wait() for process in processes] == [0, 0, 0]
+    assert list((tmp_path / "shared").iterdir()) == []
+
+
+def test_the_lock_of_another_host_is_kept(tmp_path: Path) -> None:
+    content = '{"pid": 1, "host": "elsewhere"}'
+    (tmp_path / LOCK).write_text(content)
+    line = f"{tmp_path}: process 1 on 'elsewhere' is writing there; if it is not, remove "
+    with pytest.raises(UsageError) as refused, hold_lock(tmp_path):
         pass
+    assert str(refused.value) == f"{line}{tmp_path / LOCK}"
     assert (tmp_path / LOCK).read_text() == content
+
+
+def test_what_cannot_be_locked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / LOCK).mkdir()
+    with pytest.raises(UsageError, match=f"{LOCK}: cannot be locked: Is a directory"):
+        hold_lock(tmp_path).__enter__()
+    (tmp_path / LOCK).rmdir()
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with pytest.raises(UsageError, match="cannot be locked: Function not implemented"):
+        hold_lock(tmp_path).__enter__()
