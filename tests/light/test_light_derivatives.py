@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from media import half_empty, make_camera, make_scene
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -53,7 +54,7 @@ each_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS.keys())
 
 
 @pytest.fixture
-def build(make_scene, make_camera, half_empty) -> Callable[[dict[str, Any]], Scene]:
+def build() -> Callable[[dict[str, Any]], Scene]:
     def make(way: dict[str, Any]) -> Scene:
         options = dict(way)
         return make_scene(

@@ -4,10 +4,9 @@ closed forms say.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
+from media import make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -20,8 +19,8 @@ STEP = 1e-5
 
 
 @pytest.fixture
-def scene(make_scene: Callable[..., Scene], random: Callable[..., Tensor]) -> Scene:
-    return make_scene(random(4, 3, 5), g=0.3, ambient=(0.2, 0.3, 0.4))
+def scene() -> Scene:
+    return make_scene(random_values(4, 3, 5), g=0.3, ambient=(0.2, 0.3, 0.4))
 
 
 def images_of(scene: Scene) -> dict[str, Tensor]:

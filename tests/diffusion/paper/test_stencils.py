@@ -8,6 +8,7 @@ import itertools
 
 import pytest
 import torch
+from media import box_grid, convergence_order, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.paper.stencils import (
@@ -25,14 +26,14 @@ SHAPE = (3, 4, 2)
 
 
 @pytest.fixture
-def grid(box) -> Grid:
+def grid() -> Grid:
     """Cells that are not cubes."""
-    return box(SHAPE)
+    return box_grid(SHAPE)
 
 
 @pytest.fixture
-def extended(random) -> Tensor:
-    return random(2, *(n + 2 for n in SHAPE))
+def extended() -> Tensor:
+    return random_values(2, *(n + 2 for n in SHAPE))
 
 
 def padded_centers(grid: Grid) -> list[Tensor]:
@@ -63,16 +64,16 @@ def test_gradients_of_quadratics_and_laplacians_of_cubics_are_exact(
         z, y, x = (c**n if n >= 0 else 0 * c for c, n in zip(coordinates, exponents, strict=True))
         return (z * y * x).expand([n + 2 for n in SHAPE])
 
-    def derivative(axis: int, order: int, of: tuple[int, ...]) -> Tensor:
-        factor = of[axis] * (of[axis] - 1 if order == 2 else 1)
+    def derivative(axis: int, of: tuple[int, ...]) -> Tensor:
+        factor = of[axis] * (of[axis] - 1 if convergence_order == 2 else 1)
         return factor * inside(
-            monomial([n - order * (axis == other) for other, n in enumerate(of)])
+            monomial([n - convergence_order * (axis == other) for other, n in enumerate(of)])
         )
 
     gradient = convolve(monomial(list(powers))[None], stencils.gradient)[0]
     torch.testing.assert_close(
         gradient,
-        torch.stack([derivative(axis, 1, powers) for axis in range(3)]),
+        torch.stack([derivative(axis, powers) for axis in range(3)]),
         rtol=1e-12,
         atol=1e-12,
     )
@@ -80,7 +81,7 @@ def test_gradients_of_quadratics_and_laplacians_of_cubics_are_exact(
     neighbors = convolve(monomial(list(cubic))[None], stencils.terms)[0, 0]
     laplacian = neighbors - inside(monomial(list(cubic))) * sum(2 / h**2 for h in grid.spacing)
     torch.testing.assert_close(
-        laplacian, sum(derivative(axis, 2, cubic) for axis in range(3)), rtol=1e-11, atol=1e-11
+        laplacian, sum(derivative(axis, cubic) for axis in range(3)), rtol=1e-11, atol=1e-11
     )
 
 
@@ -114,8 +115,8 @@ def test_each_stencil_against_indices(grid: Grid, extended: Tensor):
         )
 
 
-def test_ghost_cells_repeat_their_neighbors(random):
-    u = random(2, *SHAPE)
+def test_ghost_cells_repeat_their_neighbors():
+    u = random_values(2, *SHAPE)
     extended = extend(u)
     assert torch.equal(inside(extended), u)
     for axis in (1, 2, 3):
@@ -123,8 +124,8 @@ def test_ghost_cells_repeat_their_neighbors(random):
             assert torch.equal(extended.select(axis, ghost), extended.select(axis, neighbor))
 
 
-def test_transposes(grid: Grid, extended: Tensor, random):
-    u, v = random(2, *SHAPE, seed=1), random(2, 4, *SHAPE, seed=2)
+def test_transposes(grid: Grid, extended: Tensor):
+    u, v = random_values(2, *SHAPE, seed=1), random_values(2, 4, *SHAPE, seed=2)
     kernels = Stencils.on(grid, u).terms
     torch.testing.assert_close(
         (fold(extended) * u).sum(), (extended * extend(u)).sum(), rtol=1e-13, atol=0
@@ -137,8 +138,8 @@ def test_transposes(grid: Grid, extended: Tensor, random):
     )
 
 
-def test_the_divergence_of_position_is_three_inside(box):
-    grid = box((3, 4, 5))
+def test_the_divergence_of_position_is_three_inside():
+    grid = box_grid((3, 4, 5))
     z, y, x = (
         c.expand(grid.shape)[None] for c in grid.centers(torch.zeros(1, dtype=torch.float64))
     )
@@ -148,8 +149,8 @@ def test_the_divergence_of_position_is_three_inside(box):
     torch.testing.assert_close(found, torch.full_like(found, 3), rtol=1e-13, atol=0)
 
 
-def test_normals_point_out_of_the_box(random):
-    normals = outward(random(1, *SHAPE))
+def test_normals_point_out_of_the_box():
+    normals = outward(random_values(1, *SHAPE))
     assert not inside(normals).any()
     for axis in range(3):
         faces = normals[axis].movedim(axis, 0)
