@@ -7,21 +7,12 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from click.testing import Result
 
 from ddrecon.errors import UsageError
-from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.lock import LOCK, hold_lock
-
-Run = Callable[..., Result]
-COMMANDS = {
-    "optimize": ["optimize", "scene.yaml", "-q", "-o", "out", "--iterations", "1"],
-    "render": ["render", "scene.yaml", "-q", "-o", "out"],
-}
 
 
 def holder(folder: Path) -> dict[str, object]:
@@ -29,15 +20,21 @@ def holder(folder: Path) -> dict[str, object]:
     return content
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_second_run_is_refused(run: Run, command: str) -> None:
-    with claim_folder(Path("out"), may_exist=False):
-        for more in ([], ["--overwrite"]):
-            result = run(*COMMANDS[command], *more)
-            line = f"out: process {os.getpid()} is writing there; wait for it, or choose another folder\n"
-            assert (result.exit_code, result.stderr, result.stdout) == (2, line, "")
-    assert run(*COMMANDS[command]).exit_code == 0
-    assert not Path("out", LOCK).exists()
+def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path: Path) -> None:
+    script = "import sys; from pathlib import Path; from ddrecon.io.files.lock import hold_lock\n"
+    script += "with hold_lock(Path(sys.argv[1])): print('held', flush=True); input()"
+    command = [sys.executable, "-c", script, tmp_path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
+        assert first.stdout is not None and first.stdout.readline() == b"held\n"
+        for _ in range(2):
+            with pytest.raises(UsageError) as refused, hold_lock(tmp_path):
+                pass
+            assert str(refused.value) == (
+                f"{tmp_path}: process {first.pid} is writing there; "
+                "wait for it, or choose another folder"
+            )
+        first.communicate(b"\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_lock_goes_when_the_block_fails(tmp_path: Path) -> None:
@@ -48,7 +45,9 @@ def test_a_lock_goes_when_the_block_fails(tmp_path: Path) -> None:
 
 
 def test_a_killed_process_blocks_nobody(tmp_path: Path) -> None:
-    script = "import os, sys; from pathlib import Path; from ddrecon.io.files.lock import hold_lock\n"
+    script = (
+        "import os, sys; from pathlib import Path; from ddrecon.io.files.lock import hold_lock\n"
+    )
     script += "with hold_lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", script, tmp_path]).returncode == -9
     assert holder(tmp_path)["pid"] != os.getpid()
@@ -74,7 +73,7 @@ from ddrecon.errors import UsageError
 from ddrecon.io.files.lock import hold_lock
 folder, inside = Path(sys.argv[1]), Path(sys.argv[2])
 entered = 0
-while entered < 200:
+while entered < 100:
     try:
         with hold_lock(folder):
             os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
