@@ -19,7 +19,7 @@ from ddrecon.io.volumes.field import Field
 CANDIDATES = (sys.executable, "/usr/bin/python3")
 IMPORT = "import importlib.util as u, numpy; exit(not (u.find_spec('openvdb') or u.find_spec('pyopenvdb')))"
 READ = """
-import sys; from pathlib import Path; import numpy as np; from ddrecon.io.volumes import field_names, read_field
+import sys; from pathlib import Path; import numpy as np; from ddrecon.io.volumes.table import field_names, read_field
 path = Path(sys.argv[1]); fields = {name: read_field(path, name) for name in field_names(path)}
 arrays = {f"{name}.{key}": getattr(field, key) for name, field in fields.items() for key in ("values", "bounds")}
 np.savez(path.with_suffix(".found.npz"), **arrays)

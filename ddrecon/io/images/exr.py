@@ -28,15 +28,9 @@ def read_exr(path: Path) -> np.ndarray:
     when it cannot be used.
     """
     module = load_for_file("OpenEXR", path)
-    try:
-        _check_window(module.File(str(path), header_only=True).header(), path)
-        channels = {
-            name: channel.pixels
-            for name, channel in module.File(str(path), separate_channels=True).channels().items()
-        }
-    except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise FormatError(path, f"not a complete OpenEXR image: {error}") from error
-    planes = [as_float32(channels[name]) for name in _chosen(list(channels), path)]
+    _check_window(module.File(str(path), header_only=True).header(), path)
+    channels = module.File(str(path), separate_channels=True).channels()
+    planes = [as_float32(channels[name].pixels) for name in _color_names(list(channels), path)]
     return planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
 
 
@@ -56,7 +50,8 @@ def _check_window(header: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) 
     check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
 
 
-def _chosen(names: list[str], path: Path) -> list[str]:
+def _color_names(names: list[str], path: Path) -> list[str]:
+    """Which of the channels `names` are red, green and blue, and alpha, or the only one."""
     if {"R", "G", "B"} <= set(names):
         return ["R", "G", "B", "A"] if "A" in names else ["R", "G", "B"]
     if len(names) == 1:

@@ -25,10 +25,8 @@ def read_vol(path: Path, name: str) -> Field:
     """The field in the file at `path`, taken for `name`; raises FormatError when it is damaged or
     not a legal field.
     """
-    try:
-        data = _read(path)
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    check_size(path.stat().st_size, path, "the volume")
+    data = path.read_bytes()
     if len(data) < HEADER.size or data[:3] != MAGIC:
         raise FormatError(path, "not a Mitsuba volume: it does not begin with 'VOL' and a header")
     _, version, kind, x, y, z, colors, *corners = HEADER.unpack_from(data)
@@ -63,8 +61,3 @@ def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     )
     with replace_file(path) as temporary:
         temporary.write_bytes(header + as_float32(values).astype("<f4", copy=False).tobytes())
-
-
-def _read(path: Path) -> bytes:
-    check_size(path.stat().st_size, path, "the volume")
-    return path.read_bytes()

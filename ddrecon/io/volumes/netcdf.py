@@ -8,8 +8,6 @@ unit of length.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +81,7 @@ def netcdf_names(path: Path) -> list[str]:
     """The variables of the file at `path` that have axes x, y and z; raises FormatError when it
     cannot be read.
     """
-    with _open(path) as file:
+    with load_for_file("netCDF4", path).Dataset(path) as file:
         return _names(file)
 
 
@@ -91,7 +89,7 @@ def read_netcdf(path: Path, name: str) -> Field:
     """The variable `name` of the file at `path`; raises FormatError when it is damaged, absent,
     unevenly spaced or not a legal field.
     """
-    with _open(path) as file:
+    with load_for_file("netCDF4", path).Dataset(path) as file:
         if name not in file.variables:
             raise FormatError(
                 path,
@@ -107,21 +105,6 @@ def read_netcdf(path: Path, name: str) -> Field:
     known = [sorted(edge) for edge in edges if edge is not None]
     bounds = np.array(known[::-1]).T if len(known) == 3 else None
     return check_field(path, name, values[flips], bounds)
-
-
-@contextmanager
-def _open(path: Path) -> Iterator[Any]:
-    netcdf = load_for_file("netCDF4", path)
-    try:
-        path.stat()
-        with netcdf.Dataset(path) as file:
-            yield file
-    except FormatError:
-        raise
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except (RuntimeError, ValueError, IndexError, AttributeError) as error:
-        raise FormatError(path, f"not a netCDF file that can be read: {error}") from error
 
 
 def _axis_of(file: Any, dimension: str) -> str | None:

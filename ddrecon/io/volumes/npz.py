@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,15 +16,6 @@ from ddrecon.io.files.arrays import read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.volumes.field import Field, Fields, check_field
 
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    EOFError,
-    OSError,
-    ValueError,
-    NotImplementedError,
-    RuntimeError,
-)
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
@@ -59,8 +49,6 @@ def _open(path: Path) -> Iterator[zipfile.ZipFile]:
         raise FormatError(
             path, f"not a complete .npz archive: {error}; write it with numpy.savez_compressed"
         ) from error
-    except _DAMAGE as error:
-        raise FormatError(path, f"cannot be read: {error}") from error
 
 
 def _names(archive: zipfile.ZipFile) -> list[str]:

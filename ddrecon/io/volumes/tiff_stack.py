@@ -9,7 +9,6 @@ description.
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.images.tiff import MARK
+from ddrecon.io.images.tiff import MARK, open_tiff
 from ddrecon.io.volumes.field import Field, Fields, check_field, require_only_field
 
 
@@ -52,22 +51,11 @@ def read_stack(path: Path, name: str) -> Field:
     """The field in the file at `path`, taken for `name`; raises FormatError when it is damaged or
     not a legal field.
     """
-    tifffile = load_for_file("tifffile", path)
-    logging.getLogger("tifffile").setLevel(
-        logging.CRITICAL
-    )  # what it has to say of damage, our errors do
-    try:
-        with tifffile.TiffFile(path) as file:
-            series = file.series[0]
-            check_size(series.size * series.dtype.itemsize, path, "the stack")
-            values = _slices(path, series.asarray(), series.axes)
-            bounds = _bounds(file, values.shape[2::-1])
-    except FormatError:
-        raise
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # decoders of damaged files raise whatever they like
-        raise FormatError(path, f"not a TIFF stack that can be read: {error}") from error
+    with open_tiff(path) as file:
+        series = file.series[0]
+        check_size(series.size * series.dtype.itemsize, path, "the stack")
+        values = _slices(path, series.asarray(), series.axes)
+        bounds = _bounds(file, values.shape[2::-1])
     return check_field(path, name, values, bounds)
 
 

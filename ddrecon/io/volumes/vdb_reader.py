@@ -57,10 +57,7 @@ def _grids(path: Path) -> dict[str, Any]:
     """The grids by name, but for those of other kinds of values."""
     module = _module(path)
     try:
-        path.stat()
         grids, _ = module.readAll(str(path))
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     except Exception as error:  # OpenVDB's own exceptions are of many kinds
         raise FormatError(path, f"not an OpenVDB file that can be read: {error}") from error
     return {grid.name: grid for grid in grids if grid.valueTypeName in COMPONENTS}

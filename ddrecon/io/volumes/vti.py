@@ -79,12 +79,8 @@ def read_vti(path: Path, name: str) -> Field:
 @contextmanager
 def _open(path: Path) -> Iterator[tuple[ElementTree.Element, bytes]]:
     """The XML of the file at `path`, and the data appended to it."""
-    try:
-        check_size(path.stat().st_size, path, "the volume")
-        content = path.read_bytes()
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    head, appended = _split(content)
+    check_size(path.stat().st_size, path, "the volume")
+    head, appended = _split(path.read_bytes())
     if b"<!DOCTYPE" in head:
         raise FormatError(
             path, f"has a document type, which may define entities without end; {ADVICE}"
