@@ -94,10 +94,20 @@ def is_stack(path: Path) -> bool:
 
 @contextmanager
 def open_tiff(path: Path) -> Iterator[Any]:
-    """The `tifffile.TiffFile` at `path`, for a block that reads it."""
+    """The `tifffile.TiffFile` at `path`, for a block that reads it.
+
+    Raises FormatError for damage that tifffile only logs: it takes the pages before a cut for all.
+    """
     tifffile = load_for_file("tifffile", path)
-    # What it has to say of damage, our errors do.
-    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    errors: list[str] = []
+
+    def keep_errors(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            errors.append(record.getMessage())
+        return False
+
+    logger = logging.getLogger("tifffile")
+    logger.addFilter(keep_errors)
     try:
         with tifffile.TiffFile(path) as file:
             yield file
@@ -105,6 +115,10 @@ def open_tiff(path: Path) -> Iterator[Any]:
         if "imagecodecs" in str(error):
             raise FormatError(path, f"cannot be read: {error}; save it uncompressed") from error
         raise
+    finally:
+        logger.removeFilter(keep_errors)
+    if errors:
+        raise FormatError(path, f"is damaged: {errors[0]}")
 
 
 def _is_stack(file: Any) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image as Pillow
+from refusals import image_refusal
 
 from ddrecon.errors import FormatError
 from ddrecon.io.images import png16, srgb
@@ -100,22 +101,16 @@ def test_bands_of_rows_follow_from_each_other(
         assert np.array_equal(png16.read_deep_png(tmp_path / "a.png"), stored)
 
 
-def refusal(path: Path) -> str:
-    with pytest.raises(FormatError) as caught:
-        read_image(path)
-    return caught.value.reason
-
-
 def test_what_cannot_be_read_is_refused(tmp_path: Path) -> None:
     path, whole = tmp_path / "a.png", encoded(deep(3), FILTERS)
     path.write_bytes(encoded(deep(3), FILTERS, interlace=1))
-    assert "is interlaced" in refusal(path)
+    assert "is interlaced" in image_refusal(path)
     path.write_bytes(whole[:-20])
-    assert "not a complete PNG image" in refusal(path)
+    assert "not a complete PNG image" in image_refusal(path)
     path.write_bytes(whole.replace(b"gAMA", b"gAMB"))
-    assert "wrong checksum" in refusal(path)
+    assert "wrong checksum" in image_refusal(path)
     path.write_bytes(encoded(deep(3), [0] * 7)[:33] + encoded(deep(3)[:3], [0] * 3)[33:])
-    assert "is damaged: it holds 93 bytes of pixels, not 217" in refusal(path)
+    assert "is damaged: it holds 93 bytes of pixels, not 217" in image_refusal(path)
     for position in range(0, len(whole), 3):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 0x5A]) + whole[position + 1 :])
         with contextlib.suppress(FormatError):

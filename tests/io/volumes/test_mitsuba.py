@@ -57,12 +57,3 @@ def test_a_damaged_file_is_refused(
 ) -> None:
     with pytest.raises(FormatError, match=reason):
         read_field(altered(tmp_path / "f.vol", offset, layout, value), "density")
-
-
-@pytest.mark.parametrize("length", [0, 3, 47, 60])
-def test_a_cut_file_is_refused(tmp_path: Path, length: int) -> None:
-    path = tmp_path / "f.vol"
-    write_field(path, "density", VALUES, BOUNDS)
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(FormatError):
-        read_field(path, "density")
