@@ -1,4 +1,4 @@
-"""What every test has: its own seed, one thread, volume formats by what is installed, and commands run in this process."""
+"""What every test has: a seed of its own, one thread, and commands that run in this process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ torch.set_num_threads(1)  # tests run side by side, one a core
 
 @pytest.fixture(autouse=True)
 def same_seed() -> None:
-    """No test depends on those before it: which views an iteration looks at follows from the seed."""
+    """No test depends on those before it; the seed decides which views an iteration looks at."""
     torch.manual_seed(0)
 
 
@@ -47,9 +47,8 @@ def readable_formats() -> list[str]:
 def suffix(request: pytest.FixtureRequest) -> str:
     """The suffix of each kind of volume file that can be read here."""
     if not _is_readable(request.param):
-        pytest.skip(
-            f"reading {request.param} needs {' or '.join(PACKAGES[request.param])}, not installed here"
-        )
+        packages = " or ".join(PACKAGES[request.param])
+        pytest.skip(f"reading {request.param} needs {packages}, not installed here")
     return request.param
 
 

@@ -1,4 +1,7 @@
-"""Small random media, operators, cameras and scenes: every test states what matters to it and nothing else."""
+"""Small random media, operators, cameras and scenes.
+
+Every test states what matters to it and nothing else.
+"""
 
 from __future__ import annotations
 
