@@ -1,5 +1,6 @@
-"""OpenEXR images, through the `OpenEXR` module of the extra `exr`. Linear; alpha, where present, is
-premultiplied by convention.
+"""OpenEXR images, through the package `OpenEXR` (extra `exr`).
+
+Linear; alpha, where present, is premultiplied by convention.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ def has_exr() -> bool:
 
 
 def read_exr(path: Path) -> np.ndarray:
-    """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4]; raises FormatError
-    when it cannot be used.
+    """The pixels of the file at `path`: float32 [h, w], [h, w, 3] or [h, w, 4].
+
+    Raises FormatError where it is cropped, has other channels, or OpenEXR is not installed.
     """
     module = load_for_file("OpenEXR", path)
     _check_window(module.File(str(path), header_only=True).header(), path)

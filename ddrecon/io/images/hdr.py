@@ -1,9 +1,9 @@
-"""Radiance pictures, .hdr: 8-bit mantissas that share an exponent, in flat or run-length encoded
-scanlines.
+"""Radiance pictures, .hdr: red, green and blue as 8-bit mantissas that share an exponent.
 
 The format of Ward, *Real Pixels*, Graphics Gems II (1991), and of the Radiance file format page. A
 byte m under exponent e stands for m 2^(e - 136), as in Walter's widely copied rgbe.c. Scanlines are
-decoded one by one, so memory is taken only for what the file holds.
+flat or run-length encoded; they are decoded one by one, so memory is taken only for what the file
+holds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import check_size
 
 MAX_HEADER = 65536
+"""Bytes within which a header must end."""
 MAX_SIDE = 65536
+"""Scanlines, and pixels of one, at most."""
 _BEGINNING = re.compile(rb"(.*?)\n\r?\n([^\n]*)\n", re.DOTALL)
 _SIZE = re.compile(rb"([-+])([XY]) +(\d{1,9}) +([-+])([XY]) +(\d{1,9})\s*")
 
@@ -33,7 +35,7 @@ class _Layout:
     are_lines_flipped: bool
     are_pixels_flipped: bool
 
-    def arranged(self, pixels: np.ndarray) -> np.ndarray:
+    def arrange(self, pixels: np.ndarray) -> np.ndarray:
         """`pixels` [lines, length, 3] as an image whose row 0 is the top and column 0 the left."""
         pixels = pixels[::-1] if self.are_lines_flipped else pixels
         pixels = pixels[:, ::-1] if self.are_pixels_flipped else pixels
@@ -41,8 +43,9 @@ class _Layout:
 
 
 def read_hdr(path: Path) -> np.ndarray:
-    """The pixels of the file at `path`, float32 [h, w, 3], exposure divided out; raises FormatError
-    when it cannot be used.
+    """The pixels of the file at `path`, float32 [h, w, 3], exposure divided out.
+
+    Raises FormatError when it is damaged, too large, or holds other than red, green and blue.
     """
     check_size(path.stat().st_size, path, "the image")
     data = path.read_bytes()
@@ -51,15 +54,16 @@ def read_hdr(path: Path) -> np.ndarray:
     match = _BEGINNING.match(data[:MAX_HEADER])
     if match is None:
         raise FormatError(path, "is damaged: its header does not end")
-    exposure, layout = _exposure(match[1], path), _layout(match[2], path)
-    lines = _scanlines(data, match.end(), layout, path)
+    exposure, layout = _read_exposure(match[1], path), _read_layout(match[2], path)
+    lines = _read_scanlines(data, match.end(), layout, path)
     with np.errstate(over="ignore"):
-        return layout.arranged((_radiance(lines) / exposure).astype(np.float32))
+        return layout.arrange((_radiance(lines) / exposure).astype(np.float32))
 
 
-def _exposure(header: bytes, path: Path) -> np.ndarray:
-    """What the stored values were multiplied by, [1] or [3]; raises FormatError when they are not
-    red, green and blue.
+def _read_exposure(header: bytes, path: Path) -> np.ndarray:
+    """What the stored values were multiplied by, [1] or [3].
+
+    Raises FormatError when they are not red, green and blue.
     """
     factor = np.ones(1)
     for line in header.splitlines()[1:]:
@@ -67,14 +71,16 @@ def _exposure(header: bytes, path: Path) -> np.ndarray:
         if name == b"FORMAT" and value != b"32-bit_rle_rgbe":
             raise FormatError(
                 path,
-                f"holds pixels of format {value.decode(errors='replace')!r}; save it as 32-bit_rle_rgbe, or as .exr",
+                f"holds pixels of format {value.decode(errors='replace')!r}; "
+                "save it as 32-bit_rle_rgbe, or as .exr",
             )
         if name in (b"EXPOSURE", b"COLORCORR"):
-            factor = factor * _positive(value, 1 if name == b"EXPOSURE" else 3, path)
+            factor = factor * _read_factors(value, 1 if name == b"EXPOSURE" else 3, path)
     return factor
 
 
-def _positive(text: bytes, count: int, path: Path) -> np.ndarray:
+def _read_factors(text: bytes, count: int, path: Path) -> np.ndarray:
+    """The `count` positive numbers in `text`."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
@@ -87,12 +93,13 @@ def _positive(text: bytes, count: int, path: Path) -> np.ndarray:
     return values
 
 
-def _layout(text: bytes, path: Path) -> _Layout:
+def _read_layout(text: bytes, path: Path) -> _Layout:
     match = _SIZE.fullmatch(text)
     if match is None or match[2] == match[5]:
         raise FormatError(
             path,
-            f"is damaged: {text[:40].decode(errors='replace')!r} is no size such as '-Y 512 +X 1024'",
+            f"is damaged: {text[:40].decode(errors='replace')!r} is no size such as "
+            "'-Y 512 +X 1024'",
         )
     lines, length = int(match[3]), int(match[6])
     if not (0 < lines <= MAX_SIDE and 0 < length <= MAX_SIDE):
@@ -100,6 +107,7 @@ def _layout(text: bytes, path: Path) -> _Layout:
             path, f"has {lines} scanlines of {length} pixels; 1 to {MAX_SIDE} of each are read"
         )
     check_size(12 * lines * length, path, f"an image of {lines} scanlines of {length} pixels")
+    # From the top down is -Y, from left to right +X; the other signs are flipped.
     flips = {
         axis: sign != {b"Y": b"-", b"X": b"+"}[axis]
         for sign, axis in ((match[1], match[2]), (match[4], match[5]))
@@ -107,12 +115,12 @@ def _layout(text: bytes, path: Path) -> _Layout:
     return _Layout(lines, length, match[2] == b"Y", flips[match[2]], flips[match[5]])
 
 
-def _scanlines(data: bytes, position: int, layout: _Layout, path: Path) -> np.ndarray:
+def _read_scanlines(data: bytes, position: int, layout: _Layout, path: Path) -> np.ndarray:
     """The stored bytes uint8 [lines, length, 4] that begin at `position` in `data`."""
     rows = []
     for number in range(layout.lines):
         try:
-            row, position = _scanline(data, position, layout.length)
+            row, position = _read_scanline(data, position, layout.length)
         except ValueError as error:
             raise FormatError(
                 path, f"is damaged: scanline {number} of {layout.lines} {error}"
@@ -121,14 +129,16 @@ def _scanlines(data: bytes, position: int, layout: _Layout, path: Path) -> np.nd
     return np.stack(rows)
 
 
-def _scanline(data: bytes, position: int, length: int) -> tuple[np.ndarray, int]:
-    """One scanline uint8 [length, 4], and where the next begins; raises ValueError when it is
-    damaged.
+def _read_scanline(data: bytes, position: int, length: int) -> tuple[np.ndarray, int]:
+    """One scanline uint8 [length, 4], and where the next begins.
+
+    Run-length encoded it begins with 2, 2 and its length in two bytes, high first; then come all
+    red bytes, all green, all blue, all exponents. Raises ValueError when it is damaged.
     """
     start = data[position : position + 4]
     is_encoded = 8 <= length < 32768 and start[:2] == b"\2\2" and len(start) == 4 and start[2] < 128
     if not is_encoded:
-        return _old_scanline(data, position, length)
+        return _read_old_scanline(data, position, length)
     if int.from_bytes(start[2:], "big") != length:
         raise ValueError(f"is {int.from_bytes(start[2:], 'big')} pixels long, not {length}")
     planes = bytearray()
@@ -139,8 +149,9 @@ def _scanline(data: bytes, position: int, length: int) -> tuple[np.ndarray, int]
 
 
 def _unpack(data: bytes, position: int, planes: bytearray, end: int) -> int:
-    """Appends runs and literal bytes to `planes` until it is `end` long; returns where it stopped
-    reading.
+    """Appends bytes of `data` to `planes` until it is `end` long; returns where it stopped reading.
+
+    A byte n above 128 says: the next one, n - 128 times; n up to 128: the next n as they are.
     """
     while len(planes) < end:
         head = data[position : position + 2]
@@ -157,9 +168,10 @@ def _unpack(data: bytes, position: int, planes: bytearray, end: int) -> int:
     return position
 
 
-def _old_scanline(data: bytes, position: int, length: int) -> tuple[np.ndarray, int]:
-    """A scanline of flat pixels, or of pixels repeated by (1, 1, 1, n) n times; of several in a
-    row, each counts 256 times the last.
+def _read_old_scanline(data: bytes, position: int, length: int) -> tuple[np.ndarray, int]:
+    """A scanline of flat pixels, or of pixels that (1, 1, 1, n) repeats n times.
+
+    Of several such repetitions in a row each counts 256 times the one before.
     """
     chunk = data[position : position + 8 * length]
     if len(chunk) < 4:
@@ -168,11 +180,14 @@ def _old_scanline(data: bytes, position: int, length: int) -> tuple[np.ndarray, 
     is_run = (pixels[:, :3] == 1).all(axis=1)
     if len(pixels) >= length and not is_run[:length].any():
         return pixels[:length], position + 4 * length
+    # The last pixel that is not a repetition: what a repetition repeats.
     index = np.arange(len(pixels))
     origin = np.maximum.accumulate(np.where(is_run, -1, index))
+    # How often each entry stands in the scanline: itself, or n 256^k as the k-th in a row.
     counts = np.where(
         is_run, pixels[:, 3].astype(np.int64) << 8 * np.clip(index - origin - 1, 0, 4), 1
     )
+    # The entries that fill the scanline, which the last of them must do exactly.
     used = int(np.searchsorted(np.cumsum(counts), length)) + 1
     if used > len(pixels):
         raise ValueError("ends too early")
@@ -182,8 +197,9 @@ def _old_scanline(data: bytes, position: int, length: int) -> tuple[np.ndarray, 
 
 
 def _radiance(stored: np.ndarray) -> np.ndarray:
-    """Linear values of `stored` uint8 [..., 4]: mantissas times 2^(exponent - 136), black where the
-    exponent is 0.
+    """Linear values [..., 3] of `stored` uint8 [..., 4]: mantissa 2^(exponent - 136).
+
+    Black where the exponent is 0.
     """
     exponent = stored[..., 3:].astype(np.int32)
     return np.ldexp(

@@ -16,17 +16,8 @@ SECONDS = 4.0
 
 
 def encode_frames(frames: Sequence[np.ndarray], white: float) -> np.ndarray:
-    """`frames` [h, w, 3], linear, as 8-bit sRGB [n, h, w, 3]; radiance from `white` > 0 up is
-    white.
-    """
-    return np.stack(
-        [
-            np.round(255 * srgb.encode(np.clip(np.nan_to_num(frame / white), 0, 1))).astype(
-                np.uint8
-            )
-            for frame in frames
-        ]
-    )
+    """`frames` [h, w, 3], linear, as 8-bit sRGB [n, h, w, 3], where radiance `white` > 0 is white."""
+    return np.stack([srgb.encode_bytes(frame / white) for frame in frames])
 
 
 def animation_of(frames: np.ndarray) -> bytes:
@@ -56,8 +47,9 @@ def require_mp4() -> None:
 
 
 def write_mp4(path: Path, frames: np.ndarray) -> None:
-    """Writes `frames`, 8-bit [n, h, w, 3], as H.264 in MP4; a last odd row or column is repeated.
-    Raises MissingExtraError.
+    """Writes `frames`, 8-bit [n, h, w, 3], as H.264 in MP4; raises MissingExtraError.
+
+    H.264 takes even sizes only: a last odd row or column is repeated.
     """
     import imageio.v3 as iio
 

@@ -26,15 +26,17 @@ from ddrecon.io.images.tiff import read_tiff, write_tiff
 PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
 """How the .png of an image is to be read."""
 BEGINNINGS = ((b"\x89PNG\r\n\x1a\n", b""), (b"\xff\xd8\xff", b""), (b"RIFF", b"WEBP"))
-"""How the first 12 bytes of encoded images begin and end. Pillow would look at nothing but the
-content, and run Ghostscript on some.
+"""How the first 12 bytes of encoded images begin and end.
+
+Pillow alone would go by content whatever the suffix, and run Ghostscript on PostScript.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """`pixels` float32 [h, w, 3], linear radiance, finite, black where empty; `coverage` float32
-    [h, w], the alpha, where given.
+    """`pixels` float32 [h, w, 3]: linear radiance, finite, black where empty.
+
+    `coverage` float32 [h, w] is the alpha, where the file has one.
     """
 
     pixels: np.ndarray
@@ -47,8 +49,9 @@ class Image:
 
 
 def read_image(path: Path) -> Image:
-    """The image at `path`; raises FormatError when it is damaged, of an unknown kind, or has NaN or
-    infinite pixels.
+    """The image at `path`.
+
+    Raises FormatError when it is damaged, of an unknown kind, or has NaN or infinite pixels.
     """
     values = _read_values(path)
     if values.ndim == 2:
@@ -60,16 +63,18 @@ def read_image(path: Path) -> Image:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """The mask at `path`: float32 [h, w], 0 where its image is black (ignore the pixel) or empty
-    and 1 elsewhere.
+    """The mask at `path`, float32 [h, w]: 0 where its image is black or empty, else 1.
+
+    Pixels of mask 0 are ignored.
     """
     brightest: np.ndarray = read_image(path).pixels.max(axis=2)
     return as_float32(brightest > 0)
 
 
 def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
-    """Writes `pixels` [h, w, 3] as float32 to `stem`.exr (.tif where OpenEXR is not installed) and
-    `stem`.npy; returns these paths.
+    """Writes `pixels` [h, w, 3] as float32 to `stem`.exr and `stem`.npy; returns these paths.
+
+    Where OpenEXR is not installed, a float .tif takes the place of the .exr.
     """
     suffix, write = (".exr", write_exr) if has_exr() else (".tif", write_tiff)
     picture, array = (stem.with_name(stem.name + ending) for ending in (suffix, ".npy"))
@@ -89,14 +94,15 @@ def png_of(pixels: np.ndarray) -> bytes:
     """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
     import imageio.v3 as iio
 
-    encoded = np.round(255 * srgb.encode(np.clip(np.nan_to_num(pixels), 0, 1))).astype(np.uint8)
+    encoded = srgb.encode_bytes(pixels)
     content: bytes = iio.imwrite("<bytes>", encoded, plugin="pillow", extension=".png")
     return content
 
 
 def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
-    """Writes `pixels` [h, w, 3] as `write_linear` does, and `preview` [h, w, 3] (None: `pixels`
-    again) to `stem`.png; returns all paths.
+    """Writes `pixels` [h, w, 3] as `write_linear` does, and a preview to `stem`.png.
+
+    `preview` [h, w, 3] is what it shows (None: `pixels`). Returns all paths.
     """
     path = stem.with_name(stem.name + ".png")
     write_preview(path, pixels if preview is None else preview)
@@ -119,10 +125,12 @@ def _read_values(path: Path) -> np.ndarray:
         raise FormatError(
             path, f"has shape {list(values.shape)}; expected [h, w], [h, w, 3] or [h, w, 4]"
         )
-    return _finite(as_float32(values), path)
+    values = as_float32(values)
+    _require_finite(values, path)
+    return values
 
 
-def _finite(values: np.ndarray, path: Path) -> np.ndarray:
+def _require_finite(values: np.ndarray, path: Path) -> None:
     flawed = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(axis=2)
     if flawed.any():
         row, column = np.argwhere(flawed)[0]
@@ -131,7 +139,6 @@ def _finite(values: np.ndarray, path: Path) -> np.ndarray:
         raise FormatError(
             path, f"{what} at {where}; repair it: a pixel to ignore may hold any finite number"
         )
-    return values
 
 
 def _read_array(path: Path) -> np.ndarray:
@@ -145,9 +152,7 @@ def _read_encoded(path: Path) -> np.ndarray:
 
     with path.open("rb") as stream:
         start = stream.read(12)
-    if not any(
-        start.startswith(beginning) and start.endswith(end) for beginning, end in BEGINNINGS
-    ):
+    if not any(start.startswith(head) and start.endswith(tail) for head, tail in BEGINNINGS):
         raise FormatError(path, "is no PNG, JPEG or WebP image")
     if has_deep_colors(path):
         return _decode(read_deep_png(path))
@@ -162,8 +167,9 @@ def _read_encoded(path: Path) -> np.ndarray:
 
 
 def _decode(stored: np.ndarray) -> np.ndarray:
-    """Linear values of `stored` [h, w] or [h, w, c], multiplied by the alpha that the last of 2 or
-    4 channels is.
+    """Linear values of `stored` [h, w] or [h, w, c]; the last of 2 or 4 channels is alpha.
+
+    Colors are multiplied by it.
     """
     values = stored / (1 if stored.dtype == bool else np.iinfo(stored.dtype).max)
     if values.ndim == 2 or values.shape[2] == 3:
