@@ -1,5 +1,6 @@
-"""Optional packages: imported where they are needed, and asked for by the extra that brings them
-where they are absent.
+"""Optional packages: imported where they are needed.
+
+Where one is absent, the user is told the extra of ddrecon that brings it.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ def advice(package: str) -> str:
 
 
 def load_extra(package: str, purpose: str) -> ModuleType:
-    """The module `package`; raises MissingExtraError, which says that `purpose` needs it, where it
-    is not installed.
+    """The module `package`.
+
+    Raises MissingExtraError where it is not installed: `purpose` needs it.
     """
     try:
         return import_module(package)
@@ -37,8 +39,9 @@ def load_extra(package: str, purpose: str) -> ModuleType:
 
 
 def load_for_file(package: str, path: object) -> ModuleType:
-    """The module `package`, to read or write the file at `path`; raises FormatError where it is not
-    installed.
+    """The module `package`, to read or write the file at `path`.
+
+    Raises FormatError where it is not installed.
     """
     try:
         return import_module(package)

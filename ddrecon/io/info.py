@@ -1,7 +1,8 @@
-"""What is in a file, in words: a volume's box, cells and fields, or an image's size and values."""
+"""What a data file holds, in words: a volume's box, cells and fields, or an image's values."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,15 @@ from ddrecon.io.volumes.table import FORMATS, field_names, read_field
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The contents of the volume or image at `path`; raises FormatError when it is neither, or
-    damaged.
+    """The contents of the volume or image at `path`, for `lines` or JSON.
+
+    Raises FormatError when it is neither, or damaged.
     """
     return _describe_volume(path) if _is_volume(path) else _describe_image(path)
 
 
 def _is_volume(path: Path) -> bool:
-    """Told by suffix; a .tif is a volume where it has several pages."""
+    """Whether the suffix of `path` says so; a .tif is a volume where it has several pages."""
     suffix = path.suffix.lower()
     return suffix in FORMATS and (suffix not in READERS or (path.is_file() and is_stack(path)))
 
@@ -33,7 +35,7 @@ def _describe_volume(path: Path) -> dict[str, Any]:
         report["bounds"] = None if field.bounds is None else field.bounds.tolist()
         report["fields"][name] = {
             "colors": 1 if field.values.ndim == 3 else 3,
-            **_numbers(field.values),
+            **_summarize(field.values),
         }
     return report
 
@@ -46,11 +48,12 @@ def _describe_image(path: Path) -> dict[str, Any]:
         "pixels": [width, height],
         "colors": 1 if is_gray else 3,
         "has_alpha": image.coverage is not None,
-        **_numbers(image.pixels),
+        **_summarize(image.pixels),
     }
 
 
-def _numbers(values: np.ndarray) -> dict[str, float]:
+def _summarize(values: np.ndarray) -> dict[str, float]:
+    """Extremes and mean of `values`, and the part of cells or pixels that is `filled`: not 0."""
     places = values if values.ndim != 4 else values.any(-1)
     return {
         "min": float(values.min()),
@@ -65,11 +68,12 @@ def lines(report: dict[str, Any]) -> list[str]:
     if "pixels" in report:
         alpha = ", with alpha" if report["has_alpha"] else ""
         return [
-            f"image: {_by(report['pixels'])} pixels, {_colors(report)}{alpha}, linear radiance {_values(report)}"
+            f"image: {_sizes(report['pixels'])} pixels, {_colors(report)}{alpha}, "
+            f"linear radiance {_values(report)}"
         ]
     if not report["fields"]:
         return ["no fields"]
-    cells = f"cells: {_by(report['resolution'])} (x, y, z)"
+    cells = f"cells: {_sizes(report['resolution'])} (x, y, z)"
     return [
         cells + _box(report),
         *(
@@ -84,7 +88,7 @@ def _box(report: dict[str, Any]) -> str:
         return ", no box: the scene's volume.bounds will be taken"
     low, high = report["bounds"]
     sides = [(b - a) / count for a, b, count in zip(low, high, report["resolution"], strict=True)]
-    return f" of {_by(sides)} u, from {low} to {high}"
+    return f" of {_sizes(sides)} u, from {low} to {high}"
 
 
 def _colors(report: dict[str, Any]) -> str:
@@ -92,8 +96,12 @@ def _colors(report: dict[str, Any]) -> str:
 
 
 def _values(report: dict[str, Any]) -> str:
-    return f"{report['min']:.4g} to {report['max']:.4g}, mean {report['mean']:.4g}, not 0 in {100 * report['filled']:.3g} %"
+    return (
+        f"{report['min']:.4g} to {report['max']:.4g}, mean {report['mean']:.4g}, "
+        f"not 0 in {100 * report['filled']:.3g} %"
+    )
 
 
-def _by(sizes: list[float]) -> str:
-    return " x ".join(f"{size:.4g}" for size in sizes)
+def _sizes(sizes: Sequence[float]) -> str:
+    """`sizes` as in 6 x 5 x 0.25."""
+    return " x ".join(str(size) if isinstance(size, int) else f"{size:.4g}" for size in sizes)

@@ -1,5 +1,6 @@
-"""NumPy's .npy encoding, read with suspicion: the header is checked before memory is taken, and
-pickles are refused.
+"""NumPy's .npy encoding, read with suspicion.
+
+The header is checked before memory is taken, and pickles are refused.
 """
 
 from __future__ import annotations
@@ -18,23 +19,21 @@ MAX_BYTES = 4 * 2**30
 
 
 def read_npy(stream: IO[bytes], size: int, path: Path, name: str) -> np.ndarray:
-    """The real numeric array in `stream`, which holds `size` bytes of .npy; `path` and `name` are
-    what errors speak of.
+    """The array of real numbers in `stream`, which holds `size` bytes of .npy.
 
-    Raises FormatError for arrays of objects or text, over 4 GiB, or shorter or longer than their
-    header says.
+    `path` and `name` are what errors speak of. Raises FormatError for arrays of objects or
+    text, over 4 GiB, or shorter or longer than their header says.
     """
     check_size(size, path, name)
     shape, dtype = _read_header(stream, path, name)
     if dtype.kind not in "fiub":
-        raise FormatError(
-            path,
-            f"{name} holds {'Python objects' if dtype.hasobject else f'values of type {dtype}'}; save it as float32",
-        )
+        kind = "Python objects" if dtype.hasobject else f"values of type {dtype}"
+        raise FormatError(path, f"{name} holds {kind}; save it as float32")
     if math.prod(shape) * dtype.itemsize != size - stream.tell():
         raise FormatError(
             path,
-            f"{name} is damaged: its header says {list(shape)} of {dtype}, which is not the size of its data",
+            f"{name} is damaged: its header says {list(shape)} of {dtype}, "
+            "which is not the size of its data",
         )
     stream.seek(0)
     return npy.read_array(stream, allow_pickle=False)
@@ -45,13 +44,15 @@ def check_size(size: int, path: Path, name: str) -> None:
     if size > MAX_BYTES:
         raise FormatError(
             path,
-            f"{name} takes {size / 2**30:.1f} GiB uncompressed; at most {MAX_BYTES // 2**30} GiB are read",
+            f"{name} takes {size / 2**30:.1f} GiB uncompressed; "
+            f"at most {MAX_BYTES // 2**30} GiB are read",
         )
 
 
 def as_float32(values: np.ndarray) -> np.ndarray:
-    """`values` as contiguous float32; numbers beyond its range become infinite, which callers
-    refuse.
+    """`values` as contiguous float32.
+
+    Numbers beyond its range become infinite, which callers refuse.
     """
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(values, dtype=np.float32)

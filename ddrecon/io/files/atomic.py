@@ -11,15 +11,15 @@ from pathlib import Path
 
 from ddrecon.errors import FormatError
 
-TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
+_TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
 
 
 @contextmanager
 def replace_file(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path`, with its suffix, that becomes `path` when the block ends well
-    and vanishes when not.
+    """A temporary name beside `path`, with its suffix, for a block to write to.
 
-    Raises FormatError where the system refuses to write.
+    It becomes `path` when the block ends well, and vanishes when not. Raises FormatError where the
+    system refuses to write.
     """
     temporary = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:12]}{path.suffix}")
     with refusals(path):
@@ -32,8 +32,9 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
-    """As `replace_file`, but safe from a loss of power once it has ended; what `path` was until
-    then is kept as `kept_as`.
+    """As `replace_file`, but safe from a loss of power once it has ended.
+
+    What `path` was until then is kept as `kept_as`.
     """
     with replace_file(path) as temporary:
         yield temporary
@@ -46,13 +47,14 @@ def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
 def remove_temporaries(folder: Path) -> None:
     """Removes what processes that were killed while writing have left in `folder`."""
     for path in folder.iterdir():
-        if TEMPORARY.fullmatch(path.name):
+        if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
 
 
 def flush(path: Path) -> None:
-    """Has the system put the file or folder at `path` on its disk; raises FormatError where it
-    cannot.
+    """Has the system put the file or folder at `path` on its disk.
+
+    Raises FormatError where it cannot.
     """
     with refusals(path):
         handle = os.open(path, os.O_RDONLY)

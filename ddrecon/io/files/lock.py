@@ -1,4 +1,4 @@
-"""One process at a time in a folder: a lock of the operating system on a file that names its holder.
+"""One process at a time in a folder: the operating system locks a file that names its holder.
 
 The system lets go of a lock when its process ends, however it ends, so what a killed process left
 behind is only a name. Between machines that share a folder no system does so reliably: the name of
@@ -25,7 +25,10 @@ LOCK = "ddrecon.lock"
 
 @contextmanager
 def hold_lock(folder: Path) -> Iterator[None]:
-    """Nobody else's `folder` until the block ends; raises UsageError while another process has it."""
+    """Keeps other processes out of `folder` until the block ends.
+
+    Raises UsageError while another process holds it, and where the file cannot be locked.
+    """
     path = folder / LOCK
     try:
         # No soft locks: what they leave behind would have to be judged stale or not.

@@ -1,5 +1,6 @@
-"""Reading files that strangers made: only what lies on a disk is opened, and whatever a decoder
-stumbles on becomes one line.
+"""Reading files that strangers made.
+
+Only what lies on a disk is opened, and whatever a decoder stumbles on becomes one line.
 """
 
 from __future__ import annotations
@@ -23,8 +24,7 @@ KINDS = {
 
 @contextmanager
 def guard_reading(path: Path) -> Iterator[None]:
-    """Any error of the block, which reads the file (or folder of files) at `path`, becomes a
-    FormatError.
+    """Any error of the block, which reads the file or folder at `path`, becomes a FormatError.
 
     Raises FormatError, before the block, for what is neither: a pipe or a device is never opened.
     """
@@ -42,9 +42,7 @@ def guard_reading(path: Path) -> Iterator[None]:
 
 
 def require_stored(path: Path) -> None:
-    """Raises FormatError where `path` is a pipe, a device or a socket, OSError where there is
-    nothing.
-    """
+    """Raises FormatError where `path` is a pipe, a device or a socket; OSError where it is not."""
     kind = stat.S_IFMT(os.stat(path).st_mode)
     if kind in KINDS:
         raise FormatError(path, f"is {KINDS[kind]}; only regular files are read")

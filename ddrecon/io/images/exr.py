@@ -37,7 +37,10 @@ def read_exr(path: Path) -> np.ndarray:
 
 
 def write_exr(path: Path, pixels: np.ndarray) -> None:
-    """Writes `pixels` [h, w, 3] as float32 RGB; raises FormatError where OpenEXR is not installed."""
+    """Writes `pixels` [h, w, 3] as float32 RGB.
+
+    Raises FormatError where OpenEXR is not installed.
+    """
     module = load_for_file("OpenEXR", path)
     header = {"compression": module.ZIP_COMPRESSION, "type": module.scanlineimage}
     with replace_file(path) as temporary:

@@ -16,7 +16,7 @@ SECONDS = 4.0
 
 
 def encode_frames(frames: Sequence[np.ndarray], white: float) -> np.ndarray:
-    """`frames` [h, w, 3], linear, as 8-bit sRGB [n, h, w, 3], where radiance `white` > 0 is white."""
+    """`frames` [h, w, 3], linear, as 8-bit sRGB [n, h, w, 3]; radiance `white` > 0 is white."""
     return np.stack([srgb.encode_bytes(frame / white) for frame in frames])
 
 

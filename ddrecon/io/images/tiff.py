@@ -1,4 +1,4 @@
-"""Float TIFF images, gray, RGB or RGBA: read through `tifffile` (extra `tiff`), written by ourselves.
+"""Float TIFF images, gray, RGB or RGBA: read through `tifffile` (extra `tiff`), written without.
 
 What is written is the baseline of TIFF 6.0 (Adobe, 1992): one strip of uncompressed 32-bit floats.
 imageio alone writes no float colors, and this much needs no package.
@@ -87,7 +87,7 @@ def read_tiff(path: Path) -> np.ndarray:
 
 
 def is_stack(path: Path) -> bool:
-    """Whether the TIFF file at `path` is a volume: of several pages, or of one that we wrote as one."""
+    """Whether the TIFF file at `path` is a volume: of several pages, or written as one by us."""
     with guard_reading(path), open_tiff(path) as file:
         return _is_stack(file)
 

@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError, SceneError
-from ddrecon.io.volumes.field import Field
+from ddrecon.io.volumes.field import BOX, Field
 from ddrecon.io.volumes.table import field_names, read_field, require_format, write_fields
 
 
 def convert(sources: Sequence[Path], output: Path, *, may_exist: bool) -> list[Path]:
-    """Writes all fields of the volumes `sources` to `output`, in the format of its suffix; returns
-    what was written.
+    """Writes all fields of the volumes `sources` to `output`, in the format of its suffix.
 
-    Raises SceneError where `output` is there and may not be, FormatError for volumes of different
-    cells or boxes, and for none at all.
+    Returns what was written. Raises SceneError where `output` is there and may not be, FormatError
+    for volumes of different cells or boxes, and for none at all.
     """
     require_format(output)
     if output.exists() and not may_exist:
@@ -43,16 +42,14 @@ def _require_same_cells(path: Path, field: Field, first: Field) -> None:
     if field.resolution != first.resolution:
         ours, theirs = (" x ".join(map(str, each.resolution)) for each in (field, first))
         raise FormatError(path, f"has {ours} cells (x, y, z), the first field {theirs}")
-    if not np.array_equal(_bounds(path, field), _bounds(path, first)):
+    box, first_box = _bounds(path, field), _bounds(path, first)
+    if not np.array_equal(box, first_box):
         raise FormatError(
-            path,
-            f"lies in the box {_bounds(path, field).tolist()}, the first field in {_bounds(path, first).tolist()}",
+            path, f"lies in the box {box.tolist()}, the first field in {first_box.tolist()}"
         )
 
 
 def _bounds(path: Path, field: Field) -> np.ndarray:
     if field.bounds is None:
-        raise FormatError(
-            path, 'says no box; add an array "bounds", [[xmin, ymin, zmin], [xmax, ymax, zmax]]'
-        )
+        raise FormatError(path, f'says no box; add an array "bounds", {BOX}')
     return field.bounds

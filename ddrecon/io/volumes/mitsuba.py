@@ -1,8 +1,7 @@
-"""Mitsuba's grid volumes (.vol): a header of 48 bytes, then float32 values, x fastest but for the
-colors, little-endian.
+"""Mitsuba's grid volumes (.vol): a header of 48 bytes, then float32 values, little-endian.
 
 The header: `VOL`, version 3, then int32 type (1: float32), cells along x, y, z and colors, then the
-box as six float32. A file holds one field, without a name.
+box as six float32. Of values, colors run fastest, then x. A file holds one field, without a name.
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ MAGIC, VERSION, FLOAT32 = b"VOL", 3, 1
 
 
 def read_vol(path: Path, name: str) -> Field:
-    """The field in the file at `path`, taken for `name`; raises FormatError when it is damaged or
-    not a legal field.
+    """The field in the file at `path`, taken for `name`.
+
+    Raises FormatError when it is damaged or not a legal field.
     """
     check_size(path.stat().st_size, path, "the volume")
     data = path.read_bytes()
@@ -33,12 +33,14 @@ def read_vol(path: Path, name: str) -> Field:
     if (version, kind) != (VERSION, FLOAT32):
         raise FormatError(
             path,
-            f"is of version {version} and type {kind}; only version {VERSION} with float32 values (type 1) can be read",
+            f"is of version {version} and type {kind}; "
+            f"only version {VERSION} with float32 values (type {FLOAT32}) can be read",
         )
     if min(x, y, z, colors) < 1 or len(data) != HEADER.size + 4 * x * y * z * colors:
         raise FormatError(
             path,
-            f"is damaged: its header says {x} x {y} x {z} cells of {colors}, which is not the size of its data",
+            f"is damaged: its header says {x} x {y} x {z} cells of {colors}, "
+            "which is not the size of its data",
         )
     values = np.frombuffer(data, "<f4", offset=HEADER.size).reshape(z, y, x, colors)
     return check_field(
@@ -50,8 +52,9 @@ def read_vol(path: Path, name: str) -> Field:
 
 
 def write_vol(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes the one of `fields` [z, y, x] or [z, y, x, C] and `bounds` [2, 3] (x, y, z), both as
-    float32; the format knows no names.
+    """Writes the one of `fields`, [z, y, x] or [z, y, x, C], and its box, both as float32.
+
+    `bounds` [2, 3] are the corners (x, y, z) [u]. The format knows no names.
     """
     values = require_only_field(path, fields)
     colors = values.shape[3] if values.ndim == 4 else 1

@@ -1,9 +1,8 @@
-"""Volumes as netCDF, for atmospheric fields: variables on axes x, y and z in any order, through
-`netCDF4` (extra `netcdf`).
+"""Volumes as netCDF, for atmospheric fields, through `netCDF4` (extra `netcdf`).
 
-An axis is told by the attribute `axis` of its coordinate (CF conventions), else by its name.
-Coordinates are centers of cells, evenly spaced, in the unit of x; what they are in is the scene's
-unit of length.
+A field is a variable on axes x, y and z in any order. An axis is known by the attribute `axis` of
+its coordinate (CF conventions), else by its name. Coordinates are centers of cells, evenly spaced,
+in the unit of x, which is taken for the scene's unit of length.
 """
 
 from __future__ import annotations
@@ -37,13 +36,13 @@ METERS = {
     "kilometers": 1000.0,
 }
 EVEN = 0.05
-"""How far off even spacing a coordinate may be, in cells: they are often rounded to a few digits.
-"""
+"""How far off even spacing a coordinate may be [cells]: files often round to a few digits."""
 
 
 def write_netcdf(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, [z, y, x] or [z, y, x, 3], as float32 variables, and `bounds` [2, 3] (x, y,
-    z) as coordinates and their bounds.
+    """Writes `fields`, [z, y, x] or [z, y, x, 3], as float32 variables, and their box.
+
+    `bounds` [2, 3], its corners (x, y, z), are written as coordinates and their bounds.
     """
     netcdf = load_for_file("netCDF4", path)
     z, y, x = next(iter(fields.values())).shape[:3]
@@ -78,22 +77,25 @@ def _write_axis(file: Any, axis: str, edges: np.ndarray) -> None:
 
 
 def netcdf_names(path: Path) -> list[str]:
-    """The variables of the file at `path` that have axes x, y and z; raises FormatError when it
-    cannot be read.
+    """The variables of the file at `path` that have axes x, y and z.
+
+    Raises FormatError when it cannot be read.
     """
     with load_for_file("netCDF4", path).Dataset(path) as file:
         return _names(file)
 
 
 def read_netcdf(path: Path, name: str) -> Field:
-    """The variable `name` of the file at `path`; raises FormatError when it is damaged, absent,
-    unevenly spaced or not a legal field.
+    """The variable `name` of the file at `path`.
+
+    Raises FormatError when it is damaged, absent, unevenly spaced or not a legal field.
     """
     with load_for_file("netCDF4", path).Dataset(path) as file:
         if name not in file.variables:
             raise FormatError(
                 path,
-                f"has no variable {name!r}; on axes x, y and z it has {', '.join(map(repr, _names(file))) or 'none'}",
+                f"has no variable {name!r}; on axes x, y and z it has "
+                f"{', '.join(map(repr, _names(file))) or 'none'}",
             )
         variable = file.variables[name]
         check_size(int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize, path, name)
@@ -109,9 +111,9 @@ def read_netcdf(path: Path, name: str) -> Field:
 
 def _axis_of(file: Any, dimension: str) -> str | None:
     """Which of x, y, z, or color, the `dimension` is."""
-    told = str(getattr(file.variables.get(dimension), "axis", "")).lower()
-    if told in NAMES or dimension == COLOR:
-        return told or COLOR
+    attribute = str(getattr(file.variables.get(dimension), "axis", "")).lower()
+    if attribute in NAMES or dimension == COLOR:
+        return attribute or COLOR
     return next(
         (axis for axis, names in NAMES.items() if dimension.lower().startswith(names)), None
     )
@@ -126,9 +128,11 @@ def _names(file: Any) -> list[str]:
 
 
 def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str]]:
-    """The values as [z, y, x] or [z, y, x, colors], and the names of the dimensions z, y and x;
-    others must have one entry.
+    """The values as [z, y, x] or [z, y, x, colors], and the names of the dimensions z, y and x.
+
+    Other dimensions must have one entry.
     """
+    # What is masked (_FillValue) is NaN, which `check_field` refuses.
     values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
     kept, places = [], {}
     for index, dimension in enumerate(variable.dimensions):
@@ -136,7 +140,8 @@ def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str
         if axis is None and values.shape[index] > 1:
             raise FormatError(
                 path,
-                f"{variable.name} has {values.shape[index]} entries along {dimension!r}; choose one (ncks -d {dimension},0)",
+                f"{variable.name} has {values.shape[index]} entries along {dimension!r}; "
+                f"choose one (ncks -d {dimension},0)",
             )
         if axis is not None:
             places[axis] = dimension
@@ -144,7 +149,8 @@ def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str
     if sorted(kept) not in (["x", "y", "z"], [COLOR, "x", "y", "z"]):
         raise FormatError(
             path,
-            f"{variable.name} has the dimensions {', '.join(variable.dimensions)}; expected x, y and z: rename them so",
+            f"{variable.name} has the dimensions {', '.join(variable.dimensions)}; "
+            "expected x, y and z: rename them so",
         )
     values = values.reshape([len(file.dimensions[places[axis]]) for axis in kept])
     order = ["z", "y", "x", COLOR][: len(kept)]
@@ -152,9 +158,7 @@ def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str
 
 
 def _edges(path: Path, file: Any, dimension: str) -> tuple[float, float] | None:
-    """Where cells along `dimension` begin and end, as they are ordered; None where the file does
-    not say.
-    """
+    """Where cells along `dimension` begin and end, in their order; None if it is not said."""
     if dimension not in file.variables:
         return None
     coordinate = file.variables[dimension]
@@ -162,10 +166,11 @@ def _edges(path: Path, file: Any, dimension: str) -> tuple[float, float] | None:
     steps = np.diff(centers)
     even = np.linspace(centers[0], centers[-1], len(centers))
     if len(steps) and not np.abs(centers - even).max() <= EVEN * abs(steps.mean()):
-        least, most = np.abs(steps).min(), np.abs(steps).max()
+        shortest, longest = np.abs(steps).min(), np.abs(steps).max()
         raise FormatError(
             path,
-            f"{dimension} is not evenly spaced ({least:g} to {most:g}); interpolate it first (xarray: .interp)",
+            f"{dimension} is not evenly spaced ({shortest:g} to {longest:g}); "
+            "interpolate it first (xarray: .interp)",
         )
     scale = _scale(file, coordinate)
     corners = file.variables.get(getattr(coordinate, "bounds", ""))
@@ -177,7 +182,7 @@ def _edges(path: Path, file: Any, dimension: str) -> tuple[float, float] | None:
 
 
 def _scale(file: Any, coordinate: Any) -> float:
-    """What takes `coordinate` to the unit of the first axis of x, where both units are known."""
+    """What takes `coordinate` to the unit of the first axis of x; 1 unless both are known."""
     first = next(
         (
             file.variables[name]

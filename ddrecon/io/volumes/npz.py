@@ -1,5 +1,6 @@
-"""Volumes as NumPy archives: each field under its own name, with `bounds` [[xmin, ymin, zmin],
-[xmax, ymax, zmax]] beside it.
+"""Volumes as NumPy archives: each field under its own name, and its box as `bounds`.
+
+`bounds` is [[xmin, ymin, zmin], [xmax, ymax, zmax]].
 """
 
 from __future__ import annotations
@@ -20,24 +21,26 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def read_npz(path: Path, name: str) -> Field:
-    """The field `name` of the archive at `path`; raises FormatError when it is damaged, absent or
-    not a legal field.
+    """The field `name` of the archive at `path`.
+
+    Raises FormatError when it is damaged, absent or not a legal field.
     """
     with _open(path) as archive:
         names = _names(archive)
         if name not in names:
-            raise FormatError(path, _absence(name, [other for other in names if other != "bounds"]))
+            raise FormatError(path, _explain_absence(name, _without_bounds(names)))
         bounds = _read_entry(archive, "bounds", path) if "bounds" in names else None
         values = _read_entry(archive, name, path)
     return check_field(path, name, values, bounds)
 
 
 def npz_names(path: Path) -> list[str]:
-    """The names of all arrays of the archive at `path` but `bounds`; raises FormatError when it is
-    damaged.
+    """The names of all arrays of the archive at `path` but `bounds`.
+
+    Raises FormatError when it is damaged.
     """
     with _open(path) as archive:
-        return [name for name in _names(archive) if name != "bounds"]
+        return _without_bounds(_names(archive))
 
 
 @contextmanager
@@ -55,9 +58,14 @@ def _names(archive: zipfile.ZipFile) -> list[str]:
     return [entry.removesuffix(".npy") for entry in archive.namelist()]
 
 
+def _without_bounds(names: list[str]) -> list[str]:
+    return [name for name in names if name != "bounds"]
+
+
 def write_npz(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 under their names, with `bounds`
-    [2, 3] (x, y, z), compressed.
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 under their names, compressed.
+
+    `bounds` [2, 3] are the corners (x, y, z) of the box [u].
     """
     with replace_file(path) as temporary, temporary.open("wb") as stream:
         arrays = {name: np.asarray(values, np.float32) for name, values in fields.items()} | {
@@ -71,13 +79,17 @@ def _read_entry(archive: zipfile.ZipFile, name: str, path: Path) -> np.ndarray:
     if entry.compress_type not in _METHODS:
         raise FormatError(
             path,
-            f"{name} is compressed by method {entry.compress_type}; write it with numpy.savez_compressed",
+            f"{name} is compressed by method {entry.compress_type}; "
+            "write it with numpy.savez_compressed",
         )
     with archive.open(entry) as stream:
         return read_npy(stream, entry.file_size, path, name)
 
 
-def _absence(name: str, others: list[str]) -> str:
+def _explain_absence(name: str, others: list[str]) -> str:
     if len(others) == 1:
-        return f"has no field {name!r}, only {others[0]!r}; save that array as {name!r}, or say name: {others[0]} beside file"
+        return (
+            f"has no field {name!r}, only {others[0]!r}; "
+            f"save that array as {name!r}, or say name: {others[0]} beside file"
+        )
     return f"has no field {name!r}; it has {', '.join(map(repr, others)) or 'none'}"

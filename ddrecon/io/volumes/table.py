@@ -22,8 +22,9 @@ from ddrecon.io.volumes.vti import read_vti, vti_names, write_vti
 
 @dataclass(frozen=True)
 class VolumeFormat:
-    """How one kind of volume file is read and written: `names(path)`, `read(path, name)`,
-    `write(path, fields, bounds)`.
+    """How one kind of volume file is read and written.
+
+    By `names(path)`, `read(path, name)` and `write(path, fields, bounds)`.
     """
 
     names: Callable[[Path], list[str]]
@@ -42,15 +43,19 @@ FORMATS: dict[str, VolumeFormat] = {
 
 
 def field_names(path: Path) -> list[str]:
-    """The fields that the volume file at `path` holds; raises FormatError when it cannot be read."""
+    """The fields that the volume file at `path` holds.
+
+    Raises FormatError when it cannot be read.
+    """
     names = _format_of(path).names
     with guard_reading(path):
         return names(path)
 
 
 def read_field(path: Path, name: str) -> Field:
-    """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`; raises FormatError
-    when it cannot be used.
+    """The field `name` (`density`, `sigma_a`, ...) of the volume file at `path`.
+
+    Raises FormatError when it cannot be used.
     """
     read = _format_of(path).read
     with guard_reading(path):
@@ -58,15 +63,17 @@ def read_field(path: Path, name: str) -> Field:
 
 
 def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -> None:
-    """Writes `values` [z, y, x] or [z, y, x, 3] and `bounds` [2, 3] (x, y, z) in the format of
-    `path`'s suffix, as float32.
+    """Writes `values` [z, y, x] or [z, y, x, 3], as float32, in the format of `path`'s suffix.
+
+    `bounds` [2, 3] are the corners (x, y, z) of the box [u].
     """
     write_fields(path, {name: values}, bounds)
 
 
 def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes several fields of the same cells, by name, each as `write_field`; raises FormatError
-    where the format holds but one.
+    """Writes several fields of the same cells, by name, each as `write_field` does.
+
+    Raises FormatError where the format holds but one.
     """
     _format_of(path).write(path, fields, bounds)
 

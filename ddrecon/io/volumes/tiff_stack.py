@@ -1,9 +1,8 @@
-"""Volumes as float TIFF stacks, for Fiji and napari: a page a slice across z, row 0 at the lowest
-y, three channels for colors.
+"""Volumes as float TIFF stacks, for Fiji and napari: a page a slice across z.
 
-Laid out as ImageJ's hyperstacks, through `tifffile` (extra `tiff`). A file holds one field, without
-a name. Its box is in ImageJ's calibration, and in full precision in an entry `bounds` of its
-description.
+Row 0 is at the lowest y, and colors are three channels. Laid out as ImageJ's hyperstacks, through
+`tifffile` (extra `tiff`). A file holds one field, without a name. Its box is in ImageJ's
+calibration, and in full precision in an entry `bounds` of its description.
 """
 
 from __future__ import annotations
@@ -23,8 +22,9 @@ from ddrecon.io.volumes.field import Field, Fields, check_field, require_only_fi
 
 
 def write_stack(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes the one of `fields`, [z, y, x] or [z, y, x, 3], as float32, and `bounds` [2, 3] (x, y,
-    z); the format knows no names.
+    """Writes the one of `fields`, [z, y, x] or [z, y, x, 3], as float32, and its box.
+
+    `bounds` [2, 3] are the corners (x, y, z) [u]. The format knows no names.
     """
     tifffile = load_for_file("tifffile", path)
     values = as_float32(require_only_field(path, fields))
@@ -48,8 +48,9 @@ def write_stack(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 
 
 def read_stack(path: Path, name: str) -> Field:
-    """The field in the file at `path`, taken for `name`; raises FormatError when it is damaged or
-    not a legal field.
+    """The field in the file at `path`, taken for `name`.
+
+    Raises FormatError when it is damaged or not a legal field.
     """
     with open_tiff(path) as file:
         series = file.series[0]
@@ -60,8 +61,9 @@ def read_stack(path: Path, name: str) -> Field:
 
 
 def _slices(path: Path, values: np.ndarray, axes: str) -> np.ndarray:
-    """`values` as [z, y, x] or [z, y, x, colors]; `axes` are tifffile's letters, of which C and S
-    are colors.
+    """`values` as [z, y, x] or [z, y, x, colors].
+
+    `axes` are tifffile's letters, of which C (channels) and S (samples) are colors.
     """
     if values.dtype.kind not in "fiub":
         raise FormatError(path, f"holds values of type {values.dtype}; save it as 32-bit float")
@@ -72,7 +74,8 @@ def _slices(path: Path, values: np.ndarray, axes: str) -> np.ndarray:
     if axes[-2:] != "YX" or len(axes) > 3:
         raise FormatError(
             path,
-            f"has the axes {axes}; expected slices (Z), rows (Y) and columns (X), and colors if any",
+            f"has the axes {axes}; "
+            "expected slices (Z), rows (Y) and columns (X), and colors if any",
         )
     return values if len(axes) == 3 else values[None]
 

@@ -1,9 +1,9 @@
-"""OpenVDB files (.vdb), for Blender, Houdini and Karma: each field a fog volume of its own name,
-float, or vec3s for colors.
+"""OpenVDB files (.vdb), for Blender, Houdini and Karma, written without OpenVDB.
 
-Voxel (i, j, k) of a file is our cell (i, j, k) along x, y, z; its center is where the grid's
-transform puts that index. The background is 0, and active is what is not 0. How many cells the box
-has, which a sparse grid does not say, is its metadata `ddrecon_resolution`.
+Each field is a fog volume of its own name, of type float, or vec3s for colors. Voxel (i, j, k) of a
+file is our cell (i, j, k) along x, y, z; its center is where the grid's transform puts that index.
+The background is 0, and active is what is not 0. How many cells the box has, which a sparse grid
+does not say, is its metadata `ddrecon_resolution`.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ MAGIC, FILE_VERSION, LIBRARY_VERSION = 0x56444220, 224, (10, 0)
 ACTIVE_MASK_COMPRESSION = 2
 ONLY_ACTIVE_VALUES = b"\0"
 LEAF, LOWER, UPPER = 3, 4, 5
-"""Log2 of the children along an axis of a leaf and of the nodes above it: OpenVDB's standard tree.
-"""
+"""Log2 of the children along an axis, of a leaf and the nodes above: OpenVDB's standard tree."""
 POSITIONS = struct.Struct("<3q")
 
 
 def write_vdb(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes, and `bounds` [2, 3]
-    (x, y, z) as their transform.
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes.
+
+    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform.
     """
     header = (
         struct.pack("<qIIIB", MAGIC, FILE_VERSION, *LIBRARY_VERSION, 1) + str(uuid.uuid4()).encode()
@@ -45,8 +45,9 @@ def write_vdb(path: Path, fields: Fields, bounds: np.ndarray) -> None:
 
 
 def _grid(name: str, values: np.ndarray, bounds: np.ndarray, start: int) -> bytes:
-    """The grid of `values` for the place `start` in a file: a descriptor that says where its parts
-    lie, then those parts.
+    """The grid of `values`, for the place `start` in a file.
+
+    It is a descriptor that says where its parts lie, then those parts.
     """
     kind = "float" if values.ndim == 3 else "vec3s"
     descriptor = _text(name) + _text(f"Tree_{kind}_5_4_3") + _text("")
@@ -79,8 +80,10 @@ def _grid(name: str, values: np.ndarray, bounds: np.ndarray, start: int) -> byte
 
 @dataclass(frozen=True)
 class _Leaf:
-    """8^3 voxels: under which child of the root (x, y, z), under which of its and of that one's
-    children; the active ones, their values.
+    """8^3 voxels: which are active, and their values.
+
+    It is under the child `root` (x, y, z) of the root, that one's child number `upper`, and its
+    child number `lower`.
     """
 
     root: tuple[int, int, int]
@@ -92,15 +95,18 @@ class _Leaf:
 
 def _leaves(values: np.ndarray) -> list[_Leaf]:
     """The leaves of `values` that hold anything but 0, in the order of the tree."""
+    # [x, y, z, color], padded to whole leaves.
     colors = values.reshape(*values.shape[:3], -1).transpose(2, 1, 0, 3)
     padded = np.pad(colors, [(0, -count % 8) for count in colors.shape[:3]] + [(0, 0)])
     x, y, z = (count // 8 for count in padded.shape[:3])
+    # The 512 voxels of each leaf, z fastest.
     blocks = (
         padded.reshape(x, 8, y, 8, z, 8, -1)
         .transpose(0, 2, 4, 1, 3, 5, 6)
         .reshape(x, y, z, 512, -1)
     )
     is_active = (blocks != 0).any(-1)
+    # Leaves that hold something, in order of the nodes they are under, from the top.
     places = np.argwhere(is_active.any(-1))
     keys = np.column_stack(
         [places >> (LOWER + UPPER), _offset(places >> LOWER, UPPER), _offset(places, LOWER)]
@@ -123,8 +129,9 @@ def _leaf(key: list[int], voxels: np.ndarray, is_active: np.ndarray) -> _Leaf:
 
 
 def _offset(places: np.ndarray, size: int) -> np.ndarray:
-    """The number, z fastest, of the child of a node at each of `places` [n, 3], modulo its 2^size
-    children along an axis.
+    """The number, z fastest, of a node's child at each of `places` [n, 3].
+
+    A node has 2^size children along an axis.
     """
     return (places % 2**size) @ [2 ** (2 * size), 2**size, 1]
 
@@ -139,14 +146,12 @@ def _topology(leaves: list[_Leaf], background: bytes) -> bytes:
     data = struct.pack("<i", 1) + background + struct.pack("<II", 0, len(roots))
     side = 2 ** (LEAF + LOWER + UPPER)
     for root, members in roots:
-        data += struct.pack("<3i", *(side * place for place in root)) + _node(
-            [leaf.upper for leaf in members], UPPER
-        )
+        data += struct.pack("<3i", *(side * place for place in root))
+        data += _node([leaf.upper for leaf in members], UPPER)
         for _, siblings in groupby(members, lambda leaf: leaf.upper):
             below = list(siblings)
-            data += _node([leaf.lower for leaf in below], LOWER) + b"".join(
-                leaf.mask for leaf in below
-            )
+            data += _node([leaf.lower for leaf in below], LOWER)
+            data += b"".join(leaf.mask for leaf in below)
     return data
 
 

@@ -1,5 +1,6 @@
-"""Reading OpenVDB files, through the module `openvdb` (`pyopenvdb` before OpenVDB 11), which Debian
-and Blender have but pip has not.
+"""Reading OpenVDB files, through the module `openvdb` (`pyopenvdb` before OpenVDB 11).
+
+Debian and Blender have it, pip has not.
 """
 
 from __future__ import annotations
@@ -18,25 +19,27 @@ from ddrecon.io.volumes.vdb import RESOLUTION
 
 MODULES = ("openvdb", "pyopenvdb")
 ADVICE = (
-    "reading .vdb needs the Python module openvdb, which pip does not have. Convert the file to .npz where it is at hand, in Blender's "
-    "Python or in Debian's (apt-get install python3-openvdb): docs/formats.md has the line to type"
+    "reading .vdb needs the Python module openvdb, which pip does not have. Convert the file to "
+    ".npz where it is at hand, in Blender's Python or in Debian's (apt-get install "
+    "python3-openvdb): docs/formats.md has the line to type"
 )
 COMPONENTS = {"float": 1, "double": 1, "half": 1, "vec3s": 3, "vec3d": 3}
 
 
 def vdb_names(path: Path) -> list[str]:
-    """The names of the scalar and vector grids of the file at `path`; raises FormatError when it
-    cannot be read.
+    """The names of the scalar and vector grids of the file at `path`.
+
+    Raises FormatError when it cannot be read.
     """
     return list(_grids(path))
 
 
 def read_vdb(path: Path, name: str) -> Field:
-    """The grid `name` of the file at `path`, over the cells it was written with or else the active
-    voxels of all such grids together.
+    """The grid `name` of the file at `path`.
 
-    Raises FormatError when it cannot be read, is absent, turned against the axes, or not a legal
-    field.
+    It has the cells that it was written with, or else those of the active voxels of all grids that
+    lie as it does. Raises FormatError when it cannot be read, is absent, turned against the axes,
+    or not a legal field.
     """
     grids = _grids(path)
     if name not in grids:
@@ -93,19 +96,21 @@ def _cells(path: Path, grid: Any, others: list[Any]) -> tuple[np.ndarray, np.nda
 
 
 def _map(path: Path, grid: Any) -> np.ndarray:
-    """Index to world as [[scale], [shift]], both (x, y, z); raises FormatError unless cells lie
-    along the axes.
+    """Index to world as [[scale], [shift]], both (x, y, z).
+
+    Raises FormatError unless cells lie along the axes.
     """
     origin, *ends = (
         np.array(grid.transform.indexToWorld(tuple(place)))
         for place in np.vstack([np.zeros(3), np.eye(3)])
     )
-    turn = np.stack(ends) - origin
-    scale = np.diagonal(turn)
-    if (np.abs(turn - np.diag(scale)) > 1e-6 * np.abs(scale).max()).any() or (scale <= 0).any():
+    axes = np.stack(ends) - origin
+    scale = np.diagonal(axes)
+    if (np.abs(axes - np.diag(scale)) > 1e-6 * np.abs(scale).max()).any() or (scale <= 0).any():
         raise FormatError(
             path,
-            f"grid {grid.name!r} is turned, mirrored or in perspective; resample it along the axes first",
+            f"grid {grid.name!r} is turned, mirrored or in perspective; "
+            "resample it along the axes first",
         )
     return np.stack([scale, origin])
 

@@ -1,8 +1,8 @@
-"""Volumes as VTK image data (.vti), which ParaView opens: each field a cell array of its own name,
-three components for colors.
+"""Volumes as VTK image data (.vti), which ParaView opens.
 
-Written as float32, appended raw. Read: uncompressed cell arrays of float32 or float64, appended raw
-or inline in base64 ("binary").
+Each field is a cell array of its own name, with three components for colors. Written as float32,
+appended raw. Read: uncompressed cell arrays of float32 or float64, appended raw or inline in base64
+("binary").
 """
 
 from __future__ import annotations
@@ -30,13 +30,12 @@ ADVICE = 'save it uncompressed, cell data as Float32, encoded "Appended raw" or 
 
 
 def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
-    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and `bounds` [2, 3] (x, y,
-    z) as origin and spacing.
+    """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 cells, and their box.
+
+    `bounds` [2, 3], its corners (x, y, z) [u], are written as origin and spacing.
     """
-    cells, (low, high) = (
-        np.array(next(iter(fields.values())).shape[2::-1]),
-        np.asarray(bounds, np.float64),
-    )
+    cells = np.array(next(iter(fields.values())).shape[2::-1])
+    low, high = np.asarray(bounds, np.float64)
     extent = " ".join(f"0 {count}" for count in cells)
     origin, spacing = (
         " ".join(repr(float(number)) for number in line) for line in (low, (high - low) / cells)
@@ -44,7 +43,10 @@ def write_vti(path: Path, fields: Fields, bounds: np.ndarray) -> None:
     arrays, data = "", b""
     for name, values in fields.items():
         components = values.shape[3] if values.ndim == 4 else 1
-        arrays += f'<DataArray type="Float32" Name={quoteattr(name)} NumberOfComponents="{components}" format="appended" offset="{len(data)}"/>\n'
+        arrays += (
+            f'<DataArray type="Float32" Name={quoteattr(name)} NumberOfComponents="{components}" '
+            f'format="appended" offset="{len(data)}"/>\n'
+        )
         block = as_float32(values).astype("<f4", copy=False).tobytes()
         data += np.array(len(block), "<u8").tobytes() + block
     head = f"""<?xml version="1.0"?>
@@ -68,8 +70,9 @@ def vti_names(path: Path) -> list[str]:
 
 
 def read_vti(path: Path, name: str) -> Field:
-    """The cell array `name` of the file at `path`; raises FormatError when it is damaged, absent,
-    compressed or not a legal field.
+    """The cell array `name` of the file at `path`.
+
+    Raises FormatError when it is damaged, absent, compressed or not a legal field.
     """
     with _open(path) as (root, appended):
         values, bounds = _read(path, root, appended, name)
@@ -104,6 +107,7 @@ def _split(content: bytes) -> tuple[bytes, bytes]:
 def _read(
     path: Path, root: ElementTree.Element, appended: bytes, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
+    """The cell array `name` as it is stored, [z, y, x] or [z, y, x, components], and its box."""
     if "compressor" in root.attrib:
         raise ValueError("compressed")
     image = _only(root, "ImageData")
