@@ -21,7 +21,7 @@ from torch import Tensor
 from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.grid import Grid
 from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
-from ddrecon.reference.trace import load_mitsuba, translate_errors
+from ddrecon.reference.trace import load_mitsuba, make_mitsuba_objects
 from ddrecon.scene import Scene
 
 RING = 2
@@ -49,7 +49,7 @@ class Replay:
         described = mitsuba_scene(scene, scene.views[:1]) | {
             MEDIUM: mitsuba_scene(_roomy_scene(scene, headroom), [])[MEDIUM]
         }
-        loaded = module.load_dict(translate_errors(module, described))
+        loaded = module.load_dict(make_mitsuba_objects(module, described))
         integrator = module.load_dict(
             {"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST}
         )

@@ -16,18 +16,20 @@ from ddrecon.scene import Scene
 
 
 def pick_color(scene: Scene, color: int) -> Scene:
-    """`scene` as seen in `color` (0, 1, 2 for red, green, blue) alone; views keep their cameras
-    only.
+    """`scene` as seen in `color` alone: 0, 1, 2 for red, green, blue.
+
+    Views keep their cameras only.
     """
     volume = replace(
         scene.volume,
         sigma_a=_pick(scene.volume.sigma_a, color),
         sigma_s=_pick(scene.volume.sigma_s, color),
     )
-    return replace(scene, volume=volume, lights=[_light(light, color) for light in scene.lights])
+    lights = [_pick_light(light, color) for light in scene.lights]
+    return replace(scene, volume=volume, lights=lights)
 
 
-def _light(light: Light, color: int) -> Light:
+def _pick_light(light: Light, color: int) -> Light:
     if isinstance(light, DirectionalLight):
         return replace(light, irradiance=_pick(light.irradiance, color))
     if isinstance(light, AmbientLight):

@@ -22,27 +22,22 @@ from ddrecon.report.pictures import comparison, diverging, pixels
 from ddrecon.scene import Scene, View
 
 PASSES = 8
-"""Passes an image is traced in, by whose scatter its noise is told; fewer where there are fewer
-paths a pixel than that.
-"""
+"""Passes an image is traced in, whose scatter says how noisy it is; no more than paths a pixel."""
 SEEDS = 2**30
+"""Seeds that Mitsuba takes."""
 Progress = Callable[[Sequence[int], str], Iterable[int]]
+"""Hands on the numbers of passes while it shows how far, under this name, they are."""
 
 
 def trace_to_folder(
     tracer: Tracer, views: Sequence[View], folder: Path, samples: int, seed: int, progress: Progress
 ) -> dict[str, Any]:
-    """Writes the images of `views`, traced with `samples` paths a pixel, as NAME.* into `folder`,
-    and returns a report.
+    """Writes the images of `views`, traced with `samples` paths a pixel, and returns a report.
 
-    `tracer` must be of these views, `samples` at least 2; `progress` is told of the passes of each
-    view.
+    They are NAME.* in `folder`. `tracer` must be of these views, `samples` at least 2; `progress`
+    is told of the passes of each view.
     """
-    report: dict[str, Any] = {
-        "settings": _settings(tracer, samples, seed),
-        "views": {},
-        "files": {},
-    }
+    report = _start_report(tracer, samples, seed)
     for index, view in enumerate(views):
         traced, seconds = _trace(tracer, index, view.name, samples, seed, progress)
         report["views"][view.name] = {"noise": traced.noise, "seconds": {"reference": seconds}}
@@ -61,16 +56,12 @@ def compare_to_folder(
     seed: int,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Writes NAME.reference.*, NAME.ours.*, NAME.difference.* (ours less the reference) and
-    NAME.comparison.png for `views` of `scene`.
+    """Writes traced and our own images of `views` of `scene`, and returns a report with our errors.
 
-    Arguments and result are those of `trace_to_folder`, the report with our errors in it.
+    They are NAME.reference.*, NAME.ours.*, NAME.difference.* (ours less the reference) and
+    NAME.comparison.png in `folder`. Arguments are those of `trace_to_folder`.
     """
-    report: dict[str, Any] = {
-        "settings": _settings(tracer, samples, seed),
-        "views": {},
-        "files": {},
-    }
+    report = _start_report(tracer, samples, seed)
     start = perf_counter()
     with torch.no_grad():
         light_field = solve_light(scene, SolveMemory())
@@ -82,7 +73,7 @@ def compare_to_folder(
             ours = view_image(light_field, scene, view.camera).cpu()
         times = {"reference": seconds, "ours": perf_counter() - start}
         theirs = torch.from_numpy(traced.image).permute(2, 0, 1).to(ours)
-        report["views"][view.name] = _figures(traced, ours, theirs) | {"seconds": times}
+        report["views"][view.name] = _measure(traced, ours, theirs) | {"seconds": times}
         report["files"][view.name] = [
             path.name for path in _write(folder / view.name, ours, theirs)
         ]
@@ -92,8 +83,9 @@ def compare_to_folder(
 def write_reference_report(
     folder: Path, report: dict[str, Any], environment: dict[str, Any]
 ) -> dict[str, Any]:
-    """Writes `report` and the `environment` it was made in to `reference.json` in `folder`, and
-    returns both together.
+    """Writes `report` and the `environment` it was made in to `reference.json` in `folder`.
+
+    Returns both together.
     """
     import mitsuba
 
@@ -102,10 +94,11 @@ def write_reference_report(
     return whole
 
 
-def _settings(tracer: Tracer, samples: int, seed: int) -> dict[str, Any]:
-    passes = min(PASSES, samples)
-    return {
-        "samples_per_pixel": passes * -(-samples // passes),
+def _start_report(tracer: Tracer, samples: int, seed: int) -> dict[str, Any]:
+    """A report of the settings, and as yet of no view."""
+    passes, samples_per_pass = _split(samples)
+    settings = {
+        "samples_per_pixel": passes * samples_per_pass,
         "passes": passes,
         "seed": seed,
         "variant": tracer.module.variant(),
@@ -114,22 +107,30 @@ def _settings(tracer: Tracer, samples: int, seed: int) -> dict[str, Any]:
         "russian_roulette": False,
         "colors_traced_apart": len(tracer.scenes) > 1,
     }
+    return {"settings": settings, "views": {}, "files": {}}
+
+
+def _split(samples: int) -> tuple[int, int]:
+    """How many passes `samples` are traced in, and how many each has, rounded up."""
+    passes = min(PASSES, samples)
+    return passes, -(-samples // passes)
 
 
 def _trace(
     tracer: Tracer, index: int, name: str, samples: int, seed: int, progress: Progress
 ) -> tuple[Traced, float]:
     """The traced image of view number `index`, and the seconds it took."""
-    passes, start = min(PASSES, samples), perf_counter()
-    share, first = -(-samples // passes), seed * passes
+    start = perf_counter()
+    passes, samples_per_pass = _split(samples)
     images = [
-        tracer.trace(index, (first + number) % SEEDS, share)
+        tracer.trace(index, (seed * passes + number) % SEEDS, samples_per_pass)
         for number in progress(range(passes), name)
     ]
     return Traced.of(images), perf_counter() - start
 
 
-def _figures(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:
+def _measure(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:
+    """How far `ours` [3, h, w] is from what was traced; `theirs` is the same image as a tensor."""
     image, mean = pixels(ours).astype(np.float64), float(traced.image.mean())
     return {
         "error": traced.error(image),

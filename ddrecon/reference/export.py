@@ -1,5 +1,6 @@
-"""A scene as files that Mitsuba opens: XML, and beside it its volumes (.vol) and its environment
-map (.exr). Mitsuba is not needed.
+"""A scene as files that Mitsuba opens, for which Mitsuba is not needed.
+
+They are XML, and beside it its volumes (.vol) and its environment map (.exr).
 """
 
 from __future__ import annotations
@@ -39,10 +40,11 @@ KINDS = {
 VECTORS = {"position": "point", "direction": "vector"}
 NUMBERS: dict[type, str] = {bool: "boolean", int: "integer", float: "float", str: "string"}
 Arrays = dict[Path, np.ndarray]
+"""What belongs in files beside the XML."""
 
 
 def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
-    """Writes `scene` to `path` (.xml) and files named like it beside it, and returns their paths.
+    """Writes `scene` to `path` (.xml) and files named like it beside it; returns their paths.
 
     Raises SceneError where one exists and `may_exist` is False, the folder does not exist, or for
     what Mitsuba cannot show.
@@ -73,8 +75,9 @@ def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
 
 
 def _element(name: str, value: Any, naming: str, path: Path, arrays: Arrays) -> ElementTree.Element:
-    """`value` as XML, called `name` in the attribute `naming`; what belongs in a file of its own is
-    added to `arrays`.
+    """`value` as XML, called `name` in the attribute `naming`.
+
+    What belongs in a file of its own is added to `arrays`.
     """
     if isinstance(value, dict):
         return _plugin(name, value, naming, path, arrays)

@@ -19,8 +19,9 @@ Color = tuple[float, float, float]
 
 
 def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
-    """What Mitsuba makes of `lights`, by names of their own; raises SceneError for more than one
-    environment map.
+    """`lights` as Mitsuba's emitters, by names of their own.
+
+    Raises SceneError for more than one environment map.
     """
     near = {
         f"light_{index}": _light(light)
@@ -30,7 +31,8 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
     maps = [light for light in lights if isinstance(light, EnvironmentLight)]
     if len(maps) > 1:
         raise SceneError(
-            f"the scene has {len(maps)} environment maps, and Mitsuba takes one; give it the one they sum to"
+            f"the scene has {len(maps)} environment maps, and Mitsuba takes one; "
+            "give it the one they sum to"
         )
     ambient = np.sum(
         [_color(light.radiance) for light in lights if isinstance(light, AmbientLight)]

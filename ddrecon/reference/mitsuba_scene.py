@@ -1,8 +1,8 @@
-"""A scene in Mitsuba's words: nested dictionaries as its `load_dict` takes them, but of plain
-values, so that Mitsuba is not needed here.
+"""A scene in Mitsuba's words: nested dictionaries as its `load_dict` takes them.
 
-The one convention: arrays are told apart by their axes. [4, 4] is a transform, [h, w, 3] a picture,
-[z, y, x, C] a volume, all float32 but the transform; a tuple is a color and a list a vector.
+They are of plain values, so that Mitsuba is not needed here. The one convention: arrays are told
+apart by their axes. [4, 4] is a transform, [h, w, 3] a picture, [z, y, x, C] a volume, all float32
+but the transform; a tuple is a color and a list a vector.
 
 Where albedo differs from cell to cell, Mitsuba interpolates it where we interpolate the scattering
 coefficient, so it is handed over on `FINER` times finer cells (in grids of at most `MANY`), between
@@ -35,26 +35,21 @@ weighs so much that noise was ten times higher.
 SAMPLES = 256
 """Paths a pixel where nobody says otherwise."""
 GRAY = 1e-5
-"""Colors whose extinctions differ by less, relatively, are of one extinction: red, green and blue
-then share their paths.
-"""
+"""Colors whose extinctions differ by less, relatively, share their paths."""
 FINER, MANY = 3, 2**20
 NEAR = 1e-4
 """How far from the eye Mitsuba's rays start, in diagonals of the box; it wants more than 0."""
 SQUARE = 1e-5
-"""Pixels this little off square are taken for square, which is an error of as many parts of the
-image's height.
-"""
+"""Pixels this little off square are taken for square: the error is that part of the height."""
 MEDIUM = "medium"
 
 
 def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[str, Any]:
-    """`scene` seen by the cameras of `views`, by paths of at most `depth` segments (2: scattered
-    once; -1: up to `LONGEST`).
+    """`scene` seen by the cameras of `views`, by paths of at most `depth` segments.
 
-    The cameras are `sensor_0`, `sensor_1`, ... Raises SceneError for what Mitsuba cannot show:
-    several environment maps, pixels that are not square, and views of whose rays only some start
-    inside the volume.
+    With 2 light scatters once; -1 is `LONGEST`. The cameras are `sensor_0`, `sensor_1`, ... Raises
+    SceneError for what Mitsuba cannot show: several environment maps, pixels that are not square,
+    and views of whose rays only some start inside the volume.
     """
     return {
         "type": "scene",
@@ -83,7 +78,7 @@ def is_gray(volume: Volume) -> bool:
 
 
 def _medium(volume: Volume) -> dict[str, Any]:
-    volume = _plain(volume)
+    volume = _to_double(volume)
     sigma_t = volume.sigma_a + volume.sigma_s
     if is_gray(volume):
         sigma_t = sigma_t.mean(0, keepdim=True)
@@ -100,9 +95,10 @@ def _medium(volume: Volume) -> dict[str, Any]:
     }
 
 
-def _plain(volume: Volume) -> Volume:
-    """`volume` in double precision on the CPU, without derivatives; cross sections [C, z, y, x] or
-    [C, 1, 1, 1].
+def _to_double(volume: Volume) -> Volume:
+    """`volume` in double precision on the CPU, without derivatives.
+
+    Cross sections are [C, z, y, x] or [C, 1, 1, 1].
     """
     density, sigma_a, sigma_s, g = (
         value.detach().cpu().double()
@@ -116,11 +112,13 @@ def _fields(sigma: Tensor) -> Tensor:
 
 
 def _albedo(volume: Volume) -> Any:
-    """The part of extinction that scatters: a number, a color or a volume; 0 where nothing is
-    extinguished.
+    """The part of extinction that scatters: a number, a color or a volume.
+
+    0 where nothing is extinguished.
     """
     absorbing, scattering = torch.broadcast_tensors(volume.sigma_a, volume.sigma_s)
     if absorbing[0].numel() > 1:
+        # Finer cells: Mitsuba interpolates the albedo, we the scattering coefficient.
         times = FINER if volume.grid.cells <= MANY else 1
         fields = (sigma * volume.density for sigma in (absorbing, scattering))
         absorbing, scattering = (
@@ -143,30 +141,31 @@ def _grid_volume(values: Tensor, grid: Grid) -> dict[str, Any]:
         "type": "gridvolume",
         "grid": array,
         "raw": True,
-        "to_world": _placed(lower, upper - lower),
+        "to_world": _place(lower, upper - lower),
     }
 
 
 def _box(grid: Grid) -> dict[str, Any]:
     """The box, whose faces do nothing but hold the medium; Mitsuba's cube runs from -1 to 1."""
-    place = _placed(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2)
     return {
         "type": "cube",
-        "to_world": place,
+        "to_world": _place(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2),
         "bsdf": {"type": "null"},
         "interior": {"type": "ref", "id": MEDIUM},
     }
 
 
-def _placed(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The transform [4, 4] that scales by `scale` [3] and then shifts by `origin` [3]."""
     matrix = np.diag([*scale, 1.0])
     matrix[:3, 3] = origin
     return matrix
 
 
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:
-    """The camera: Mitsuba's looks along +z with +x to the left, and its film keeps the mean of each
-    pixel.
+    """The camera of `view`, whose film keeps the mean of each pixel.
+
+    Mitsuba's cameras look along +z with +x to the left.
     """
     camera = view.camera
     height, width = camera.size
@@ -191,7 +190,8 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     if camera.is_perspective:
         if not math.isclose(camera.pixel_aspect, 1, rel_tol=SQUARE):
             raise SceneError(
-                f"view {view.name!r}: Mitsuba's pixels are square, those of this camera {camera.pixel_aspect:.6g} times as high as wide"
+                f"view {view.name!r}: Mitsuba's pixels are square, "
+                f"those of this camera {camera.pixel_aspect:.6g} times as high as wide"
             )
         fov = 2 * math.degrees(math.atan(camera.half_width))
         offsets = {
@@ -217,6 +217,7 @@ def _starts_inside(name: str, camera: Camera, grid: Grid) -> bool:
     is_inside = ((start > lower) & (start < upper)).all(1)
     if bool(is_inside.any()) and not bool(is_inside.all()):
         raise SceneError(
-            f"view {name!r}: Mitsuba cannot show rays of which only some start inside the volume; move the camera back"
+            f"view {name!r}: Mitsuba cannot show rays of which only some start inside the volume; "
+            "move the camera back"
         )
     return bool(is_inside.any())

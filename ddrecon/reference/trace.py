@@ -1,5 +1,6 @@
-"""Path-traced images (Mitsuba 3, extra `reference`): passes with seeds of their own, whose scatter
-tells how noisy their mean is.
+"""Path-traced images (Mitsuba 3, extra `reference`).
+
+An image is traced in passes with seeds of their own, whose scatter tells how noisy their mean is.
 """
 
 from __future__ import annotations
@@ -21,14 +22,15 @@ from ddrecon.scene import Scene, View
 
 @dataclass(frozen=True, eq=False)
 class Tracer:
-    """Mitsuba, and its `scenes`: one that all colors share, or one for each of red, green and blue."""
+    """Mitsuba, and its `scenes`: one that colors share, or one for each of red, green and blue."""
 
     module: ModuleType
     scenes: tuple[Any, ...]
 
     def trace(self, view: int, seed: int, samples: int) -> np.ndarray:
-        """The image [h, w, 3], float64, of view number `view` by `samples` paths a pixel; each
-        `seed` >= 0 has paths of its own.
+        """The image [h, w, 3], float64, of view number `view` by `samples` paths a pixel.
+
+        Each `seed` >= 0 has paths of its own.
         """
         images = [
             self._render(scene, view, len(self.scenes) * seed + index, samples)
@@ -46,28 +48,27 @@ class Tracer:
 def open_tracer(
     scene: Scene, views: Sequence[View], depth: int = -1, threads: int | None = None
 ) -> Tracer:
-    """What traces `views` of `scene` on `threads` threads (None: all), by paths of at most `depth`
-    segments (-1: practically any number).
+    """What traces `views` of `scene`, by paths of at most `depth` segments, -1 for no limit.
 
-    Colors whose extinctions differ are traced one by one. Raises MissingExtraError without Mitsuba,
-    SceneError for what it cannot show.
+    It takes `threads` threads (None: all). Colors whose extinctions differ are traced one by one.
+    Raises MissingExtraError without Mitsuba, SceneError for what it cannot show.
     """
     module = load_mitsuba(threads)
     scenes = [scene] if is_gray(scene.volume) else [pick_color(scene, color) for color in range(3)]
     return Tracer(
         module,
         tuple(
-            module.load_dict(translate_errors(module, mitsuba_scene(one, views, depth)))
+            module.load_dict(make_mitsuba_objects(module, mitsuba_scene(one, views, depth)))
             for one in scenes
         ),
     )
 
 
 def load_mitsuba(threads: int | None = None) -> ModuleType:
-    """Mitsuba, set to the variant `llvm_ad_rgb` where DRJIT_LIBLLVM_PATH names an LLVM for it, else
-    to `scalar_rgb`.
+    """Mitsuba, on `threads` threads (None: all); it is quiet but for errors.
 
-    Raises MissingExtraError where it is not installed.
+    Its variant is `llvm_ad_rgb` where DRJIT_LIBLLVM_PATH names an LLVM, else `scalar_rgb`. Raises
+    MissingExtraError where it is not installed.
     """
     mitsuba = load_extra("mitsuba", "the reference renderer")
     mitsuba.set_variant("llvm_ad_rgb" if os.environ.get("DRJIT_LIBLLVM_PATH") else "scalar_rgb")
@@ -79,10 +80,10 @@ def load_mitsuba(threads: int | None = None) -> ModuleType:
     return mitsuba
 
 
-def translate_errors(module: ModuleType, value: Any) -> Any:
+def make_mitsuba_objects(module: ModuleType, value: Any) -> Any:
     """A description by `mitsuba_scene` with Mitsuba's own objects in it."""
     if isinstance(value, dict):
-        return {key: translate_errors(module, entry) for key, entry in value.items()}
+        return {key: make_mitsuba_objects(module, entry) for key, entry in value.items()}
     if isinstance(value, tuple):
         return {"type": "rgb", "value": list(value)}
     if isinstance(value, np.ndarray):
@@ -115,8 +116,9 @@ class Traced:
         return math.sqrt(self._square(image))
 
     def error(self, image: np.ndarray) -> float:
-        """The `distance` of `image` less the noise, in quadrature: what would be left were this one
-        free of noise; at least 0.
+        """The `distance` of `image` less the noise, in quadrature; at least 0.
+
+        That is what would be left were this image free of noise.
         """
         return math.sqrt(max(0.0, self._square(image) - self.noise**2))
 
