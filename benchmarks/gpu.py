@@ -22,21 +22,18 @@ from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings, ParameterSettings
 
+SMALL = "64 x 96 x 64, 512 x 512, density (the paper: 22.5 iterations a second on an RTX 2080 Ti)"
+JOINT = (
+    "168 x 252 x 168, 512 x 512, density, sigma_a and sigma_s in RGB: 49.8 million numbers "
+    "(the paper: 8 s an iteration)"
+)
+LARGE = "448 x 672 x 448, 512 x 512, density"
 CASES = {
-    "64 x 96 x 64, 512 x 512, density (the paper: 22.5 iterations a second on an RTX 2080 Ti)": (
-        64,
-        512,
-        False,
-        30,
-    ),
-    "168 x 252 x 168, 512 x 512, density, sigma_a and sigma_s in RGB: 49.8 million numbers (the paper: 8 s an iteration)": (
-        168,
-        512,
-        True,
-        5,
-    ),
-    "448 x 672 x 448, 512 x 512, density": (448, 512, False, 2),
+    SMALL: (64, 512, False, 30),
+    JOINT: (168, 512, True, 5),
+    LARGE: (448, 512, False, 2),
 }
+"""Cells across, pixels across, whether colored fields are optimized too, and iterations."""
 
 
 def scene_of(cells: int, pixels: int, is_joint: bool, device: torch.device) -> Scene:
@@ -95,7 +92,8 @@ def main() -> None:
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
     print(
-        f"{torch.cuda.get_device_name(device) if device.type == 'cuda' else 'CPU'}, torch {torch.__version__}"
+        f"{torch.cuda.get_device_name(device) if device.type == 'cuda' else 'CPU'}, torch "
+        f"{torch.__version__}"
     )
     print("| case | seconds an iteration | iterations a second | peak memory |\n|---|---|---|---|")
     for name, (cells, pixels, is_joint, iterations) in CASES.items():

@@ -71,7 +71,8 @@ def main() -> None:
             f"{r.kind} {r.iterations} iterations {r.seconds:.3f} s" for r in memory.records[-2:]
         )
         print(
-            f"{'warm' if is_warm else 'cold'}: render {render:.3f} s, derivative {derivative:.3f} s ({solves})"
+            f"{'warm' if is_warm else 'cold'}: render {render:.3f} s, derivative {derivative:.3f} "
+            f"s ({solves})"
         )
     with torch.no_grad():
         images = render_each(scene, scene.views, SolveMemory())

@@ -35,10 +35,15 @@ volume:
 lights:
   - {type: directional, direction: [-1, -2, -1], irradiance: 3}
 views:
-  - {name: front, image: front.npy, camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
-  - {name: side, image: side.npy, camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
+  - {name: front, image: front.npy,
+     camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0],
+              fov: 30, resolution: [8, 6]}}
+  - {name: side, image: side.npy,
+     camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0],
+              fov: 30, resolution: [8, 6]}}
   - {name: test, image: side.npy, split: test,
-     camera: {type: perspective, origin: [-2.5, 0, 0], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
+     camera: {type: perspective, origin: [-2.5, 0, 0], target: [0, 0, 0],
+              fov: 30, resolution: [8, 6]}}
 optimize:
   views_per_iteration: 1
   parameters: {density: {init: 0.5, lr: 0.01}}
@@ -149,10 +154,12 @@ def main() -> None:
     rows = tenths(samples, given.iterations)
     for number, row in enumerate(rows, 1):
         print(
-            f"tenth {number}: {row['MiB']:.1f} MiB, {row['ms']:.2f} ms an iteration, {row['KiB']:.0f} KiB of files"
+            f"tenth {number}: {row['MiB']:.1f} MiB, {row['ms']:.2f} ms an iteration, "
+            f"{row['KiB']:.0f} KiB of files"
         )
     print(
-        f"memory, last tenth over second: {rows[-1]['MiB'] / rows[1]['MiB']:.4f}; time: {rows[-1]['ms'] / rows[1]['ms']:.3f}"
+        f"memory, last tenth over second: {rows[-1]['MiB'] / rows[1]['MiB']:.4f}; time: "
+        f"{rows[-1]['ms'] / rows[1]['ms']:.3f}"
     )
     print(json.dumps({"exit": process.returncode, "tenths": rows}))
 

@@ -39,7 +39,7 @@ SIGMAS = (10.0, 100.0)
 
 @dataclass(frozen=True)
 class Case:
-    """One view: the scene with `leaves` in its light field, which the image is differentiated by."""
+    """One view: the scene with `leaves` in its light field, by which images are differentiated."""
 
     scene: Scene
     light: LightField
@@ -123,7 +123,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     print(
-        "| sigma_t, view | tolerance | error of the image | of the derivative | time | time, in interpolations of every pixel |"
+        "| sigma_t, view | tolerance | error of the image | of the derivative | time | time, in "
+        "interpolations of every pixel |"
     )
     print("|---|---|---|---|---|---|")
     for sigma_t in SIGMAS:
@@ -140,7 +141,10 @@ def main() -> None:
                 time_part, floors = (
                     seconds[str(tolerance)] / seconds[key] for key in ("0.0", "floor")
                 )
-                row = f"{100 * errors[0]:.2f} % | {100 * errors[1]:.1f} % | {time_part:.2f} | {floors:.2f}"
+                row = (
+                    f"{100 * errors[0]:.2f} % | {100 * errors[1]:.1f} % | {time_part:.2f} | "
+                    f"{floors:.2f}"
+                )
                 print(f"| {sigma_t:g}, {name} | {tolerance:g} | {row} |", flush=True)
 
 

@@ -122,7 +122,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         print(
-            "| scene | cells | solve, there and back [bytes per cell and color] | command | peak [MiB] | predicted / peak |"
+            "| scene | cells | solve, there and back [bytes per cell and color] | command | peak "
+            "[MiB] | predicted / peak |"
         )
         print(f"|{'---|' * 6}")
         for title, case in ((title, CASES[title]) for title in arguments.scene):
@@ -137,7 +138,8 @@ def main() -> None:
                     found, predicted = measured(folder, verb, cells, arguments.pixels, case)
                     used = found - bases[verb]
                     print(
-                        f"| {title} | {cells}^3 | {each:.0f} | {verb} | {used / 2**20:.0f} | {predicted / used:.2f} |",
+                        f"| {title} | {cells}^3 | {each:.0f} | {verb} | {used / 2**20:.0f} | "
+                        f"{predicted / used:.2f} |",
                         flush=True,
                     )
 

@@ -50,7 +50,8 @@ SCRIPT = Path(__file__).name
 PAPER_PIXELS, PAPER_CELLS = 512, 192
 CUBE = np.array([[-0.5] * 3, [0.5] * 3])
 TOP = (
-    "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | loss | PSNR shown, novel | found |\n"
+    "| config | iterations | seconds an iteration | forward, adjoint iterations of the solves | "
+    "loss | PSNR shown, novel | found |\n"
     "|---|---|---|---|---|---|---|\n"
 )
 
@@ -184,11 +185,14 @@ def row(experiment: Experiment, log: Log, words: str) -> str:
         "-" if np.isnan(log[name][-1]) else f"{log[name][-1]:.1f} dB"
         for name in ("psnr", "test_psnr")
     )
-    return f"| {experiment.name} | {len(seconds)} | {times} | {solves} | {losses} | {quality} | {words} |\n"
+    return (
+        f"| {experiment.name} | {len(seconds)} | {times} | {solves} | {losses} | {quality} | "
+        f"{words} |\n"
+    )
 
 
 def merge_rows(rows: dict[str, str]) -> None:
-    """Puts `rows` into the table of docs/experiments.md in place of those of the same experiments."""
+    """Puts `rows` into the table of docs/experiments.md, in place of those of the same names."""
     lines = read_table(SCRIPT).removeprefix(TOP).splitlines(keepends=True)
     merged = {
         line.split(" | ")[0].removeprefix("| "): line for line in lines if line.strip()
@@ -256,7 +260,7 @@ def main() -> None:
     parser.add_argument(
         "--paths",
         type=int,
-        help="a pixel of the pictures at the paper's size, instead of as many as those shipped have",
+        help="a pixel of the pictures at the paper's size; unless given, as many as those shipped",
     )
     parser.add_argument("--keep", action="store_true", help="do not run again what has been run")
     given = parser.parse_args()

@@ -253,7 +253,10 @@ def line(
         f"{region} {relative(image[where], truth[where]):.3f}" for region, where in seen.items()
     )
     size, alike = np.sqrt((truth**2).mean()), np.corrcoef(image.ravel(), truth.ravel())[0, 1]
-    return f"| {change.parameter} | {name} | {noise / size:.3f} | {relative(image, truth):.3f} | {told} | {alike:.3f} |\n"
+    return (
+        f"| {change.parameter} | {name} | {noise / size:.3f} | {relative(image, truth):.3f} | "
+        f"{told} | {alike:.3f} |\n"
+    )
 
 
 def shares(
@@ -271,11 +274,15 @@ def shares(
         for name in ("before", "after")
     ]
     light, slope = ((ends[0] + ends[1]) / 2)[where].mean(), truth[where].mean()
-    return [
-        f"| {change.parameter} | {name} | {found['multiple'][where].mean() / (light - found['single'][where].mean()):.3f} "
-        f"| {found['multiple slope'][where].mean() / (slope - found['single slope'][where].mean()):.3f} |\n"
-        for name, found in images.items()
-    ]
+    rows = []
+    for name, found in images.items():
+        multiple, single, multiple_slope, single_slope = (
+            found[kind][where].mean()
+            for kind in ("multiple", "single", "multiple slope", "single slope")
+        )
+        parts = multiple / (light - single), multiple_slope / (slope - single_slope)
+        rows.append(f"| {change.parameter} | {name} | {parts[0]:.3f} | {parts[1]:.3f} |\n")
+    return rows
 
 
 def main() -> None:

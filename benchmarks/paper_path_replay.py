@@ -1,7 +1,8 @@
 """Fig. 7 of docs/experiments.md: density from one picture, by us and by path replay backpropagation
 in Mitsuba 3, 64 paths a pixel.
 
-    DRJIT_LIBLLVM_PATH=... python benchmarks/paper_path_replay.py [-o FOLDER] [--iterations 40] [--keep]
+    DRJIT_LIBLLVM_PATH=... python benchmarks/paper_path_replay.py [-o FOLDER] [--iterations 40]
+                                                                  [--keep]
 
 All look at the picture of configs/paper/fig07.yaml, in pixels two or three times as large, start
 from the same density, and step by Adam at the same rates against the same loss and the same total
@@ -48,7 +49,8 @@ JUDGED_AT = (5, 15, 40)
 JUDGING, CONVERGED = 64, 512
 """Paths a pixel of each trace that judges, and of each target."""
 TOP = (
-    "| pixels | total variation | | seconds an iteration | times ours | error, shown view | novel view | L1 error of density | along z |\n"
+    "| pixels | total variation | | seconds an iteration | times ours | error, shown view | "
+    "novel view | L1 error of density | along z |\n"
     "|---|---|---|---|---|---|---|---|---|\n"
 )
 
@@ -228,10 +230,8 @@ def run(
 ) -> Entry:
     """Runs a contender, or reads what it did."""
     times, tv = case
-    path = (
-        folder
-        / f"{times}_{'default' if tv is None else tv}_{name.replace(', ', '_').replace(' ', '_')}.npz"
-    )
+    words = (times, "default" if tv is None else tv, *name.replace(",", "").split())
+    path = folder / f"{'_'.join(map(str, words))}.npz"
     if not (is_kept and path.exists()):
         contender, overrides = CONTENDERS[name]
         picture = larger(np.load(TARGET / "front.npy").astype(np.float32), times)
@@ -313,7 +313,8 @@ def table(entries: list[Entry], enlarged: dict[str, float], truth: Array) -> str
         )
         lines.append(f"| {96 // times}^2 | {words} | {entry.name} | {figures} |\n")
     lines += [
-        f"| {ENLARGED}^2 | default | {name} | {pace:.2g} | {pace / enlarged['ours']:.1f} | | | | |\n"
+        f"| {ENLARGED}^2 | default | {name} | {pace:.2g} | {pace / enlarged['ours']:.1f} | | | | "
+        "|\n"
         for name, pace in enlarged.items()
     ]
     return TOP + "".join(lines)
@@ -346,7 +347,8 @@ def draw(entries: list[Entry], truth: Array, path: Path) -> None:
             axis.set_title(title, fontsize=8)
         show(row[2], projected(truth, 0, 1), full)
         row[0].set_ylabel(
-            f"{96 // case[0]} x {96 // case[0]} pixels,\n{'no' if case[1] == 0 else 'with'} total variation",
+            f"{96 // case[0]} x {96 // case[0]} pixels,\n{'no' if case[1] == 0 else 'with'} total "
+            "variation",
             fontsize=8,
         )
         row[0].legend(fontsize=5)

@@ -28,7 +28,8 @@ NAMES_13 = {
     "half_printed": "half the cells, printed",
 }
 TOP_13 = (
-    "| model | iterations | seconds | PSNR shown, novel | L1 error of the density | in the lowest third | density there, in truth 1 |\n"
+    "| model | iterations | seconds | PSNR shown, novel | L1 error of the density | in the "
+    "lowest third | density there, in truth 1 |\n"
     "|---|---|---|---|---|---|---|\n"
 )
 
@@ -125,9 +126,13 @@ def draw_rounds(runs: Runs) -> None:
         )
         low = slice(0, len(density[0]) // 3)
         quality = f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"
-        parts = f"{apart(density, true):.3f} | {apart(density[:, low], true[:, low]):.2f} | {density[:, low].sum() / true[:, low].sum():.2f}"
+        parts = (
+            f"{apart(density, true):.3f} | {apart(density[:, low], true[:, low]):.2f} | "
+            f"{density[:, low].sum() / true[:, low].sum():.2f}"
+        )
         lines.append(
-            f"| {NAMES_13[name]} | {len(log['loss'])} | {log['seconds'][-1]:.0f} | {quality} | {parts} |\n"
+            f"| {NAMES_13[name]} | {len(log['loss'])} | {log['seconds'][-1]:.0f} | {quality} | "
+            f"{parts} |\n"
         )
     draw(PICTURES / "fig13_rounds.png", pairs, {})
     rewrite_table("paper.py fig13", TOP_13 + "".join(lines))
@@ -213,7 +218,8 @@ def show_optics(runs: Runs) -> tuple[list[Pair], str]:
     alone = f", alone {runs['g_alone'].number('g'):.3f}" if "g_alone" in runs else ""
     return (
         pairs,
-        f"g {run.number('g'):.3f}{alone}, in truth -0.802; relative L1 error of absorption and scattering {errors}",
+        f"g {run.number('g'):.3f}{alone}, in truth -0.802; relative L1 error of absorption and "
+        f"scattering {errors}",
     )
 
 

@@ -50,7 +50,8 @@ def main() -> None:
         image, gradient = seconds[name]
         found = correlation(shot.by_amount, theirs[-1].by_amount)
         print(
-            f"| {name} | {image:.2f} | {gradient:.2f} | {(image + gradient) / sum(seconds['ours']):.0f} | {found:.3f} |"
+            f"| {name} | {image:.2f} | {gradient:.2f} | "
+            f"{(image + gradient) / sum(seconds['ours']):.0f} | {found:.3f} |"
         )
 
 

@@ -60,14 +60,16 @@ def main() -> None:
     """Prints two tables."""
     torch.set_num_threads(1)
     print(
-        "| scene | time of a view with empty slices left out, as a part of that without |\n|---|---|"
+        "| scene | time of a view with empty slices left out, as a part of that without "
+        "|\n|---|---|"
     )
     with torch.no_grad():
         for name, (config, overrides) in SCENES.items():
             scene = load_scene(ROOT / "configs" / f"{config}.yaml", overrides=overrides)
             print(f"| {name} | {seconds(scene, False) / seconds(scene, True):.2f} |")
     print(
-        f"\n| volume | sigma_t | samples behind {DARK:g}, by rays | by tiles of {TILE} x {TILE} |\n|---|---|---|---|"
+        f"\n| volume | sigma_t | samples behind {DARK:g}, by rays | by tiles of {TILE} x {TILE} "
+        "|\n|---|---|---|---|"
     )
     for name, cases in OPAQUE.items():
         for file, sigma_t in cases:

@@ -1,7 +1,8 @@
 """Iterations and time of each diffusion solver, to the same residual from the same zero start, on
 real media; ratios are to multigrid.
 
-    python benchmarks/solver.py [--device cuda] [--cells 32 64 128] [--tolerances 1e-3 1e-6] [--jacobi]
+    python benchmarks/solver.py [--device cuda] [--cells 32 64 128] [--tolerances 1e-3 1e-6]
+                                [--jacobi]
 
 `--cells`: edges of cubes, measured beside 64 x 96 x 64; three colors, float32. The plume is
 `data/plume/density.npz` under its light; `--densities FILE...` adds other volumes. Solvers run in

@@ -74,12 +74,14 @@ def main() -> None:
     u = torch.rand(SHAPE, device=device)
     convolve = by_convolution(operator)
     print(
-        f"largest difference {float((operator.apply(u) - convolve(u)).abs().max()):.1e} of {float(operator.apply(u).abs().max()):.1f}"
+        f"largest difference {float((operator.apply(u) - convolve(u)).abs().max()):.1e} of "
+        f"{float(operator.apply(u).abs().max()):.1f}"
     )
     times = [(seconds(operator.apply, u), seconds(convolve, u)) for _ in range(20)]
     slicing, convolution = (statistics.median(column) for column in zip(*times, strict=True))
     print(
-        f"slicing {1e3 * slicing:.2f} ms, conv3d {1e3 * convolution:.2f} ms, ratio {convolution / slicing:.1f}"
+        f"slicing {1e3 * slicing:.2f} ms, conv3d {1e3 * convolution:.2f} ms, ratio "
+        f"{convolution / slicing:.1f}"
     )
 
 

@@ -40,7 +40,7 @@ def centers(bounds: Array, cells: tuple[int, int, int]) -> Array:
 
 
 def bunny_mesh(package: Path) -> Array:
-    """Triangles [n, 3, 3] of the bunny, corners (x, y, z) [u], centered in the box and 0.88 u wide."""
+    """Triangles [n, 3, 3] of the bunny: corners (x, y, z) [u], centered, 0.88 u wide."""
     with tarfile.open(package) as archive:
         source = archive.extractfile("package/index.js").read().decode()  # type: ignore[union-attr]
     positions, cells = (

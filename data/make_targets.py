@@ -3,8 +3,8 @@ through `ddrecon reference`.
 
     python data/make_targets.py [NAME]... [--pixels 512] [--paths 1024] [--threads 2] [-o FOLDER]
 
-NAME is that of a folder in data/paper. Pictures are kept as float16, whose rounding is far below their noise. Without --pixels and
---paths they are as those shipped, noise included.
+NAME is that of a folder in data/paper. Pictures are kept as float16, whose rounding is far below
+their noise. Without --pixels and --paths they are as those shipped, noise included.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ TRUTHS = {
 
 
 def reference(truth: Truth, pixels: int, paths: int, threads: int | None, output: Path) -> None:
-    """Path-traces every view of `truth` into the folder `output`, on so many `threads` (None: all)."""
+    """Path-traces every view of `truth` into the folder `output`, on `threads` (None: all)."""
     config = ROOT / "configs" / "paper" / f"{truth.config}.yaml"
     count = len(yaml.safe_load(config.read_text())["views"])
     sizes = [f"views.{index}.camera.resolution=[{pixels}, {pixels}]" for index in range(count)]

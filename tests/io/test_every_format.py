@@ -1,4 +1,4 @@
-"""What holds of every format: a hot corner comes back in its place, and what cannot be read says so."""
+"""Every format brings a hot corner back to its place, and refuses what cannot be read."""
 
 from __future__ import annotations
 

@@ -39,7 +39,8 @@ import numpy as np
 from ddrecon.reference.trace import load_mitsuba
 mitsuba = load_mitsuba(threads=2)
 path, options = sys.argv[1:]
-np.save(path + ".npy", np.array(mitsuba.render(mitsuba.load_file(path), **json.loads(options)), np.float64))
+image = mitsuba.render(mitsuba.load_file(path), **json.loads(options))
+np.save(path + ".npy", np.array(image, np.float64))
 """
 
 

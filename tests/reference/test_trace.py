@@ -1,4 +1,4 @@
-"""Mitsuba's images of our scenes: closed forms, places, and our own images of light scattered once."""
+"""Mitsuba's images of our scenes: closed forms, places, and our images of light scattered once."""
 
 from __future__ import annotations
 

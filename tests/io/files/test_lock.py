@@ -1,4 +1,4 @@
-"""One process writes to a folder: a lock keeps others out while its process lives, and no longer."""
+"""A lock keeps others out of a folder while its process lives, and no longer."""
 
 from __future__ import annotations
 

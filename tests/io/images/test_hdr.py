@@ -21,7 +21,7 @@ HEADER = b"#?RADIANCE\n# made by a test\nFORMAT=32-bit_rle_rgbe\n"
 
 
 def random_bytes(height: int, width: int, seed: int = 0, *, has_runs: bool = True) -> np.ndarray:
-    """Legal pixels uint8 [h, w, 4]: a mantissa of 128 or more in each, black ones and, often, runs."""
+    """Legal pixels uint8 [h, w, 4]: in each a mantissa from 128; black ones and, often, runs."""
     generator = np.random.default_rng(seed)
     pixels = generator.integers(0, 256, (height, width, 4), np.uint8)
     pixels[..., 1] |= 128

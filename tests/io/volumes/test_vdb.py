@@ -76,7 +76,10 @@ def test_cells_lie_where_openvdb_has_them(
 ) -> None:
     """Index (0, 0, 0) is the center of the first cell."""
     path = written(tmp_path / "smoke.vdb", density=np.ones(shape))
-    facts = "[[g.transform.typeName, g.transform.indexToWorld((0, 0, 0)), g.transform.voxelSize()] for g in grids.values()]"
+    facts = (
+        "[[g.transform.typeName, g.transform.indexToWorld((0, 0, 0)), g.transform.voxelSize()] "
+        "for g in grids.values()]"
+    )
     ((name, first, size),) = openvdb_python.described(facts, path)
     sides = (BOUNDS[1] - BOUNDS[0]) / shape[::-1]
     assert name == kind and np.allclose(size, sides) and np.allclose(first, BOUNDS[0] + sides / 2)
@@ -112,7 +115,8 @@ def test_grids_of_other_programs_share_the_box_of_what_is_active(tmp_path: Path)
 
 
 CATCH = """
-import sys; from pathlib import Path; from ddrecon.errors import FormatError; from ddrecon.io.volumes.table import read_field
+import sys; from pathlib import Path; from ddrecon.errors import FormatError
+from ddrecon.io.volumes.table import read_field
 try: read_field(Path(sys.argv[1]), sys.argv[2])
 except FormatError as error: print(error.reason)
 """
@@ -136,10 +140,8 @@ def test_without_openvdb_the_ways_are_named(
 ) -> None:
     for name in ("openvdb", "pyopenvdb"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(
-        FormatError,
-        match=r"needs the Python module openvdb.*Blender.*apt-get install python3-openvdb.*docs/formats\.md",
-    ):
+    module, package = "needs the Python module openvdb", "apt-get install python3-openvdb"
+    with pytest.raises(FormatError, match=rf"{module}.*Blender.*{package}.*docs/formats\.md"):
         read_field(written(tmp_path / "smoke.vdb", density=np.ones((1, 2, 3))), "density")
 
 

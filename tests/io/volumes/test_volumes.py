@@ -68,9 +68,9 @@ def test_a_missing_name_lists_what_there_is(tmp_path: Path):
 
 def test_a_single_other_name_says_which_to_use(tmp_path: Path):
     path = saved(tmp_path / "f.npz", arr_0=np.ones((2, 2, 2)), bounds=BOUNDS)
-    assert (
-        refusal(path)
-        == "has no field 'density', only 'arr_0'; save that array as 'density', or say name: arr_0 beside file"
+    assert refusal(path) == (
+        "has no field 'density', only 'arr_0'; save that array as 'density', or say name: "
+        "arr_0 beside file"
     )
 
 

@@ -36,7 +36,8 @@ def inline(values: np.ndarray, kind: str, order: str, header: str) -> bytes:
     data = values.astype(prefix + {"Float32": "f4", "Float64": "f8"}[kind]).tobytes()
     count = np.array(len(data), prefix + {"UInt32": "u4", "UInt64": "u8"}[header]).tobytes()
     return f"""<VTKFile type="ImageData" version="0.1" byte_order="{order}" header_type="{header}">
-      <ImageData WholeExtent="1 3 0 3 0 4" Origin="-2 -2 -3" Spacing="1 1.5 1.5"><Piece Extent="1 3 0 3 0 4"><PointData/>
+      <ImageData WholeExtent="1 3 0 3 0 4" Origin="-2 -2 -3" Spacing="1 1.5 1.5">
+      <Piece Extent="1 3 0 3 0 4"><PointData/>
       <CellData><DataArray type="{kind}" Name="lwc" format="binary">
         {base64.b64encode(count + data).decode()}
       </DataArray></CellData></Piece></ImageData></VTKFile>""".encode()
