@@ -1,0 +1,108 @@
+"""Markdown is written one sentence a line, and its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = [
+    path
+    for pattern in ("*.md", "docs/**/*.md", "benchmarks/**/*.md", "data/**/*.md")
+    for path in sorted(ROOT.glob(pattern))
+]
+LATER = {ROOT / "CONTRIBUTING.md"}
+"""Pages whose sentences are not held to a line each yet; their links are."""
+ABBREVIATIONS = ("e.g", "i.e", "et al", "Fig", "Figs", "Eq", "Eqs", "cf", "vs", "resp", "approx")
+"""What a full stop may follow within a sentence."""
+LONGEST = 60
+"""No sentence has more words."""
+
+CODE_SPAN = re.compile(r"`[^`]*`")
+LINK = re.compile(r"\]\(([^()\s]+)\)")
+MARKER = re.compile(r"\s*(?:[-*+]|\d+\.)\s+|#+\s+|>\s*")
+END = re.compile(r"(?<!\.)[.!?][)\]\"'*_]*\s+\S")
+CLOSED = re.compile(r"[.:!?][)\]\"'*_]*$")
+
+
+def blocks(text: str) -> Iterator[list[str]]:
+    """Paragraphs, headings and list items of a page, a list of lines each; code, tables, comments and pictures are left out."""
+    paragraph: list[str] = []
+    is_code = False
+    for line in [*text.splitlines(), ""]:
+        is_fence = line.lstrip().startswith("```")
+        is_other = is_code or is_fence or not line.strip() or line.startswith(("    ", "|", "<", "![", "#"))
+        if paragraph and (is_other or MARKER.match(line)):
+            yield paragraph
+            paragraph = []
+        if line.startswith("#") and not is_code:
+            yield [line]
+        elif not is_other:
+            paragraph.append(line)
+        is_code ^= is_fence
+
+
+def plain(line: str) -> str:
+    """`line` without its marker of a list or a heading, code and the targets of links."""
+    return LINK.sub("]", CODE_SPAN.sub("code", MARKER.sub("", line, count=1) if MARKER.match(line) else line.strip()))
+
+
+def ends_early(line: str) -> bool:
+    """Whether a sentence ends before the end of `line`."""
+    text = plain(line)
+    return any(not text[: match.start()].endswith(ABBREVIATIONS) for match in END.finditer(text))
+
+
+def anchors(page: Path) -> set[str]:
+    """What a link to a heading of `page` may say after the #."""
+    headings = [lines[0] for lines in blocks(page.read_text(encoding="utf-8")) if lines[0].startswith("#")]
+    words = [re.sub(r"[^\w\s-]", "", re.sub(r"[`*]", "", heading.lstrip("# "))).strip().lower() for heading in headings]
+    return {re.sub(r"[-\s]+", "-", heading) for heading in words}
+
+
+def named(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("One. Two.", True),
+        ("- One (of two.) Two.", True),
+        ("Is it? It is.", True),
+        ("**Bold.** Then more.", True),
+        ("It is 0.5 in `a. b` of scene.yaml, e.g. Fig. 7 of Cen et al. 2023.", False),
+        ("1. A step.", False),
+        ("And so on ... to the end.", False),
+    ],
+)
+def test_the_end_of_a_sentence_is_known(line: str, expected: bool) -> None:
+    assert ends_early(line) == expected
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
+def test_a_line_holds_one_sentence(page: Path) -> None:
+    paragraphs = list(blocks(page.read_text(encoding="utf-8")))
+    assert [line for lines in paragraphs for line in lines if ends_early(line)] == []
+    assert [line for lines in paragraphs for line in lines[:-1] if not CLOSED.search(line)] == [], "broken sentences"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
+def test_sentences_are_not_too_long(page: Path) -> None:
+    lines = [line for lines in blocks(page.read_text(encoding="utf-8")) for line in lines]
+    assert [line for line in lines if len(plain(line).split()) > LONGEST] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for target in LINK.findall(text):
+        if "://" in target or target.startswith("mailto:"):
+            continue
+        path, _, anchor = target.partition("#")
+        there = (page.parent / path).resolve() if path else page
+        assert there.exists(), f"{target}: there is no {there}"
+        assert not anchor or anchor in anchors(there), f"{target}: no such heading; there are {sorted(anchors(there))}"
