@@ -23,7 +23,9 @@ LONGEST = 60
 
 CODE_SPAN = re.compile(r"`[^`]*`")
 LINK = re.compile(r"\]\(([^()\s]+)\)")
-MARKER = re.compile(r"\s*(?:[-*+]|\d+\.)\s+|#+\s+|>\s*")
+MARKER = re.compile(r"\s*(?:[-*+]|\d+\.)\s+|#+\s+(?:\d+\.\s+)?|>\s*")
+LABEL = re.compile(r"\*\*[^*]+[.:?]\*\*\s+")
+"""What a paragraph may begin with: its subject in bold."""
 END = re.compile(r"(?<!\.)[.!?][)\]\"'*_]*\s+\S")
 CLOSED = re.compile(r"[.:!?][)\]\"'*_]*$")
 
@@ -46,8 +48,11 @@ def blocks(text: str) -> Iterator[list[str]]:
 
 
 def plain(line: str) -> str:
-    """`line` without its marker of a list or a heading, code and the targets of links."""
-    return LINK.sub("]", CODE_SPAN.sub("code", MARKER.sub("", line, count=1) if MARKER.match(line) else line.strip()))
+    """`line` without its marker of a list or a heading, its label, code and the targets of links."""
+    for start in (MARKER, LABEL):
+        match = start.match(line)
+        line = line[match.end() :] if match else line
+    return LINK.sub("]", CODE_SPAN.sub("code", line.strip()))
 
 
 def ends_early(line: str) -> bool:
@@ -57,10 +62,11 @@ def ends_early(line: str) -> bool:
 
 
 def anchors(page: Path) -> set[str]:
-    """What a link to a heading of `page` may say after the #."""
+    """What a link to a heading of `page` may say after the #, both where GitHub shows the page and on the site that MkDocs builds."""
     headings = [lines[0] for lines in blocks(page.read_text(encoding="utf-8")) if lines[0].startswith("#")]
-    words = [re.sub(r"[^\w\s-]", "", re.sub(r"[`*]", "", heading.lstrip("# "))).strip().lower() for heading in headings]
-    return {re.sub(r"[-\s]+", "-", heading) for heading in words}
+    words = [re.sub(r"[^\w\s-]", "", heading.lstrip("# ")).lower() for heading in headings]
+    hosted, built = [{word.replace(" ", "-") for word in words}, {re.sub(r"[-\s]+", "-", word.strip()) for word in words}]
+    return hosted & built
 
 
 def named(page: Path) -> str:
@@ -73,7 +79,8 @@ def named(page: Path) -> str:
         ("One. Two.", True),
         ("- One (of two.) Two.", True),
         ("Is it? It is.", True),
-        ("**Bold.** Then more.", True),
+        ("**Label.** Then more.", False),
+        ("- **Label.** Then more. And more.", True),
         ("It is 0.5 in `a. b` of scene.yaml, e.g. Fig. 7 of Cen et al. 2023.", False),
         ("1. A step.", False),
         ("And so on ... to the end.", False),
