@@ -4,8 +4,9 @@
     python benchmarks/accuracy.py convergence --references FOLDER
     python benchmarks/accuracy.py order
 
-`cases`: anisotropy, volumes, lights and cameras, by the number of transport rounds. `convergence`: rounds, directions and cells together.
-`order`: transmittance and light scattered once against closed forms, by size of cells. The others need Mitsuba 3 (extra `reference`).
+`cases`: anisotropy, volumes, lights and cameras, by the number of transport rounds. `convergence`:
+rounds, directions and cells together. `order`: transmittance and light scattered once against
+closed forms, by size of cells. The others need Mitsuba 3 (extra `reference`).
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ import torch
 from torch import Tensor
 from traced import Traced, traced
 
-from ddrecon.cameras import Camera, look_at, rays
+from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight, Light, PointLight
-from ddrecon.medium import Volume
-from ddrecon.phase import henyey_greenstein
+from ddrecon.light.lights import AmbientLight, DirectionalLight, Light, PointLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.renderer import render, solve_light, view_components, view_image
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.world import Scene, View
 
 Field = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Density at x, y and z, each from -0.5 to 0.5 across the box."""
@@ -49,7 +50,11 @@ def around(center: Vector, outer: float, width: float = 0.11) -> Field:
     """A soft ball."""
 
     def density(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        return soft(((x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2).sqrt(), outer, width)
+        return soft(
+            ((x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2).sqrt(),
+            outer,
+            width,
+        )
 
     return density
 
@@ -72,9 +77,15 @@ def slab(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
 def plume(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     """A rising, widening, swaying and ragged column, denser below."""
     rise = y + 0.5
-    across = ((x - 0.1 * rise * torch.sin(7 * rise)) ** 2 + (z - 0.1 * rise * torch.cos(6 * rise)) ** 2).sqrt()
-    ragged = 0.05 * torch.sin(23 * x + 11 * y) * torch.sin(19 * y + 5 * z) * torch.sin(21 * z - 9 * x)
-    return soft(across + ragged, 0.12 + 0.2 * rise, 0.1) * soft(y.abs(), 0.46, 0.08) * (1 - 0.6 * rise)
+    across = (
+        (x - 0.1 * rise * torch.sin(7 * rise)) ** 2 + (z - 0.1 * rise * torch.cos(6 * rise)) ** 2
+    ).sqrt()
+    ragged = (
+        0.05 * torch.sin(23 * x + 11 * y) * torch.sin(19 * y + 5 * z) * torch.sin(21 * z - 9 * x)
+    )
+    return (
+        soft(across + ragged, 0.12 + 0.2 * rise, 0.1) * soft(y.abs(), 0.46, 0.08) * (1 - 0.6 * rise)
+    )
 
 
 BALL, SMALL = around((0.0, 0.0, 0.0), 0.38), around((0.22, -0.18, 0.12), 0.17, 0.06)
@@ -116,12 +127,19 @@ class Case:
 
     def scene(self, cells: int = 48, **diffusion: Any) -> Scene:
         """This scene on `cells`^3 cells, with such diffusion settings."""
-        grid = Grid.from_xyz((cells,) * 3, *(tuple(sign * side for side in self.extent) for sign in (-0.5, 0.5)))
-        z, y, x = (center / side for center, side in zip(grid.centers(torch.zeros(())), grid.extent, strict=True))
+        grid = Grid.from_xyz(
+            (cells,) * 3, *(tuple(sign * side for side in self.extent) for sign in (-0.5, 0.5))
+        )
+        z, y, x = (
+            center / side
+            for center, side in zip(grid.centers(torch.zeros(())), grid.extent, strict=True)
+        )
         sigmas = (torch.tensor([self.sigma_t * part]) for part in (1 - self.albedo, self.albedo))
         pose = look_at(torch.tensor(self.eye), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
         camera = Camera(pose, (SIZE, SIZE), self.half_width, self.is_perspective)
-        volume = Volume(grid, self.field(x, y, z).expand(grid.shape).contiguous(), *sigmas, torch.tensor(self.g))
+        volume = Volume(
+            grid, self.field(x, y, z).expand(grid.shape).contiguous(), *sigmas, torch.tensor(self.g)
+        )
         settings = RenderSettings(samples_per_pixel=SAMPLES), DiffusionSettings(**diffusion)
         return Scene(volume, self.lights, [View("view", camera)], *settings)
 
@@ -129,19 +147,57 @@ class Case:
 ANISOTROPIES = (-0.8, -0.4, 0.0, 0.4, 0.8, 0.9)
 CASES = (
     *(Case(f"lit from the side, g {g}", CLOUD, 25.0, g=g) for g in ANISOTROPIES),
-    *(Case(f"seen against the light, g {g}", CLOUD, 25.0, g=g, lights=[sun((-2.0, -0.4, -2.2))], eye=FAR) for g in ANISOTROPIES),
-    *(Case(f"{angle} degrees from the light, g 0.8", CLOUD, 25.0, g=0.8, lights=[sun(from_far(angle))], eye=FAR) for angle in (45, 70)),
-    *(Case(f"lit from the eye, g {g}", CLOUD, 25.0, g=g, lights=[sun((2.0, -1.2, 2.2))], eye=FAR) for g in (-0.8, -0.4, 0.0, 0.4)),
+    *(
+        Case(
+            f"seen against the light, g {g}",
+            CLOUD,
+            25.0,
+            g=g,
+            lights=[sun((-2.0, -0.4, -2.2))],
+            eye=FAR,
+        )
+        for g in ANISOTROPIES
+    ),
+    *(
+        Case(
+            f"{angle} degrees from the light, g 0.8",
+            CLOUD,
+            25.0,
+            g=0.8,
+            lights=[sun(from_far(angle))],
+            eye=FAR,
+        )
+        for angle in (45, 70)
+    ),
+    *(
+        Case(f"lit from the eye, g {g}", CLOUD, 25.0, g=g, lights=[sun((2.0, -1.2, 2.2))], eye=FAR)
+        for g in (-0.8, -0.4, 0.0, 0.4)
+    ),
     *(Case(f"ball, depth {depth}", BALL, depth / DEPTH_OF_BALL, 0.99) for depth in (5, 20, 60)),
-    *(Case(f"ball, depth 20, albedo {albedo}", BALL, 20 / DEPTH_OF_BALL, albedo) for albedo in (0.5, 1.0)),
+    *(
+        Case(f"ball, depth 20, albedo {albedo}", BALL, 20 / DEPTH_OF_BALL, albedo)
+        for albedo in (0.5, 1.0)
+    ),
     Case("thin slab", slab, 60.0, 0.99, lights=[sun((-0.5, -2.0, -0.7))], eye=(0.0, 1.6, 2.8)),
     Case("small ball off center", SMALL, 60.0, 0.99),
     Case("plume, g 0.5", plume, 25.0, g=0.5, extent=(1.0, 1.5, 1.0), half_width=0.3),
-    Case("ball, point light", BALL, 25.0, lights=[PointLight(torch.tensor([0.9, 0.7, 0.5]), torch.tensor([3.0]))]),
+    Case(
+        "ball, point light",
+        BALL,
+        25.0,
+        lights=[PointLight(torch.tensor([0.9, 0.7, 0.5]), torch.tensor([3.0]))],
+    ),
     Case("cloud, ambient light", CLOUD, 25.0, lights=[ambient(1.0)]),
     Case("cloud, ambient light and sun", CLOUD, 25.0, lights=[ambient(0.3), sun(SIDE)]),
     Case("cloud in 2 x 0.5 x 1", CLOUD, 25.0, extent=(2.0, 0.5, 1.0), half_width=0.33),
-    Case("plume, parallel rays, from below", plume, 25.0, eye=BELOW, half_width=0.7, is_perspective=False),
+    Case(
+        "plume, parallel rays, from below",
+        plume,
+        25.0,
+        eye=BELOW,
+        half_width=0.7,
+        is_perspective=False,
+    ),
 )
 CONVERGING = (
     Case("cloud, g 0", CLOUD, 15.0, 0.95, noise=0.01),
@@ -166,7 +222,12 @@ def scattered_once(scene: Scene) -> np.ndarray:
 
 
 def row(cells: Iterable[object]) -> None:
-    print("|", " | ".join(f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells), "|", flush=True)
+    print(
+        "|",
+        " | ".join(f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells),
+        "|",
+        flush=True,
+    )
 
 
 def measure_cases(references: Path, only: str, pictures: Path | None, directions: int) -> None:
@@ -178,12 +239,19 @@ def measure_cases(references: Path, only: str, pictures: Path | None, directions
             continue
         whole = traced(case.scene(), references, noise=case.noise)
         once = traced(case.scene(), references, depth=2, noise=0.02)
-        found = {n: image(case.scene(transport_rounds=n, transport_directions=directions)) for n in ROUNDS}
+        found = {
+            n: image(case.scene(transport_rounds=n, transport_directions=directions))
+            for n in ROUNDS
+        }
         single = once.error(scattered_once(case.scene()))
         errors = [_visible(whole.error(picture), whole.noise) for picture in found.values()]
         row([case.name, whole.noise, _visible(single, once.noise), *errors])
         if pictures is not None:
-            draw(pictures / f"{'_'.join(case.name.replace(',', '').split())}.png", whole, [found[n] for n in (0, 2)])
+            draw(
+                pictures / f"{'_'.join(case.name.replace(',', '').split())}.png",
+                whole,
+                [found[n] for n in (0, 2)],
+            )
 
 
 def _visible(error: float, noise: float) -> str:
@@ -192,7 +260,9 @@ def _visible(error: float, noise: float) -> str:
 
 
 def measure_convergence(references: Path) -> None:
-    """Prints errors by cells, directions and rounds, against the path-traced image of the finest grid."""
+    """Prints errors by cells, directions and rounds, against the path-traced image of the finest
+    grid.
+    """
     rounds = (0, 1, 2, 4, 8)
     row(["case", "noise", "cells", "directions", *(f"n = {n}" for n in rounds)])
     row(["---"] * (4 + len(rounds)))
@@ -201,43 +271,72 @@ def measure_convergence(references: Path) -> None:
         for cells, counts in {24: (26, 50, 86), 48: (26, 50, 86), 96: (50,)}.items():
             diffusion = image(case.scene(cells))
             for directions in counts:
-                scenes = (case.scene(cells, transport_rounds=n, transport_directions=directions) for n in rounds[1:])
+                scenes = (
+                    case.scene(cells, transport_rounds=n, transport_directions=directions)
+                    for n in rounds[1:]
+                )
                 found = [diffusion, *(image(scene) for scene in scenes)]
-                row([case.name, whole.noise, cells, directions, *(_visible(whole.error(item), whole.noise) for item in found)])
+                row(
+                    [
+                        case.name,
+                        whole.noise,
+                        cells,
+                        directions,
+                        *(_visible(whole.error(item), whole.noise) for item in found),
+                    ]
+                )
 
 
 WIDTH, PEAK, SIGMA_A, SIGMA_S, TILT = 0.1, 12.0, 0.5, 2.0, -0.3
-"""A Gaussian ball: its standard deviation, density in its middle, cross sections and mean cosine."""
+"""A Gaussian ball: its standard deviation, density in its middle, cross sections and mean cosine.
+"""
 
 
 def measure_order() -> None:
-    """Prints errors of transmittance and of light scattered once for a Gaussian ball, and the slope to the next row."""
+    """Prints errors of transmittance and of light scattered once for a Gaussian ball, and the slope
+    to the next row.
+    """
     expected = gaussian_ball()
     row(["cells", "transmittance", "order", "scattered once", "order"])
     row(["---"] * 5)
     before: tuple[float, ...] = ()
     counts = (12, 24, 48, 96)
     for index, cells in enumerate(counts):
-        errors = tuple(float((mine - exact).norm() / exact.norm()) for mine, exact in zip(rendered_ball(cells), expected, strict=True))
-        slopes = [math.log(old / new) / math.log(cells / counts[index - 1]) for old, new in zip(before, errors, strict=False)] or ["", ""]
+        errors = tuple(
+            float((mine - exact).norm() / exact.norm())
+            for mine, exact in zip(rendered_ball(cells), expected, strict=True)
+        )
+        slopes = [
+            math.log(old / new) / math.log(cells / counts[index - 1])
+            for old, new in zip(before, errors, strict=False)
+        ] or ["", ""]
         row([cells, f"{errors[0]:.1e}", slopes[0], f"{errors[1]:.1e}", slopes[1]])
         before = errors
 
 
 def ball_camera() -> Camera:
-    eye, up = torch.tensor([0.3, 0.4, 2.5], dtype=torch.float64), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    eye, up = (
+        torch.tensor([0.3, 0.4, 2.5], dtype=torch.float64),
+        torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64),
+    )
     return Camera(look_at(eye, torch.zeros_like(eye), up), (9, 9), 0.1)
 
 
 def rendered_ball(cells: int) -> tuple[Tensor, Tensor]:
-    """Transmittance along the view rays, by a background of 1 behind the absorbing ball, and radiance scattered once."""
+    """Transmittance along the view rays, by a background of 1 behind the absorbing ball, and
+    radiance scattered once.
+    """
     grid, camera = Grid((cells,) * 3, (-0.5,) * 3, (0.5,) * 3), ball_camera()
     density = PEAK * torch.exp(-sum(axis**2 for axis in grid.centers(camera.pose)) / (2 * WIDTH**2))
-    absorbing, scattering = (torch.tensor([value], dtype=torch.float64) for value in (SIGMA_A, SIGMA_S))
+    absorbing, scattering = (
+        torch.tensor([value], dtype=torch.float64) for value in (SIGMA_A, SIGMA_S)
+    )
     g = torch.tensor(TILT, dtype=torch.float64)
     dark = Volume(grid, density, absorbing + scattering, 0 * scattering, g)
     lit = Volume(grid, density, absorbing, scattering, g)
-    light = DirectionalLight(torch.tensor(SIDE, dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64))
+    light = DirectionalLight(
+        torch.tensor(SIDE, dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64)
+    )
     outside = AmbientLight(torch.tensor([1.0], dtype=torch.float64))
     scenes = (
         Scene(volume, [item], [View("view", camera)], diffusion=DiffusionSettings(model="none"))
@@ -248,16 +347,29 @@ def rendered_ball(cells: int) -> tuple[Tensor, Tensor]:
 
 
 def gaussian_ball(steps: int = 1000) -> tuple[Tensor, Tensor]:
-    """What `rendered_ball` approaches: depths of a Gaussian are error functions, and the one integral left is a fine sum."""
-    bundle, distance = rays(ball_camera()), torch.linspace(1.0, 4.0, steps, dtype=torch.float64)
+    """What `rendered_ball` approaches: depths of a Gaussian are error functions, and the one
+    integral left is a fine sum.
+    """
+    bundle, distance = (
+        cast_rays(ball_camera()),
+        torch.linspace(1.0, 4.0, steps, dtype=torch.float64),
+    )
     travel = torch.nn.functional.normalize(torch.tensor(SIDE, dtype=torch.float64), dim=0)
     origin, direction = bundle.origin.flip(-1)[:, None], bundle.direction.flip(-1)[:, None]
     point = origin + distance[:, None] * direction
     to_light = mass_before(point, travel)
     to_camera = mass_before(point, direction)
-    phase = henyey_greenstein(-(direction * travel).sum(-1), torch.tensor(TILT, dtype=torch.float64))
+    phase = henyey_greenstein(
+        -(direction * travel).sum(-1), torch.tensor(TILT, dtype=torch.float64)
+    )
     density = PEAK * torch.exp(-(point**2).sum(-1) / (2 * WIDTH**2))
-    emitted = SIGMA_S * density * phase / (4 * math.pi) * torch.exp(-(SIGMA_A + SIGMA_S) * (to_camera + to_light))
+    emitted = (
+        SIGMA_S
+        * density
+        * phase
+        / (4 * math.pi)
+        * torch.exp(-(SIGMA_A + SIGMA_S) * (to_camera + to_light))
+    )
     passed = torch.exp(-(SIGMA_A + SIGMA_S) * to_camera[:, -1])
     return passed.view(9, 9), torch.trapezoid(emitted, distance).view(9, 9)
 
@@ -266,11 +378,19 @@ def mass_before(point: Tensor, direction: Tensor) -> Tensor:
     """The integral of the Gaussian ball's density along `direction` up to `point`."""
     along = (point * direction).sum(-1)
     across = torch.exp(-((point**2).sum(-1) - along**2) / (2 * WIDTH**2))
-    return PEAK * across * WIDTH * math.sqrt(math.pi / 2) * (1 + torch.erf(along / WIDTH / math.sqrt(2)))
+    return (
+        PEAK
+        * across
+        * WIDTH
+        * math.sqrt(math.pi / 2)
+        * (1 + torch.erf(along / WIDTH / math.sqrt(2)))
+    )
 
 
 def draw(path: Path, target: Traced, renders: list[np.ndarray]) -> None:
-    """Writes target, render and signed difference, a row for n = 0 and one for n = 2, where there is anything to see."""
+    """Writes target, render and signed difference, a row for n = 0 and one for n = 2, where there
+    is anything to see.
+    """
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -281,10 +401,14 @@ def draw(path: Path, target: Traced, renders: list[np.ndarray]) -> None:
     figure, axes = plt.subplots(2, 3, figsize=(7.6, 4.9), layout="constrained")
     for line, picture, rounds in zip(axes, renders, (0, 2), strict=True):
         error = f"difference, relative RMS {target.error(picture):.3f}"
-        for axis, shown, title in zip(line, (target.image, picture), ("path traced", f"ddrecon, n = {rounds}"), strict=False):
+        for axis, shown, title in zip(
+            line, (target.image, picture), ("path traced", f"ddrecon, n = {rounds}"), strict=False
+        ):
             radiance = axis.imshow(shown[crop], cmap="gray", vmin=0, vmax=top)
             axis.set_title(title, fontsize=9)
-        change = line[2].imshow((picture - target.image)[crop], cmap="RdBu_r", vmin=-most, vmax=most)
+        change = line[2].imshow(
+            (picture - target.image)[crop], cmap="RdBu_r", vmin=-most, vmax=most
+        )
         line[2].set_title(error, fontsize=9)
     for axis in axes.flat:
         axis.set_xticks([])

@@ -1,9 +1,10 @@
-"""Iterations a second and peak memory of reconstructions, meant for a GPU: the paper's size, its joint case, and as many cells as fit.
+"""Iterations a second and peak memory of reconstructions, meant for a GPU: the paper's size, its
+joint case, and as many cells as fit.
 
     python benchmarks/gpu.py [--device cuda] [--shrink 1]
 
-Each reconstructs a plume of `ddrecon.bench.plume` from its own image at full resolution, one view. `--shrink 8` makes grids and images
-eight times smaller, to try the script where there is no GPU.
+Each reconstructs a plume of `ddrecon.bench.plume` from its own image at full resolution, one view.
+`--shrink 8` makes grids and images eight times smaller, to try the script where there is no GPU.
 """
 
 from __future__ import annotations
@@ -18,11 +19,16 @@ from ddrecon.bench.plume import plume_scene
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.settings import OptimizeSettings, ParameterSettings
 
 CASES = {
-    "64 x 96 x 64, 512 x 512, density (the paper: 22.5 iterations a second on an RTX 2080 Ti)": (64, 512, False, 30),
+    "64 x 96 x 64, 512 x 512, density (the paper: 22.5 iterations a second on an RTX 2080 Ti)": (
+        64,
+        512,
+        False,
+        30,
+    ),
     "168 x 252 x 168, 512 x 512, density, sigma_a and sigma_s in RGB: 49.8 million numbers (the paper: 8 s an iteration)": (
         168,
         512,
@@ -39,14 +45,21 @@ def scene_of(cells: int, pixels: int, is_joint: bool, device: torch.device) -> S
     if is_joint:
         volume, shape = scene.volume, (3, *scene.volume.grid.shape)
         colors = torch.tensor([1.0, 0.9, 0.7], device=device).view(3, 1, 1, 1)
-        fields = {name: (getattr(volume, name) * colors).expand(shape).contiguous() for name in ("sigma_a", "sigma_s")}
+        fields = {
+            name: (getattr(volume, name) * colors).expand(shape).contiguous()
+            for name in ("sigma_a", "sigma_s")
+        }
         scene = replace(scene, volume=replace(volume, **fields))
     with torch.no_grad():
         (image,) = render_each(scene, scene.views, SolveMemory())
     names = ("density", "sigma_a", "sigma_s") if is_joint else ("density",)
     starts = {name: 0.5 * getattr(scene.volume, name) for name in names}
-    settings = OptimizeSettings({name: ParameterSettings(field=True) for name in names}, iterations=1000, refine_at=())
-    return replace(scene, views=[replace(scene.views[0], image=image)], optimize=settings, starts=starts)
+    settings = OptimizeSettings(
+        {name: ParameterSettings(field=True) for name in names}, iterations=1000, refine_at=()
+    )
+    return replace(
+        scene, views=[replace(scene.views[0], image=image)], optimize=settings, starts=starts
+    )
 
 
 def measure(name: str, scene: Scene, iterations: int, device: torch.device) -> str:
@@ -59,7 +72,11 @@ def measure(name: str, scene: Scene, iterations: int, device: torch.device) -> s
     for _ in range(iterations):
         run.step()
     seconds = (now(device) - start) / iterations
-    peak = f"{torch.cuda.max_memory_allocated(device) / 2**30:.2f} GiB" if device.type == "cuda" else "-"
+    peak = (
+        f"{torch.cuda.max_memory_allocated(device) / 2**30:.2f} GiB"
+        if device.type == "cuda"
+        else "-"
+    )
     return f"| {name} | {seconds:.4f} | {1 / seconds:.1f} | {peak} |"
 
 
@@ -77,7 +94,9 @@ def main() -> None:
     parser.add_argument("--shrink", type=int, default=1)
     arguments = parser.parse_args()
     device = torch.device(arguments.device)
-    print(f"{torch.cuda.get_device_name(device) if device.type == 'cuda' else 'CPU'}, torch {torch.__version__}")
+    print(
+        f"{torch.cuda.get_device_name(device) if device.type == 'cuda' else 'CPU'}, torch {torch.__version__}"
+    )
     print("| case | seconds an iteration | iterations a second | peak memory |\n|---|---|---|---|")
     for name, (cells, pixels, is_joint, iterations) in CASES.items():
         scene = scene_of(cells // arguments.shrink, pixels // arguments.shrink, is_joint, device)

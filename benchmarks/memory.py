@@ -1,8 +1,10 @@
-"""Peak memory against what `ddrecon check` predicts, and bytes per cell and color of a forward and adjoint solve.
+"""Peak memory against what `ddrecon check` predicts, and bytes per cell and color of a forward and
+adjoint solve.
 
     python benchmarks/memory.py
 
-Every figure is the highest resident size of a process of its own, less that of the same work on 16^3 cells.
+Every figure is the highest resident size of a process of its own, less that of the same work on
+16^3 cells.
 """
 
 from __future__ import annotations
@@ -17,7 +19,12 @@ from pathlib import Path
 
 SMALL = 16
 SCENE = {
-    "volume": {"bounds": {"min": [-0.5] * 3, "max": [0.5] * 3}, "density": 1, "sigma_t": 20, "g": 0.0},
+    "volume": {
+        "bounds": {"min": [-0.5] * 3, "max": [0.5] * 3},
+        "density": 1,
+        "sigma_t": 20,
+        "g": 0.0,
+    },
     "lights": [{"type": "directional", "direction": [-2, -2, -1], "irradiance": 3.14159}],
 }
 CAMERA = {"type": "perspective", "target": [0, 0, 0], "up": [0, 1, 0], "fov": 28}
@@ -42,12 +49,25 @@ torch.autograd.grad(solve_light(scene, SolveMemory()).outgoing.mean.sum(), densi
 """
 
 
-def scene_of(cells: int, pixels: int, case: dict[str, object], is_optimized: bool) -> dict[str, object]:
+def scene_of(
+    cells: int, pixels: int, case: dict[str, object], is_optimized: bool
+) -> dict[str, object]:
     """A scene file's contents: one view."""
-    volume = {**SCENE["volume"], "resolution": [cells] * 3, "albedo": case.get("albedo", 0.9), "g": case.get("g", 0.0)}  # type: ignore[dict-item]
-    views = [{"name": "view", "camera": {**CAMERA, "origin": [0, 0.3, 3.2], "resolution": [pixels] * 2}}]
+    volume = {
+        **SCENE["volume"],
+        "resolution": [cells] * 3,
+        "albedo": case.get("albedo", 0.9),
+        "g": case.get("g", 0.0),
+    }  # type: ignore[dict-item]
+    views = [
+        {"name": "view", "camera": {**CAMERA, "origin": [0, 0.3, 3.2], "resolution": [pixels] * 2}}
+    ]
     scene = {**SCENE, "volume": volume, "views": views}
-    scene["diffusion"] = {"transport_rounds": case.get("rounds", 0), "model": case.get("model", "p1"), "tolerance": 1e-2}
+    scene["diffusion"] = {
+        "transport_rounds": case.get("rounds", 0),
+        "model": case.get("model", "p1"),
+        "tolerance": 1e-2,
+    }
     if is_optimized:
         scene["views"] = [{**views[0], "image": "view.npy", "split": "train"}]
         parameters: dict[str, object] = {"density": {"init": 1}}
@@ -56,7 +76,9 @@ def scene_of(cells: int, pixels: int, case: dict[str, object], is_optimized: boo
         if case.get("joint"):
             del volume["sigma_t"], volume["albedo"]
             volume |= {"sigma_a": [1.0, 2.0, 4.0], "sigma_s": [19.0, 18.0, 16.0]}
-            parameters |= {name: {"init": volume[name], "field": True} for name in ("sigma_a", "sigma_s")}
+            parameters |= {
+                name: {"init": volume[name], "field": True} for name in ("sigma_a", "sigma_s")
+            }
         scene["optimize"] = {"iterations": 1, "refine_at": [], "parameters": parameters}
     return scene
 
@@ -70,7 +92,9 @@ def peak(command: list[str]) -> int:
     return usage.ru_maxrss * 1024
 
 
-def measured(folder: Path, verb: str, cells: int, pixels: int, case: dict[str, object]) -> tuple[int, int]:
+def measured(
+    folder: Path, verb: str, cells: int, pixels: int, case: dict[str, object]
+) -> tuple[int, int]:
     """The peak of `verb` and what `ddrecon check` says of the scene [bytes]."""
     import numpy as np
 
@@ -78,7 +102,9 @@ def measured(folder: Path, verb: str, cells: int, pixels: int, case: dict[str, o
     path = folder / "scene.yaml"
     path.write_text(json.dumps(scene_of(cells, pixels, case, verb == "optimize")))
     program = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
-    found = subprocess.run([*program, "check", str(path), "--json"], capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        [*program, "check", str(path), "--json"], capture_output=True, text=True, check=True
+    )
     if verb == "solve":
         command = [sys.executable, "-c", SOLVE, str(path)]
     else:
@@ -95,17 +121,25 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        print("| scene | cells | solve, there and back [bytes per cell and color] | command | peak [MiB] | predicted / peak |")
+        print(
+            "| scene | cells | solve, there and back [bytes per cell and color] | command | peak [MiB] | predicted / peak |"
+        )
         print(f"|{'---|' * 6}")
         for title, case in ((title, CASES[title]) for title in arguments.scene):
-            bases = {verb: measured(folder, verb, SMALL, 16, case)[0] for verb in ("solve", "render", "optimize")}
+            bases = {
+                verb: measured(folder, verb, SMALL, 16, case)[0]
+                for verb in ("solve", "render", "optimize")
+            }
             for cells in arguments.cells:
                 solve = measured(folder, "solve", cells, 16, case)[0] - bases["solve"]
                 each = solve / (cells**3 - SMALL**3) / (3 if "albedo" in case else 1)
                 for verb in ("render", "optimize"):
                     found, predicted = measured(folder, verb, cells, arguments.pixels, case)
                     used = found - bases[verb]
-                    print(f"| {title} | {cells}^3 | {each:.0f} | {verb} | {used / 2**20:.0f} | {predicted / used:.2f} |", flush=True)
+                    print(
+                        f"| {title} | {cells}^3 | {each:.0f} | {verb} | {used / 2**20:.0f} | {predicted / used:.2f} |",
+                        flush=True,
+                    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Remakes the experiments of docs/experiments.md: runs them through the command line, draws their pictures, rewrites the table.
+"""Remakes the experiments of docs/experiments.md: runs them through the command line, draws their
+pictures, rewrites the table.
 
     python benchmarks/paper.py [NAME]... [-o FOLDER] [--size paper] [--keep]
 
-NAME is that of a config in configs/paper; without one, all are remade, Fig. 7 and 8 too where Mitsuba can run. `--size paper` path-traces
-pictures of the paper's size first and runs as many cells and iterations as the paper did (or `--iterations`), which wants a GPU; its
-figures are printed, and docs/ is left alone. `--keep` draws finished runs again.
+NAME is that of a config in configs/paper; without one, all are remade, Fig. 7 and 8 too where
+Mitsuba can run. `--size paper` path-traces pictures of the paper's size first and runs as many
+cells and iterations as the paper did (or `--iterations`), which wants a GPU; its figures are
+printed, and docs/ is left alone. `--keep` draws finished runs again.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ from paper_shown import (
     show_smoke,
 )
 
-from ddrecon.io.volumes import write_field
+from ddrecon.io.volumes.table import write_field
 
 SCRIPT = Path(__file__).name
 PAPER_PIXELS, PAPER_CELLS = 512, 192
@@ -55,11 +57,13 @@ TOP = (
 
 @dataclass(frozen=True)
 class Experiment:
-    """How the config `name` is run: by `variants`, names of runs with their overrides, and at the paper's size with `paper_size` besides.
+    """How the config `name` is run: by `variants`, names of runs with their overrides, and at the
+    paper's size with `paper_size` besides.
 
-    `truth` names the folder of data/paper its pictures are in, if they are path-traced. `shown` makes the pairs to draw and says what was
-    found. `others` are variants too, of the small size alone, whose logs are not drawn; `draw_more` makes further pictures of them all.
-    `known` names the shape whose density is given, which at the paper's size is interpolated to its cells.
+    `truth` names the folder of data/paper its pictures are in, if they are path-traced. `shown`
+    makes the pairs to draw and says what was found. `others` are variants too, of the small size
+    alone, whose logs are not drawn; `draw_more` makes further pictures of them all. `known` names
+    the shape whose density is given, which at the paper's size is interpolated to its cells.
     """
 
     name: str
@@ -80,7 +84,8 @@ G_ALONE = (
 )
 """Overrides that leave nothing but g to be found."""
 HALF = ("volume.resolution=[32, 48, 32]", "optimize.refine_at=[0.5]", "optimize.iterations=120")
-"""Fig. 13 in cells twice as large, where the printed scheme, by Jacobi iteration, comes to an end."""
+"""Fig. 13 in cells twice as large, where the printed scheme, by Jacobi iteration, comes to an end.
+"""
 ROUNDS = {
     "one_round": ("diffusion.transport_rounds=1",),
     "half": HALF,
@@ -90,14 +95,30 @@ ROUNDS = {
 PARTS = {name: (f"optimize.derivatives={name}",) for name in ("all", "diffusion", "single")}
 FINE = "volume.resolution=[192, 192, 192]"
 EXPERIMENTS = (
-    Experiment("fig13", "fig13", show_density("bunny", "ring_00"), ("optimize.iterations=1000",), others=ROUNDS, draw_more=draw_rounds),
+    Experiment(
+        "fig13",
+        "fig13",
+        show_density("bunny", "ring_00"),
+        ("optimize.iterations=1000",),
+        others=ROUNDS,
+        draw_more=draw_rounds,
+    ),
     Experiment("fig06_light", "fig06_light", show_light, ("optimize.iterations=100",)),
     Experiment("fig06_density", "knot", show_density("knot", "front")),
-    Experiment("fig10", "fig10", show_optics, ("optimize.iterations=3000",), others={"g_alone": G_ALONE}, known="cloud"),
+    Experiment(
+        "fig10",
+        "fig10",
+        show_optics,
+        ("optimize.iterations=3000",),
+        others={"g_alone": G_ALONE},
+        known="cloud",
+    ),
     Experiment("fig12_single", "smoke", show_smoke, (FINE,)),
     Experiment("fig12_four", "smoke", show_four, (FINE,)),
     Experiment("fig09", "knot", show_derivatives, (), PARTS, draw_more=draw_parts),
-    Experiment("fig14", "", show_photograph, (FINE, "views.0.image=../../data/cumulus/cumulus.webp")),
+    Experiment(
+        "fig14", "", show_photograph, (FINE, "views.0.image=../../data/cumulus/cumulus.webp")
+    ),
 )
 """In the order of docs/experiments.md."""
 
@@ -110,9 +131,15 @@ def optimize(name: str, folder: Path, overrides: list[str]) -> Run:
     return run
 
 
-def at_paper_size(experiment: Experiment, output: Path, iterations: int | None, paths: int | None) -> list[str]:
-    """Overrides for the paper's size, its pictures traced by so many `paths`; given `iterations`, all of them are at full resolution."""
-    fewer = () if iterations is None else (f"optimize.iterations={iterations}", "optimize.refine_at=[]")
+def at_paper_size(
+    experiment: Experiment, output: Path, iterations: int | None, paths: int | None
+) -> list[str]:
+    """Overrides for the paper's size, its pictures traced by so many `paths`; given `iterations`,
+    all of them are at full resolution.
+    """
+    fewer = (
+        () if iterations is None else (f"optimize.iterations={iterations}", "optimize.refine_at=[]")
+    )
     size = [*experiment.paper_size, *fewer]
     if experiment.known:
         output.mkdir(parents=True, exist_ok=True)
@@ -121,10 +148,25 @@ def at_paper_size(experiment: Experiment, output: Path, iterations: int | None, 
         size.append(f"volume.density={{file: {path.resolve()}}}")
     if not experiment.truth:
         return size
-    traced, views = output / "targets", yaml.safe_load((CONFIGS / f"{experiment.name}.yaml").read_text())["views"]
-    options = ["--pixels", str(PAPER_PIXELS), "-o", traced, *([] if paths is None else ["--paths", str(paths)])]
-    subprocess.run([sys.executable, ROOT / "data" / "make_targets.py", experiment.truth, *options], check=True)
-    images = {index: traced.resolve() / experiment.truth / Path(view["image"]).name for index, view in enumerate(views) if "image" in view}
+    traced, views = (
+        output / "targets",
+        yaml.safe_load((CONFIGS / f"{experiment.name}.yaml").read_text())["views"],
+    )
+    options = [
+        "--pixels",
+        str(PAPER_PIXELS),
+        "-o",
+        traced,
+        *([] if paths is None else ["--paths", str(paths)]),
+    ]
+    subprocess.run(
+        [sys.executable, ROOT / "data" / "make_targets.py", experiment.truth, *options], check=True
+    )
+    images = {
+        index: traced.resolve() / experiment.truth / Path(view["image"]).name
+        for index, view in enumerate(views)
+        if "image" in view
+    }
     return [*(f"views.{index}.image={image}" for index, image in images.items()), *size]
 
 
@@ -133,20 +175,36 @@ def row(experiment: Experiment, log: Log, words: str) -> str:
     tenth = max(len(log["loss"]) // 10, 1)
     seconds, ends = pace(log), (slice(tenth), slice(-tenth, None))
     times = " to ".join(f"{np.median(seconds[end]):.2g}" for end in ends)
-    solves = "; ".join(", ".join(f"{log[f'{kind}_iterations'][end].mean():.1f}" for kind in ("forward", "adjoint")) for end in ends)
+    solves = "; ".join(
+        ", ".join(f"{log[f'{kind}_iterations'][end].mean():.1f}" for kind in ("forward", "adjoint"))
+        for end in ends
+    )
     losses = " to ".join(f"{log['loss'][end]:.2g}" for end in (0, -1))
-    quality = ", ".join("-" if np.isnan(log[name][-1]) else f"{log[name][-1]:.1f} dB" for name in ("psnr", "test_psnr"))
+    quality = ", ".join(
+        "-" if np.isnan(log[name][-1]) else f"{log[name][-1]:.1f} dB"
+        for name in ("psnr", "test_psnr")
+    )
     return f"| {experiment.name} | {len(seconds)} | {times} | {solves} | {losses} | {quality} | {words} |\n"
 
 
 def merge_rows(rows: dict[str, str]) -> None:
     """Puts `rows` into the table of docs/experiments.md in place of those of the same experiments."""
     lines = read_table(SCRIPT).removeprefix(TOP).splitlines(keepends=True)
-    merged = {line.split(" | ")[0].removeprefix("| "): line for line in lines if line.strip()} | rows
-    rewrite_table(SCRIPT, TOP + "".join(merged[experiment.name] for experiment in EXPERIMENTS if experiment.name in merged))
+    merged = {
+        line.split(" | ")[0].removeprefix("| "): line for line in lines if line.strip()
+    } | rows
+    rewrite_table(
+        SCRIPT,
+        TOP
+        + "".join(
+            merged[experiment.name] for experiment in EXPERIMENTS if experiment.name in merged
+        ),
+    )
 
 
-def remake(experiment: Experiment, output: Path, overrides: list[str], is_small: bool, is_kept: bool) -> str:
+def remake(
+    experiment: Experiment, output: Path, overrides: list[str], is_small: bool, is_kept: bool
+) -> str:
     """Runs `experiment` unless `is_kept` and done, draws it, and returns its line of the table."""
     runs = {}
     variants = {**experiment.variants, **experiment.others} if is_small else experiment.variants
@@ -154,10 +212,14 @@ def remake(experiment: Experiment, output: Path, overrides: list[str], is_small:
         folder = output / (f"{experiment.name}_{variant}" if variant else experiment.name)
         is_done = is_kept and (folder / "summary.json").exists()
         runs[variant or "default"] = (
-            Run(experiment.name, folder) if is_done else optimize(experiment.name, folder, [*overrides, *variants[variant]])
+            Run(experiment.name, folder)
+            if is_done
+            else optimize(experiment.name, folder, [*overrides, *variants[variant]])
         )
     pairs, words = experiment.shown(runs)
-    logs = {name: read_log(run.folder) for name, run in runs.items() if name not in experiment.others}
+    logs = {
+        name: read_log(run.folder) for name, run in runs.items() if name not in experiment.others
+    }
     draw((PICTURES if is_small else output) / f"{experiment.name}.png", pairs, logs)
     if is_small:
         experiment.draw_more(runs)
@@ -182,20 +244,38 @@ def remake_replay(names: list[str], output: Path, is_kept: bool) -> None:
 
 def main() -> None:
     """Runs, draws and tabulates the named experiments, or all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help="of a config in configs/paper; all unless given")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="of a config in configs/paper; all unless given"
+    )
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper")
     parser.add_argument("--size", choices=("small", "paper"), default="small")
     parser.add_argument("--iterations", type=int, help="instead of as many as the paper's size has")
-    parser.add_argument("--paths", type=int, help="a pixel of the pictures at the paper's size, instead of as many as those shipped have")
+    parser.add_argument(
+        "--paths",
+        type=int,
+        help="a pixel of the pictures at the paper's size, instead of as many as those shipped have",
+    )
     parser.add_argument("--keep", action="store_true", help="do not run again what has been run")
     given = parser.parse_args()
-    names, is_small, rows = given.names or [config.stem for config in CONFIGS.glob("*.yaml")], given.size == "small", dict[str, str]()
+    names, is_small, rows = (
+        given.names or [config.stem for config in CONFIGS.glob("*.yaml")],
+        given.size == "small",
+        dict[str, str](),
+    )
     for experiment in EXPERIMENTS:
         if experiment.name not in names:
             continue
-        overrides = [] if is_small else at_paper_size(experiment, given.output, given.iterations, given.paths)
-        rows[experiment.name] = remake(experiment, given.output / given.size, overrides, is_small, given.keep)
+        overrides = (
+            []
+            if is_small
+            else at_paper_size(experiment, given.output, given.iterations, given.paths)
+        )
+        rows[experiment.name] = remake(
+            experiment, given.output / given.size, overrides, is_small, given.keep
+        )
         print(rows[experiment.name], end="", flush=True)
     if is_small:
         merge_rows(rows)

@@ -1,4 +1,6 @@
-"""The pictures of docs/experiments.md: truth, ours, the absolute difference, and what a run took. Arrays are [h, w] or [h, w, 3]."""
+"""The pictures of docs/experiments.md: truth, ours, the absolute difference, and what a run took.
+Arrays are [h, w] or [h, w, 3].
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ddrecon.io import srgb
+from ddrecon.io.images import srgb
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -27,7 +29,9 @@ COLORS = 192
 
 @dataclass(frozen=True)
 class Pair:
-    """What should look alike: pictures in linear radiance or maps of a quantity; `truth` is None where nobody knows it."""
+    """What should look alike: pictures in linear radiance or maps of a quantity; `truth` is None
+    where nobody knows it.
+    """
 
     title: str
     truth: Array | None
@@ -52,14 +56,20 @@ def pace(log: Log) -> NDArray[np.float64]:
 
 
 def projected(field: Array, axis: int, side: float) -> Array:
-    """The integral of `field` [z, y, x] along `axis` (0 or 2) across a box of that `side` [u], y upwards."""
+    """The integral of `field` [z, y, x] along `axis` (0 or 2) across a box of that `side` [u], y
+    upwards.
+    """
     total = field.sum(axis) * (side / field.shape[axis])
     return (total if axis == 0 else total.T)[::-1]
 
 
 def draw(path: Path, pairs: Sequence[Pair], logs: Mapping[str, Log]) -> None:
-    """Writes a PNG: a column for each of `pairs`, and below them loss, solves and time of each run in `logs`, if there are any."""
-    figure = plt.figure(figsize=(max(2.1 * len(pairs), 8), 8.6 if logs else 6.4), layout="constrained")
+    """Writes a PNG: a column for each of `pairs`, and below them loss, solves and time of each run
+    in `logs`, if there are any.
+    """
+    figure = plt.figure(
+        figsize=(max(2.1 * len(pairs), 8), 8.6 if logs else 6.4), layout="constrained"
+    )
     upper, lower = figure.subfigures(2, 1, height_ratios=(3, 1.15)) if logs else (figure, figure)
     axes = upper.subplots(3, len(pairs), squeeze=False)
     for column, pair in zip(axes.T, pairs, strict=True):
@@ -72,8 +82,12 @@ def draw(path: Path, pairs: Sequence[Pair], logs: Mapping[str, Log]) -> None:
 
 
 def draw_derivatives(path: Path, images: Sequence[tuple[str, Array]]) -> None:
-    """Writes a PNG of titled derivative images [h, w] in a row: red where pixels grow brighter, blue where darker, each to a scale."""
-    figure, axes = plt.subplots(1, len(images), figsize=(2.1 * len(images), 2.6), layout="constrained")
+    """Writes a PNG of titled derivative images [h, w] in a row: red where pixels grow brighter,
+    blue where darker, each to a scale.
+    """
+    figure, axes = plt.subplots(
+        1, len(images), figsize=(2.1 * len(images), 2.6), layout="constrained"
+    )
     for axis, (title, image) in zip(axes, images, strict=True):
         full = float(np.quantile(np.abs(image), 0.999))
         signed(axis, image, full, title)
@@ -111,7 +125,9 @@ def _draw_pair(column: Sequence[Any], pair: Pair) -> None:
 
 
 def show(axis: Any, values: Array | None, white: float, colors: str = "viridis") -> None:
-    """Draws a picture in linear radiance, or a map of a quantity in `colors`, on `axis` without ticks; nothing where there is none."""
+    """Draws a picture in linear radiance, or a map of a quantity in `colors`, on `axis` without
+    ticks; nothing where there is none.
+    """
     axis.set(xticks=[], yticks=[])
     if values is None:
         axis.axis("off")
@@ -125,10 +141,23 @@ def _draw_logs(axes: Sequence[Any], logs: Mapping[str, Log]) -> None:
     for index, (name, log) in enumerate(logs.items()):
         color, label = f"C{index}", name if len(logs) > 1 else ""
         axes[0].semilogy(log["iteration"], log["loss"], color=color, label=label)
-        axes[1].plot(log["iteration"], log["forward_iterations"], color=color, label=f"{label} forward".strip())
-        axes[1].plot(log["iteration"], log["adjoint_iterations"], color=color, linestyle=":", label=f"{label} adjoint".strip())
+        axes[1].plot(
+            log["iteration"],
+            log["forward_iterations"],
+            color=color,
+            label=f"{label} forward".strip(),
+        )
+        axes[1].plot(
+            log["iteration"],
+            log["adjoint_iterations"],
+            color=color,
+            linestyle=":",
+            label=f"{label} adjoint".strip(),
+        )
         axes[2].plot(log["iteration"], pace(log), color=color, label=label)
-    for axis, title in zip(axes, ("loss", "iterations of the solves", "seconds an iteration"), strict=True):
+    for axis, title in zip(
+        axes, ("loss", "iterations of the solves", "seconds an iteration"), strict=True
+    ):
         axis.set_title(title, fontsize=9)
         axis.tick_params(labelsize=7)
         axis.set_xlabel("iteration", fontsize=7)

@@ -2,9 +2,10 @@
 
     python benchmarks/paper_gradients.py [-o FOLDER] [--paths 8192] [--replay-paths 512]
 
-Every cell's density, or its absorption, changes by the same amount. Derivatives are taken in the middle between two scenes that Mitsuba
-traces: the cloud as it is, and with a little more density everywhere; for absorption, less and more. Where DRJIT_LIBLLVM_PATH is set, path
-replay's are shown too, of pixels twice as large, one by one. Pictures that are there already are not traced again.
+Every cell's density, or its absorption, changes by the same amount. Derivatives are taken in the
+middle between two scenes that Mitsuba traces: the cloud as it is, and with a little more density
+everywhere; for absorption, less and more. Where DRJIT_LIBLLVM_PATH is set, path replay's are shown
+too, of pixels twice as large, one by one. Pictures that are there already are not traced again.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, rew
 from path_replay import ALBEDO, Replay, why_not
 
 from ddrecon.bench.path_tracing import DENSITY
-from ddrecon.io.volumes import read_field, write_field
-from ddrecon.scene.build import load_scene
+from ddrecon.io.volumes.table import read_field, write_field
+from ddrecon.scene_file.build import load_scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -51,7 +52,9 @@ TOP_PARTS = "| by | what | light scattered more than once | its derivative |\n|-
 
 @dataclass(frozen=True)
 class Change:
-    """The scenes `before`, `between` and `after` as overrides; `parameter` changes by `amount` in all, from the first to the last."""
+    """The scenes `before`, `between` and `after` as overrides; `parameter` changes by `amount` in
+    all, from the first to the last.
+    """
 
     parameter: str
     amount: float
@@ -65,21 +68,31 @@ def changes(folder: Path) -> list[Change]:
     cloud = read_field(CLOUD, "density")
     names = {"before": 0.0, "between": HAZE / 2, "after": HAZE}
     for name, haze in names.items():
-        write_field(folder / f"{name}.npz", "density", cloud.values + np.float32(haze), cloud.bounds)
+        write_field(
+            folder / f"{name}.npz", "density", cloud.values + np.float32(haze), cloud.bounds
+        )
     hazy = [f"volume.density={{file: {(folder / f'{name}.npz').resolve()}}}" for name in names]
     return [
         Change("density", HAZE, *hazy),
-        Change("sigma_a", ABSORPTION, *(f"volume.sigma_a={1 + ABSORPTION * part}" for part in (-0.5, 0, 0.5))),
+        Change(
+            "sigma_a",
+            ABSORPTION,
+            *(f"volume.sigma_a={1 + ABSORPTION * part}" for part in (-0.5, 0, 0.5)),
+        ),
     ]
 
 
 def traced(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
-    """The derivative image [h, w] from path tracing, and the standard error of its pixels (root mean square)."""
+    """The derivative image [h, w] from path tracing, and the standard error of its pixels (root
+    mean square).
+    """
     pictures, variance = [], 0.0
     for name, override in (("before", change.before), ("after", change.after)):
         output = folder / f"{change.parameter}_{name}"
         if not (output / "reference.json").exists():
-            ddrecon("reference", CONFIG, "-o", output, "--views", "--spp", str(paths), "-D", override)
+            ddrecon(
+                "reference", CONFIG, "-o", output, "--views", "--spp", str(paths), "-D", override
+            )
         picture = np.load(output / "front.npy").mean(-1)
         noise = json.loads((output / "reference.json").read_text())["views"]["front"]["noise"]
         variance += noise**2 * float((picture**2).mean())
@@ -88,9 +101,11 @@ def traced(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
 
 
 def replayed(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
-    """The derivative image [h, w] by path replay, in larger pixels, and the standard error of its pixels (root mean square).
+    """The derivative image [h, w] by path replay, in larger pixels, and the standard error of its
+    pixels (root mean square).
 
-    Each pixel is a picture of its own, one camera being shifted from one to the next: a gradient has but one loss.
+    Each pixel is a picture of its own, one camera being shifted from one to the next: a gradient
+    has but one loss.
     """
     path = folder / f"{change.parameter}_replay.npy"
     if not path.exists():
@@ -103,31 +118,54 @@ def _replayed_once(change: Change, paths: int, seed: int) -> Array:
     import drjit
 
     scene = load_scene(CONFIG, overrides=[change.between])
-    (view,), (height, width) = scene.views, scene.views[0].camera.resized(LARGER).size
+    (view,), (height, width) = scene.views, scene.views[0].camera.resize(LARGER).size
     small = replace(view.camera, size=(1, 1), half_width=view.camera.half_width / width)
     replay, volume = Replay.of(replace(scene, views=[replace(view, camera=small)])), scene.volume
-    names, image = [replay.name(ending) for ending in (DENSITY, ALBEDO)], np.zeros((height, width), np.float32)
+    names, image = (
+        [replay.name(ending) for ending in (DENSITY, ALBEDO)],
+        np.zeros((height, width), np.float32),
+    )
     for row, column in np.ndindex(height, width):
         replay.parameters[replay.name("principal_point_offset_x")] = column + 0.5 - width / 2
         replay.parameters[replay.name("principal_point_offset_y")] = row + 0.5 - height / 2
         pixel = seed * height * width + row * width + column
-        _, (by_density, by_albedo) = replay.gradients(lambda picture: drjit.mean(picture, axis=None), names, pixel, paths)
+        _, (by_density, by_albedo) = replay.gradients(
+            lambda picture: drjit.mean(picture, axis=None), names, pixel, paths
+        )
         if change.parameter == "density":
             image[row, column] = by_density.sum()
         else:
             sigma_a, sigma_s = float(volume.sigma_a), float(volume.sigma_s)
-            by_extinction = float(replay.by_density(by_density, volume.density).mul(volume.density).sum()) / (sigma_a + sigma_s)
-            image[row, column] = by_extinction - by_albedo.sum() * sigma_s / (sigma_a + sigma_s) ** 2
+            by_extinction = float(
+                replay.by_density(by_density, volume.density).mul(volume.density).sum()
+            ) / (sigma_a + sigma_s)
+            image[row, column] = (
+                by_extinction - by_albedo.sum() * sigma_s / (sigma_a + sigma_s) ** 2
+            )
     return image
 
 
 def ours(change: Change, folder: Path, model: str) -> dict[str, Array]:
-    """By one of `MODELS`: the `image` [h, w] and its `derivative`, and of each the part of light scattered more than once, as `many`."""
+    """By one of `MODELS`: the `image` [h, w] and its `derivative`, and of each the part of light
+    scattered more than once, as `many`.
+    """
     output = folder / f"{change.parameter}_{model[0]}"
-    ddrecon("render", CONFIG, "-o", output, "--components", "--gradient", change.parameter, *as_options([change.between, *MODELS[model]]))
+    ddrecon(
+        "render",
+        CONFIG,
+        "-o",
+        output,
+        "--components",
+        "--gradient",
+        change.parameter,
+        *as_options([change.between, *MODELS[model]]),
+    )
     names = {"single": "front.single", "multiple": "front.multiple"}
     parts = {name: np.load(output / f"{file}.npy").mean(-1) for name, file in names.items()}
-    slopes = {name: np.load(output / f"{file.replace('front', 'front.gradient')}.npy").mean(-1) for name, file in names.items()}
+    slopes = {
+        name: np.load(output / f"{file.replace('front', 'front.gradient')}.npy").mean(-1)
+        for name, file in names.items()
+    }
     reduced = np.load(output / "front.gradient.reduced.npy").mean(-1)
     return {
         "derivative": slopes["single"] + slopes["multiple"] + reduced,
@@ -143,7 +181,11 @@ def regions(folder: Path) -> dict[str, NDArray[np.bool_]]:
     black = ["volume.sigma_s=0", "volume.sigma_a=12", "lights=[{type: ambient, radiance: 1}]"]
     ddrecon("render", CONFIG, "-o", folder / "through", *as_options(black))
     through = np.load(folder / "through" / "front.npy").mean(-1)
-    return {"thick": through < 0.2, "thin": (through >= 0.2) & (through < 0.95), "empty": through >= 0.95}
+    return {
+        "thick": through < 0.2,
+        "thin": (through >= 0.2) & (through < 0.95),
+        "empty": through >= 0.95,
+    }
 
 
 def relative(image: Array, truth: Array) -> float:
@@ -178,8 +220,19 @@ def remake(folder: Path, paths: int = PATHS, replay_paths: int = REPLAY_PATHS) -
             axis.axis("off")
         if why_not() is None:
             image, scatter = replayed(change, folder, replay_paths)
-            regions_there = {name: coarser(region.astype(np.float32)) > 0.5 for name, region in seen.items()}
-            lines.append(line(change, "path replay, larger pixels", image, coarser(truth), scatter, regions_there))
+            regions_there = {
+                name: coarser(region.astype(np.float32)) > 0.5 for name, region in seen.items()
+            }
+            lines.append(
+                line(
+                    change,
+                    "path replay, larger pixels",
+                    image,
+                    coarser(truth),
+                    scatter,
+                    regions_there,
+                )
+            )
             _compared(row[1], row[5], image, coarser(truth), full, "path replay")
     save(figure, PICTURE)
     for name, top, text in ((SCRIPT, TOP, lines), (f"{SCRIPT} (parts)", TOP_PARTS, parts)):
@@ -187,16 +240,36 @@ def remake(folder: Path, paths: int = PATHS, replay_paths: int = REPLAY_PATHS) -
         rewrite_table(name, top + "".join(text))
 
 
-def line(change: Change, name: str, image: Array, truth: Array, noise: float, seen: dict[str, NDArray[np.bool_]]) -> str:
+def line(
+    change: Change,
+    name: str,
+    image: Array,
+    truth: Array,
+    noise: float,
+    seen: dict[str, NDArray[np.bool_]],
+) -> str:
     """A line of the table: errors of `image`, and the `noise` there is in truth, or in it."""
-    told = ", ".join(f"{region} {relative(image[where], truth[where]):.3f}" for region, where in seen.items())
+    told = ", ".join(
+        f"{region} {relative(image[where], truth[where]):.3f}" for region, where in seen.items()
+    )
     size, alike = np.sqrt((truth**2).mean()), np.corrcoef(image.ravel(), truth.ravel())[0, 1]
     return f"| {change.parameter} | {name} | {noise / size:.3f} | {relative(image, truth):.3f} | {told} | {alike:.3f} |\n"
 
 
-def shares(change: Change, images: dict[str, dict[str, Array]], folder: Path, truth: Array, where: NDArray[np.bool_]) -> list[str]:
-    """Lines of the other table: light scattered more than once, as parts of what path tracing has, in the pixels `where`."""
-    ends = [np.load(folder / f"{change.parameter}_{name}" / "front.npy").mean(-1) for name in ("before", "after")]
+def shares(
+    change: Change,
+    images: dict[str, dict[str, Array]],
+    folder: Path,
+    truth: Array,
+    where: NDArray[np.bool_],
+) -> list[str]:
+    """Lines of the other table: light scattered more than once, as parts of what path tracing has,
+    in the pixels `where`.
+    """
+    ends = [
+        np.load(folder / f"{change.parameter}_{name}" / "front.npy").mean(-1)
+        for name in ("before", "after")
+    ]
     light, slope = ((ends[0] + ends[1]) / 2)[where].mean(), truth[where].mean()
     return [
         f"| {change.parameter} | {name} | {found['multiple'][where].mean() / (light - found['single'][where].mean()):.3f} "
@@ -207,7 +280,9 @@ def shares(change: Change, images: dict[str, dict[str, Array]], folder: Path, tr
 
 def main() -> None:
     """Remakes Fig. 8."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper" / "fig08")
     parser.add_argument("--paths", type=int, default=PATHS)
     parser.add_argument("--replay-paths", type=int, default=REPLAY_PATHS)
@@ -215,12 +290,16 @@ def main() -> None:
     remake(given.output, given.paths, given.replay_paths)
 
 
-def _compared(axis: Any, error_axis: Any, image: Array, truth: Array, full: float, title: str) -> None:
+def _compared(
+    axis: Any, error_axis: Any, image: Array, truth: Array, full: float, title: str
+) -> None:
     for each in (axis, error_axis):
         each.axis("on")
     signed(axis, image, full, title)
     show(error_axis, np.abs(image - truth), full / ENLARGED, "inferno")
-    error_axis.set_title(f"{ENLARGED} x |error|,\n{title}: {relative(image, truth):.2f}", fontsize=8)
+    error_axis.set_title(
+        f"{ENLARGED} x |error|,\n{title}: {relative(image, truth):.2f}", fontsize=8
+    )
 
 
 if __name__ == "__main__":

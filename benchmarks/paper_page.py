@@ -1,4 +1,6 @@
-"""What the scripts of the paper's experiments share: commands they run, and the tables of docs/experiments.md that they rewrite."""
+"""What the scripts of the paper's experiments share: commands they run, and the tables of
+docs/experiments.md that they rewrite.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,20 @@ import subprocess
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-CONFIGS, SHAPES, PICTURES = ROOT / "configs" / "paper", ROOT / "data" / "shapes", ROOT / "docs" / "pictures" / "paper"
+CONFIGS, SHAPES, PICTURES = (
+    ROOT / "configs" / "paper",
+    ROOT / "data" / "shapes",
+    ROOT / "docs" / "pictures" / "paper",
+)
 PAGE = ROOT / "docs" / "experiments.md"
 END = "<!-- end of table -->"
 
 
 def ddrecon(*arguments: str | Path) -> None:
     """Runs a command, quietly."""
-    subprocess.run(["ddrecon", *arguments, "-q", "--overwrite"], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        ["ddrecon", *arguments, "-q", "--overwrite"], check=True, stdout=subprocess.DEVNULL
+    )
 
 
 def as_options(overrides: list[str]) -> list[str]:

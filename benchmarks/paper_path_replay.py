@@ -1,11 +1,13 @@
-"""Fig. 7 of docs/experiments.md: density from one picture, by us and by path replay backpropagation in Mitsuba 3, 64 paths a pixel.
+"""Fig. 7 of docs/experiments.md: density from one picture, by us and by path replay backpropagation
+in Mitsuba 3, 64 paths a pixel.
 
     DRJIT_LIBLLVM_PATH=... python benchmarks/paper_path_replay.py [-o FOLDER] [--iterations 40] [--keep]
 
-All look at the picture of configs/paper/fig07.yaml, in pixels two or three times as large, start from the same density, and
-step by Adam at the same rates against the same loss and the same total variation. Seconds are those of the processor, on one thread.
-What each found is judged by path tracing: the mean of products of two errors, each of a trace and of a target of its own, is the squared
-error without their noise. `--keep` takes finished runs as they are.
+All look at the picture of configs/paper/fig07.yaml, in pixels two or three times as large, start
+from the same density, and step by Adam at the same rates against the same loss and the same total
+variation. Seconds are those of the processor, on one thread. What each found is judged by path
+tracing: the mean of products of two errors, each of a trace and of a target of its own, is the
+squared error without their noise. `--keep` takes finished runs as they are.
 """
 
 from __future__ import annotations
@@ -25,13 +27,13 @@ from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, rewrite_table
 from path_replay import HEADROOM, Replay, why_not
 
 from ddrecon.bench.path_tracing import DENSITY
-from ddrecon.io.volumes import read_field
+from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import rate_at
 from ddrecon.reference.trace import open_tracer
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -74,23 +76,34 @@ def by_us(scene: Scene, iterations: int) -> Found:
 
 
 def by_path_replay(scene: Scene, iterations: int, headroom: float = 1.0) -> Found:
-    """The same by path replay, with Mitsuba's majorant raised to `headroom` times the densest; its losses are those of noisy pictures."""
+    """The same by path replay, with Mitsuba's majorant raised to `headroom` times the densest; its
+    losses are those of noisy pictures.
+    """
     import drjit
 
     settings = scene.optimize.parameters["density"]  # type: ignore[union-attr]
     parameter = Parameter("density", settings, RATE, scene.starts["density"], scene.volume.grid)
     target = scene.views[0].image.movedim(0, -1)  # type: ignore[union-attr]
-    replay, found, power = Replay.of(scene, headroom), Found([], [], {}), float(target.square().mean())
+    replay, found, power = (
+        Replay.of(scene, headroom),
+        Found([], [], {}),
+        float(target.square().mean()),
+    )
     wanted = replay.module.TensorXf(target.numpy())
     for iteration in range(iterations):
         start, density = time.process_time(), parameter.value.detach()
         replay.set_density(density)
         loss, (gradient,) = replay.gradients(
-            lambda image: drjit.mean(drjit.square(image - wanted), axis=None), [replay.name(DENSITY)], iteration, PATHS
+            lambda image: drjit.mean(drjit.square(image - wanted), axis=None),
+            [replay.name(DENSITY)],
+            iteration,
+            PATHS,
         )
         penalty = power * parameter.penalty()
         smooth = torch.autograd.grad(penalty, parameter.value)[0] if parameter.tv else 0
-        parameter.step(replay.by_density(gradient, density) + smooth, rate_at(iteration, iterations))
+        parameter.step(
+            replay.by_density(gradient, density) + smooth, rate_at(iteration, iterations)
+        )
         _note(found, time.process_time() - start, loss + float(penalty), parameter.value.detach())
     return found
 
@@ -108,19 +121,28 @@ CONTENDERS: dict[str, tuple[Contender, tuple[str, ...]]] = {
     "ours": (by_us, ()),
     "ours, one round": (by_us, ("diffusion.transport_rounds=1",)),
     "path replay": (by_path_replay, ()),
-    "path replay, higher majorant": (lambda scene, iterations: by_path_replay(scene, iterations, HEADROOM), ()),
+    "path replay, higher majorant": (
+        lambda scene, iterations: by_path_replay(scene, iterations, HEADROOM),
+        (),
+    ),
 }
 CASES = (
     (3, 0.0, ("ours", "path replay", "path replay, higher majorant")),
     (2, None, ("ours", "ours, one round", "path replay")),
 )
-"""How much larger pixels are, the weight of the total variation (None: its default), and who competes."""
+"""How much larger pixels are, the weight of the total variation (None: its default), and who
+competes.
+"""
 
 
 def larger(picture: Array, times: int) -> Array:
     """`picture` [h, w, 3] in pixels `times` times as large."""
     height, width = (size // times for size in picture.shape[:2])
-    mean: Array = picture[: height * times, : width * times].reshape(height, times, width, times, 3).mean((1, 3))
+    mean: Array = (
+        picture[: height * times, : width * times]
+        .reshape(height, times, width, times, 3)
+        .mean((1, 3))
+    )
     return mean
 
 
@@ -128,9 +150,16 @@ def scene_of(picture: Array, folder: Path, overrides: tuple[str, ...], tv: float
     """The scene to reconstruct from `picture` [h, w, 3] alone."""
     path = folder / f"front_{len(picture)}.npy"
     np.save(path, picture)
-    settings = {"render.samples_per_pixel": RAYS, "views.0.image": path.resolve(), "optimize.parameters.density.lr": RATE}
+    settings = {
+        "render.samples_per_pixel": RAYS,
+        "views.0.image": path.resolve(),
+        "optimize.parameters.density.lr": RATE,
+    }
     weights = {} if tv is None else {"optimize.parameters.density.tv": tv}
-    scene = load_scene(CONFIG, overrides=[*(f"{key}={value}" for key, value in (settings | weights).items()), *overrides])
+    scene = load_scene(
+        CONFIG,
+        overrides=[*(f"{key}={value}" for key, value in (settings | weights).items()), *overrides],
+    )
     return replace(scene, views=scene.views[:1])
 
 
@@ -147,26 +176,41 @@ class Judge:
         scene = load_scene(CONFIG, overrides=[f"volume.density={{file: {SHAPES / 'cloud.npz'}}}"])
         path = folder / "targets.npy"
         if not path.exists():
-            np.save(path, _traced(scene, scene.volume.density.numpy(), CONVERGED, 1000, len(scene.views)))
+            np.save(
+                path,
+                _traced(scene, scene.volume.density.numpy(), CONVERGED, 1000, len(scene.views)),
+            )
         return Judge(scene, np.load(path))
 
     def errors(self, density: Array, times: int, views: int) -> list[float]:
-        """The mean squared error of each of the first `views`, in pixels `times` times as large, without noise."""
+        """The mean squared error of each of the first `views`, in pixels `times` times as large,
+        without noise.
+        """
         pictures = _traced(self.scene, density, JUDGING, 0, views)
-        pairs = [[larger(a - b, times) for a, b in zip(*both, strict=True)] for both in zip(pictures, self.targets, strict=False)]
+        pairs = [
+            [larger(a - b, times) for a, b in zip(*both, strict=True)]
+            for both in zip(pictures, self.targets, strict=False)
+        ]
         return [float((first * second).mean()) for first, second in pairs]
 
 
 def _traced(scene: Scene, density: Array, paths: int, seed: int, views: int) -> list[list[Array]]:
-    """Two pictures of each of the first `views`, each `seed` and those after it with paths of its own."""
+    """Two pictures of each of the first `views`, each `seed` and those after it with paths of its
+    own.
+    """
     scene = replace(scene, volume=replace(scene.volume, density=torch.from_numpy(density)))
     tracer = open_tracer(scene, scene.views, threads=torch.get_num_threads())
-    return [[tracer.trace(view, seed + 2 * view + turn, paths) for turn in range(2)] for view in range(views)]
+    return [
+        [tracer.trace(view, seed + 2 * view + turn, paths) for turn in range(2)]
+        for view in range(views)
+    ]
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One run: the case it is of, what it found, and its squared errors where judged, in the end of the novel view too."""
+    """One run: the case it is of, what it found, and its squared errors where judged, in the end of
+    the novel view too.
+    """
 
     case: tuple[int, float | None]
     name: str
@@ -174,65 +218,119 @@ class Entry:
     errors: dict[int, list[float]]
 
 
-def run(case: tuple[int, float | None], name: str, folder: Path, iterations: int, judge: Judge, is_kept: bool) -> Entry:
+def run(
+    case: tuple[int, float | None],
+    name: str,
+    folder: Path,
+    iterations: int,
+    judge: Judge,
+    is_kept: bool,
+) -> Entry:
     """Runs a contender, or reads what it did."""
     times, tv = case
-    path = folder / f"{times}_{'default' if tv is None else tv}_{name.replace(', ', '_').replace(' ', '_')}.npz"
+    path = (
+        folder
+        / f"{times}_{'default' if tv is None else tv}_{name.replace(', ', '_').replace(' ', '_')}.npz"
+    )
     if not (is_kept and path.exists()):
         contender, overrides = CONTENDERS[name]
         picture = larger(np.load(TARGET / "front.npy").astype(np.float32), times)
         print(f"{len(picture)} pixels, total variation {tv}, {name}", flush=True)
         found = contender(scene_of(picture, folder, overrides, tv), iterations)
-        errors = {i: judge.errors(density, times, 2 if i == iterations else 1) for i, density in found.densities.items()}
-        densities = {f"density_{iteration}": density for iteration, density in found.densities.items()}
+        errors = {
+            i: judge.errors(density, times, 2 if i == iterations else 1)
+            for i, density in found.densities.items()
+        }
+        densities = {
+            f"density_{iteration}": density for iteration, density in found.densities.items()
+        }
         judged = {f"errors_{iteration}": values for iteration, values in errors.items()}
         np.savez_compressed(path, seconds=found.seconds, losses=found.losses, **densities, **judged)  # type: ignore[arg-type]
     kept = np.load(path)
     at = [int(key.removeprefix("density_")) for key in kept if key.startswith("density_")]
-    found = Found(list(kept["seconds"]), list(kept["losses"]), {iteration: kept[f"density_{iteration}"] for iteration in at})
-    return Entry(case, name, found, {iteration: list(kept[f"errors_{iteration}"]) for iteration in at})
+    found = Found(
+        list(kept["seconds"]),
+        list(kept["losses"]),
+        {iteration: kept[f"density_{iteration}"] for iteration in at},
+    )
+    return Entry(
+        case, name, found, {iteration: list(kept[f"errors_{iteration}"]) for iteration in at}
+    )
 
 
 def paces(folder: Path, is_kept: bool) -> dict[str, float]:
-    """Seconds of an iteration at `ENLARGED` pixels a side, the picture being enlarged and good for nothing else."""
+    """Seconds of an iteration at `ENLARGED` pixels a side, the picture being enlarged and good for
+    nothing else.
+    """
     path = folder / "paces.json"
     if is_kept and path.exists():
         return dict(json.loads(path.read_text()))
     picture = torch.from_numpy(np.load(TARGET / "front.npy").astype(np.float32)).movedim(-1, 0)
-    enlarged = torch.nn.functional.interpolate(picture[None], (ENLARGED, ENLARGED), mode="bilinear")[0].movedim(0, -1).numpy()
+    enlarged = (
+        torch.nn.functional.interpolate(picture[None], (ENLARGED, ENLARGED), mode="bilinear")[0]
+        .movedim(0, -1)
+        .numpy()
+    )
     scene = scene_of(enlarged, folder, (), None)
-    found = {"ours": float(np.median(by_us(scene, 10).seconds)), "path replay": by_path_replay(scene, 1).seconds[-1]}
+    found = {
+        "ours": float(np.median(by_us(scene, 10).seconds)),
+        "path replay": by_path_replay(scene, 1).seconds[-1],
+    }
     path.write_text(json.dumps(found))
     return found
 
 
 def flat_error(density: Array, truth: Array) -> float:
     """The relative L1 error of the density's sum along z."""
-    return float(np.abs(projected(density, 0, 1) - projected(truth, 0, 1)).sum() / projected(truth, 0, 1).sum())
+    return float(
+        np.abs(projected(density, 0, 1) - projected(truth, 0, 1)).sum()
+        / projected(truth, 0, 1).sum()
+    )
 
 
 def table(entries: list[Entry], enlarged: dict[str, float], truth: Array) -> str:
     """The table of the page."""
-    base = {entry.case: float(np.median(entry.found.seconds)) for entry in entries if entry.name == "ours"}
+    base = {
+        entry.case: float(np.median(entry.found.seconds))
+        for entry in entries
+        if entry.name == "ours"
+    }
     lines = []
     for entry in entries:
-        (times, tv), last, pace = entry.case, max(entry.errors), float(np.median(entry.found.seconds))
+        (times, tv), last, pace = (
+            entry.case,
+            max(entry.errors),
+            float(np.median(entry.found.seconds)),
+        )
         shown, novel = entry.errors[last]
         density = entry.found.densities[last]
-        found = f"{np.abs(density - truth).sum() / truth.sum():.2f} | {flat_error(density, truth):.2f}"
+        found = (
+            f"{np.abs(density - truth).sum() / truth.sum():.2f} | {flat_error(density, truth):.2f}"
+        )
         words = "none" if tv == 0 else "default"
-        figures = f"{pace:.2g} | {pace / base[entry.case]:.1f} | {shown:.1e} | {novel:.1e} | {found}"
+        figures = (
+            f"{pace:.2g} | {pace / base[entry.case]:.1f} | {shown:.1e} | {novel:.1e} | {found}"
+        )
         lines.append(f"| {96 // times}^2 | {words} | {entry.name} | {figures} |\n")
     lines += [
-        f"| {ENLARGED}^2 | default | {name} | {pace:.2g} | {pace / enlarged['ours']:.1f} | | | | |\n" for name, pace in enlarged.items()
+        f"| {ENLARGED}^2 | default | {name} | {pace:.2g} | {pace / enlarged['ours']:.1f} | | | | |\n"
+        for name, pace in enlarged.items()
     ]
     return TOP + "".join(lines)
 
 
 def draw(entries: list[Entry], truth: Array, path: Path) -> None:
-    """Writes the picture: for each case errors against iterations and seconds, and the density along z."""
+    """Writes the picture: for each case errors against iterations and seconds, and the density
+    along z.
+    """
     cases = list(dict.fromkeys(entry.case for entry in entries))
-    figure, axes = plt.subplots(len(cases), 6, figsize=(12.5, 2.6 * len(cases)), layout="constrained", width_ratios=(1.5, 1.5, 1, 1, 1, 1))
+    figure, axes = plt.subplots(
+        len(cases),
+        6,
+        figsize=(12.5, 2.6 * len(cases)),
+        layout="constrained",
+        width_ratios=(1.5, 1.5, 1, 1, 1, 1),
+    )
     full = float(projected(truth, 0, 1).max())
     for row, case in zip(axes, cases, strict=True):
         for axis in row[2:]:
@@ -241,13 +339,20 @@ def draw(entries: list[Entry], truth: Array, path: Path) -> None:
         for index, entry in enumerate(some):
             _curves(row[:2], entry, f"C{list(CONTENDERS).index(entry.name)}")
             show(row[3 + index], projected(entry.found.densities[max(entry.errors)], 0, 1), full)
-        for axis, title in zip(row[2:], ["truth", *(entry.name.replace(", ", ",\n") for entry in some)], strict=False):
+        for axis, title in zip(
+            row[2:], ["truth", *(entry.name.replace(", ", ",\n") for entry in some)], strict=False
+        ):
             axis.axis("on")
             axis.set_title(title, fontsize=8)
         show(row[2], projected(truth, 0, 1), full)
-        row[0].set_ylabel(f"{96 // case[0]} x {96 // case[0]} pixels,\n{'no' if case[1] == 0 else 'with'} total variation", fontsize=8)
+        row[0].set_ylabel(
+            f"{96 // case[0]} x {96 // case[0]} pixels,\n{'no' if case[1] == 0 else 'with'} total variation",
+            fontsize=8,
+        )
         row[0].legend(fontsize=5)
-    axes[0, 0].set_title("loss of its own (line), error\nby path tracing (dots); iteration", fontsize=8)
+    axes[0, 0].set_title(
+        "loss of its own (line), error\nby path tracing (dots); iteration", fontsize=8
+    )
     axes[0, 1].set_title("the same against seconds", fontsize=8)
     save(figure, path)
 
@@ -256,7 +361,9 @@ def _curves(axes: list[plt.Axes], entry: Entry, color: str) -> None:
     seconds = np.cumsum(entry.found.seconds)
     at = sorted(entry.errors)
     judged = [entry.errors[iteration][0] for iteration in at]
-    axes[0].semilogy(range(1, len(seconds) + 1), entry.found.losses, color=color, label=entry.name, linewidth=1)
+    axes[0].semilogy(
+        range(1, len(seconds) + 1), entry.found.losses, color=color, label=entry.name, linewidth=1
+    )
     axes[0].semilogy(at, judged, "o", color=color, markersize=4)
     axes[1].loglog(seconds, entry.found.losses, color=color, linewidth=1)
     axes[1].loglog(seconds[np.array(at) - 1], judged, "o", color=color, markersize=4)
@@ -269,7 +376,11 @@ def remake(folder: Path, iterations: int = 40, is_kept: bool = False) -> None:
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     truth, judge = read_field(SHAPES / "cloud.npz", "density").values, Judge.of(folder)
-    entries = [run((times, tv), name, folder, iterations, judge, is_kept) for times, tv, names in CASES for name in names]
+    entries = [
+        run((times, tv), name, folder, iterations, judge, is_kept)
+        for times, tv, names in CASES
+        for name in names
+    ]
     draw(entries, truth, PICTURES / "fig07.png")
     text = table(entries, paces(folder, is_kept), truth)
     print(text, end="")
@@ -278,7 +389,9 @@ def remake(folder: Path, iterations: int = 40, is_kept: bool = False) -> None:
 
 def main() -> None:
     """Remakes Fig. 7."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "runs" / "paper" / "fig07")
     parser.add_argument("--iterations", type=int, default=40)
     parser.add_argument("--keep", action="store_true", help="do not run again what has been run")

@@ -1,4 +1,6 @@
-"""What the paper's experiments found: what to draw of a run, beside the truth, and the words for the table."""
+"""What the paper's experiments found: what to draw of a run, beside the truth, and the words for
+the table.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,9 @@ from paper_figures import Array, Pair, draw, draw_derivatives, projected, read_l
 from paper_page import CONFIGS, PICTURES, SHAPES, as_options, ddrecon, rewrite_table
 
 from ddrecon.grid import Grid
-from ddrecon.io.images import read_image
-from ddrecon.io.volumes import read_field
-from ddrecon.reconstruct.levels import resampled
+from ddrecon.io.images.table import read_image
+from ddrecon.io.volumes.table import read_field
+from ddrecon.reconstruct.levels import resample
 
 NAMES_13 = {
     "default": "default",
@@ -70,7 +72,7 @@ def shape(name: str, like: Array, field: str = "density") -> Array:
     grid = Grid(like.shape[:3], *(tuple(corner[::-1]) for corner in values.bounds))  # type: ignore[arg-type]
     found = torch.from_numpy(values.values)
     moved = found if found.ndim == 3 else found.movedim(-1, 0)
-    carried = resampled(moved, grid)
+    carried = resample(moved, grid)
     return (carried if found.ndim == 3 else carried.movedim(0, -1)).numpy()
 
 
@@ -82,18 +84,27 @@ def apart(ours: Array, truth: Array) -> float:
 def densities(run: Run, truth: Array) -> list[Pair]:
     """Density seen from the front and from the side, and its middle slice, beside `truth`."""
     ours = run.field("density")
-    pairs = [Pair(f"density along {name}", projected(truth, axis, 1), projected(ours, axis, 1)) for axis, name in ((0, "z"), (2, "x"))]
+    pairs = [
+        Pair(f"density along {name}", projected(truth, axis, 1), projected(ours, axis, 1))
+        for axis, name in ((0, "z"), (2, "x"))
+    ]
     middle = truth.shape[0] // 2
     return [*pairs, Pair("density, middle slice", truth[middle, ::-1], ours[middle, ::-1])]
 
 
 def show_density(truth: str, front: str) -> Shown:
-    """What to show of a run that looks for the density of the shape `truth` and was shown the view `front`."""
+    """What to show of a run that looks for the density of the shape `truth` and was shown the view
+    `front`.
+    """
 
     def shown(runs: Runs) -> tuple[list[Pair], str]:
         run = first(runs)
         density = shape(truth, run.field("density"))
-        pairs = [run.view(front, "a view it was shown"), run.view("novel", "novel view"), *densities(run, density)]
+        pairs = [
+            run.view(front, "a view it was shown"),
+            run.view("novel", "novel view"),
+            *densities(run, density),
+        ]
         return pairs, f"relative L1 error of the density {apart(run.field('density'), density):.2f}"
 
     return shown
@@ -105,27 +116,57 @@ def draw_rounds(runs: Runs) -> None:
     for name, run in runs.items():
         density, log = run.field("density"), read_log(run.folder)
         true = shape("bunny", density)
-        pairs.append(Pair(f"{NAMES_13[name]}:\ndensity along x", projected(true, 2, 1), projected(density, 2, 1)))
+        pairs.append(
+            Pair(
+                f"{NAMES_13[name]}:\ndensity along x",
+                projected(true, 2, 1),
+                projected(density, 2, 1),
+            )
+        )
         low = slice(0, len(density[0]) // 3)
         quality = f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"
-        parts = (
-            f"{apart(density, true):.3f} | {apart(density[:, low], true[:, low]):.2f} | {density[:, low].sum() / true[:, low].sum():.2f}"
+        parts = f"{apart(density, true):.3f} | {apart(density[:, low], true[:, low]):.2f} | {density[:, low].sum() / true[:, low].sum():.2f}"
+        lines.append(
+            f"| {NAMES_13[name]} | {len(log['loss'])} | {log['seconds'][-1]:.0f} | {quality} | {parts} |\n"
         )
-        lines.append(f"| {NAMES_13[name]} | {len(log['loss'])} | {log['seconds'][-1]:.0f} | {quality} | {parts} |\n")
     draw(PICTURES / "fig13_rounds.png", pairs, {})
     rewrite_table("paper.py fig13", TOP_13 + "".join(lines))
 
 
 def draw_parts(runs: Runs) -> None:
-    """Fig. 9: derivatives of pixels by density, of each part of the radiance, at the start and at what each run found."""
-    images, parts = [], {"single": ("reduced", "single"), "diffusion": ("multiple",), "all": ("reduced", "single", "multiple")}
+    """Fig. 9: derivatives of pixels by density, of each part of the radiance, at the start and at
+    what each run found.
+    """
+    images, parts = (
+        [],
+        {
+            "single": ("reduced", "single"),
+            "diffusion": ("multiple",),
+            "all": ("reduced", "single", "multiple"),
+        },
+    )
     for name in parts:
         run, places = runs[name], {"start": ["volume.density={file: ../../data/shapes/bunny.npz}"]}
         for place, overrides in (places | {"end": found(run)}).items():
             folder, scene = run.folder / f"derivative_{place}", CONFIGS / "fig09.yaml"
-            ddrecon("render", scene, "-o", folder, "--view", "front", "--components", "--gradient", "density", *as_options(overrides))
-            image = sum(np.load(folder / f"front.gradient.{part}.npy").mean(-1) for part in parts[name])
-            images.append((f"{name}, {'at the bunny' if place == 'start' else 'in the end'}", image))
+            ddrecon(
+                "render",
+                scene,
+                "-o",
+                folder,
+                "--view",
+                "front",
+                "--components",
+                "--gradient",
+                "density",
+                *as_options(overrides),
+            )
+            image = sum(
+                np.load(folder / f"front.gradient.{part}.npy").mean(-1) for part in parts[name]
+            )
+            images.append(
+                (f"{name}, {'at the bunny' if place == 'start' else 'in the end'}", image)
+            )
     draw_derivatives(PICTURES / "fig09_derivatives.png", images)
 
 
@@ -138,9 +179,15 @@ def show_light(runs: Runs) -> tuple[list[Pair], str]:
 
 def show_derivatives(runs: Runs) -> tuple[list[Pair], str]:
     """What each part of the derivative leads to."""
-    pairs = [run.view(view, f"{name}: {view} view") for name, run in runs.items() for view in ("front", "novel")]
+    pairs = [
+        run.view(view, f"{name}: {view} view")
+        for name, run in runs.items()
+        for view in ("front", "novel")
+    ]
     losses = {name: read_log(run.folder)["loss"] for name, run in runs.items()}
-    return pairs, "last loss " + ", ".join(f"{name} {loss[-1]:.2g}" for name, loss in losses.items())
+    return pairs, "last loss " + ", ".join(
+        f"{name} {loss[-1]:.2g}" for name, loss in losses.items()
+    )
 
 
 def show_optics(runs: Runs) -> tuple[list[Pair], str]:
@@ -148,30 +195,60 @@ def show_optics(runs: Runs) -> tuple[list[Pair], str]:
     run = first(runs)
     fields = [run.field(name) for name in ("sigma_a", "sigma_s")]
     density = shape("cloud", fields[0])[..., None]
-    truths = [density * shape("cloud", field, name) for name, field in zip(("sigma_a", "sigma_s"), fields, strict=True)]
+    truths = [
+        density * shape("cloud", field, name)
+        for name, field in zip(("sigma_a", "sigma_s"), fields, strict=True)
+    ]
     found = [density * field for field in fields]
     pairs = [run.view("ring_00", "a view it was shown"), run.view("novel", "novel view")]
-    for title, color, truth, ours in zip(("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True):
-        pairs.append(Pair(f"{title}, middle slices", *(middle(field[..., color]) for field in (truth, ours))))
-    errors = ", ".join(f"{apart(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True))
+    for title, color, truth, ours in zip(
+        ("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True
+    ):
+        pairs.append(
+            Pair(f"{title}, middle slices", *(middle(field[..., color]) for field in (truth, ours)))
+        )
+    errors = ", ".join(
+        f"{apart(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
+    )
     alone = f", alone {runs['g_alone'].number('g'):.3f}" if "g_alone" in runs else ""
-    return pairs, f"g {run.number('g'):.3f}{alone}, in truth -0.802; relative L1 error of absorption and scattering {errors}"
+    return (
+        pairs,
+        f"g {run.number('g'):.3f}{alone}, in truth -0.802; relative L1 error of absorption and scattering {errors}",
+    )
 
 
 def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
     """The colored smoke, and its coefficients in the middle."""
     run = first(runs)
-    truths, found = ([density * sigma for sigma in sigmas] for density, *sigmas in (smoke_truth(run.field("density")), smoke_found(run)))
+    truths, found = (
+        [density * sigma for sigma in sigmas]
+        for density, *sigmas in (smoke_truth(run.field("density")), smoke_found(run))
+    )
     pairs = [run.view("front", "the view it was shown"), run.view("novel", "novel view")]
-    for title, color, truth, ours in zip(("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True):
-        pairs.append(Pair(f"{title}, along z", *(projected(field[..., color], 0, 1) for field in (truth, ours))))
-    errors = ", ".join(f"{apart(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True))
+    for title, color, truth, ours in zip(
+        ("absorption, red", "scattering, green"), (0, 1), truths, found, strict=True
+    ):
+        pairs.append(
+            Pair(
+                f"{title}, along z",
+                *(projected(field[..., color], 0, 1) for field in (truth, ours)),
+            )
+        )
+    errors = ", ".join(
+        f"{apart(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
+    )
     return pairs, f"relative L1 error of absorption and scattering {errors}"
 
 
 def smoke_truth(like: Array) -> list[Array]:
-    """Density [z, y, x, 1], sigma_a and sigma_s of the colored smoke, in cells as small as those of `like`."""
-    return [shape("smoke", like)[..., None], shape("smoke", like, "sigma_a"), shape("smoke", like, "sigma_s")]
+    """Density [z, y, x, 1], sigma_a and sigma_s of the colored smoke, in cells as small as those of
+    `like`.
+    """
+    return [
+        shape("smoke", like)[..., None],
+        shape("smoke", like, "sigma_a"),
+        shape("smoke", like, "sigma_s"),
+    ]
 
 
 def smoke_found(run: Run) -> list[Array]:
@@ -182,7 +259,9 @@ def smoke_found(run: Run) -> list[Array]:
 def show_four(runs: Runs) -> tuple[list[Pair], str]:
     """The smoke from all four sides, and from one that nobody knows."""
     run = first(runs)
-    return [run.view(name, name) for name in ("front", "right", "back", "left", "novel")], "no true volume"
+    return [
+        run.view(name, name) for name in ("front", "right", "back", "left", "novel")
+    ], "no true volume"
 
 
 def show_photograph(runs: Runs) -> tuple[list[Pair], str]:
@@ -202,12 +281,23 @@ def middle(field: Array) -> Array:
 
 def rounded(values: float | list[float]) -> str:
     """Numbers to three digits."""
-    return f"{values:.3g}" if isinstance(values, float) else f"[{', '.join(f'{value:.3g}' for value in values)}]"
+    return (
+        f"{values:.3g}"
+        if isinstance(values, float)
+        else f"[{', '.join(f'{value:.3g}' for value in values)}]"
+    )
 
 
 def found(run: Run) -> list[str]:
     """Overrides that put what `run` found into its scene."""
-    fields = [f"volume.{path.stem}={{file: {path.resolve()}}}" for path in sorted((run.folder / "volumes").glob("*.npz"))]
+    fields = [
+        f"volume.{path.stem}={{file: {path.resolve()}}}"
+        for path in sorted((run.folder / "volumes").glob("*.npz"))
+    ]
     numbers = json.loads((run.folder / "parameters.json").read_text())
-    lights = [f"{name}={value[0] if len(value) == 1 else value}" for name, value in numbers.items() if name.startswith("lights.")]
+    lights = [
+        f"{name}={value[0] if len(value) == 1 else value}"
+        for name, value in numbers.items()
+        if name.startswith("lights.")
+    ]
     return [*fields, f"volume.g={numbers['g']}", *lights]

@@ -1,8 +1,10 @@
-"""Path replay backpropagation in Mitsuba 3 (Vicini, Speierer and Jakob 2021), with room above the densest cell.
+"""Path replay backpropagation in Mitsuba 3 (Vicini, Speierer and Jakob 2021), with room above the
+densest cell.
 
-Mitsuba's majorant is the greatest extinction in the grid. Where extinction reaches it there are no null collisions, and those carry the
-derivative of transmittance: path replay does not see it there. So cells are added around the grid, outside the box that holds the medium,
-one of them HEADROOM times as dense as the densest within; images are the same.
+Mitsuba's majorant is the greatest extinction in the grid. Where extinction reaches it there are no
+null collisions, and those carry the derivative of transmittance: path replay does not see it there.
+So cells are added around the grid, outside the box that holds the medium, one of them HEADROOM
+times as dense as the densest within; images are the same.
 """
 
 from __future__ import annotations
@@ -19,8 +21,8 @@ from torch import Tensor
 from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.grid import Grid
 from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
-from ddrecon.reference.trace import load_mitsuba, translated
-from ddrecon.world import Scene
+from ddrecon.reference.trace import load_mitsuba, translate_errors
+from ddrecon.scene import Scene
 
 RING = 2
 HEADROOM = 2.0
@@ -30,7 +32,9 @@ ALBEDO = ".albedo.value.value"
 
 @dataclass(frozen=True)
 class Replay:
-    """Mitsuba on the first view of a gray scene: `gradients` of a loss by what `parameters` are called `names`."""
+    """Mitsuba on the first view of a gray scene: `gradients` of a loss by what `parameters` are
+    called `names`.
+    """
 
     module: Any
     scene: Any
@@ -42,9 +46,13 @@ class Replay:
     def of(scene: Scene, headroom: float = HEADROOM) -> Replay:
         """That of `scene`, on as many threads as torch has; `headroom` 1: as Mitsuba comes."""
         module = load_mitsuba(torch.get_num_threads())
-        described = mitsuba_scene(scene, scene.views[:1]) | {MEDIUM: mitsuba_scene(_roomy_scene(scene, headroom), [])[MEDIUM]}
-        loaded = module.load_dict(translated(module, described))
-        integrator = module.load_dict({"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST})
+        described = mitsuba_scene(scene, scene.views[:1]) | {
+            MEDIUM: mitsuba_scene(_roomy_scene(scene, headroom), [])[MEDIUM]
+        }
+        loaded = module.load_dict(translate_errors(module, described))
+        integrator = module.load_dict(
+            {"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST}
+        )
         return Replay(module, loaded, module.traverse(loaded), integrator, headroom)
 
     def name(self, ending: str) -> str:
@@ -54,17 +62,25 @@ class Replay:
 
     def set_density(self, density: Tensor) -> None:
         """Puts `density` [z, y, x] into the scene."""
-        self.parameters[self.name(DENSITY)] = self.module.TensorXf(roomy(density, self.headroom).numpy()[..., None])
+        self.parameters[self.name(DENSITY)] = self.module.TensorXf(
+            roomy(density, self.headroom).numpy()[..., None]
+        )
         self.parameters.update()
 
-    def gradients(self, loss_of: Callable[[Any], Any], names: list[str], seed: int, paths: int) -> tuple[float, list[np.ndarray]]:
-        """`loss_of` the image by so many `paths` a pixel, and its derivatives by the parameters called `names`."""
+    def gradients(
+        self, loss_of: Callable[[Any], Any], names: list[str], seed: int, paths: int
+    ) -> tuple[float, list[np.ndarray]]:
+        """`loss_of` the image by so many `paths` a pixel, and its derivatives by the parameters
+        called `names`.
+        """
         import drjit
 
         for name in names:
             drjit.enable_grad(self.parameters[name])
         self.parameters.update()
-        image = self.module.render(self.scene, self.parameters, integrator=self.integrator, sensor=0, seed=seed, spp=paths)
+        image = self.module.render(
+            self.scene, self.parameters, integrator=self.integrator, sensor=0, seed=seed, spp=paths
+        )
         loss = loss_of(image)
         drjit.backward(loss)
         found = [np.array(drjit.grad(self.parameters[name]), np.float32) for name in names]
@@ -81,7 +97,9 @@ class Replay:
 
 
 def roomy(density: Tensor, headroom: float) -> Tensor:
-    """`density` [z, y, x] with RING more cells on all sides, like their neighbors but for one in a corner, `headroom` times the densest."""
+    """`density` [z, y, x] with RING more cells on all sides, like their neighbors but for one in a
+    corner, `headroom` times the densest.
+    """
     padded = torch.nn.functional.pad(density[None, None], (RING,) * 6, mode="replicate")[0, 0]
     is_corner = torch.zeros_like(padded, dtype=torch.bool)
     is_corner[0, 0, 0] = True
@@ -93,7 +111,9 @@ def _roomy_scene(scene: Scene, headroom: float) -> Scene:
     lower = tuple(low - RING * step for low, step in zip(grid.lower, grid.spacing, strict=True))
     upper = tuple(high + RING * step for high, step in zip(grid.upper, grid.spacing, strict=True))
     wide = Grid(tuple(count + 2 * RING for count in grid.shape), lower, upper)  # type: ignore[arg-type]
-    return replace(scene, volume=replace(volume, grid=wide, density=roomy(volume.density, headroom)))
+    return replace(
+        scene, volume=replace(volume, grid=wide, density=roomy(volume.density, headroom))
+    )
 
 
 def why_not() -> str | None:

@@ -1,4 +1,5 @@
-"""How far the density that `ddrecon optimize configs/plume.yaml -o RUN_DIR` found is from the true one.
+"""How far the density that `ddrecon optimize configs/plume.yaml -o RUN_DIR` found is from the true
+one.
 
 python benchmarks/reconstruction.py RUN_DIR [RUN_DIR ...]
 """
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddrecon.io.volumes import read_field
+from ddrecon.io.volumes.table import read_field
 
 TRUTH = Path(__file__).parents[1] / "data/plume/density.npz"
 
@@ -20,10 +21,14 @@ def main() -> None:
     """Prints a row for each run."""
     parser = argparse.ArgumentParser()
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR")
-    parser.add_argument("--truth", type=Path, default=TRUTH, help="the true density; the plume's unless given")
+    parser.add_argument(
+        "--truth", type=Path, default=TRUTH, help="the true density; the plume's unless given"
+    )
     arguments = parser.parse_args()
     true = read_field(arguments.truth, "density").values.astype(np.float64)
-    print("| run | L1 | L2 | correlation | held-out PSNR [dB] | seconds |\n|---|---|---|---|---|---|")
+    print(
+        "| run | L1 | L2 | correlation | held-out PSNR [dB] | seconds |\n|---|---|---|---|---|---|"
+    )
     for run in arguments.runs:
         found = read_field(run / "volumes" / "density.npz", "density").values.astype(np.float64)
         summary = json.loads((run / "summary.json").read_text())

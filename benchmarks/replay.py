@@ -1,9 +1,11 @@
-"""An image of the plume and its gradient by every cell's density, beside Mitsuba's path replay backpropagation.
+"""An image of the plume and its gradient by every cell's density, beside Mitsuba's path replay
+backpropagation.
 
     DRJIT_LIBLLVM_PATH=... python benchmarks/replay.py [--pixels 512] [--paths 4 16]
 
-Needs Mitsuba 3 (extra `reference`) and its variant `llvm_ad_rgb`. Times are of this run only, on as many threads for both. Gradients are
-compared as sums of density times gradient over blocks of 4^3 cells, each with that of the most paths.
+Needs Mitsuba 3 (extra `reference`) and its variant `llvm_ad_rgb`. Times are of this run only, on as
+many threads for both. Gradients are compared as sums of density times gradient over blocks of 4^3
+cells, each with that of the most paths.
 """
 
 from __future__ import annotations
@@ -34,14 +36,22 @@ def main() -> None:
         raise SystemExit("path replay needs the variant llvm_ad_rgb: set DRJIT_LIBLLVM_PATH")
     tracer.shoot(1, seed=len(arguments.paths))
     theirs = [tracer.shoot(paths, seed) for seed, paths in enumerate(arguments.paths)]
-    rows = {"ours": ours[0]} | {f"Mitsuba, {paths} paths a pixel": shot for paths, shot in zip(arguments.paths, theirs, strict=True)}
+    rows = {"ours": ours[0]} | {
+        f"Mitsuba, {paths} paths a pixel": shot
+        for paths, shot in zip(arguments.paths, theirs, strict=True)
+    }
     seconds = {name: (shot.image_seconds, shot.gradient_seconds) for name, shot in rows.items()}
-    seconds["ours"] = (statistics.median(s.image_seconds for s in ours), statistics.median(s.gradient_seconds for s in ours))
+    seconds["ours"] = (
+        statistics.median(s.image_seconds for s in ours),
+        statistics.median(s.gradient_seconds for s in ours),
+    )
     print("| | image s | gradient s | times ours | correlation |\n|---|---|---|---|---|")
     for name, shot in rows.items():
         image, gradient = seconds[name]
         found = correlation(shot.by_amount, theirs[-1].by_amount)
-        print(f"| {name} | {image:.2f} | {gradient:.2f} | {(image + gradient) / sum(seconds['ours']):.0f} | {found:.3f} |")
+        print(
+            f"| {name} | {image:.2f} | {gradient:.2f} | {(image + gradient) / sum(seconds['ours']):.0f} | {found:.3f} |"
+        )
 
 
 if __name__ == "__main__":

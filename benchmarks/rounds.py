@@ -1,4 +1,5 @@
-"""How long a render of the plume takes by transport rounds and directions, relative to none in the same run: docs/accuracy.md.
+"""How long a render of the plume takes by transport rounds and directions, relative to none in the
+same run: docs/accuracy.md.
 
 python benchmarks/rounds.py [--repeat 3]
 """
@@ -14,8 +15,8 @@ import torch
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import render_each
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 ROOT = Path(__file__).parents[1]
 CASES = {
@@ -46,15 +47,25 @@ def main() -> None:
     with torch.no_grad():
         for overrides in CASES.values():
             truth = f"volume.density={{file: {ROOT / 'data/plume/density.npz'}}}"
-            scene = load_scene(ROOT / "configs/plume.yaml", overrides=[truth, "optimize.parameters.density={}", *overrides])
+            scene = load_scene(
+                ROOT / "configs/plume.yaml",
+                overrides=[truth, "optimize.parameters.density={}", *overrides],
+            )
             for rounds, directions in ROUNDS:
-                settings = replace(scene.diffusion, transport_rounds=rounds, transport_directions=directions)
-                times[rounds, directions].append(seconds(replace(scene, diffusion=settings), arguments.repeat))
+                settings = replace(
+                    scene.diffusion, transport_rounds=rounds, transport_directions=directions
+                )
+                times[rounds, directions].append(
+                    seconds(replace(scene, diffusion=settings), arguments.repeat)
+                )
     print(f"| n | directions | {' | '.join(CASES)} |\n|{'---|' * (2 + len(CASES))}")
     for (rounds, directions), row in times.items():
         ratios = (f"{found / base:.1f}" for found, base in zip(row, times[ROUNDS[0]], strict=True))
         print(f"| {rounds} | {directions if rounds else '-'} | {' | '.join(ratios)} |")
-    print("seconds at n = 0:", ", ".join(f"{name} {base:.2f}" for name, base in zip(CASES, times[ROUNDS[0]], strict=True)))
+    print(
+        "seconds at n = 0:",
+        ", ".join(f"{name} {base:.2f}" for name, base in zip(CASES, times[ROUNDS[0]], strict=True)),
+    )
 
 
 if __name__ == "__main__":

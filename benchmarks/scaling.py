@@ -1,10 +1,13 @@
-"""Seconds of an iteration of a reconstruction against cells, pixels, views, lights and colors, with the exponents fitted to them.
+"""Seconds of an iteration of a reconstruction against cells, pixels, views, lights and colors, with
+the exponents fitted to them.
 
     python benchmarks/scaling.py [--largest 192] [--device cuda]
 
-The plume of `ddrecon.bench.plume` is reconstructed from half its density, from its own images at full resolution. One thing grows at a
-time, from 64 x 96 x 64 cells, 128 x 128 pixels, one view, one light and one color; with the cells so does the width of the image, which has
-two pixels a cell: what a view can tell of so many. On a CPU these are seconds of one thread's processor time, whatever else may be running.
+The plume of `ddrecon.bench.plume` is reconstructed from half its density, from its own images at
+full resolution. One thing grows at a time, from 64 x 96 x 64 cells, 128 x 128 pixels, one view, one
+light and one color; with the cells so does the width of the image, which has two pixels a cell:
+what a view can tell of so many. On a CPU these are seconds of one thread's processor time, whatever
+else may be running.
 """
 
 from __future__ import annotations
@@ -22,11 +25,11 @@ import torch
 from ddrecon.bench.plume import plume_scene
 from ddrecon.cameras import look_at
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.lights import DirectionalLight
+from ddrecon.light.lights import DirectionalLight
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.settings import OptimizeSettings, ParameterSettings
 
 CELLS, PIXELS = 64, 128
 SIZES = (16, 24, 32, 48, 64, 96, 128, 192)
@@ -39,7 +42,9 @@ def with_views(scene: Scene, count: int) -> Scene:
         angle = 2 * math.pi * index / count
         eye = camera.pose.new_tensor([3.2 * math.sin(angle), 0.3, 3.2 * math.cos(angle)])
         pose = look_at(eye, eye.new_zeros(3), eye.new_tensor([0.0, 1.0, 0.0]))
-        views.append(replace(scene.views[0], name=f"view{index}", camera=replace(camera, pose=pose)))
+        views.append(
+            replace(scene.views[0], name=f"view{index}", camera=replace(camera, pose=pose))
+        )
     return replace(scene, views=views)
 
 
@@ -47,7 +52,12 @@ def with_lights(scene: Scene, count: int) -> Scene:
     """`count` directional lights, each of its own direction."""
     turns = [2.4 * index for index in range(count)]
     tensor = scene.volume.density.new_tensor
-    return replace(scene, lights=[DirectionalLight(tensor([math.cos(a), -0.7, math.sin(a)]), tensor([3.0])) for a in turns])
+    return replace(
+        scene,
+        lights=[
+            DirectionalLight(tensor([math.cos(a), -0.7, math.sin(a)]), tensor([3.0])) for a in turns
+        ],
+    )
 
 
 def with_colors(scene: Scene, count: int) -> Scene:
@@ -61,8 +71,17 @@ def started(scene: Scene) -> Reconstruction:
     with torch.no_grad():
         images = render_each(scene, scene.views, SolveMemory())
     views = [replace(view, image=image) for view, image in zip(scene.views, images, strict=True)]
-    settings = OptimizeSettings({"density": ParameterSettings(field=True)}, iterations=1000, refine_at=(), views_per_iteration=0)
-    return Reconstruction(replace(scene, views=views, optimize=settings, starts={"density": 0.5 * scene.volume.density}))
+    settings = OptimizeSettings(
+        {"density": ParameterSettings(field=True)},
+        iterations=1000,
+        refine_at=(),
+        views_per_iteration=0,
+    )
+    return Reconstruction(
+        replace(
+            scene, views=views, optimize=settings, starts={"density": 0.5 * scene.volume.density}
+        )
+    )
 
 
 def seconds(scene: Scene, repeat: int) -> float:
@@ -83,11 +102,22 @@ def now(scene: Scene) -> float:
     return time.perf_counter()
 
 
-def report(name: str, amounts: Sequence[int], scene_of: Callable[[int], Scene], repeat: int, dimensions: int = 1) -> None:
-    """One row of the table: seconds at each of the `amounts`, and the power of `amount ** dimensions` that they grow with."""
+def report(
+    name: str,
+    amounts: Sequence[int],
+    scene_of: Callable[[int], Scene],
+    repeat: int,
+    dimensions: int = 1,
+) -> None:
+    """One row of the table: seconds at each of the `amounts`, and the power of `amount **
+    dimensions` that they grow with.
+    """
     times = [seconds(scene_of(amount), repeat) for amount in amounts]
     logs = dimensions * np.log(amounts), np.log(times)
-    exponent, upper = (np.polyfit(*(column[half:] for column in logs), 1)[0] for half in (0, min(len(amounts) // 2, len(amounts) - 2)))
+    exponent, upper = (
+        np.polyfit(*(column[half:] for column in logs), 1)[0]
+        for half in (0, min(len(amounts) // 2, len(amounts) - 2))
+    )
     shown = ", ".join(f"{amount}: {time:.3f}" for amount, time in zip(amounts, times, strict=True))
     print(f"| {name} | {shown} | {exponent:.2f} | {upper:.2f} |", flush=True)
 
@@ -106,8 +136,20 @@ def main() -> None:
 
     print("| what grows | seconds an iteration | exponent | of the upper half |\n|---|---|---|---|")
     sizes = [size for size in SIZES if size <= arguments.largest]
-    report("cells (n x 1.5 n x n, pixels 2 n x 2 n)", sizes, lambda n: plume(n, 2 * n), arguments.repeat, dimensions=3)
-    report("pixels (n x n)", (64, 128, 256, 512, 1024), lambda n: plume(pixels=n), arguments.repeat, dimensions=2)
+    report(
+        "cells (n x 1.5 n x n, pixels 2 n x 2 n)",
+        sizes,
+        lambda n: plume(n, 2 * n),
+        arguments.repeat,
+        dimensions=3,
+    )
+    report(
+        "pixels (n x n)",
+        (64, 128, 256, 512, 1024),
+        lambda n: plume(pixels=n),
+        arguments.repeat,
+        dimensions=2,
+    )
     report("views", (1, 2, 4, 8), lambda n: with_views(plume(), n), arguments.repeat)
     report("lights", (1, 2, 4, 8), lambda n: with_lights(plume(), n), arguments.repeat)
     report("colors", (1, 3), lambda n: with_colors(plume(), n), arguments.repeat)

@@ -1,4 +1,5 @@
-"""What leaving samples out saves, or would save: empty slices of a fixed medium, and what lies behind an opaque one.
+"""What leaving samples out saves, or would save: empty slices of a fixed medium, and what lies
+behind an opaque one.
 
 python benchmarks/skipping.py
 """
@@ -13,10 +14,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.io.volumes import read_field
+from ddrecon.io.volumes.table import read_field
 from ddrecon.renderer import solve_light, view_image
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 ROOT = Path(__file__).parents[1]
 PLUME = f"volume.density={{file: {ROOT / 'data/plume/density.npz'}}}"
@@ -46,7 +47,9 @@ def seconds(scene: Scene, is_varied: bool) -> float:
 
 
 def behind(density: Tensor, sigma_t: float) -> tuple[float, float]:
-    """The part of all samples along z that less than `DARK` of the light reaches: ray by ray, and where whole tiles of rays could stop."""
+    """The part of all samples along z that less than `DARK` of the light reaches: ray by ray, and
+    where whole tiles of rays could stop.
+    """
     step = 1 / density.shape[0]
     is_dark = (density * sigma_t * step).cumsum(0) > -math.log(DARK)
     tiles = is_dark.unfold(1, TILE, TILE).unfold(2, TILE, TILE).flatten(3).all(-1)
@@ -56,12 +59,16 @@ def behind(density: Tensor, sigma_t: float) -> tuple[float, float]:
 def main() -> None:
     """Prints two tables."""
     torch.set_num_threads(1)
-    print("| scene | time of a view with empty slices left out, as a part of that without |\n|---|---|")
+    print(
+        "| scene | time of a view with empty slices left out, as a part of that without |\n|---|---|"
+    )
     with torch.no_grad():
         for name, (config, overrides) in SCENES.items():
             scene = load_scene(ROOT / "configs" / f"{config}.yaml", overrides=overrides)
             print(f"| {name} | {seconds(scene, False) / seconds(scene, True):.2f} |")
-    print(f"\n| volume | sigma_t | samples behind {DARK:g}, by rays | by tiles of {TILE} x {TILE} |\n|---|---|---|---|")
+    print(
+        f"\n| volume | sigma_t | samples behind {DARK:g}, by rays | by tiles of {TILE} x {TILE} |\n|---|---|---|---|"
+    )
     for name, cases in OPAQUE.items():
         for file, sigma_t in cases:
             density = torch.from_numpy(read_field(ROOT / "data" / f"{file}.npz", "density").values)

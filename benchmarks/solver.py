@@ -1,11 +1,13 @@
-"""Iterations and time of each diffusion solver, to the same residual from the same zero start, on real media; ratios are to multigrid.
+"""Iterations and time of each diffusion solver, to the same residual from the same zero start, on
+real media; ratios are to multigrid.
 
     python benchmarks/solver.py [--device cuda] [--cells 32 64 128] [--tolerances 1e-3 1e-6] [--jacobi]
 
-`--cells`: edges of cubes, measured beside 64 x 96 x 64; three colors, float32. The plume is `data/plume/density.npz` under its light;
-`--densities FILE...` adds other volumes. Solvers run in turns, as often as `--repeats` says, and the median of the turns' ratios counts.
-Multigrid's time includes making its grids; an adjoint solve finds them made. On a CPU, time is that of the processor, which others on
-the machine disturb less.
+`--cells`: edges of cubes, measured beside 64 x 96 x 64; three colors, float32. The plume is
+`data/plume/density.npz` under its light; `--densities FILE...` adds other volumes. Solvers run in
+turns, as often as `--repeats` says, and the median of the turns' ratios counts. Multigrid's time
+includes making its grids; an adjoint solve finds them made. On a CPU, time is that of the
+processor, which others on the machine disturb less.
 """
 
 from __future__ import annotations
@@ -24,26 +26,42 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.grid import Grid
-from ddrecon.io.volumes import read_field
-from ddrecon.lights import DirectionalLight
-from ddrecon.medium import Volume, scaled_medium
-from ddrecon.reduced import reduced_light
+from ddrecon.io.volumes.table import read_field
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.reduced import reduced_light
+from ddrecon.medium.coefficients import Volume, scale_medium
 
 PLUME = Path(__file__).parents[1] / "data/plume/density.npz"
 
 
 def system(density: Tensor, sigma_t: float, device: str) -> tuple[Operator, Tensor]:
-    """The operator and the source of beams in `density` [z, y, x], albedo 0.999, 0.9 and 0.8, g 0.3, in a box of side 1 along x."""
+    """The operator and the source of beams in `density` [z, y, x], albedo 0.999, 0.9 and 0.8, g
+    0.3, in a box of side 1 along x.
+    """
     depth, height, width = density.shape
     half = (depth / width / 2, height / width / 2, 0.5)
     grid = Grid((depth, height, width), (-half[0], -half[1], -half[2]), half)
     albedo = torch.tensor([0.999, 0.9, 0.8], device=device)
-    volume = Volume(grid, density.to(device), sigma_t * (1 - albedo), sigma_t * albedo, torch.tensor(0.3, device=device))
-    medium = scaled_medium(volume)
-    light = DirectionalLight(torch.tensor([-2.0, -2.0, -1.0], device=device), torch.full((3,), 3.14, device=device))
+    volume = Volume(
+        grid,
+        density.to(device),
+        sigma_t * (1 - albedo),
+        sigma_t * albedo,
+        torch.tensor(0.3, device=device),
+    )
+    medium = scale_medium(volume)
+    light = DirectionalLight(
+        torch.tensor([-2.0, -2.0, -1.0], device=device), torch.full((3,), 3.14, device=device)
+    )
     source = reduced_light(medium, [light], True).source
     outside = torch.zeros(1, 1, 1, 1, device=device)
-    problem = DiffusionProblem(medium, lambda extinction: CLOSURES["geometric"](extinction, grid, 1.0), source, outside, True)
+    problem = DiffusionProblem(
+        medium,
+        lambda extinction: CLOSURES["geometric"](extinction, grid, 1.0),
+        source,
+        outside,
+        True,
+    )
     with torch.no_grad():
         return problem.system
 
@@ -62,13 +80,25 @@ def seconds(solver: str, operator: Operator, source: Tensor, tolerance: float) -
     return clock() - start, iterations
 
 
-def row(name: str, operator: Operator, source: Tensor, tolerance: float, solvers: list[str], repeats: int) -> str:
+def row(
+    name: str,
+    operator: Operator,
+    source: Tensor,
+    tolerance: float,
+    solvers: list[str],
+    repeats: int,
+) -> str:
     """One line of the table."""
-    turns = [{solver: seconds(solver, operator, source, tolerance) for solver in solvers} for _ in range(repeats)]
+    turns = [
+        {solver: seconds(solver, operator, source, tolerance) for solver in solvers}
+        for _ in range(repeats)
+    ]
     cells = " x ".join(str(n) for n in source.shape[1:])
     columns = [str(turns[0][solver][1]) for solver in solvers]
     for solver in solvers[1:]:
-        columns.append(f"{statistics.median(turn[solver][0] / turn['multigrid'][0] for turn in turns):.1f}")
+        columns.append(
+            f"{statistics.median(turn[solver][0] / turn['multigrid'][0] for turn in turns):.1f}"
+        )
     return f"| {name}, {cells}, {tolerance:.0e} | {' | '.join(columns)} |"
 
 
@@ -84,10 +114,14 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(2)
     solvers = ["multigrid", "conjugate_gradient", *(["jacobi"] if arguments.jacobi else [])]
-    heads = [f"{solver}: iterations" for solver in solvers] + [f"time of {solver} / multigrid" for solver in solvers[1:]]
+    heads = [f"{solver}: iterations" for solver in solvers] + [
+        f"time of {solver} / multigrid" for solver in solvers[1:]
+    ]
     print(f"| medium, cells, tolerance | {' | '.join(heads)} |\n|{'---|' * (len(heads) + 1)}")
     files = {"plume": PLUME} | {path.stem: path for path in arguments.densities}
-    media = {name: torch.from_numpy(read_field(path, "density").values) for name, path in files.items()}
+    media = {
+        name: torch.from_numpy(read_field(path, "density").values) for name, path in files.items()
+    }
     shapes = [(n, n, n) for n in arguments.cells] + [(64, 96, 64)]
     for shape in shapes:
         fields = {name: (resampled(values, shape), 40.0) for name, values in media.items()} | {
@@ -96,7 +130,9 @@ def main() -> None:
         for name, (density, sigma_t) in fields.items():
             operator, source = system(density, sigma_t, arguments.device)
             for tolerance in arguments.tolerances:
-                print(row(name, operator, source, tolerance, solvers, arguments.repeats), flush=True)
+                print(
+                    row(name, operator, source, tolerance, solvers, arguments.repeats), flush=True
+                )
 
 
 if __name__ == "__main__":

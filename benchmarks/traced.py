@@ -1,4 +1,5 @@
-"""Path-traced images of gray scenes (Mitsuba 3, extra `reference`), kept in a folder so that a second run is quick.
+"""Path-traced images of gray scenes (Mitsuba 3, extra `reference`), kept in a folder so that a
+second run is quick.
 
 Passes of independent seeds are added until the noise of their mean is low enough.
 """
@@ -13,16 +14,20 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.reference.trace import Traced, open_tracer
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 SAMPLES, LEAST = 128, 4
 """Paths a pixel in each pass, and the fewest passes."""
 
 
-def traced(scene: Scene, folder: Path, depth: int = -1, noise: float = 0.03, passes: int = 32) -> Traced:
-    """The image [h, w] of the first view of `scene` by paths of at most `depth` segments (2: scattered once; -1: any number).
+def traced(
+    scene: Scene, folder: Path, depth: int = -1, noise: float = 0.03, passes: int = 32
+) -> Traced:
+    """The image [h, w] of the first view of `scene` by paths of at most `depth` segments (2:
+    scattered once; -1: any number).
 
-    Passes are made until their mean has so much `noise`, but no more than so many; what `folder` holds is taken from there.
+    Passes are made until their mean has so much `noise`, but no more than so many; what `folder`
+    holds is taken from there.
     """
     path = folder / f"{_fingerprint(scene, depth)}.npz"
     images = list(np.load(path)["images"]) if path.exists() else []
@@ -49,4 +54,8 @@ def _fingerprint(scene: Scene, depth: int) -> str:
 
 
 def _written(value: object) -> object:
-    return (tuple(value.shape), hashlib.sha256(value.numpy().tobytes()).hexdigest()) if isinstance(value, Tensor) else value
+    return (
+        (tuple(value.shape), hashlib.sha256(value.numpy().tobytes()).hexdigest())
+        if isinstance(value, Tensor)
+        else value
+    )

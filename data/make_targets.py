@@ -1,4 +1,5 @@
-"""Makes data/paper: the pictures that configs/paper reconstructs from, path-traced by Mitsuba 3 through `ddrecon reference`.
+"""Makes data/paper: the pictures that configs/paper reconstructs from, path-traced by Mitsuba 3
+through `ddrecon reference`.
 
     python data/make_targets.py [NAME]... [--pixels 512] [--paths 1024] [--threads 2] [-o FOLDER]
 
@@ -19,12 +20,16 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 FOLDER = Path(__file__).parent / "paper"
-BUNNY, KNOT, CLOUD, SMOKE = (f"{{file: ../../data/shapes/{name}.npz}}" for name in ("bunny", "knot", "cloud", "smoke"))
+BUNNY, KNOT, CLOUD, SMOKE = (
+    f"{{file: ../../data/shapes/{name}.npz}}" for name in ("bunny", "knot", "cloud", "smoke")
+)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The scene of `config` as it is in truth, by `overrides`; its pictures have `pixels` along each side, of `paths` each."""
+    """The scene of `config` as it is in truth, by `overrides`; its pictures have `pixels` along
+    each side, of `paths` each.
+    """
 
     config: str
     overrides: tuple[str, ...]
@@ -35,10 +40,17 @@ class Truth:
 TRUTHS = {
     "fig06_light": Truth("fig06_light", ("lights.0.irradiance=[3.2, 2.1, 1.2]",), 96, 512),
     "fig07": Truth("fig07", (f"volume.density={CLOUD}",), 96, 512),
-    "fig10": Truth("fig10", (f"volume.sigma_a={CLOUD}", f"volume.sigma_s={CLOUD}", "volume.g=-0.802"), 64, 512),
+    "fig10": Truth(
+        "fig10", (f"volume.sigma_a={CLOUD}", f"volume.sigma_s={CLOUD}", "volume.g=-0.802"), 64, 512
+    ),
     "fig13": Truth("fig13", (f"volume.density={BUNNY}",), 96, 256),
     "knot": Truth("fig06_density", (f"volume.density={KNOT}",), 128, 512),
-    "smoke": Truth("fig12_single", tuple(f"volume.{name}={SMOKE}" for name in ("density", "sigma_a", "sigma_s")), 96, 512),
+    "smoke": Truth(
+        "fig12_single",
+        tuple(f"volume.{name}={SMOKE}" for name in ("density", "sigma_a", "sigma_s")),
+        96,
+        512,
+    ),
 }
 
 
@@ -48,12 +60,30 @@ def reference(truth: Truth, pixels: int, paths: int, threads: int | None, output
     count = len(yaml.safe_load(config.read_text())["views"])
     sizes = [f"views.{index}.camera.resolution=[{pixels}, {pixels}]" for index in range(count)]
     overrides = [*truth.overrides, *(f"views.{index}.image=" for index in range(count)), *sizes]
-    options = [part for override in overrides for part in ("-D", override)] + ([] if threads is None else ["--threads", str(threads)])
-    subprocess.run(["ddrecon", "reference", config, "-o", output, "--views", "--spp", str(paths), "-q", *options], check=True)
+    options = [part for override in overrides for part in ("-D", override)] + (
+        [] if threads is None else ["--threads", str(threads)]
+    )
+    subprocess.run(
+        [
+            "ddrecon",
+            "reference",
+            config,
+            "-o",
+            output,
+            "--views",
+            "--spp",
+            str(paths),
+            "-q",
+            *options,
+        ],
+        check=True,
+    )
 
 
 def keep(traced: Path, folder: Path) -> None:
-    """Keeps the pictures in the folder `traced` as float16 arrays; the smoke's also mirrored, for the views from left and right."""
+    """Keeps the pictures in the folder `traced` as float16 arrays; the smoke's also mirrored, for
+    the views from left and right.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for path in sorted(traced.glob("*.npy")):
         picture = np.load(path).astype(np.float16)
@@ -64,7 +94,9 @@ def keep(traced: Path, folder: Path) -> None:
 
 def main() -> None:
     """Writes the pictures of the named truths, or of all."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(TRUTHS)}")
     parser.add_argument("--pixels", type=int)
     parser.add_argument("--paths", type=int)
@@ -74,7 +106,13 @@ def main() -> None:
     for name in given.names or TRUTHS:
         truth = TRUTHS[name]
         with tempfile.TemporaryDirectory() as traced:
-            reference(truth, given.pixels or truth.pixels, given.paths or truth.paths, given.threads, Path(traced))
+            reference(
+                truth,
+                given.pixels or truth.pixels,
+                given.paths or truth.paths,
+                given.threads,
+                Path(traced),
+            )
             keep(Path(traced), given.output / name)
 
 

@@ -1,7 +1,8 @@
 """ddrecon: density volumes from pictures of smoke and clouds, by differential diffusion.
 
-`load_scene(path) -> Scene`, `render(scene, view=None) -> Tensor [views, 3, h, w]`, `optimize(scene, ...) -> Result` and
-`VolumeRenderer`, the renderer as a layer. Names are imported when first used, so that `import ddrecon` costs nothing.
+`load_scene(path) -> Scene`, `render(scene, view=None) -> Tensor [views, 3, h, w]`, `optimize(scene,
+...) -> Result` and `VolumeRenderer`, the renderer as a layer. Names are imported when first used,
+so that `import ddrecon` costs nothing.
 """
 
 from importlib import import_module
@@ -9,14 +10,15 @@ from typing import Any
 
 __version__ = "0.1.0"
 _HOMES = {
-    "load_scene": "ddrecon.scene.build",
+    "load_scene": "ddrecon.scene_file.build",
     "render": "ddrecon.renderer",
     "VolumeRenderer": "ddrecon.layer",
     "optimize": "ddrecon.reconstruct.loop",
     "Result": "ddrecon.reconstruct.loop",
-    "Scene": "ddrecon.world",
+    "Scene": "ddrecon.scene",
     "DdreconError": "ddrecon.errors",
     "SceneError": "ddrecon.errors",
+    "UsageError": "ddrecon.errors",
     "FormatError": "ddrecon.errors",
     "SolveError": "ddrecon.errors",
 }

@@ -1,6 +1,7 @@
 """The ways ddrecon refuses its input or gives up, each with the exit code of the command line.
 
-Everything a user can cause is a `DdreconError`; whatever else is raised is a bug and keeps its traceback.
+Everything a user can cause is a `DdreconError`; whatever else is raised is a bug and keeps its
+traceback.
 """
 
 from __future__ import annotations
@@ -12,8 +13,14 @@ LONGEST = 1000
 
 
 def one_line(text: str) -> str:
-    """`text` as a line that can be printed: what cannot be is escaped, and what is too long shortened."""
-    line = text if text.isprintable() else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    """`text` as a line that can be printed: what cannot be is escaped, and what is too long
+    shortened.
+    """
+    line = (
+        text
+        if text.isprintable()
+        else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    )
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
@@ -23,16 +30,29 @@ class DdreconError(Exception):
     exit_code = 2
 
 
-class SceneError(DdreconError):
-    """A scene that cannot be used: one line per problem, `file:line:column: key.path: what is wrong`."""
+class _ProblemsError(DdreconError):
+    """One line for each of `problems`."""
 
     def __init__(self, problems: str | Sequence[str]):
-        self.problems = [one_line(problem) for problem in ([problems] if isinstance(problems, str) else problems)]
+        each = [problems] if isinstance(problems, str) else problems
+        self.problems = [one_line(problem) for problem in each]
         super().__init__("\n".join(self.problems))
 
 
+class SceneError(_ProblemsError):
+    """A scene that cannot be used; a problem reads `file:line:column: key.path: what is wrong`."""
+
+
+class UsageError(_ProblemsError):
+    """A command that cannot be carried out as it was given: an output that is there already, a
+    locked folder, a device or a checkpoint that is missing.
+    """
+
+
 class FormatError(DdreconError):
-    """A data file that exists but cannot be used, or several: the first, and the lines that tell of the `others`."""
+    """A data file that exists but cannot be used, or several: the first, and the lines that tell of
+    the `others`.
+    """
 
     exit_code = 3
 
@@ -55,11 +75,15 @@ class SolveError(DdreconError):
 
     def __init__(self, what: str, iterations: int, residual: float, advice: str):
         self.iterations, self.residual, self.advice = iterations, residual, advice
-        super().__init__(f"{what} after {iterations} iterations (residual {residual:.2e}); {advice}")
+        super().__init__(
+            f"{what} after {iterations} iterations (residual {residual:.2e}); {advice}"
+        )
 
 
 class DivergenceError(SolveError):
-    """An optimization that cannot go on: `iteration`, counted from 1, failed by what `what` says; `residual` is that of its solve."""
+    """An optimization that cannot go on: `iteration`, counted from 1, failed by what `what` says;
+    `residual` is that of its solve.
+    """
 
     def __init__(self, iteration: int, what: str, residual: float, advice: str):
         self.what, self.iterations, self.residual, self.advice = what, iteration, residual, advice

@@ -1,4 +1,6 @@
-"""Optional packages: imported where they are needed, and asked for by the extra that brings them where they are absent."""
+"""Optional packages: imported where they are needed, and asked for by the extra that brings them
+where they are absent.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def advice(package: str) -> str:
 
 
 def load_extra(package: str, purpose: str) -> ModuleType:
-    """The module `package`; raises MissingExtraError, which says that `purpose` needs it, where it is not installed."""
+    """The module `package`; raises MissingExtraError, which says that `purpose` needs it, where it
+    is not installed.
+    """
     try:
         return import_module(package)
     except ImportError as error:
@@ -33,7 +37,9 @@ def load_extra(package: str, purpose: str) -> ModuleType:
 
 
 def load_for_file(package: str, path: object) -> ModuleType:
-    """The module `package`, to read or write the file at `path`; raises FormatError where it is not installed."""
+    """The module `package`, to read or write the file at `path`; raises FormatError where it is not
+    installed.
+    """
     try:
         return import_module(package)
     except ImportError as error:

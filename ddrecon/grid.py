@@ -1,7 +1,8 @@
 """The cell-centered grid: where its cells lie in the world.
 
-The one convention: users speak (x, y, z), arrays are `[z, y, x]` with x fastest. This is the only file that turns one into
-the other; inside the physics, vectors are in array order too, so component 0 belongs to array axis 0 (z).
+The one convention: users speak (x, y, z), arrays are `[z, y, x]` with x fastest. This is the only
+file that turns one into the other; inside the physics, vectors are in array order too, so component
+0 belongs to array axis 0 (z).
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ Triple = tuple[float, float, float]
 class Grid:
     """A box of `shape` cells between the corners `lower` and `upper`, all in array order (z, y, x).
 
-    `shape` counts cells, at least one along each axis; `lower` and `upper` are in world units u, `lower < upper`.
+    `shape` counts cells, at least one along each axis; `lower` and `upper` are in world units u,
+    `lower < upper`.
     """
 
     shape: tuple[int, int, int]
@@ -61,19 +63,27 @@ class Grid:
         return (lx + ux) / 2, (ly + uy) / 2, (lz + uz) / 2
 
     def centers(self, like: Tensor) -> list[Tensor]:
-        """World coordinates [u] of the cell centers: one tensor per axis, shaped to broadcast to `[z, y, x]`."""
+        """World coordinates [u] of the cell centers: one tensor per axis, shaped to broadcast to
+        `[z, y, x]`.
+        """
         coordinates = []
-        for axis, (cells, low, step) in enumerate(zip(self.shape, self.lower, self.spacing, strict=True)):
+        for axis, (cells, low, step) in enumerate(
+            zip(self.shape, self.lower, self.spacing, strict=True)
+        ):
             line = low + step * (torch.arange(cells, dtype=like.dtype, device=like.device) + 0.5)
             coordinates.append(line.view([-1 if axis == other else 1 for other in range(3)]))
         return coordinates
 
-    def coarsened(self, factor: int) -> Grid:
-        """The grid over the same box with about `factor` times fewer cells along each axis (at least one)."""
+    def coarsen(self, factor: int) -> Grid:
+        """The grid over the same box with about `factor` times fewer cells along each axis (at
+        least one).
+        """
         z, y, x = (max(1, round(cells / factor)) for cells in self.shape)
         return Grid((z, y, x), self.lower, self.upper)
 
 
 def array_order(vector: Tensor) -> Tensor:
-    """A vector `[..., 3]` given as (x, y, z) in array order (z, y, x), or back: the swap is its own inverse."""
+    """A vector `[..., 3]` given as (x, y, z) in array order (z, y, x), or back: the swap is its own
+    inverse.
+    """
     return vector.flip(-1)

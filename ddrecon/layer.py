@@ -9,14 +9,16 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import render
-from ddrecon.variables import with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.values import with_values
 
 
 class VolumeRenderer(torch.nn.Module):
-    """Renders the views of `scene` with whatever fields its caller puts in place of the scene's own.
+    """Renders the views of `scene` with whatever fields its caller puts in place of the scene's
+    own.
 
-    Solutions are remembered from one call to the next as starting points, unless `scene.diffusion.warm_start` is off.
+    Solutions are remembered from one call to the next as starting points, unless
+    `scene.diffusion.warm_start` is off.
     """
 
     def __init__(self, scene: Scene):
@@ -35,11 +37,14 @@ class VolumeRenderer(torch.nn.Module):
     ) -> Tensor:
         """Images `[views, 3, h, w]` of all views, or of the one named `view`.
 
-        `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar in (-1, 1); `values`: anything else by
-        name, such as `lights.0.irradiance` (`ddrecon.variables`). What is not given is the scene's. Raises KeyError for a name the scene
-        does not have, ValueError for a density of another shape than the grid's.
+        `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar
+        in (-1, 1); `values`: anything else by name, such as `lights.0.irradiance`
+        (`ddrecon.variables`). What is not given is the scene's. Raises KeyError for a name the
+        scene does not have, ValueError for a density of another shape than the grid's.
         """
         given = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
-        chosen = {name: value for name, value in given.items() if value is not None} | dict(values or {})
+        chosen = {name: value for name, value in given.items() if value is not None} | dict(
+            values or {}
+        )
         self.memory.records.clear()
         return render(with_values(self.scene, chosen), view, self.memory)

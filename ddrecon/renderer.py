@@ -1,7 +1,9 @@
-"""The paper on one page: light not yet scattered, light scattered many times, and the view rays that collect both.
+"""The paper on one page: light not yet scattered, light scattered many times, and the view rays
+that collect both.
 
-`render` composes only the terms a scene needs: no diffusion solve when the model is `none` or nothing scatters, no quadrature over
-directions but where unscattered ambient light is asked for by itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
+`render` composes only the terms a scene needs: no diffusion solve when the model is `none` or
+nothing scatters, no quadrature over directions but where unscattered ambient light is asked for by
+itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 """
 
 from __future__ import annotations
@@ -12,32 +14,36 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import is_varied, recomputed
-from ddrecon.cameras import Camera, Rays, rays, subpixel_offsets
-from ddrecon.diffusion import conservative, flux_limited, printed
+from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
+from ddrecon.diffusion import conservative, flux_limited
 from ddrecon.diffusion.closures import CLOSURES, smooth
 from ddrecon.diffusion.implicit import Solve, SolveMemory
 from ddrecon.diffusion.limiters import LIMITERS
+from ddrecon.diffusion.paper import printed
+from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.diffusion.transport import transported
-from ddrecon.environment import environment_radiance
-from ddrecon.lights import AmbientLight, EnvironmentLight, Light
-from ddrecon.march import Emission, march
-from ddrecon.medium import Medium, scaled_medium, unscaled_medium
-from ddrecon.moments import Moments, Vector
-from ddrecon.point_light import PointBeam
-from ddrecon.reduced import Beam, ambient_radiance, ambient_sky, reduced_light, scattered_sky, unscattered_sky
+from ddrecon.light.beam import Beam
+from ddrecon.light.environment import environment_radiance
+from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
+from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.point_light import PointBeam
+from ddrecon.light.reduced import ambient_radiance, reduced_light
+from ddrecon.light.sky import Sky, decompose_lights
+from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
+from ddrecon.march.integral import Emission, march
+from ddrecon.medium.coefficients import Medium, has_flux, keep_medium, scale_medium
+from ddrecon.numerics.autodiff import is_varied, recompute
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
-from ddrecon.sky import Sky, sources
-from ddrecon.world import Scene, View
 
 
 @dataclass(frozen=True)
 class LightField:
-    """All light inside a medium: `beams` of directional and point lights, and `outgoing`, what one more scattering makes of the rest.
+    """All light inside a medium: `beams` of directional and point lights, and `outgoing`, what one
+    more scattering makes of the rest.
 
-    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3. `skies` are those whose light it lacks: they scatter by
-    the exact phase function, into each camera's rays anew.
+    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3. `skies` are those whose
+    light it lacks: they scatter by the exact phase function, into each camera's rays anew.
     """
 
     medium: Medium
@@ -48,7 +54,9 @@ class LightField:
 
 @dataclass(frozen=True)
 class Components:
-    """The terms of E1, each [3, h, w]; they sum to the image. Forward-peaked light counts as `multiple`, as in path tracing."""
+    """The terms of E1, each [3, h, w]; they sum to the image. Forward-peaked light counts as
+    `multiple`, as in path tracing.
+    """
 
     reduced: Tensor
     single: Tensor
@@ -56,39 +64,51 @@ class Components:
 
 
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
-    """Images `[views, 3, h, w]` (linear radiance) of all views of `scene`, or of the one named `view`.
+    """Images `[views, 3, h, w]` (linear radiance) of all views of `scene`, or of the one named
+    `view`.
 
-    Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume` and of its lights. `memory` carries
-    the last solutions from one call to the next, as starting points. Raises ValueError when views differ in size: render those one by one.
+    Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume`
+    and of its lights. `memory` carries the last solutions from one call to the next, as starting
+    points. Raises ValueError when views differ in size: render those one by one.
     """
     views = scene.views if view is None else [scene.view(view)]
     if len({item.camera.size for item in views}) > 1:
-        raise ValueError("the views differ in size; render them one by one: render(scene, view=name)")
+        raise ValueError(
+            "the views differ in size; render them one by one: render(scene, view=name)"
+        )
     return torch.stack(render_each(scene, views, memory or SolveMemory()))
 
 
 def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> list[Tensor]:
-    """The images `[3, h, w]` of `views`, which may differ in size, in the one light field of `scene`."""
+    """The images `[3, h, w]` of `views`, which may differ in size, in the one light field of
+    `scene`.
+    """
     light_field = solve_light(scene, memory)
     return [view_image(light_field, scene, view.camera) for view in views]
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
-    """The light inside the volume of `scene`: E4 and E5 on top of the reduced light, or that alone where nothing scatters twice."""
-    medium = scaled_medium(scene.volume)
+    """The light inside the volume of `scene`: E4 and E5 on top of the reduced light, or that alone
+    where nothing scatters twice.
+    """
+    medium = scale_medium(scene.volume)
     if not multiply_scatters(medium, scene.diffusion):
-        return unscattered_light(unscaled_medium(scene.volume), scene.lights)
-    lights = sources(scene.lights)
+        return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
+    lights = decompose_lights(scene.lights)
     reduced = reduced_light(medium, lights, has_flux(medium))
-    sky = unscattered_sky(medium, lights, has_flux(medium))
+    sky = sum_unscattered_sky(medium, lights, has_flux(medium))
     source = reduced.source.plus(sky.scaled(1.0, medium.mean_cosine))
-    diffuse = solve_diffuse(medium, source, ambient_radiance(lights, medium.g), scene.diffusion, memory)
-    return LightField(medium, reduced.beams, _scattered_once_more(medium, diffuse.plus(sky)))
+    diffuse = solve_diffuse(
+        medium, source, ambient_radiance(lights, medium.g), scene.diffusion, memory
+    )
+    return LightField(medium, reduced.beams, _scatter_once_more(medium, diffuse.plus(sky)))
 
 
-def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
-    """The light inside `medium` that has not been scattered: beams, and by quadrature over directions ambient light and skies."""
-    parts = sources(lights)
+def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
+    """The light inside `medium` that has not been scattered: beams, and by quadrature over
+    directions ambient light and skies.
+    """
+    parts = decompose_lights(lights)
     beams = reduced_light(medium, parts, False).beams
     skies = tuple(part for part in parts if isinstance(part, Sky))
     if any(isinstance(part, AmbientLight) for part in parts):
@@ -96,26 +116,33 @@ def unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
     nothing = Moments(torch.zeros_like(medium.extinction.value))
     if has_flux(medium):
         return LightField(medium, beams, nothing, skies)
-    return LightField(medium, beams, unscattered_sky(medium, skies, has_flux=False))
+    return LightField(medium, beams, sum_unscattered_sky(medium, skies, has_flux=False))
 
 
-def _scattered_once_more(medium: Medium, light: Moments) -> Moments:
+def _scatter_once_more(medium: Medium, light: Moments) -> Moments:
     kept = 1 - medium.forward_fraction
     return light.scaled(kept, kept * medium.mean_cosine)
 
 
-def has_flux(medium: Medium) -> bool:
-    """Whether light's direction matters to scattering: g is not 0, or is being differentiated."""
-    return is_varied(medium.g) or bool(medium.g.detach() != 0)
-
-
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
-    """Whether light may be scattered more than once: the model is not `none`, and sigma_s is not 0 or is being differentiated."""
-    return settings.model != "none" and (is_varied(medium.scattering.scale) or bool((medium.scattering.scale != 0).any()))
+    """Whether light may be scattered more than once: the model is not `none`, and sigma_s is not 0
+    or is being differentiated.
+    """
+    return settings.model != "none" and (
+        is_varied(medium.scattering.scale) or bool((medium.scattering.scale != 0).any())
+    )
 
 
-def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: DiffusionSettings, memory: SolveMemory) -> Moments:
-    """L0 and L1 (E4 to E6) of `source`, Q0 and Q1 of beams, and of ambient light `outside` [C, 1, 1, 1], by the scheme of `settings`."""
+def solve_diffuse(
+    medium: Medium,
+    source: Moments,
+    outside: Tensor,
+    settings: DiffusionSettings,
+    memory: SolveMemory,
+) -> Moments:
+    """L0 and L1 (E4 to E6) of `source`, Q0 and Q1 of beams, and of ambient light `outside` [C, 1,
+    1, 1], by the scheme of `settings`.
+    """
 
     def closure(transport_extinction: Tensor) -> Tensor:
         return CLOSURES[settings.closure](transport_extinction, medium.grid, settings.floor)
@@ -125,23 +152,32 @@ def solve_diffuse(medium: Medium, source: Moments, outside: Tensor, settings: Di
         diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
-        return printed.diffuse_light(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
+        return printed.diffuse_light(
+            medium, diffusion, scattered, outside, by_jacobi, has_flux(medium)
+        )
     solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
     if settings.model == "flux_limited":
-        return flux_limited.diffuse_light(medium, LIMITERS[settings.limiter], source, outside, solve, has_flux(medium))
+        return flux_limited.diffuse_light(
+            medium, LIMITERS[settings.limiter], source, outside, solve, has_flux(medium)
+        )
     problem = conservative.DiffusionProblem(medium, closure, source, outside, has_flux(medium))
     light = conservative.diffuse_light(problem, solve)
-    return transported(problem, light, solve, settings.transport_rounds, settings.transport_directions)
+    return run_rounds(
+        problem, light, solve, settings.transport_rounds, settings.transport_directions
+    )
 
 
-def view_image(light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all") -> Tensor:
+def view_image(
+    light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all"
+) -> Tensor:
     """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1).
 
-    `derivatives` says which of its radiance passes derivatives on: `all`, `single` (E2 of beams, and what is seen unscattered) or
-    `diffusion` (E3, with the ambient light in it). The image is the same.
+    `derivatives` says which of its radiance passes derivatives on: `all`, `single` (E2 of beams,
+    and what is seen unscattered) or `diffusion` (E3, with the ambient light in it). The image is
+    the same.
     """
     if derivatives == "all":
-        emission = _emission(light_field, rays(camera))
+        emission = _emission(light_field, cast_rays(camera))
         return _image(emission, scene, camera)
     nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
     once, often = replace(light_field, outgoing=nothing), replace(light_field, beams=(), skies=())
@@ -160,10 +196,11 @@ def _without_background(scene: Scene) -> Scene:
 def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Components:
     """The image of `camera` split into its terms; `light_field` must be that of `scene`.
 
-    With forward scattering the image sees the delta-Eddington scaled medium; reduced and single radiance are those of the medium
-    itself, and the difference, light scattered forward once or more, belongs to `multiple`.
+    With forward scattering the image sees the delta-Eddington scaled medium; reduced and single
+    radiance are those of the medium itself, and the difference, light scattered forward once or
+    more, belongs to `multiple`.
     """
-    once = unscattered_light(unscaled_medium(scene.volume), scene.lights)
+    once = follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     image = view_image(light_field, scene, camera)
     single = view_image(once, _without_background(scene), camera)
     reduced = view_image(once, scene, camera) - single
@@ -173,7 +210,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
 def _image(emission: Emission, scene: Scene, camera: Camera) -> Tensor:
     """Radiance [3, h, w]: E1, averaged over the rays of each pixel."""
     offsets = subpixel_offsets(scene.render.samples_per_pixel)
-    bundle = Rays.joined([rays(camera, offset) for offset in offsets])
+    bundle = Rays.join([cast_rays(camera, offset) for offset in offsets])
     behind = _background(scene.lights if scene.render.background else [], bundle)
     scattered, clear = march(emission, bundle, scene.render, float(behind.detach().max()))
     radiance = (scattered + clear * behind).unflatten(-1, (len(offsets), -1)).mean(-2)
@@ -184,14 +221,24 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to."""
     medium = light_field.medium
     towards = _towards_camera(medium, bundle)
-    diffuse = recomputed(light_field.outgoing.positive_along, towards)
+    diffuse = recompute(light_field.outgoing.positive_along, towards)
     if light_field.skies:
-        diffuse = diffuse + scattered_sky(medium, light_field.skies, towards)
-    return Emission(medium.grid, medium.extinction, medium.scattering, light_field.beams, diffuse, medium.g, medium.peak)
+        diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
+    return Emission(
+        medium.grid,
+        medium.extinction,
+        medium.scattering,
+        light_field.beams,
+        diffuse,
+        medium.g,
+        medium.peak,
+    )
 
 
 def _background(lights: Sequence[Light], bundle: Rays) -> Tensor:
-    """The radiance [C, R] of ambient light and environment maps along `bundle`, where nothing is in the way."""
+    """The radiance [C, R] of ambient light and environment maps along `bundle`, where nothing is in
+    the way.
+    """
     total = ambient_radiance(lights, bundle.direction).view(-1, 1)
     for light in lights:
         if isinstance(light, EnvironmentLight):
@@ -200,14 +247,20 @@ def _background(lights: Sequence[Light], bundle: Rays) -> Tensor:
 
 
 def _towards_camera(medium: Medium, bundle: Rays) -> Vector:
-    """Components along z, y, x, each broadcasting to `[z, y, x]`, of unit directions from the cells towards the camera.
+    """Components along z, y, x, each broadcasting to `[z, y, x]`, of unit directions from the cells
+    towards the camera.
 
-    All rays through a cell's center have the same direction, so that outgoing light is a field of the camera, interpolated like any other.
+    All rays through a cell's center have the same direction, so that outgoing light is a field of
+    the camera, interpolated like any other.
     """
     if bundle.eye is None:
         z, y, x = -bundle.direction[0]
         return z, y, x
     offsets = [e - c for e, c in zip(bundle.eye, medium.grid.centers(bundle.eye), strict=True)]
-    distance = (offsets[0] ** 2 + offsets[1] ** 2 + offsets[2] ** 2).sqrt().clamp(min=torch.finfo(bundle.eye.dtype).tiny)
+    distance = (
+        (offsets[0] ** 2 + offsets[1] ** 2 + offsets[2] ** 2)
+        .sqrt()
+        .clamp(min=torch.finfo(bundle.eye.dtype).tiny)
+    )
     z, y, x = (offset / distance for offset in offsets)
     return z, y, x

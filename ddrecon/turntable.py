@@ -1,4 +1,6 @@
-"""Cameras around a volume: one view's camera turned about the upright axis through the middle of the box."""
+"""Cameras around a volume: one view's camera turned about the upright axis through the middle of
+the box.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera
 from ddrecon.grid import Triple
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 
 def upright_axis(cameras: Sequence[Camera]) -> int:
@@ -19,23 +21,32 @@ def upright_axis(cameras: Sequence[Camera]) -> int:
     return int(torch.stack([camera.pose[:, 1] for camera in cameras]).sum(0).abs().argmax())
 
 
-def turned(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
-    """`camera` turned by `angle` [rad] about the line along `axis` (0, 1, 2: x, y, z) through `center` (x, y, z)."""
+def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
+    """`camera` turned by `angle` [rad] about the line along `axis` (0, 1, 2: x, y, z) through
+    `center` (x, y, z).
+    """
     middle = camera.pose.new_tensor(center)
     rotation = _rotation(axis, angle).to(camera.pose)
     origin = middle + rotation @ (camera.pose[:, 3] - middle)
     return replace(camera, pose=torch.cat([rotation @ camera.pose[:, :3], origin[:, None]], 1))
 
 
-def turntable(scene: Scene, view: View, count: int) -> list[View]:
-    """`count` >= 1 views, `ring_000` that of `view` and the others like it in equal steps once around the volume of `scene`."""
+def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
+    """`count` >= 1 views, `ring_000` that of `view` and the others like it in equal steps once
+    around the volume of `scene`.
+    """
     axis, center = upright_axis([item.camera for item in scene.views]), scene.volume.grid.center_xyz
     steps = [2 * math.pi * index / count for index in range(count)]
-    return [View(f"ring_{index:03d}", turned(view.camera, axis, angle, center)) for index, angle in enumerate(steps)]
+    return [
+        View(f"ring_{index:03d}", turn_camera(view.camera, axis, angle, center))
+        for index, angle in enumerate(steps)
+    ]
 
 
 def _rotation(axis: int, angle: float) -> Tensor:
-    """The matrix [3, 3] that turns by `angle` about `axis`, counterclockwise seen from its positive end."""
+    """The matrix [3, 3] that turns by `angle` about `axis`, counterclockwise seen from its positive
+    end.
+    """
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = torch.eye(3, dtype=torch.float64)
     matrix[first, first] = matrix[second, second] = math.cos(angle)

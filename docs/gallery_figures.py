@@ -1,10 +1,12 @@
-"""Makes a picture of docs/gallery.md from the folder of a run, and that of its `ddrecon render --ring`.
+"""Makes a picture of docs/gallery.md from the folder of a run, and that of its `ddrecon render
+--ring`.
 
     ddrecon optimize configs/NAME.yaml -o runs/NAME
     ddrecon render runs/NAME -o runs/NAME_around --ring 8 --light '{...}'
     python docs/gallery_figures.py runs/NAME runs/NAME_around VIEW docs/pictures/gallery/NAME.png
 
-Above: the target of VIEW, our render, their difference four times enlarged, and the slices of the density. Below: the volume from around.
+Above: the target of VIEW, our render, their difference four times enlarged, and the slices of the
+density. Below: the volume from around.
 """
 
 from __future__ import annotations
@@ -29,28 +31,40 @@ def scaled(picture: Picture) -> Picture:
         return picture.repeat(round(HEIGHT / height), 0).repeat(round(HEIGHT / height), 1)
     factor = round(height / HEIGHT)
     rows, columns = (size // factor * factor for size in picture.shape[:2])
-    means = picture[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor, 3).mean((1, 3))
+    means = (
+        picture[:rows, :columns]
+        .reshape(rows // factor, factor, columns // factor, factor, 3)
+        .mean((1, 3))
+    )
     return means.astype(np.uint8)
 
 
 def row(pictures: list[Picture]) -> Picture:
     """`pictures` side by side."""
     height = max(picture.shape[0] for picture in pictures)
-    padded = [np.pad(picture, ((0, height - picture.shape[0]), (0, GAP), (0, 0))) for picture in pictures]
+    padded = [
+        np.pad(picture, ((0, height - picture.shape[0]), (0, GAP), (0, 0))) for picture in pictures
+    ]
     return np.concatenate(padded, 1)
 
 
 def column(rows: list[Picture]) -> Picture:
     """`rows` below each other."""
     width = max(part.shape[1] for part in rows)
-    return np.concatenate([np.pad(part, ((0, GAP), (0, width - part.shape[1]), (0, 0))) for part in rows], 0)
+    return np.concatenate(
+        [np.pad(part, ((0, GAP), (0, width - part.shape[1]), (0, 0))) for part in rows], 0
+    )
 
 
 def main(run: Path, around: Path, view: str, output: Path) -> None:
     """Writes the picture."""
-    above = [iio.imread(run / "previews" / f"{name}.png")[..., :3] for name in (view, "density.slices")]
+    above = [
+        iio.imread(run / "previews" / f"{name}.png")[..., :3] for name in (view, "density.slices")
+    ]
     turned = iio.imread(around / "ring.png", index=..., plugin="pillow")[..., :3]
-    whole = column([row([scaled(picture) for picture in above]), row([scaled(frame) for frame in turned[:5]])])
+    whole = column(
+        [row([scaled(picture) for picture in above]), row([scaled(frame) for frame in turned[:5]])]
+    )
     output.parent.mkdir(parents=True, exist_ok=True)
     iio.imwrite(output, whole, optimize=True)
 

@@ -1,4 +1,5 @@
-"""Makes docs/scene_file.md, the manual of scene files, from the schema: keys, kinds, limits and defaults are those the program checks.
+"""Makes docs/scene_file.md, the manual of scene files, from the schema: keys, kinds, limits and
+defaults are those the program checks.
 
 python docs/make_scene_file.py
 """
@@ -10,9 +11,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from ddrecon.scene import schema
-from ddrecon.scene.parameter_kinds import KINDS
+from ddrecon.scene_file import schema
 from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.variables.kinds import KINDS
 
 PAGE = Path(__file__).parent / "scene_file.md"
 KIND_NAMES = {
@@ -246,8 +247,21 @@ def _section(heading: str, record: type, what: str, texts: dict[str, str]) -> st
     hints = get_type_hints(record)
     declared = {field.name: field for field in fields(record)}
     own = {name: declared[name] for name in texts}
-    rows = [f"| `{name}` | {_takes(hints[name], field)} | {_default(field)} | {texts[name]} |" for name, field in own.items()]
-    return "\n".join([f"## {heading}", "", what, "", "| key | takes | default | what |", "|---|---|---|---|", *rows])
+    rows = [
+        f"| `{name}` | {_takes(hints[name], field)} | {_default(field)} | {texts[name]} |"
+        for name, field in own.items()
+    ]
+    return "\n".join(
+        [
+            f"## {heading}",
+            "",
+            what,
+            "",
+            "| key | takes | default | what |",
+            "|---|---|---|---|",
+            *rows,
+        ]
+    )
 
 
 def _takes(hint: Any, field: Field[Any]) -> str:
@@ -255,13 +269,21 @@ def _takes(hint: Any, field: Field[Any]) -> str:
     limits = {key: value for key, value in field.metadata.items() if value is not None}
     if "choices" in limits:
         return ", ".join(f"`{choice}`" for choice in limits["choices"])
-    words = {"minimum": "at least {:g}", "above": "above {:g}", "maximum": "at most {:g}", "below": "below {:g}"}
+    words = {
+        "minimum": "at least {:g}",
+        "above": "above {:g}",
+        "maximum": "at most {:g}",
+        "below": "below {:g}",
+    }
     within = [words[key].format(value) for key, value in limits.items()]
     return ", ".join([_kind(hint), *within])
 
 
 def _kind(hint: Any) -> str:
-    return next((name for known, name in KIND_NAMES.items() if _alternatives(known) == _alternatives(hint)), "mapping")
+    return next(
+        (name for known, name in KIND_NAMES.items() if _alternatives(known) == _alternatives(hint)),
+        "mapping",
+    )
 
 
 def _alternatives(hint: Any) -> set[Any]:
@@ -286,11 +308,26 @@ def _parameters() -> str:
     rows = []
     for name, kind in KINDS.items():
         limits = (
-            "" if kind.low == -float("inf") else f"{kind.low:g} to {kind.high:g}" if kind.high < float("inf") else f"at least {kind.low:g}"
+            ""
+            if kind.low == -float("inf")
+            else f"{kind.low:g} to {kind.high:g}"
+            if kind.high < float("inf")
+            else f"at least {kind.low:g}"
         )
-        rows.append(f"| `{name}` | {limits} | {'yes' if kind.is_color else ''} | {'yes' if kind.is_cellwise else ''} |")
-    told = "What can be found. N is a light's place in the list, counted from 0, NAME a view's name."
-    head = ["## Names of parameters", "", told, "", "| name | kept within | by color | from cell to cell |", "|---|---|---|---|"]
+        rows.append(
+            f"| `{name}` | {limits} | {'yes' if kind.is_color else ''} | {'yes' if kind.is_cellwise else ''} |"
+        )
+    told = (
+        "What can be found. N is a light's place in the list, counted from 0, NAME a view's name."
+    )
+    head = [
+        "## Names of parameters",
+        "",
+        told,
+        "",
+        "| name | kept within | by color | from cell to cell |",
+        "|---|---|---|---|",
+    ]
     return "\n".join([*head, *rows])
 
 

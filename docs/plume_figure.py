@@ -14,24 +14,35 @@ import torch
 from numpy.typing import NDArray
 
 import ddrecon
-from ddrecon.io import srgb
-from ddrecon.io.volumes import read_field
-from ddrecon.reconstruct.previews import pixels
+from ddrecon.io.images import srgb
+from ddrecon.io.volumes.table import read_field
+from ddrecon.report.pictures import pixels
 
 ROOT = Path(__file__).parents[1]
 VIEW = "test_10"
 
 
 def pictures(run: Path) -> list[tuple[str, NDArray[np.float32]]]:
-    """Target, render of the reconstruction and of a relit one, in linear radiance, each scaled to its brightest pixels."""
+    """Target, render of the reconstruction and of a relit one, in linear radiance, each scaled to
+    its brightest pixels.
+    """
     density = f"volume.density={{file: {(run / 'volumes' / 'density.npz').resolve()}}}"
     scene = ddrecon.load_scene(run / "scene.yaml", overrides=[density])
-    relit = ddrecon.load_scene(run / "scene.yaml", overrides=[density, "lights.0.direction=[2, -1, 1]"])
+    relit = ddrecon.load_scene(
+        run / "scene.yaml", overrides=[density, "lights.0.direction=[2, -1, 1]"]
+    )
     target = scene.view(VIEW).image
     with torch.no_grad():
         images = [target, ddrecon.render(scene, VIEW)[0], ddrecon.render(relit, VIEW)[0]]
-    titles = ["held-out picture\n(path-traced)", "our render of\nthe reconstruction", "the same, lit from\nthe other side"]
-    return [(title, pixels(image) / np.quantile(pixels(image), 0.999)) for title, image in zip(titles, images, strict=True)]
+    titles = [
+        "held-out picture\n(path-traced)",
+        "our render of\nthe reconstruction",
+        "the same, lit from\nthe other side",
+    ]
+    return [
+        (title, pixels(image) / np.quantile(pixels(image), 0.999))
+        for title, image in zip(titles, images, strict=True)
+    ]
 
 
 def slices(run: Path) -> list[tuple[str, NDArray[np.float32]]]:

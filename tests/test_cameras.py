@@ -10,25 +10,36 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddrecon.cameras import Camera, look_at, rays, subpixel_offsets, twisted
+from ddrecon.cameras import Camera, cast_rays, look_at, subpixel_offsets, twist
 
-ORIGIN, TARGET, UP = (torch.tensor(v, dtype=torch.float64) for v in ([1.0, 2.0, 5.0], [0.3, -0.2, 0.1], [0.1, 1.0, 0.2]))
+ORIGIN, TARGET, UP = (
+    torch.tensor(v, dtype=torch.float64)
+    for v in ([1.0, 2.0, 5.0], [0.3, -0.2, 0.1], [0.1, 1.0, 0.2])
+)
 
 
-def camera(size: tuple[int, int] = (3, 5), half_width: float = 0.4, is_perspective: bool = True) -> Camera:
+def camera(
+    size: tuple[int, int] = (3, 5), half_width: float = 0.4, is_perspective: bool = True
+) -> Camera:
     return Camera(look_at(ORIGIN, TARGET, UP), size, half_width, is_perspective)
 
 
 def test_a_pose_is_rigid_and_looks_at_its_target():
     pose = look_at(ORIGIN, TARGET, UP)
     right, up, backward, origin = pose.unbind(1)
-    torch.testing.assert_close(pose[:, :3].T @ pose[:, :3], torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-15)
+    torch.testing.assert_close(
+        pose[:, :3].T @ pose[:, :3], torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-15
+    )
     torch.testing.assert_close(torch.linalg.cross(right, up), backward, rtol=0, atol=1e-15)
-    torch.testing.assert_close(origin - backward * (TARGET - ORIGIN).norm(), TARGET, rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        origin - backward * (TARGET - ORIGIN).norm(), TARGET, rtol=0, atol=1e-14
+    )
     assert up @ UP > 0 and abs(right @ UP) < 1e-15
 
 
-@pytest.mark.parametrize(("target", "up"), [(ORIGIN, UP), (TARGET, TARGET - ORIGIN), (TARGET, 3 * (ORIGIN - TARGET))])
+@pytest.mark.parametrize(
+    ("target", "up"), [(ORIGIN, UP), (TARGET, TARGET - ORIGIN), (TARGET, 3 * (ORIGIN - TARGET))]
+)
 def test_a_view_without_a_direction_is_refused(target: torch.Tensor, up: torch.Tensor):
     with pytest.raises(ValueError, match="do not span a view"):
         look_at(ORIGIN, target, up)
@@ -38,7 +49,7 @@ def test_a_view_without_a_direction_is_refused(target: torch.Tensor, up: torch.T
 def test_every_ray_against_explicit_pixel_arithmetic(is_perspective: bool):
     """Row 0 is the top, column 0 the left, and pixels are square, whatever the picture's shape."""
     view = camera(is_perspective=is_perspective)
-    bundle = rays(view, (0.25, 0.75))
+    bundle = cast_rays(view, (0.25, 0.75))
     right, up, backward, origin = view.pose.unbind(1)
     height, width = view.size
     for row in range(height):
@@ -46,15 +57,19 @@ def test_every_ray_against_explicit_pixel_arithmetic(is_perspective: bool):
             x = (2 * (column + 0.75) / width - 1) * view.half_width
             y = (height - 2 * (row + 0.25)) / width * view.half_width
             shift = x * right + y * up
-            start, toward = (origin, shift - backward) if is_perspective else (origin + shift, -backward)
+            start, toward = (
+                (origin, shift - backward) if is_perspective else (origin + shift, -backward)
+            )
             index = row * width + column
             torch.testing.assert_close(bundle.origin[index].flip(0), start, rtol=0, atol=1e-14)
-            torch.testing.assert_close(bundle.direction[index].flip(0), toward / toward.norm(), rtol=0, atol=1e-15)
+            torch.testing.assert_close(
+                bundle.direction[index].flip(0), toward / toward.norm(), rtol=0, atol=1e-15
+            )
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_the_middle_ray_goes_from_origin_to_target(is_perspective: bool):
-    bundle = rays(camera(is_perspective=is_perspective))
+    bundle = cast_rays(camera(is_perspective=is_perspective))
     middle = len(bundle.direction) // 2
     toward = ((TARGET - ORIGIN) / (TARGET - ORIGIN).norm()).flip(0)
     torch.testing.assert_close(bundle.direction[middle], toward, rtol=0, atol=1e-15)
@@ -63,48 +78,71 @@ def test_the_middle_ray_goes_from_origin_to_target(is_perspective: bool):
 
 def test_the_field_of_view_is_that_of_the_outermost_columns():
     view = camera((1, 2), half_width=math.tan(0.3))
-    left, right = rays(view, (0.5, 0.0)).direction[0], rays(view, (0.5, 1.0)).direction[1]
+    left, right = cast_rays(view, (0.5, 0.0)).direction[0], cast_rays(view, (0.5, 1.0)).direction[1]
     assert math.acos(left @ right) == pytest.approx(2 * 0.3, rel=1e-12)
 
 
 def test_only_perspective_rays_meet():
-    assert rays(camera(is_perspective=False)).eye is None
-    torch.testing.assert_close(rays(camera()).eye, ORIGIN.flip(0), rtol=0, atol=0)
+    assert cast_rays(camera(is_perspective=False)).eye is None
+    torch.testing.assert_close(cast_rays(camera()).eye, ORIGIN.flip(0), rtol=0, atol=0)
 
 
 def test_a_smaller_picture_sees_the_same():
     view = camera((6, 8))
-    torch.testing.assert_close(rays(view.resized(2), (0.5, 0.5)).direction[0], rays(view, (1.0, 1.0)).direction[0], rtol=0, atol=1e-15)
-    assert view.resized(100).size == (1, 1)
+    torch.testing.assert_close(
+        cast_rays(view.resize(2), (0.5, 0.5)).direction[0],
+        cast_rays(view, (1.0, 1.0)).direction[0],
+        rtol=0,
+        atol=1e-15,
+    )
+    assert view.resize(100).size == (1, 1)
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_corners_stay_where_they_are_in_a_smaller_picture(is_perspective: bool):
     """Also where its size is no whole fraction, and whatever the principal point."""
-    view = replace(camera((7, 11), is_perspective=is_perspective), principal_point=(0.3, 0.6), pixel_aspect=1.1)
+    view = replace(
+        camera((7, 11), is_perspective=is_perspective), principal_point=(0.3, 0.6), pixel_aspect=1.1
+    )
     for factor in (2, 3, 100):
         for corner, index in (((0.0, 0.0), 0), ((1.0, 1.0), -1)):
-            small, large = rays(view.resized(factor), corner), rays(view, corner)
-            torch.testing.assert_close(small.direction[index], large.direction[index], rtol=0, atol=1e-15)
+            small, large = cast_rays(view.resize(factor), corner), cast_rays(view, corner)
+            torch.testing.assert_close(
+                small.direction[index], large.direction[index], rtol=0, atol=1e-15
+            )
             torch.testing.assert_close(small.origin[index], large.origin[index], rtol=0, atol=1e-14)
 
 
 def test_rays_of_a_calibrated_pinhole():
     """x = (column - cx) / fx to the right, y = (cy - row) / fy up, whatever the focal lengths."""
     height, width, fx, fy, cx, cy = 3, 5, 7.0, 6.0, 2.2, 1.9
-    view = Camera(look_at(ORIGIN, TARGET, UP), (height, width), width / 2 / fx, True, (cx / width, cy / height), fx / fy)
+    view = Camera(
+        look_at(ORIGIN, TARGET, UP),
+        (height, width),
+        width / 2 / fx,
+        True,
+        (cx / width, cy / height),
+        fx / fy,
+    )
     right, up, backward, _ = view.pose.unbind(1)
     for row in range(height):
         for column in range(width):
             toward = (column + 0.5 - cx) / fx * right + (cy - row - 0.5) / fy * up - backward
-            torch.testing.assert_close(rays(view).direction[row * width + column].flip(0), toward / toward.norm(), rtol=0, atol=1e-15)
+            torch.testing.assert_close(
+                cast_rays(view).direction[row * width + column].flip(0),
+                toward / toward.norm(),
+                rtol=0,
+                atol=1e-15,
+            )
 
 
 @given(st.integers(1, 64))
 def test_samples_are_centers_of_equal_parts(samples: int):
     offsets = torch.tensor(subpixel_offsets(samples), dtype=torch.float64)
     assert len({(round(a, 9), round(b, 9)) for a, b in offsets.tolist()}) == samples
-    torch.testing.assert_close(offsets.mean(0), torch.full((2,), 0.5, dtype=torch.float64), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        offsets.mean(0), torch.full((2,), 0.5, dtype=torch.float64), rtol=0, atol=1e-14
+    )
     rows, columns = (len(set(line.tolist())) for line in offsets.unbind(1))
     assert rows * columns == samples
     second_moments = ((offsets - 0.5) ** 2).mean(0)
@@ -115,18 +153,25 @@ def test_samples_are_centers_of_equal_parts(samples: int):
 # --- twists ----------------------------------------------------------------------------------------------------------
 
 PIVOT = (0.2, -0.1, 0.4)
-small_twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(lambda entries: torch.tensor(entries, dtype=torch.float64))
+small_twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(
+    lambda entries: torch.tensor(entries, dtype=torch.float64)
+)
 
 
 @given(small_twists)
 def test_a_twisted_pose_is_rigid(twist: torch.Tensor):
-    turn = twisted(camera(), twist, PIVOT).pose[:, :3]
+    turn = twist(camera(), twist, PIVOT).pose[:, :3]
     torch.testing.assert_close(turn.T @ turn, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-13)
     assert torch.linalg.det(turn) > 0
 
 
 def test_no_twist_changes_nothing():
-    torch.testing.assert_close(twisted(camera(), torch.zeros(6, dtype=torch.float64), PIVOT).pose, camera().pose, rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        twist(camera(), torch.zeros(6, dtype=torch.float64), PIVOT).pose,
+        camera().pose,
+        rtol=0,
+        atol=1e-14,
+    )
 
 
 @given(small_twists)
@@ -139,9 +184,13 @@ def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(twist: torch.Tensor):
 
     turn = twist.clone()
     turn[3:] = 0
-    torch.testing.assert_close(seen(twisted(camera(), turn, PIVOT)), seen(camera()), rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        seen(twist(camera(), turn, PIVOT)), seen(camera()), rtol=0, atol=1e-13
+    )
     shift = twist - turn
-    torch.testing.assert_close(seen(twisted(camera(), shift, PIVOT)), seen(camera()) - shift[3:], rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        seen(twist(camera(), shift, PIVOT)), seen(camera()) - shift[3:], rtol=0, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -149,6 +198,8 @@ def test_a_rotation_vector_turns_by_its_length_about_its_axis_right_handed(axis:
     """A quarter turn about a camera axis takes the next axis to the one after it."""
     twist = torch.zeros(6, dtype=torch.float64)
     twist[axis] = math.pi / 2
-    before, after = camera().pose, twisted(camera(), twist, PIVOT).pose
+    before, after = camera().pose, twist(camera(), twist, PIVOT).pose
     torch.testing.assert_close(after[:, axis], before[:, axis], rtol=0, atol=1e-13)
-    torch.testing.assert_close(after[:, (axis + 1) % 3], before[:, (axis + 2) % 3], rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        after[:, (axis + 1) % 3], before[:, (axis + 2) % 3], rtol=0, atol=1e-13
+    )

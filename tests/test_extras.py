@@ -1,4 +1,6 @@
-"""Optional packages: each belongs to an extra that pip knows, and where one is absent, the user is told which."""
+"""Optional packages: each belongs to an extra that pip knows, and where one is absent, the user is
+told which.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ import pytest
 from ddrecon.errors import FormatError, MissingExtraError
 from ddrecon.extras import EXTRAS, load_extra, load_for_file
 
-PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
+    "optional-dependencies"
+]
 
 
 def test_every_extra_brings_its_package_and_all_brings_every_extra() -> None:

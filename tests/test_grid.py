@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from media import random_values
 
 from ddrecon.grid import Grid, array_order
 
@@ -31,20 +32,25 @@ def test_centers_against_explicit_indices():
     z, y, x = torch.broadcast_tensors(*GRID.centers(torch.zeros(1, dtype=torch.float64)))
     for k, j, i in itertools.product(*map(range, GRID.shape)):
         place = [
-            low + (index + 0.5) * (high - low) / cells for index, low, high, cells in zip((i, j, k), LOWER, UPPER, RESOLUTION, strict=True)
+            low + (index + 0.5) * (high - low) / cells
+            for index, low, high, cells in zip((i, j, k), LOWER, UPPER, RESOLUTION, strict=True)
         ]
-        assert (x[k, j, i].item(), y[k, j, i].item(), z[k, j, i].item()) == pytest.approx(place, rel=1e-15)
+        assert (x[k, j, i].item(), y[k, j, i].item(), z[k, j, i].item()) == pytest.approx(
+            place, rel=1e-15
+        )
 
 
 @given(st.tuples(*[st.integers(1, 40)] * 3), st.integers(1, 50))
 def test_a_coarsened_grid_fills_the_same_box(shape: tuple[int, int, int], factor: int):
-    coarse = Grid(shape, (0, 0, 0), (1, 2, 3)).coarsened(factor)
+    coarse = Grid(shape, (0, 0, 0), (1, 2, 3)).coarsen(factor)
     assert coarse.bounds_xyz == ((0, 0, 0), (3, 2, 1))
     for cells, fine in zip(coarse.shape, shape, strict=True):
         assert cells >= 1 and abs(cells - max(1, fine / factor)) <= 0.5
 
 
-def test_array_order_is_its_own_inverse(random):
-    vector = random(4, 3)
-    assert torch.equal(array_order(vector), torch.stack([vector[:, 2], vector[:, 1], vector[:, 0]], 1))
+def test_array_order_is_its_own_inverse():
+    vector = random_values(4, 3)
+    assert torch.equal(
+        array_order(vector), torch.stack([vector[:, 2], vector[:, 1], vector[:, 0]], 1)
+    )
     assert torch.equal(array_order(array_order(vector)), vector)

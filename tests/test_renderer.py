@@ -10,15 +10,16 @@ from typing import Any
 
 import pytest
 import torch
+from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ddrecon.cameras import Camera, rays
+from ddrecon.cameras import Camera, cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.renderer import Components, render, solve_light, view_components
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 SHAPE = (5, 4, 6)
 BOTH = {"directional": (3.0, 2.0, 1.0), "ambient": (0.3, 0.4, 0.5)}
@@ -38,39 +39,53 @@ def volume_with(scene: Scene, **fields: Any) -> Scene:
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.5])
-def test_components_sum_to_the_image(g: float, make_scene, half_empty):
+def test_components_sum_to_the_image(g: float):
     scene = make_scene(half_empty(*SHAPE), g=g, **BOTH)
     parts = components(scene)
-    torch.testing.assert_close(parts.reduced + parts.single + parts.multiple, render(scene)[0], rtol=1e-14, atol=0)
+    torch.testing.assert_close(
+        parts.reduced + parts.single + parts.multiple, render(scene)[0], rtol=1e-14, atol=0
+    )
     assert bool((parts.single > 0).any()) and bool((parts.multiple > 0).any())
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.5])
-def test_without_a_model_nothing_scatters_twice(g: float, make_scene, half_empty):
+def test_without_a_model_nothing_scatters_twice(g: float):
     parts = components(make_scene(half_empty(*SHAPE), g=g, model="none", **BOTH))
     torch.testing.assert_close(parts.multiple, torch.zeros_like(parts.multiple), rtol=0, atol=1e-15)
     assert bool((parts.single > 0).any())
 
 
-def test_without_scattering_only_reduced_light_is_seen(make_scene, half_empty):
+def test_without_scattering_only_reduced_light_is_seen():
     parts = components(make_scene(half_empty(*SHAPE), sigma_s=(0.0,), **BOTH))
     assert not parts.single.any() and not parts.multiple.any() and bool((parts.reduced > 0).all())
 
 
-def test_reduced_light_is_ambient_light_attenuated(make_scene, half_empty):
+def test_reduced_light_is_ambient_light_attenuated():
     """A directional light is not seen: no pixel looks straight into it."""
     density = half_empty(*SHAPE)
-    absorbing = make_scene(density, sigma_a=(8.5, 7.0, 6.0), sigma_s=(0.0,), directional=None, ambient=BOTH["ambient"])
-    torch.testing.assert_close(components(make_scene(density, g=0.3, **BOTH)).reduced, render(absorbing)[0], rtol=1e-12, atol=1e-14)
+    absorbing = make_scene(
+        density, sigma_a=(8.5, 7.0, 6.0), sigma_s=(0.0,), directional=None, ambient=BOTH["ambient"]
+    )
+    torch.testing.assert_close(
+        components(make_scene(density, g=0.3, **BOTH)).reduced,
+        render(absorbing)[0],
+        rtol=1e-12,
+        atol=1e-14,
+    )
 
 
 @pytest.mark.parametrize("solver", ["jacobi", "conjugate_gradient"])
-def test_the_solver_does_not_matter(solver: str, make_scene, half_empty):
+def test_the_solver_does_not_matter(solver: str):
     scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
-    torch.testing.assert_close(render(replace(scene, diffusion=replace(scene.diffusion, solver=solver))), render(scene), rtol=1e-10, atol=0)
+    torch.testing.assert_close(
+        render(replace(scene, diffusion=replace(scene.diffusion, solver=solver))),
+        render(scene),
+        rtol=1e-10,
+        atol=0,
+    )
 
 
-def test_views_are_rendered_by_name_and_must_agree_in_size(make_scene, make_camera, half_empty):
+def test_views_are_rendered_by_name_and_must_agree_in_size():
     scene = make_scene(half_empty(*SHAPE))
     scene.views += [View("other", make_camera(eye=(-2.5, 0.0, 1.0)))]
     both = render(scene)
@@ -86,50 +101,76 @@ def test_views_are_rendered_by_name_and_must_agree_in_size(make_scene, make_came
 RADIUS = 0.35
 
 
-def ball(make_scene, make_camera, thickness: float, g: float) -> Scene:
+def ball(thickness: float, g: float) -> Scene:
     grid = Grid((18, 20, 22), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     radius = sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))).sqrt()
     density = (radius < RADIUS).double() * thickness / (2 * RADIUS)
     camera = make_camera(size=(16, 16), half_width=0.25)
-    return make_scene(density, grid=grid, sigma_a=(0.0,), sigma_s=(1.0,), g=g, directional=None, ambient=(1.0,), camera=camera)
+    return make_scene(
+        density,
+        grid=grid,
+        sigma_a=(0.0,),
+        sigma_s=(1.0,),
+        g=g,
+        directional=None,
+        ambient=(1.0,),
+        camera=camera,
+    )
 
 
 def misses(camera: Camera, radius: float) -> Tensor:
     """Which pixels' rays stay further than `radius` from the origin, [h, w]."""
-    bundle = rays(camera)
+    bundle = cast_rays(camera)
     along = (bundle.origin * bundle.direction).sum(1)
     return ((bundle.origin**2).sum(1) - along**2 > radius**2).view(camera.size)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
 @pytest.mark.parametrize("thickness", [0.0, 1.0, 10.0])
-def test_a_white_furnace_is_white(thickness: float, g: float, make_scene, make_camera):
-    """Albedo 1 under radiance 1 from everywhere: radiance 1 everywhere, and not even rounding where nothing is in the way."""
-    scene = ball(make_scene, make_camera, thickness, g)
+def test_a_white_furnace_is_white(thickness: float, g: float):
+    """Albedo 1 under radiance 1 from everywhere: radiance 1 everywhere, and not even rounding where
+    nothing is in the way.
+    """
+    scene = ball(thickness, g)
     image = render(scene)[0]
     is_miss = misses(scene.views[0].camera, RADIUS + 0.1)
     assert bool(is_miss.any()) and bool((image[:, is_miss] == 1).all())
     error = float((image - 1).abs().max())
-    assert error < 1e-10 and (thickness > 0 or error == 0), f"white furnace: {error:.1e} at optical thickness {thickness}, g = {g}"
+    assert error < 1e-10 and (thickness > 0 or error == 0), (
+        f"white furnace: {error:.1e} at optical thickness {thickness}, g = {g}"
+    )
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
-def test_a_white_furnace_is_white_where_the_medium_touches_its_box(g: float, make_scene, half_empty):
-    scene = make_scene(half_empty(*SHAPE), sigma_a=(0.0,), sigma_s=(6.0,), g=g, directional=None, ambient=(1.0,))
+def test_a_white_furnace_is_white_where_the_medium_touches_its_box(g: float):
+    scene = make_scene(
+        half_empty(*SHAPE), sigma_a=(0.0,), sigma_s=(6.0,), g=g, directional=None, ambient=(1.0,)
+    )
     image = render(scene)
     torch.testing.assert_close(image, torch.ones_like(image), rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("g", [0.5, 0.9, -0.5])
-def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float, make_scene, random):
-    """The beam's power plus the flux of diffuse light, 4 pi / 3 L1, is the same at every depth of a wide slab.
+def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float):
+    """The beam's power plus the flux of diffuse light, 4 pi / 3 L1, is the same at every depth of a
+    wide slab.
 
     `outgoing` holds (1 - f) g' L1, which is g (1 - g) L1 with a forward peak and g L1 without.
     """
     grid, sigma = Grid((8, 1, 1), (0.0, 0.0, 0.0), (1.0, 1e9, 1e9)), 3.0
-    scene = make_scene(random(*grid.shape), grid=grid, sigma_a=(0.0,), sigma_s=(sigma,), g=g, directional=(2.0,), travel=(0.0, 0.0, 1.0))
+    scene = make_scene(
+        random_values(*grid.shape),
+        grid=grid,
+        sigma_a=(0.0,),
+        sigma_s=(sigma,),
+        g=g,
+        directional=(2.0,),
+        travel=(0.0, 0.0, 1.0),
+    )
     flux = solve_light(scene, SolveMemory()).outgoing.flux[0].flatten() / (g * (1 - max(g, 0.0)))
-    depth = (1 - max(g, 0.0) ** 2) * sigma * grid.spacing[0] * scene.volume.density.flatten().cumsum(0)
+    depth = (
+        (1 - max(g, 0.0) ** 2) * sigma * grid.spacing[0] * scene.volume.density.flatten().cumsum(0)
+    )
     beam = 2.0 * torch.exp(-torch.cat([torch.zeros(1, dtype=torch.float64), depth]))
     power = (beam[1:] + beam[:-1]) / 2 + 4 * math.pi / 3 * flux
     torch.testing.assert_close(power, power.mean().expand_as(power), rtol=1e-8, atol=0)
@@ -137,18 +178,20 @@ def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float, make_scene, r
 
 
 @pytest.mark.parametrize("g", [0.6, -0.6])
-def test_a_parallel_camera_is_a_perspective_one_from_afar(g: float, make_scene, make_camera, half_empty):
+def test_a_parallel_camera_is_a_perspective_one_from_afar(g: float):
     far = 1e4
     images = []
     for half_width, is_perspective in ((0.45, False), (0.45 / far, True)):
-        camera = make_camera(eye=(0.0, 0.6 * far, 0.8 * far), half_width=half_width, is_perspective=is_perspective)
+        camera = make_camera(
+            eye=(0.0, 0.6 * far, 0.8 * far), half_width=half_width, is_perspective=is_perspective
+        )
         images.append(render(make_scene(half_empty(*SHAPE), g=g, camera=camera)))
     torch.testing.assert_close(images[0], images[1], rtol=10 / far, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])
-def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float, make_scene, make_camera):
-    scene = ball(make_scene, make_camera, 1.0, g)
+def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float):
+    scene = ball(1.0, g)
     parts = components(scene)
     once = (parts.reduced + parts.single)[:, ~misses(scene.views[0].camera, RADIUS - 0.1)]
     assert bool((once < 1).all()) and bool((once > 0.5).all())
@@ -157,75 +200,131 @@ def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float, make_
 # --- scalings and symmetries -----------------------------------------------------------------------------------------
 
 
-def test_images_are_linear_in_light(make_scene, half_empty):
+def test_images_are_linear_in_light():
     scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
     beam, ambient = scene.lights
-    mixed = [DirectionalLight(beam.direction, 2.5 * beam.irradiance), AmbientLight(0.5 * ambient.radiance)]
-    parts = 2.5 * render(replace(scene, lights=[beam])) + 0.5 * render(replace(scene, lights=[ambient]))
+    mixed = [
+        DirectionalLight(beam.direction, 2.5 * beam.irradiance),
+        AmbientLight(0.5 * ambient.radiance),
+    ]
+    parts = 2.5 * render(replace(scene, lights=[beam])) + 0.5 * render(
+        replace(scene, lights=[ambient])
+    )
     torch.testing.assert_close(render(replace(scene, lights=mixed)), parts, rtol=1e-10, atol=0)
 
 
-def test_gray_is_three_equal_colors(make_scene, half_empty):
+def test_gray_is_three_equal_colors():
     density = half_empty(*SHAPE)
-    gray = make_scene(density, sigma_a=(0.5,), sigma_s=(6.0,), g=0.4, directional=(3.0,), ambient=(0.5,))
-    colored = make_scene(density, sigma_a=(0.5,) * 3, sigma_s=(6.0,) * 3, g=0.4, directional=(3.0,) * 3, ambient=(0.5,) * 3)
+    gray = make_scene(
+        density, sigma_a=(0.5,), sigma_s=(6.0,), g=0.4, directional=(3.0,), ambient=(0.5,)
+    )
+    colored = make_scene(
+        density,
+        sigma_a=(0.5,) * 3,
+        sigma_s=(6.0,) * 3,
+        g=0.4,
+        directional=(3.0,) * 3,
+        ambient=(0.5,) * 3,
+    )
     torch.testing.assert_close(render(gray), render(colored), rtol=1e-10, atol=0)
 
 
 @pytest.mark.parametrize("colored", ["light", "medium"])
-def test_each_color_is_a_gray_scene_of_its_own(colored: str, make_scene, half_empty):
+def test_each_color_is_a_gray_scene_of_its_own(colored: str):
     density = half_empty(*SHAPE)
     light, sigma_a, sigma_s = (
-        ((3.0, 2.0, 1.0), (0.5,) * 3, (6.0,) * 3) if colored == "light" else ((3.0,) * 3, (0.5, 1.0, 2.0), (8.0, 6.0, 4.0))
+        ((3.0, 2.0, 1.0), (0.5,) * 3, (6.0,) * 3)
+        if colored == "light"
+        else ((3.0,) * 3, (0.5, 1.0, 2.0), (8.0, 6.0, 4.0))
     )
 
     def narrow(color: tuple[float, ...]) -> tuple[float, ...]:
         return color[:1] if len(set(color)) == 1 else color
 
     image = render(
-        make_scene(density, sigma_a=narrow(sigma_a), sigma_s=narrow(sigma_s), g=0.4, directional=narrow(light), ambient=narrow(light))
+        make_scene(
+            density,
+            sigma_a=narrow(sigma_a),
+            sigma_s=narrow(sigma_s),
+            g=0.4,
+            directional=narrow(light),
+            ambient=narrow(light),
+        )
     )[0]
     for c in range(3):
-        one = {"sigma_a": sigma_a[c : c + 1], "sigma_s": sigma_s[c : c + 1], "directional": light[c : c + 1], "ambient": light[c : c + 1]}
-        torch.testing.assert_close(image[c], render(make_scene(density, g=0.4, **one))[0, 0], rtol=1e-4, atol=0)
+        one = {
+            "sigma_a": sigma_a[c : c + 1],
+            "sigma_s": sigma_s[c : c + 1],
+            "directional": light[c : c + 1],
+            "ambient": light[c : c + 1],
+        }
+        torch.testing.assert_close(
+            image[c], render(make_scene(density, g=0.4, **one))[0, 0], rtol=1e-4, atol=0
+        )
 
 
-@pytest.mark.parametrize("view", [{}, PARALLEL, INSIDE], ids=["perspective", "orthographic", "inside"])
-def test_a_world_of_another_size_looks_the_same(view: dict, make_scene, make_camera, half_empty):
+@pytest.mark.parametrize(
+    "view", [{}, PARALLEL, INSIDE], ids=["perspective", "orthographic", "inside"]
+)
+def test_a_world_of_another_size_looks_the_same(view: dict):
     """All lengths times 3, all cross sections divided by 3."""
     scale, scene = 3.0, make_scene(half_empty(*SHAPE), g=0.4, camera=make_camera(**view), **BOTH)
     grid, camera, volume = scene.volume.grid, scene.views[0].camera, scene.volume
-    lower, upper = (tuple(scale * corner for corner in corners) for corners in (grid.lower, grid.upper))
+    lower, upper = (
+        tuple(scale * corner for corner in corners) for corners in (grid.lower, grid.upper)
+    )
     pose = torch.cat([camera.pose[:, :3], scale * camera.pose[:, 3:]], 1)
     half_width = camera.half_width if camera.is_perspective else scale * camera.half_width
-    large = volume_with(scene, grid=Grid(SHAPE, lower, upper), sigma_a=volume.sigma_a / scale, sigma_s=volume.sigma_s / scale)
+    large = volume_with(
+        scene,
+        grid=Grid(SHAPE, lower, upper),
+        sigma_a=volume.sigma_a / scale,
+        sigma_s=volume.sigma_s / scale,
+    )
     large = replace(large, views=[View("view", replace(camera, pose=pose, half_width=half_width))])
     torch.testing.assert_close(render(large), render(scene), rtol=1e-10, atol=0)
 
 
-def test_density_and_cross_sections_only_matter_as_a_product(make_scene, half_empty):
+def test_density_and_cross_sections_only_matter_as_a_product():
     scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
     volume = scene.volume
-    other = volume_with(scene, density=4 * volume.density, sigma_a=volume.sigma_a / 4, sigma_s=volume.sigma_s / 4)
+    other = volume_with(
+        scene, density=4 * volume.density, sigma_a=volume.sigma_a / 4, sigma_s=volume.sigma_s / 4
+    )
     torch.testing.assert_close(render(other), render(scene), rtol=1e-10, atol=0)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4])
-def test_a_mirrored_world_looks_mirrored(g: float, make_scene, make_camera, half_empty):
+def test_a_mirrored_world_looks_mirrored(g: float):
     """Volume, light and camera mirrored in x, the light along no axis."""
     density, grid = half_empty(*SHAPE), Grid(SHAPE, (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
-    image = render(make_scene(density, grid=grid, g=g, travel=(-0.7, -1.7, -1.5), camera=make_camera(eye=(0.2, 0.3, 2.5)), **BOTH))
+    image = render(
+        make_scene(
+            density,
+            grid=grid,
+            g=g,
+            travel=(-0.7, -1.7, -1.5),
+            camera=make_camera(eye=(0.2, 0.3, 2.5)),
+            **BOTH,
+        )
+    )
     camera = make_camera(eye=(-0.2, 0.3, 2.5))
-    mirrored = render(make_scene(density.flip(2), grid=grid, g=g, travel=(0.7, -1.7, -1.5), camera=camera, **BOTH))
+    mirrored = render(
+        make_scene(density.flip(2), grid=grid, g=g, travel=(0.7, -1.7, -1.5), camera=camera, **BOTH)
+    )
     torch.testing.assert_close(mirrored.flip(-1), image, rtol=1e-10, atol=0)
 
 
-def test_a_denser_absorber_is_darker(make_scene, half_empty):
+def test_a_denser_absorber_is_darker():
     density = half_empty(*SHAPE)
-    images = [render(make_scene(density, sigma_a=(sigma,), **BOTH))[0] for sigma in (0.0, 1.0, 10.0)]
+    images = [
+        render(make_scene(density, sigma_a=(sigma,), **BOTH))[0] for sigma in (0.0, 1.0, 10.0)
+    ]
     is_seen = render(make_scene(density, sigma_s=(0.0,), directional=None, ambient=(1.0,)))[0] < 1
     for clear, dark in pairwise(images):
-        assert bool((clear[is_seen] > dark[is_seen]).all()) and torch.equal(clear[~is_seen], dark[~is_seen])
+        assert bool((clear[is_seen] > dark[is_seen]).all()) and torch.equal(
+            clear[~is_seen], dark[~is_seen]
+        )
 
 
 # --- derivatives of whole images -------------------------------------------------------------------------------------
@@ -236,36 +335,56 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
     "forward, both, perspective": {"g": 0.4, **BOTH},
     "forward, both, camera inside": {"g": 0.4, "view": INSIDE, **BOTH},
     "backward, directional, orthographic": {"g": -0.5, "view": PARALLEL},
-    "backward, ambient, camera inside": {"g": -0.5, "directional": None, "ambient": (0.5,), "view": INSIDE},
+    "backward, ambient, camera inside": {
+        "g": -0.5,
+        "directional": None,
+        "ambient": (0.5,),
+        "view": INSIDE,
+    },
     "fields, both, perspective": {"has_fields": True, "g": 0.4, **BOTH},
     "fields, directional, orthographic": {"has_fields": True, "view": PARALLEL},
     "one cell along z": {"shape": (1, 4, 5), "g": 0.4, **BOTH},
     "one cell along y": {"shape": (4, 1, 5), "g": 0.4, **BOTH},
     "one cell along x": {"shape": (4, 5, 1), "g": -0.5, **BOTH},
     "empty": {"is_empty": True, "g": 0.4, **BOTH},
-    "gray": {"sigma_a": (0.5,), "sigma_s": (6.0,), "g": -0.5, "directional": (3.0,), "ambient": (0.5,)},
+    "gray": {
+        "sigma_a": (0.5,),
+        "sigma_s": (6.0,),
+        "g": -0.5,
+        "directional": (3.0,),
+        "ambient": (0.5,),
+    },
     "no model": {"model": "none", "g": 0.4, **BOTH},
 }
-each_configuration = pytest.mark.parametrize("configuration", CONFIGURATIONS.values(), ids=CONFIGURATIONS.keys())
+each_configuration = pytest.mark.parametrize(
+    "configuration", CONFIGURATIONS.values(), ids=CONFIGURATIONS.keys()
+)
 
 
 @pytest.fixture
-def build(make_scene, make_camera, half_empty, random) -> Callable[[dict[str, Any]], Scene]:
+def build() -> Callable[[dict[str, Any]], Scene]:
     def make(configuration: dict[str, Any]) -> Scene:
         options = dict(configuration)
         shape, view = options.pop("shape", SHAPE), options.pop("view", {})
         density = half_empty(*shape, seed=7) * (not options.pop("is_empty", False))
         if options.pop("has_fields", False):
-            options |= {"sigma_a": 2 * random(3, *shape, seed=8), "sigma_s": 8 * random(3, *shape, seed=9)}
+            options |= {
+                "sigma_a": 2 * random_values(3, *shape, seed=8),
+                "sigma_s": 8 * random_values(3, *shape, seed=9),
+            }
         return make_scene(density, camera=make_camera(size=(3, 4), **view), **options)
 
     return make
 
 
 def image_loss(scene: Scene, name: str) -> Callable[[Tensor], Tensor]:
-    """A random weighted sum of the image of `scene`, as a function of the volume's tensor called `name`."""
+    """A random weighted sum of the image of `scene`, as a function of the volume's tensor called
+    `name`.
+    """
     camera = scene.views[0].camera
-    weight = torch.randn(3, *camera.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weight = torch.randn(
+        3, *camera.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     return lambda value: (render(volume_with(scene, **{name: value}))[0] * weight).sum()
 
 
@@ -275,16 +394,24 @@ def gradient(loss: Callable[[Tensor], Tensor], value: Tensor) -> Tensor:
 
 
 def modes_error(scene: Scene, name: str) -> float:
-    """How far forward mode is from reverse mode, along a random direction, relative to the size of their terms."""
+    """How far forward mode is from reverse mode, along a random direction, relative to the size of
+    their terms.
+    """
     loss, value = image_loss(scene, name), getattr(scene.volume, name)
-    direction = torch.randn(value.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    direction = torch.randn(
+        value.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    )
     with forward_ad.dual_level():
-        tangent = forward_ad.unpack_dual(loss(forward_ad.make_dual(value.detach().clone(), direction))).tangent
+        tangent = forward_ad.unpack_dual(
+            loss(forward_ad.make_dual(value.detach().clone(), direction))
+        ).tangent
     terms = gradient(loss, value) * direction
     return float((tangent - terms.sum()).abs() / terms.abs().sum())
 
 
-def central_difference(loss: Callable[[Tensor], Tensor], value: Tensor, index: int, step: float = 1e-4) -> float:
+def central_difference(
+    loss: Callable[[Tensor], Tensor], value: Tensor, index: int, step: float = 1e-4
+) -> float:
     """The derivative by the entry `index`."""
 
     def at(shift: float) -> float:
@@ -303,7 +430,12 @@ def test_tangent_and_adjoint_of_an_image_agree(configuration: dict[str, Any], bu
 
 @pytest.mark.parametrize("name", ["sigma_a", "sigma_s", "g"])
 @pytest.mark.parametrize(
-    "configuration", ["forward, both, perspective", "backward, directional, orthographic", "fields, both, perspective"]
+    "configuration",
+    [
+        "forward, both, perspective",
+        "backward, directional, orthographic",
+        "fields, both, perspective",
+    ],
 )
 def test_tangent_and_adjoint_agree_for_every_parameter(name: str, configuration: str, build):
     assert modes_error(build(CONFIGURATIONS[configuration]), name) < 1e-10
@@ -323,14 +455,18 @@ def test_gradients_of_an_image_agree_with_differences(configuration: dict[str, A
 
 
 @pytest.mark.parametrize("name", ["sigma_a", "sigma_s", "g"])
-@pytest.mark.parametrize("configuration", ["forward, both, perspective", "fields, both, perspective"])
+@pytest.mark.parametrize(
+    "configuration", ["forward, both, perspective", "fields, both, perspective"]
+)
 def test_gradients_by_other_parameters_agree_with_differences(name: str, configuration: str, build):
     scene = build(CONFIGURATIONS[configuration])
     loss, value = image_loss(scene, name), getattr(scene.volume, name)
     slopes = gradient(loss, value).flatten()
     for index in {0, value.numel() - 1}:
         expected = central_difference(loss, value, index)
-        assert slopes[index].item() == pytest.approx(expected, rel=1e-6, abs=1e-8 * float(slopes.abs().max()))
+        assert slopes[index].item() == pytest.approx(
+            expected, rel=1e-6, abs=1e-8 * float(slopes.abs().max())
+        )
 
 
 def test_the_derivative_by_g_is_that_of_both_modes_at_zero(build):
@@ -341,6 +477,8 @@ def test_the_derivative_by_g_is_that_of_both_modes_at_zero(build):
 def test_gradients_do_not_depend_on_warm_starts(build):
     scene, memory = build(CONFIGURATIONS["forward, both, perspective"]), SolveMemory()
     density = scene.volume.density.requires_grad_()
-    first, second = (torch.autograd.grad(render(scene, memory=memory).sum(), density)[0] for _ in range(2))
+    first, second = (
+        torch.autograd.grad(render(scene, memory=memory).sum(), density)[0] for _ in range(2)
+    )
     torch.testing.assert_close(second, first, rtol=1e-9, atol=1e-12)
     assert [record.kind for record in memory.records] == ["forward", "adjoint"] * 2

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
+from media import make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.renderer import render
-from ddrecon.turntable import turned, turntable, upright_axis
-from ddrecon.world import Scene
+from ddrecon.turntable import place_turntable, turn_camera, upright_axis
 
 CENTER = (0.1, -0.2, 0.3)
 
@@ -26,41 +24,58 @@ def looking(origin: tuple[float, float, float], up: tuple[float, float, float]) 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_turn_is_rigid_about_the_line_through_the_center(axis: int) -> None:
     camera, angle = looking((2.0, 1.0, -1.5), (0.3, 0.8, 0.5)), 0.7
-    moved = turned(camera, axis, angle, CENTER)
+    moved = turn_camera(camera, axis, angle, CENTER)
     change = moved.pose[:, :3] @ camera.pose[:, :3].T
-    middle, along = torch.tensor(CENTER, dtype=torch.float64), torch.eye(3, dtype=torch.float64)[axis]
+    middle, along = (
+        torch.tensor(CENTER, dtype=torch.float64),
+        torch.eye(3, dtype=torch.float64)[axis],
+    )
     assert torch.allclose(change @ change.T, torch.eye(3, dtype=torch.float64), atol=1e-14)
-    assert torch.allclose(change @ along, along, atol=1e-14) and float(change.trace()) == pytest.approx(1 + 2 * math.cos(angle))
-    assert torch.allclose(moved.pose[:, 3] - middle, change @ (camera.pose[:, 3] - middle), atol=1e-14)
+    assert torch.allclose(change @ along, along, atol=1e-14) and float(
+        change.trace()
+    ) == pytest.approx(1 + 2 * math.cos(angle))
+    assert torch.allclose(
+        moved.pose[:, 3] - middle, change @ (camera.pose[:, 3] - middle), atol=1e-14
+    )
 
 
 def test_a_quarter_turn_about_y_takes_z_to_x() -> None:
     camera = looking((CENTER[0], CENTER[1], CENTER[2] + 2), (0, 1, 0))
     expected = looking((CENTER[0] + 2, CENTER[1], CENTER[2]), (0, 1, 0))
-    assert torch.allclose(turned(camera, 1, math.pi / 2, CENTER).pose, expected.pose, atol=1e-14)
+    assert torch.allclose(
+        turn_camera(camera, 1, math.pi / 2, CENTER).pose, expected.pose, atol=1e-14
+    )
 
 
-@pytest.mark.parametrize(("up", "axis"), [((1.0, 0.1, 0), 0), ((0, 1.0, 0.2), 1), ((0.2, 0, -1.0), 2)])
-def test_the_upright_axis_is_the_one_the_cameras_agree_on(up: tuple[float, float, float], axis: int) -> None:
+@pytest.mark.parametrize(
+    ("up", "axis"), [((1.0, 0.1, 0), 0), ((0, 1.0, 0.2), 1), ((0.2, 0, -1.0), 2)]
+)
+def test_the_upright_axis_is_the_one_the_cameras_agree_on(
+    up: tuple[float, float, float], axis: int
+) -> None:
     origins = [(3.0, 0.4, 2.0), (-2.0, 0.3, 3.0), (-2.5, 3.0, -2.0)]
     assert upright_axis([looking(origin, up) for origin in origins]) == axis
 
 
-def test_a_ring_begins_at_its_view_and_goes_once_around(make_scene: Callable[..., Scene], random: Callable[..., Tensor]) -> None:
-    scene = make_scene(random(4, 5, 6))
-    views = turntable(scene, scene.views[0], 8)
+def test_a_ring_begins_at_its_view_and_goes_once_around() -> None:
+    scene = make_scene(random_values(4, 5, 6))
+    views = place_turntable(scene, scene.views[0], 8)
     assert [view.name for view in views] == [f"ring_{index:03d}" for index in range(8)]
     assert torch.allclose(views[0].camera.pose, scene.views[0].camera.pose, atol=1e-15)
     center, axis = scene.volume.grid.center_xyz, upright_axis([view.camera for view in scene.views])
-    assert torch.allclose(turned(views[7].camera, axis, math.pi / 4, center).pose, views[0].camera.pose, atol=1e-14)
+    assert torch.allclose(
+        turn_camera(views[7].camera, axis, math.pi / 4, center).pose,
+        views[0].camera.pose,
+        atol=1e-14,
+    )
 
 
-def test_a_volume_turned_by_a_quarter_looks_the_same_to_a_camera_turned_with_it(
-    make_scene: Callable[..., Scene], random: Callable[..., Tensor]
-) -> None:
-    density, grid = random(5, 4, 5), Grid((5, 4, 5), (-0.3, -0.6, -0.5), (0.7, 0.4, 0.5))
+def test_a_volume_turned_by_a_quarter_looks_the_same_to_a_camera_turned_with_it() -> None:
+    density, grid = random_values(5, 4, 5), Grid((5, 4, 5), (-0.3, -0.6, -0.5), (0.7, 0.4, 0.5))
     scene = make_scene(density, grid=grid, directional=None, ambient=(1.0,))
-    turned_density = density.transpose(0, 2).flip(0).contiguous()  # what was along z is along x, what was along x along -z
+    turned_density = (
+        density.transpose(0, 2).flip(0).contiguous()
+    )  # what was along z is along x, what was along x along -z
     other = make_scene(turned_density, grid=grid, directional=None, ambient=(1.0,))
-    other.views = turntable(scene, scene.views[0], 4)
+    other.views = place_turntable(scene, scene.views[0], 4)
     assert torch.allclose(render(scene), render(other, "ring_001"), atol=1e-9)

@@ -1,6 +1,8 @@
-"""Time and error of each variant: its image and the gradient of the image's mean by density, in turns with all others.
+"""Time and error of each variant: its image and the gradient of the image's mean by density, in
+turns with all others.
 
-The numerical error is against the same model solved exactly, in double precision; the whole error is against path tracing.
+The numerical error is against the same model solved exactly, in double precision; the whole error
+is against path tracing.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from ddrecon.bench.variants import Variant, exactly, model_of
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.renderer import render_each
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 BLOCK = 4
 """Gradients are compared as sums over blocks of so many cells along each side."""
@@ -29,10 +31,11 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 @dataclass(frozen=True)
 class Shot:
-    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density, summed over blocks [z, y, x].
+    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density,
+    summed over blocks [z, y, x].
 
-    `by_amount` is the gradient times density, summed likewise: what changes as all density there grows by a factor. Empty cells, which path
-    tracers do not see, have no part in it.
+    `by_amount` is the gradient times density, summed likewise: what changes as all density there
+    grows by a factor. Empty cells, which path tracers do not see, have no part in it.
     """
 
     image: Tensor
@@ -45,19 +48,29 @@ class Shot:
 
 @dataclass
 class Timing:
-    """The shots of one variant; `seconds` are of the image, and of image and gradient together, medians over the turns."""
+    """The shots of one variant; `seconds` are of the image, and of image and gradient together,
+    medians over the turns.
+    """
 
     shots: list[Shot] = field(default_factory=list)
 
     @property
     def seconds(self) -> tuple[float, float]:
         """Median seconds of an image, and of an image with its gradient."""
-        image, both = zip(*((shot.image_seconds, shot.image_seconds + shot.gradient_seconds) for shot in self.shots), strict=True)
+        image, both = zip(
+            *(
+                (shot.image_seconds, shot.image_seconds + shot.gradient_seconds)
+                for shot in self.shots
+            ),
+            strict=True,
+        )
         return statistics.median(image), statistics.median(both)
 
 
 def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
-    """Renders the first view of `scene` from nothing, and differentiates the mean of its image; gradients are summed to `blocks`."""
+    """Renders the first view of `scene` from nothing, and differentiates the mean of its image;
+    gradients are summed to `blocks`.
+    """
     density = scene.volume.density
     scene.volume.density = density.detach().clone().requires_grad_()
     memory = SolveMemory()
@@ -72,15 +85,20 @@ def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
     return Shot(image.detach(), *sums, middle - start, end - middle, iterations)
 
 
-def measure(contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress) -> dict[str, Timing]:
-    """By name, the timings of all `contestants` that can be solved, each once in every turn, so that what else runs slows all alike.
+def measure(
+    contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress
+) -> dict[str, Timing]:
+    """By name, the timings of all `contestants` that can be solved, each once in every turn, so
+    that what else runs slows all alike.
 
     One is run once before, uncounted: the first work of a process takes longer.
     """
     timings = {name: Timing() for name in contestants}
     with suppress(SolveError):
         next(iter(contestants.values()))()
-    for turn, name in progress([(turn, name) for turn in range(turns) for name in contestants], "bench"):
+    for turn, name in progress(
+        [(turn, name) for turn in range(turns) for name in contestants], "bench"
+    ):
         if turn == len(timings[name].shots):
             with suppress(SolveError):
                 timings[name].shots.append(contestants[name]())
@@ -88,7 +106,9 @@ def measure(contestants: Mapping[str, Callable[[], Shot]], turns: int, progress:
 
 
 def exact_shots(variants: Sequence[Variant], scene: Scene, progress: Progress) -> dict[str, Shot]:
-    """By name, what each variant of `scene` (in double precision) comes to when solved exactly; alike models are solved once."""
+    """By name, what each variant of `scene` (in double precision) comes to when solved exactly;
+    alike models are solved once.
+    """
     blocks, known = blocks_of(scene), dict[tuple[object, ...], Shot]()
     for variant in progress(variants, "exact solutions"):
         changed = variant.change(scene)
@@ -105,16 +125,23 @@ def blocks_of(scene: Scene) -> tuple[int, int, int]:
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
     """Relative RMS error."""
-    return float((found.double() - expected.double()).norm() / expected.double().norm().clamp(min=torch.finfo(torch.float64).tiny))
+    return float(
+        (found.double() - expected.double()).norm()
+        / expected.double().norm().clamp(min=torch.finfo(torch.float64).tiny)
+    )
 
 
 def correlation(one: Tensor, other: Tensor) -> float:
     """Pearson's correlation of two arrays of the same shape."""
-    return float(torch.corrcoef(torch.stack([one.flatten().double(), other.flatten().double()]))[0, 1])
+    return float(
+        torch.corrcoef(torch.stack([one.flatten().double(), other.flatten().double()]))[0, 1]
+    )
 
 
 def block_sums(gradient: Tensor, blocks: tuple[int, int, int]) -> Tensor:
-    """`gradient` [z, y, x] summed over `blocks`, whatever its own grid: the effect of scaling density there."""
+    """`gradient` [z, y, x] summed over `blocks`, whatever its own grid: the effect of scaling
+    density there.
+    """
     mean = adaptive_avg_pool3d(gradient[None], blocks)[0]
     return mean * (gradient.numel() / mean.numel())
 

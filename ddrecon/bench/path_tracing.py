@@ -1,7 +1,9 @@
-"""The same scene by Mitsuba 3 (extra `reference`): the truth that errors are measured against, and a contestant at several sample counts.
+"""The same scene by Mitsuba 3 (extra `reference`): the truth that errors are measured against, and
+a contestant at several sample counts.
 
-Gradients are those of path replay backpropagation (Vicini, Speierer and Jakob 2021, doi:10.1145/3450626.3459804), which needs the variant
-`llvm_ad_rgb`, and a medium of constant and gray cross sections.
+Gradients are those of path replay backpropagation (Vicini, Speierer and Jakob 2021,
+doi:10.1145/3450626.3459804), which needs the variant `llvm_ad_rgb`, and a medium of constant and
+gray cross sections.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from torch import Tensor
 from ddrecon.bench.measure import Shot, block_sums, blocks_of
 from ddrecon.reference.mitsuba_scene import LONGEST
 from ddrecon.reference.trace import Traced, Tracer, open_tracer
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 DENSITY = ".sigma_t.data"
 """How the name of the density ends among Mitsuba's parameters."""
@@ -27,7 +29,9 @@ TRUTH_SEED = 1000
 
 @dataclass(frozen=True)
 class Truth:
-    """Path tracing: `image` [3, h, w] and `by_amount` [z, y, x] as of a `Shot`; None where there is no path replay."""
+    """Path tracing: `image` [3, h, w] and `by_amount` [z, y, x] as of a `Shot`; None where there is
+    no path replay.
+    """
 
     image: Traced
     by_amount: Traced | None = None
@@ -42,16 +46,29 @@ class PathTracer:
     def __init__(self, scene: Scene, has_gradient: bool):
         self.scene, self.blocks = scene, blocks_of(scene)
         self.tracer = open_tracer(scene, scene.views[:1], threads=torch.get_num_threads())
-        self.replay = _replay(self.tracer, scene) if has_gradient and _has_replay(self.tracer, scene) else None
+        self.replay = (
+            _replay(self.tracer, scene)
+            if has_gradient and _has_replay(self.tracer, scene)
+            else None
+        )
 
     def shoot(self, samples: int, seed: int = 0) -> Shot:
-        """An image by so many paths a pixel, and its gradient; without path replay a gradient of zeros that took no time."""
+        """An image by so many paths a pixel, and its gradient; without path replay a gradient of
+        zeros that took no time.
+        """
         start = perf_counter()
         image = torch.from_numpy(self.tracer.trace(0, seed, samples)).movedim(-1, 0)
         middle = perf_counter()
-        gradient = torch.zeros(self.scene.volume.grid.shape) if self.replay is None else self.replay(samples, seed)
+        gradient = (
+            torch.zeros(self.scene.volume.grid.shape)
+            if self.replay is None
+            else self.replay(samples, seed)
+        )
         end = perf_counter()
-        sums = block_sums(gradient, self.blocks), block_sums(gradient * self.scene.volume.density.detach().cpu(), self.blocks)
+        sums = (
+            block_sums(gradient, self.blocks),
+            block_sums(gradient * self.scene.volume.density.detach().cpu(), self.blocks),
+        )
         return Shot(image, *sums, middle - start, end - middle, samples)
 
     def truth(self, samples: int, passes: int) -> Truth:
@@ -69,18 +86,24 @@ def _has_replay(tracer: Tracer, scene: Scene) -> bool:
 
 
 def _replay(tracer: Tracer, scene: Scene) -> Callable[[int, int], Tensor]:
-    """What makes the gradient [z, y, x] of the image's mean by density, from paths a pixel and seed."""
+    """What makes the gradient [z, y, x] of the image's mean by density, from paths a pixel and
+    seed.
+    """
     import drjit
 
     (loaded,) = tracer.scenes
-    integrator = tracer.module.load_dict({"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST})
+    integrator = tracer.module.load_dict(
+        {"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST}
+    )
     parameters = tracer.module.traverse(loaded)
     (name,) = (key for key in parameters.keys() if key.endswith(DENSITY))  # noqa: SIM118 - Mitsuba's own mapping
 
     def gradient(samples: int, seed: int) -> Tensor:
         drjit.enable_grad(parameters[name])
         parameters.update()
-        image = tracer.module.render(loaded, parameters, integrator=integrator, sensor=0, seed=seed, spp=samples)
+        image = tracer.module.render(
+            loaded, parameters, integrator=integrator, sensor=0, seed=seed, spp=samples
+        )
         drjit.backward(drjit.mean(image, axis=None))
         found = np.array(drjit.grad(parameters[name]), np.float32).reshape(scene.volume.grid.shape)
         drjit.disable_grad(parameters[name])

@@ -15,7 +15,8 @@ FLOOR = 1e-8
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Writes a PNG: the time of an image against its error, and of an image with its gradient against the gradient's numerical error.
+    """Writes a PNG: the time of an image against its error, and of an image with its gradient
+    against the gradient's numerical error.
 
     Raises MissingExtraError where matplotlib is not installed.
     """
@@ -23,17 +24,33 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
-    truth = "path tracing" if any(row.image_error is not None for row in rows) else "the same model solved exactly"
+    truth = (
+        "path tracing"
+        if any(row.image_error is not None for row in rows)
+        else "the same model solved exactly"
+    )
     kinds = list(dict.fromkeys(_kind(row) for row in rows))
-    dots = [Dot(index + 1, row.name, f"C{kinds.index(_kind(row)) % 10}") for index, row in enumerate(rows)]
-    _scatter(left, [(dot, row.image_seconds, error_of(row)) for dot, row in zip(dots, rows, strict=True)])
-    gradients = [(dot, row.both_seconds, row.gradient_numerical) for dot, row in zip(dots, rows, strict=True)]
-    _scatter(right, [(dot, seconds, error) for dot, seconds, error in gradients if error is not None])
+    dots = [
+        Dot(index + 1, row.name, f"C{kinds.index(_kind(row)) % 10}")
+        for index, row in enumerate(rows)
+    ]
+    _scatter(
+        left, [(dot, row.image_seconds, error_of(row)) for dot, row in zip(dots, rows, strict=True)]
+    )
+    gradients = [
+        (dot, row.both_seconds, row.gradient_numerical) for dot, row in zip(dots, rows, strict=True)
+    ]
+    _scatter(
+        right, [(dot, seconds, error) for dot, seconds, error in gradients if error is not None]
+    )
     front = sorted((row.image_seconds, max(error_of(row), FLOOR)) for row in rows if row.is_best)
     left.step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
-    left.set(xlabel="seconds of an image", ylabel=f"relative RMS error of the image, against {truth}")
+    left.set(
+        xlabel="seconds of an image", ylabel=f"relative RMS error of the image, against {truth}"
+    )
     right.set(
-        xlabel="seconds of an image and its gradient", ylabel="relative RMS error of the gradient, against the same model solved exactly"
+        xlabel="seconds of an image and its gradient",
+        ylabel="relative RMS error of the gradient, against the same model solved exactly",
     )
     names = [f"{dot.number}  {dot.name}" for dot in dots]
     handles = [plt.Line2D([], [], color=dot.color, marker="o", linestyle="") for dot in dots]
@@ -52,12 +69,22 @@ class Dot:
 
 
 def _scatter(axis: Any, points: Sequence[tuple[Dot, float, float]]) -> None:
-    """Draws dots at (seconds, error); numbers go around them in turn, so that those of close dots stay apart."""
+    """Draws dots at (seconds, error); numbers go around them in turn, so that those of close dots
+    stay apart.
+    """
     for index, (dot, x, y) in enumerate(sorted(points, key=lambda point: point[1])):
         height = max(y, FLOOR)
         axis.scatter([x], [height], color=dot.color, s=36, zorder=3)
         place = ((0, 9), (0, -9), (0, 18), (0, -18))[index % 4]
-        axis.annotate(str(dot.number), (x, height), xytext=place, textcoords="offset points", fontsize=8, ha="center", va="center")
+        axis.annotate(
+            str(dot.number),
+            (x, height),
+            xytext=place,
+            textcoords="offset points",
+            fontsize=8,
+            ha="center",
+            va="center",
+        )
     axis.set(xscale="log", yscale="log")
     axis.margins(0.08)
     axis.grid(which="major", alpha=0.3)

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
-from ddrecon.lights import DirectionalLight
-from ddrecon.medium import Volume
-from ddrecon.world import Scene, View
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
 
 SIGMA_T, ALBEDO = 30.0, 0.95
 """About 8 optical depths across the plume where it is densest."""
@@ -23,18 +23,34 @@ def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.devic
     z, y, x = grid.centers(torch.zeros(()))
     density = _plume(x, y / 1.5, z).expand(grid.shape).contiguous().to(device, dtype)
     tensor = density.new_tensor
-    volume = Volume(grid, density, tensor([SIGMA_T * (1 - ALBEDO)]), tensor([SIGMA_T * ALBEDO]), tensor(0.0))
+    volume = Volume(
+        grid, density, tensor([SIGMA_T * (1 - ALBEDO)]), tensor([SIGMA_T * ALBEDO]), tensor(0.0)
+    )
     pose = look_at(tensor([0.0, 0.3, 3.2]), tensor([0.0, 0.0, 0.0]), tensor([0.0, 1.0, 0.0]))
     camera = Camera(pose, (pixels, pixels), math.tan(math.radians(15)))
-    return Scene(volume, [DirectionalLight(tensor([-2.0, -1.2, -0.5]), tensor([math.pi]))], [View("front", camera)])
+    return Scene(
+        volume,
+        [DirectionalLight(tensor([-2.0, -1.2, -0.5]), tensor([math.pi]))],
+        [View("front", camera)],
+    )
 
 
 def _plume(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Density at places from -0.5 to 0.5: a rising, widening, swaying and ragged column, denser below."""
+    """Density at places from -0.5 to 0.5: a rising, widening, swaying and ragged column, denser
+    below.
+    """
     rise = y + 0.5
-    across = ((x - 0.1 * rise * torch.sin(7 * rise)) ** 2 + (z - 0.1 * rise * torch.cos(6 * rise)) ** 2).sqrt()
-    ragged = 0.05 * torch.sin(23 * x + 11 * y) * torch.sin(19 * y + 5 * z) * torch.sin(21 * z - 9 * x)
-    return _fade(across + ragged, 0.12 + 0.2 * rise, 0.1) * _fade(y.abs(), torch.tensor(0.46), 0.08) * (1 - 0.6 * rise)
+    across = (
+        (x - 0.1 * rise * torch.sin(7 * rise)) ** 2 + (z - 0.1 * rise * torch.cos(6 * rise)) ** 2
+    ).sqrt()
+    ragged = (
+        0.05 * torch.sin(23 * x + 11 * y) * torch.sin(19 * y + 5 * z) * torch.sin(21 * z - 9 * x)
+    )
+    return (
+        _fade(across + ragged, 0.12 + 0.2 * rise, 0.1)
+        * _fade(y.abs(), torch.tensor(0.46), 0.08)
+        * (1 - 0.6 * rise)
+    )
 
 
 def _fade(distance: Tensor, outer: Tensor, width: float) -> Tensor:

@@ -18,11 +18,14 @@ from ddrecon.report.page import paragraph, picture, section, write_page
 
 @dataclass(frozen=True)
 class Row:
-    """One variant, or path tracing. Seconds are medians, `both_seconds` of image and gradient; errors are relative RMS.
+    """One variant, or path tracing. Seconds are medians, `both_seconds` of image and gradient;
+    errors are relative RMS.
 
-    `image_numerical` and `gradient_numerical` are against the same model solved exactly; `image_error` is against path tracing, its noise
-    subtracted in quadrature, `gradient_correlation` with path replay's gradient times density. None where there is nothing to compare with.
-    `iterations` are the first solve's, or samples a pixel. `is_best`: no other row is faster and closer to the truth.
+    `image_numerical` and `gradient_numerical` are against the same model solved exactly;
+    `image_error` is against path tracing, its noise subtracted in quadrature,
+    `gradient_correlation` with path replay's gradient times density. None where there is nothing to
+    compare with. `iterations` are the first solve's, or samples a pixel. `is_best`: no other row is
+    faster and closer to the truth.
     """
 
     name: str
@@ -36,35 +39,56 @@ class Row:
     is_best: bool = False
 
 
-def rows_of(timings: Mapping[str, Timing], exact: Mapping[str, Shot], truth: Truth | None) -> list[Row]:
-    """A row for every contestant that was measured; `exact` are the exact solutions of those that have one."""
-    return with_best([_row(name, timing, exact.get(name), truth) for name, timing in timings.items()])
+def rows_of(
+    timings: Mapping[str, Timing], exact: Mapping[str, Shot], truth: Truth | None
+) -> list[Row]:
+    """A row for every contestant that was measured; `exact` are the exact solutions of those that
+    have one.
+    """
+    return with_best(
+        [_row(name, timing, exact.get(name), truth) for name, timing in timings.items()]
+    )
 
 
 def with_best(rows: Sequence[Row]) -> list[Row]:
     """The same rows, those marked that no other beats in both time of an image and error."""
 
     def is_beaten(row: Row) -> bool:
-        return any(other.image_seconds < row.image_seconds and error_of(other) < error_of(row) for other in rows)
+        return any(
+            other.image_seconds < row.image_seconds and error_of(other) < error_of(row)
+            for other in rows
+        )
 
     return [replace(row, is_best=not is_beaten(row)) for row in rows]
 
 
 def error_of(row: Row) -> float:
-    """Against path tracing, or where there is none against the exact solution; infinite without either."""
-    return next((error for error in (row.image_error, row.image_numerical) if error is not None), math.inf)
+    """Against path tracing, or where there is none against the exact solution; infinite without
+    either.
+    """
+    return next(
+        (error for error in (row.image_error, row.image_numerical) if error is not None), math.inf
+    )
 
 
 def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> Row:
     shot = timing.shots[0]
     row = Row(name, *timing.seconds, shot.iterations)
     if exact is not None:
-        errors = relative_error(shot.image, exact.image), relative_error(shot.gradient, exact.gradient)
+        errors = (
+            relative_error(shot.image, exact.image),
+            relative_error(shot.gradient, exact.gradient),
+        )
         row = replace(row, image_numerical=errors[0], gradient_numerical=errors[1])
     if truth is not None:
         row = replace(row, image_error=truth.image.error(shot.image.numpy()))
         if truth.by_amount is not None:
-            row = replace(row, gradient_correlation=correlation(shot.by_amount, torch.from_numpy(truth.by_amount.image)))
+            row = replace(
+                row,
+                gradient_correlation=correlation(
+                    shot.by_amount, torch.from_numpy(truth.by_amount.image)
+                ),
+            )
     return row
 
 
@@ -89,9 +113,20 @@ def cells(rows: Sequence[Row]) -> list[list[str]]:
 
 
 def _cells(row: Row, base: Row) -> list[str]:
-    times = [f"{row.image_seconds:.3f}", f"{row.both_seconds:.3f}", f"{row.both_seconds / base.both_seconds:.2f}", str(row.iterations)]
-    numerical = ["" if value is None else f"{value:.1e}" for value in (row.image_numerical, row.gradient_numerical)]
-    traced = ["" if value is None else f"{value:.3f}" for value in (row.image_error, row.gradient_correlation)]
+    times = [
+        f"{row.image_seconds:.3f}",
+        f"{row.both_seconds:.3f}",
+        f"{row.both_seconds / base.both_seconds:.2f}",
+        str(row.iterations),
+    ]
+    numerical = [
+        "" if value is None else f"{value:.1e}"
+        for value in (row.image_numerical, row.gradient_numerical)
+    ]
+    traced = [
+        "" if value is None else f"{value:.3f}"
+        for value in (row.image_error, row.gradient_correlation)
+    ]
     return [row.name, *times, *numerical, *traced, "best" if row.is_best else ""]
 
 
@@ -100,13 +135,38 @@ def table(rows: Sequence[Row]) -> list[str]:
     return [f"| {' | '.join(line)} |" for line in (HEAD, ["---"] * len(HEAD), *cells(rows))]
 
 
-def write_report(path: Path, rows: Sequence[Row], remarks: Sequence[str], plot: bytes | None, environment: Mapping[str, Any]) -> None:
-    """Writes the rows, `remarks` on them, the `plot` (a PNG) where there is one, and the versions as a page."""
-    drawn = [section("Error against time", picture(plot, "numbers are those of the legend; the line joins the best", 1080))] if plot else []
-    versions = [(key, " ".join(map(str, value)) if isinstance(value, list) else value) for key, value in environment.items()]
+def write_bench_report(
+    path: Path,
+    rows: Sequence[Row],
+    remarks: Sequence[str],
+    plot: bytes | None,
+    environment: Mapping[str, Any],
+) -> None:
+    """Writes the rows, `remarks` on them, the `plot` (a PNG) where there is one, and the versions
+    as a page.
+    """
+    drawn = (
+        [
+            section(
+                "Error against time",
+                picture(plot, "numbers are those of the legend; the line joins the best", 1080),
+            )
+        ]
+        if plot
+        else []
+    )
+    versions = [
+        (key, " ".join(map(str, value)) if isinstance(value, list) else value)
+        for key, value in environment.items()
+    ]
     sections = [
         *drawn,
         section("Variants", page.table(HEAD, cells(rows)), *map(paragraph, remarks)),
         section("Versions", page.table(["", ""], versions)),
     ]
-    write_page(path, "ddrecon bench", "Speed against error: medians of whole renders, in one run.", sections)
+    write_page(
+        path,
+        "ddrecon bench",
+        "Speed against error: medians of whole renders, in one run.",
+        sections,
+    )

@@ -15,26 +15,34 @@ from ddrecon.bench.measure import Progress, blocks_of, exact_shots, measure, sho
 from ddrecon.bench.path_tracing import PathTracer, Truth
 from ddrecon.bench.plot import draw
 from ddrecon.bench.plume import plume_scene
-from ddrecon.bench.report import Row, rows_of, table, write_report
+from ddrecon.bench.report import Row, rows_of, table, write_bench_report
 from ddrecon.bench.variants import QUICK, Sweep, variants_of
+from ddrecon.cli.session import Session
 from ddrecon.errors import MissingExtraError, SceneError
-from ddrecon.io.json_file import write_json
-from ddrecon.reconstruct.levels import at_level
-from ddrecon.session import Session
+from ddrecon.io.files.json_file import write_json
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.scene import Scene
 from ddrecon.validate import hard
-from ddrecon.world import Scene
 
 TURNS = 2
 PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
-"""Paths a pixel that Mitsuba is tried with; the truth is the mean of `TRUTH_PASSES` of the most, by other paths."""
+"""Paths a pixel that Mitsuba is tried with; the truth is the mean of `TRUTH_PASSES` of the most, by
+other paths.
+"""
 TRUTH_PASSES = 4
 QUICK_CELLS = 60_000
 """A quick bench is of a scene made coarser until it has no more cells than this."""
 
 
-def bench_speed(session: Session, path: Path | None, is_quick: bool, output: Path | None, report: Path | None) -> bool:
-    """Measures the scene at `path`, or the plume; prints the table, writes what was asked for, and has passed."""
-    scene, double = (_scene(session, path, dtype, is_quick) for dtype in (torch.float32, torch.float64))
+def bench_speed(
+    session: Session, path: Path | None, is_quick: bool, output: Path | None, report: Path | None
+) -> bool:
+    """Measures the scene at `path`, or the plume; prints the table, writes what was asked for, and
+    has passed.
+    """
+    scene, double = (
+        _scene(session, path, dtype, is_quick) for dtype in (torch.float32, torch.float64)
+    )
     scene, double = (replace(item, views=item.views[:1]) for item in (scene, double))
     tracer = _tracer(scene, has_gradient=not is_quick)
     rows, truth = run_bench(scene, double, tracer, is_quick, session.progress)
@@ -43,9 +51,15 @@ def bench_speed(session: Session, path: Path | None, is_quick: bool, output: Pat
     click.echo("\n".join([*table(rows), *remarks]))
     if output is not None:
         write_json(output / "bench.json", found)
-        click.echo(_drawn(rows, output))
+        click.echo(_draw(rows, output))
         plot = output / "bench.png"
-        write_report(output / "report.html", rows, remarks, plot.read_bytes() if plot.is_file() else None, session.environment())
+        write_bench_report(
+            output / "report.html",
+            rows,
+            remarks,
+            plot.read_bytes() if plot.is_file() else None,
+            session.environment(),
+        )
     if report is not None:
         write_json(report, found)
     return True
@@ -73,30 +87,47 @@ def quick(scene: Scene) -> Scene:
     factor = 1
     while scene.volume.grid.cells / factor**3 > QUICK_CELLS:
         factor += 1
-    return at_level(scene, factor)
+    return scene_at_level(scene, factor)
 
 
-def run_bench(scene: Scene, double: Scene, tracer: PathTracer | None, is_quick: bool, progress: Progress) -> tuple[list[Row], Truth | None]:
-    """A row for every variant of `scene` and for path tracing, and the truth; `double` is `scene` in double precision."""
+def run_bench(
+    scene: Scene, double: Scene, tracer: PathTracer | None, is_quick: bool, progress: Progress
+) -> tuple[list[Row], Truth | None]:
+    """A row for every variant of `scene` and for path tracing, and the truth; `double` is `scene`
+    in double precision.
+    """
     variants = variants_of(scene, QUICK if is_quick else Sweep())
     exact = exact_shots(variants, double, progress)
-    contestants = {variant.name: functools.partial(shoot, variant.change(scene), blocks_of(scene)) for variant in variants}
+    contestants = {
+        variant.name: functools.partial(shoot, variant.change(scene), blocks_of(scene))
+        for variant in variants
+    }
     paths = QUICK_PATHS if is_quick else PATHS
     truth = tracer.truth(paths[-1], TRUTH_PASSES) if tracer is not None else None
     if tracer is not None:
-        contestants |= {f"Mitsuba {samples} paths a pixel": functools.partial(tracer.shoot, samples) for samples in paths}
+        contestants |= {
+            f"Mitsuba {samples} paths a pixel": functools.partial(tracer.shoot, samples)
+            for samples in paths
+        }
     return rows_of(measure(contestants, 1 if is_quick else TURNS, progress), exact, truth), truth
 
 
 def against_path_tracing(rows: Sequence[Row]) -> list[str]:
-    """How long path tracing takes to the error of the base, since its own falls with the square root of time; none without it."""
-    base, traced = rows[0], [row for row in rows if row.name.startswith("Mitsuba") and row.image_error]
+    """How long path tracing takes to the error of the base, since its own falls with the square
+    root of time; none without it.
+    """
+    base, traced = (
+        rows[0],
+        [row for row in rows if row.name.startswith("Mitsuba") and row.image_error],
+    )
     if not traced or not base.image_error:
         return []
     last = traced[-1]
     seconds = last.image_seconds * ((last.image_error or 0.0) / base.image_error) ** 2
     times = seconds / base.image_seconds
-    lines = [f"Mitsuba reaches base's image error, {base.image_error:.3f}, in {seconds:.1f} s: {times:.0f} times its time"]
+    lines = [
+        f"Mitsuba reaches base's image error, {base.image_error:.3f}, in {seconds:.1f} s: {times:.0f} times its time"
+    ]
     if last.gradient_correlation is not None:
         ratio = last.both_seconds / base.both_seconds
         lines.append(
@@ -106,7 +137,7 @@ def against_path_tracing(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _drawn(rows: Sequence[Row], folder: Path) -> str:
+def _draw(rows: Sequence[Row], folder: Path) -> str:
     """Draws bench.png into `folder` where matplotlib is installed; what to tell the user."""
     try:
         draw(rows, folder / "bench.png")
@@ -115,14 +146,24 @@ def _drawn(rows: Sequence[Row], folder: Path) -> str:
     return f"written to {folder}"
 
 
-def describe(rows: Sequence[Row], truth: Truth | None, scene: Scene, environment: dict[str, Any]) -> dict[str, Any]:
+def describe(
+    rows: Sequence[Row], truth: Truth | None, scene: Scene, environment: dict[str, Any]
+) -> dict[str, Any]:
     """The bench as plain values."""
     height, width = scene.views[0].camera.size
     size = {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]}
     noise = None
     if truth is not None:
-        noise = {"image": truth.image.noise, "gradient": truth.by_amount.noise if truth.by_amount is not None else None}
-    return {"scene": size, "truth_noise": noise, "environment": environment, "rows": [asdict(row) for row in rows]}
+        noise = {
+            "image": truth.image.noise,
+            "gradient": truth.by_amount.noise if truth.by_amount is not None else None,
+        }
+    return {
+        "scene": size,
+        "truth_noise": noise,
+        "environment": environment,
+        "rows": [asdict(row) for row in rows],
+    }
 
 
 def _tracer(scene: Scene, has_gradient: bool) -> PathTracer | None:

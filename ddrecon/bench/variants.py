@@ -9,15 +9,16 @@ from typing import Any
 
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.reconstruct.levels import at_level
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
-from ddrecon.world import Scene
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is tried: tolerances of solves, models, transport rounds with directions, steps a voxel, tolerances of interpolated pixels, and
-    factors by which the grid is made coarser."""
+    """What is tried: tolerances of solves, models, transport rounds with directions, steps a voxel,
+    tolerances of interpolated pixels, and factors by which the grid is made coarser.
+    """
 
     tolerances: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
     models: tuple[str, ...] = ("p1", "flux_limited")
@@ -30,7 +31,9 @@ class Sweep:
 QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (0, 0.05), (2,))
 EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
 EXACT_LIMITED = 1e-5
-"""The tolerance in place of that for `flux_limited`, whose damped iteration gains a digit in many minutes."""
+"""The tolerance in place of that for `flux_limited`, whose damped iteration gains a digit in many
+minutes.
+"""
 EXACT_STEPS = 3
 
 
@@ -50,12 +53,19 @@ class Variant:
 
 def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
     """The base, and every variant of `sweep` that differs from it."""
-    return [Variant("base", "", lambda scene: scene), *(item for item in _all(sweep) if not _is_same(item.change(scene), scene))]
+    return [
+        Variant("base", "", lambda scene: scene),
+        *(item for item in _all(sweep) if not _is_same(item.change(scene), scene)),
+    ]
 
 
 def exactly(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows and marched in finer steps, ray by ray."""
-    render = replace(scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel), tolerance=0.0)
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows and
+    marched in finer steps, ray by ray.
+    """
+    render = replace(
+        scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel), tolerance=0.0
+    )
     diffusion = replace(scene.diffusion, **EXACT)
     if diffusion.model == "flux_limited":
         diffusion = replace(diffusion, tolerance=EXACT_LIMITED)
@@ -77,7 +87,12 @@ def _all(sweep: Sweep) -> Iterator[Variant]:
     for model in sweep.models:
         yield _diffusing("model", model, model=model)
     for rounds, directions in sweep.rounds:
-        yield _diffusing("rounds", f"{rounds}, {directions} directions", transport_rounds=rounds, transport_directions=directions)
+        yield _diffusing(
+            "rounds",
+            f"{rounds}, {directions} directions",
+            transport_rounds=rounds,
+            transport_directions=directions,
+        )
     for steps in sweep.steps:
         yield _marching("steps", steps, steps_per_voxel=steps)
     for tolerance in sweep.pixels:
@@ -87,22 +102,36 @@ def _all(sweep: Sweep) -> Iterator[Variant]:
 
 
 def _diffusing(factor: str, value: object, **changes: Any) -> Variant:
-    return Variant(factor, str(value), lambda scene: replace(scene, diffusion=replace(scene.diffusion, **changes)))
+    return Variant(
+        factor,
+        str(value),
+        lambda scene: replace(scene, diffusion=replace(scene.diffusion, **changes)),
+    )
 
 
 def _marching(factor: str, value: object, **changes: Any) -> Variant:
-    return Variant(factor, str(value), lambda scene: replace(scene, render=replace(scene.render, **changes)))
+    return Variant(
+        factor, str(value), lambda scene: replace(scene, render=replace(scene.render, **changes))
+    )
 
 
 def _coarser(factor: int, scene: Scene) -> Scene:
-    return replace(at_level(scene, factor), views=scene.views)
+    return replace(scene_at_level(scene, factor), views=scene.views)
 
 
 def _is_same(changed: Scene, scene: Scene) -> bool:
     is_same_grid = changed.volume.grid.shape == scene.volume.grid.shape
-    return is_same_grid and changed.render == scene.render and _effective(changed.diffusion) == _effective(scene.diffusion)
+    return (
+        is_same_grid
+        and changed.render == scene.render
+        and _effective(changed.diffusion) == _effective(scene.diffusion)
+    )
 
 
 def _effective(diffusion: DiffusionSettings) -> DiffusionSettings:
     """Without the number of directions where there are no rounds that it could matter to."""
-    return diffusion if diffusion.transport_rounds else replace(diffusion, transport_directions=DiffusionSettings.transport_directions)
+    return (
+        diffusion
+        if diffusion.transport_rounds
+        else replace(diffusion, transport_directions=DiffusionSettings.transport_directions)
+    )

@@ -1,1 +1,3 @@
-"""Multiply scattered light by the diffusion approximation: the operator, its solvers and the derivatives of a solve."""
+"""Multiply scattered light by the diffusion approximation: the operator, its solvers and the
+derivatives of a solve.
+"""

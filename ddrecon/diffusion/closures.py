@@ -1,7 +1,9 @@
-"""Closures: what the diffusion coefficient becomes where the medium thins out and 1 / (3 kappa_tr) grows without bound.
+"""Closures: what the diffusion coefficient becomes where the medium thins out and 1 / (3 kappa_tr)
+grows without bound.
 
-A closure turns the transport extinction [C, z, y, x] into the diffusion coefficient D [u] of the same shape, finite and with
-finite derivatives at zero density. `CLOSURES` is the table the scene file chooses from.
+A closure turns the transport extinction [C, z, y, x] into the diffusion coefficient D [u] of the
+same shape, finite and with finite derivatives at zero density. `CLOSURES` is the table the scene
+file chooses from.
 """
 
 from __future__ import annotations
@@ -16,11 +18,17 @@ from torch.nn.functional import adaptive_avg_pool3d, interpolate
 from ddrecon.grid import Grid
 
 FLOOR = 3.3
-"""Optical thickness, across the box's shortest side, of the medium that the smooth closure gives empty space (docs/theory.md section 5)."""
+"""Optical thickness, across the box's shortest side, of the medium that the smooth closure gives
+empty space (docs/theory.md section 5).
+"""
 BACKGROUND = 0.01
-"""Optical thickness, across a side of the box, of a haze that gives an empty box distances too; accuracy is flat from 0.001 to 0.1."""
+"""Optical thickness, across a side of the box, of a haze that gives an empty box distances too;
+accuracy is flat from 0.001 to 0.1.
+"""
 COARSE_CELLS = 32
-"""Cells, at most, along the longest side in which distances, which are smooth, are found; 16, 32 and 64 render alike."""
+"""Cells, at most, along the longest side in which distances, which are smooth, are found; 16, 32
+and 64 render alike.
+"""
 
 
 def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
@@ -30,10 +38,12 @@ def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Te
 
 
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
-    """D = 1 / (3 kappa_tr + 4 / distance): collisions and the spreading of light, two resistances in series (docs/theory.md section 5).
+    """D = 1 / (3 kappa_tr + 4 / distance): collisions and the spreading of light, two resistances
+    in series (docs/theory.md section 5).
 
-    `distance` is that to the medium. `floor` is not used: nothing here depends on the size of the box. Below zero, where only finite
-    differences go, D is continued to second order and stays positive.
+    `distance` is that to the medium. `floor` is not used: nothing here depends on the size of the
+    box. Below zero, where only finite differences go, D is continued to second order and stays
+    positive.
     """
     spreading = 4 * inverse_distance(transport_extinction, grid)
     ratio = 3 * transport_extinction / spreading
@@ -42,20 +52,26 @@ def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) ->
 
 
 def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
-    """The mean of 1 / distance [1/u] from each cell to all `weight` [C, z, y, x] >= 0, found on a coarse grid.
+    """The mean of 1 / distance [1/u] from each cell to all `weight` [C, z, y, x] >= 0, found on a
+    coarse grid.
 
     Outside a sphere this is 1 / (distance to its center), exactly: Newton's shell theorem.
     """
-    coarse = grid.coarsened(math.ceil(max(grid.shape) / COARSE_CELLS))
+    coarse = grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
     mass = adaptive_avg_pool3d(weight, coarse.shape) + 3 * BACKGROUND / sum(grid.extent)
     potential = _potential(mass, coarse) / mass.sum((1, 2, 3), keepdim=True)
     return interpolate(potential[None], size=grid.shape, mode="trilinear")[0]
 
 
 def _potential(mass: Tensor, grid: Grid) -> Tensor:
-    """The sum over cells of `mass` / distance [1/u], by Fourier transform in a box twice as wide, one color at a time for memory."""
+    """The sum over cells of `mass` / distance [1/u], by Fourier transform in a box twice as wide,
+    one color at a time for memory.
+    """
     wide = [2 * cells for cells in grid.shape]
-    axes = [torch.fft.fftfreq(n, 1 / (n * step), dtype=mass.dtype, device=mass.device) for n, step in zip(wide, grid.spacing, strict=True)]
+    axes = [
+        torch.fft.fftfreq(n, 1 / (n * step), dtype=mass.dtype, device=mass.device)
+        for n, step in zip(wide, grid.spacing, strict=True)
+    ]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
     radius = (3 * math.prod(grid.spacing) / (4 * math.pi)) ** (1 / 3)
     square = z * z + y * y + x * x
@@ -67,4 +83,7 @@ def _potential(mass: Tensor, grid: Grid) -> Tensor:
     return torch.stack(summed)[:, :depth, :height, :width]
 
 
-CLOSURES: dict[str, Callable[[Tensor, Grid, float], Tensor]] = {"geometric": geometric, "smooth": smooth}
+CLOSURES: dict[str, Callable[[Tensor, Grid, float], Tensor]] = {
+    "geometric": geometric,
+    "smooth": smooth,
+}

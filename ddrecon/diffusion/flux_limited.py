@@ -1,9 +1,12 @@
-"""Flux-limited diffusion (Koerner et al. 2014): D depends on the light it diffuses, so that the balance E4 is solved by Picard iteration.
+"""Flux-limited diffusion (Koerner et al. 2014): D depends on the light it diffuses, so that the
+balance E4 is solved by Picard iteration.
 
-With r(u) = A(D(u)) u - S(D(u)), an iteration is u <- u - `DAMPING` A(D(u))^-1 r(u), A being that of E7 with the D of the last light.
-Derivatives are those of the fixed point r(u, theta) = 0, by the implicit function theorem: with J = dr/du, which is not symmetric,
-J du = -(dr/dtheta) dtheta (E8) and J^T lambda = u_bar, theta_bar = -(dr/dtheta)^T lambda (E9), by the same damped iteration with the
-same A: linearized at the fixed point it is the Picard iteration, so one converges where the other does.
+With r(u) = A(D(u)) u - S(D(u)), an iteration is u <- u - `DAMPING` A(D(u))^-1 r(u), A being that of
+E7 with the D of the last light. Derivatives are those of the fixed point r(u, theta) = 0, by the
+implicit function theorem: with J = dr/du, which is not symmetric, J du = -(dr/dtheta) dtheta (E8)
+and J^T lambda = u_bar, theta_bar = -(dr/dtheta)^T lambda (E9), by the same damped iteration with
+the same A: linearized at the fixed point it is the Picard iteration, so one converges where the
+other does.
 """
 
 from __future__ import annotations
@@ -16,32 +19,46 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.autodiff import keep
 from ddrecon.diffusion.conservative import axis_flux
 from ddrecon.diffusion.implicit import Solve, SolveRecord
 from ddrecon.diffusion.limiters import Limiter
-from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, cell_average, conductance, difference, face_fluxes
+from ddrecon.diffusion.operator import (
+    AXES,
+    Operator,
+    boundary_loss,
+    cell_average,
+    conductance,
+    difference,
+    face_fluxes,
+)
 from ddrecon.diffusion.solvers.scaled import norm
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
-from ddrecon.medium import Medium
-from ddrecon.moments import Moments
+from ddrecon.light.moments import Moments
+from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import keep
 
 DAMPING = 0.7
 MAX_ITERATIONS = 1000
 INNER_TOLERANCE = 0.05
 """How closely each iteration's linear system is solved; the fixed point does not depend on it."""
 VACUUM = 0.1
-"""Optical thickness, across the shortest side, of the least medium there is: D stays finite where light is even and space empty."""
+"""Optical thickness, across the shortest side, of the least medium there is: D stays finite where
+light is even and space empty.
+"""
 DARKNESS = 1e-6
-"""Light below this part of its mean is taken as even, so that steepness is finite where there is none."""
+"""Light below this part of its mean is taken as even, so that steepness is finite where there is
+none.
+"""
 
 
 @dataclass(frozen=True)
 class Balance:
-    """r(u) = 0, the balance of flux-limited diffusion on `grid`, with [C, z, y, x] tensors of `coefficients` in this order:
+    """r(u) = 0, the balance of flux-limited diffusion on `grid`, with [C, z, y, x] tensors of
+    `coefficients` in this order:
 
-    kappa_tr, kappa_a [1/u], kappa_s Q0, the radiance outside [C, 1, 1, 1] and, where g is not 0, kappa_s Q1 along z, y, x.
+    kappa_tr, kappa_a [1/u], kappa_s Q0, the radiance outside [C, 1, 1, 1] and, where g is not 0,
+    kappa_s Q1 along z, y, x.
     """
 
     grid: Grid
@@ -50,7 +67,9 @@ class Balance:
     def diffusion(self, u: Tensor, transport_extinction: Tensor) -> Tensor:
         """D [u] in the light `u`."""
         least = VACUUM / min(self.grid.extent)
-        return self.limiter(torch.sqrt(transport_extinction**2 + least**2), steepness_square(u, self.grid))
+        return self.limiter(
+            torch.sqrt(transport_extinction**2 + least**2), steepness_square(u, self.grid)
+        )
 
     def system(self, u: Tensor, *coefficients: Tensor) -> tuple[Operator, Tensor]:
         """A and S with the D of the light `u`."""
@@ -71,7 +90,9 @@ class Balance:
 
 
 def steepness_square(u: Tensor, grid: Grid) -> Tensor:
-    """q^2 = |grad u|^2 / u^2 [1/u^2] by central differences, one-sided at the box; `u` [C, z, y, x]."""
+    """q^2 = |grad u|^2 / u^2 [1/u^2] by central differences, one-sided at the box; `u` [C, z, y,
+    x].
+    """
     total = torch.zeros_like(u)
     for axis, step in zip(AXES, grid.spacing, strict=True):
         if u.shape[axis] > 1:
@@ -82,21 +103,39 @@ def steepness_square(u: Tensor, grid: Grid) -> Tensor:
     return total / (u**2 + dark**2 + torch.finfo(u.dtype).tiny)
 
 
-def diffuse_light(medium: Medium, limiter: Limiter, source: Moments, outside: Tensor, solve: Solve[Operator], has_flux: bool) -> Moments:
-    """L0 and, where `has_flux`, L1 in `medium`; arguments as in the conservative scheme, with a `limiter` in place of a closure.
+def diffuse_light(
+    medium: Medium,
+    limiter: Limiter,
+    source: Moments,
+    outside: Tensor,
+    solve: Solve[Operator],
+    has_flux: bool,
+) -> Moments:
+    """L0 and, where `has_flux`, L1 in `medium`; arguments as in the conservative scheme, with a
+    `limiter` in place of a closure.
 
     Raises SolveError where the iteration does not converge to `solve.tolerance`.
     """
     balance = Balance(medium.grid, limiter)
     scattered = source.scaled(medium.remaining_scattering, medium.remaining_scattering)
-    fields = [medium.transport_extinction, medium.absorption.value, scattered.mean, *(scattered.flux or ())]
-    transport_extinction, absorption, gain, *flux = (field.expand_as(scattered.mean + outside) for field in fields)
+    fields = [
+        medium.transport_extinction,
+        medium.absorption.value,
+        scattered.mean,
+        *(scattered.flux or ()),
+    ]
+    transport_extinction, absorption, gain, *flux = (
+        field.expand_as(scattered.mean + outside) for field in fields
+    )
     mean = _Solve.apply(solve, balance, transport_extinction, absorption, gain, outside, *flux)
     if not has_flux:
         return Moments(mean)
     diffusion = balance.diffusion(mean, transport_extinction)
     components = source.flux or (None, None, None)
-    z, y, x = (axis_flux(medium, diffusion, part, outside, mean, axis) for axis, part in zip(AXES, components, strict=True))
+    z, y, x = (
+        axis_flux(medium, diffusion, part, outside, mean, axis)
+        for axis, part in zip(AXES, components, strict=True)
+    )
     return Moments(mean, (z, y, x))
 
 
@@ -107,7 +146,7 @@ class _Solve(torch.autograd.Function):
             operator, right = balance.system(u, *coefficients)
             return solve.solver(operator, right - operator.apply(u), None, INNER_TOLERANCE).value
 
-        return iterate(solve, "forward", torch.zeros_like(coefficients[0]), correction)
+        return iterate_picard(solve, "forward", torch.zeros_like(coefficients[0]), correction)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -123,7 +162,7 @@ class _Solve(torch.autograd.Function):
         def correction(adjoint: Tensor) -> Tensor:
             return ctx.solve.solver(operator, u_bar - pull(adjoint)[0], None, INNER_TOLERANCE).value
 
-        adjoint = iterate(ctx.solve, "adjoint", torch.zeros_like(u), correction)
+        adjoint = iterate_picard(ctx.solve, "adjoint", torch.zeros_like(u), correction)
         return None, None, *pull(-adjoint)[1:]
 
     @staticmethod
@@ -137,16 +176,21 @@ class _Solve(torch.autograd.Function):
         (right,) = push((torch.zeros_like(u), *moved))
 
         def correction(d_u: Tensor) -> Tensor:
-            return ctx.solve.solver(operator, -right - push((d_u, *still))[0], None, INNER_TOLERANCE).value
+            return ctx.solve.solver(
+                operator, -right - push((d_u, *still))[0], None, INNER_TOLERANCE
+            ).value
 
-        return iterate(ctx.solve, "tangent", torch.zeros_like(u), correction)
+        return iterate_picard(ctx.solve, "tangent", torch.zeros_like(u), correction)
 
 
-def iterate(solve: Solve[Operator], kind: str, start: Tensor, correction: Callable[[Tensor], Tensor]) -> Tensor:
-    """The u [C, z, y, x] whose `correction` vanishes, by damped steps from the last solution of this `kind`, or from `start`.
+def iterate_picard(
+    solve: Solve[Operator], kind: str, start: Tensor, correction: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """The u [C, z, y, x] whose `correction` vanishes, by damped steps from the last solution of
+    this `kind`, or from `start`.
 
-    Stops when a step's norm is below the tolerance of `solve` times that of u, for every color, and records the steps and the last such
-    change.
+    Stops when a step's norm is below the tolerance of `solve` times that of u, for every color, and
+    records the steps and the last such change.
     """
     began, memory, tolerance = perf_counter(), solve.memory, solve.tolerance_of(kind)
     guess = memory.last.get((kind, solve.turn)) if memory.is_warm and kind != "tangent" else None
@@ -158,7 +202,12 @@ def iterate(solve: Solve[Operator], kind: str, start: Tensor, correction: Callab
         change = float((norm(step) / norm(u).clamp(min=torch.finfo(u.dtype).tiny)).max())
     if not change <= tolerance:
         advice = "raise diffusion.tolerance, use --dtype float64, diffusion.limiter=marshak or diffusion.model=p1"
-        raise SolveError(f"flux-limited diffusion ({kind}) did not reach its tolerance", iteration, change, advice)
+        raise SolveError(
+            f"flux-limited diffusion ({kind}) did not reach its tolerance",
+            iteration,
+            change,
+            advice,
+        )
     memory.records.append(SolveRecord(kind, iteration, change, perf_counter() - began))
     if memory.is_warm:
         memory.last[kind, solve.turn] = u

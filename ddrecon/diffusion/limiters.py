@@ -1,7 +1,9 @@
-"""Flux limiters: D as a function of how fast light falls off, so that no more flows than radiance allows.
+"""Flux limiters: D as a function of how fast light falls off, so that no more flows than radiance
+allows.
 
-A limiter is lambda(R) in D = lambda(R) / kappa with R = |grad L0| / (kappa L0), written in the steepness q = |grad L0| / L0 [1/u] so that
-it is finite where either vanishes: `limiter(kappa, q^2) -> D` [u], smooth in both. `LIMITERS` is the table the scene file chooses from.
+A limiter is lambda(R) in D = lambda(R) / kappa with R = |grad L0| / (kappa L0), written in the
+steepness q = |grad L0| / L0 [1/u] so that it is finite where either vanishes: `limiter(kappa, q^2)
+-> D` [u], smooth in both. `LIMITERS` is the table the scene file chooses from.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ SERIES_BELOW = 0.04
 
 
 def levermore_pomraning(extinction: Tensor, steepness_square: Tensor) -> Tensor:
-    """lambda = (coth R - 1/R) / R: 1/3 in dense media, 1/R in empty space (doi:10.1086/159157, in the form of scattering albedo 1)."""
+    """lambda = (coth R - 1/R) / R: 1/3 in dense media, 1/R in empty space (doi:10.1086/159157, in
+    the form of scattering albedo 1).
+    """
     square = steepness_square / extinction**2
     is_small = square < SERIES_BELOW
     small, large = torch.where(is_small, square, 0), torch.where(is_small, 1, square).sqrt()
@@ -27,7 +31,9 @@ def levermore_pomraning(extinction: Tensor, steepness_square: Tensor) -> Tensor:
 
 
 def marshak(extinction: Tensor, steepness_square: Tensor) -> Tensor:
-    """lambda = 1 / sqrt(9 + 4 R^2): as Larsen's with n = 2, but no more than F = L0 / 2 flows, what E6 lets out of a surface."""
+    """lambda = 1 / sqrt(9 + 4 R^2): as Larsen's with n = 2, but no more than F = L0 / 2 flows, what
+    E6 lets out of a surface.
+    """
     return 1 / torch.sqrt(9 * extinction**2 + 4 * steepness_square)
 
 

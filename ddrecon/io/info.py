@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ddrecon.io.images import READERS, read_image
-from ddrecon.io.tiff import is_stack
-from ddrecon.io.volumes import FORMATS, field_names, read_field
+from ddrecon.io.images.table import READERS, read_image
+from ddrecon.io.images.tiff import is_stack
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The contents of the volume or image at `path`; raises FormatError when it is neither, or damaged."""
+    """The contents of the volume or image at `path`; raises FormatError when it is neither, or
+    damaged.
+    """
     return _describe_volume(path) if _is_volume(path) else _describe_image(path)
 
 
@@ -29,7 +31,10 @@ def _describe_volume(path: Path) -> dict[str, Any]:
         field = read_field(path, name)
         report["resolution"] = list(field.resolution)
         report["bounds"] = None if field.bounds is None else field.bounds.tolist()
-        report["fields"][name] = {"colors": 1 if field.values.ndim == 3 else 3, **_numbers(field.values)}
+        report["fields"][name] = {
+            "colors": 1 if field.values.ndim == 3 else 3,
+            **_numbers(field.values),
+        }
     return report
 
 
@@ -37,7 +42,12 @@ def _describe_image(path: Path) -> dict[str, Any]:
     image = read_image(path)
     height, width = image.size
     is_gray = bool((image.pixels == image.pixels[..., :1]).all())
-    return {"pixels": [width, height], "colors": 1 if is_gray else 3, "has_alpha": image.coverage is not None, **_numbers(image.pixels)}
+    return {
+        "pixels": [width, height],
+        "colors": 1 if is_gray else 3,
+        "has_alpha": image.coverage is not None,
+        **_numbers(image.pixels),
+    }
 
 
 def _numbers(values: np.ndarray) -> dict[str, float]:
@@ -54,11 +64,19 @@ def lines(report: dict[str, Any]) -> list[str]:
     """The report of `describe` as lines of text."""
     if "pixels" in report:
         alpha = ", with alpha" if report["has_alpha"] else ""
-        return [f"image: {_by(report['pixels'])} pixels, {_colors(report)}{alpha}, linear radiance {_values(report)}"]
+        return [
+            f"image: {_by(report['pixels'])} pixels, {_colors(report)}{alpha}, linear radiance {_values(report)}"
+        ]
     if not report["fields"]:
         return ["no fields"]
     cells = f"cells: {_by(report['resolution'])} (x, y, z)"
-    return [cells + _box(report), *(f"{name}: {_colors(field)}, {_values(field)}" for name, field in report["fields"].items())]
+    return [
+        cells + _box(report),
+        *(
+            f"{name}: {_colors(field)}, {_values(field)}"
+            for name, field in report["fields"].items()
+        ),
+    ]
 
 
 def _box(report: dict[str, Any]) -> str:

@@ -6,13 +6,15 @@ import torch
 from torch import Tensor
 
 
-def flawed_place(name: str, values: Tensor, is_field: bool) -> str | None:
-    """The first entry of `values`, of the parameter `name`, that is not finite: `density at voxel [x, y, z]`; None if there is none."""
+def describe_flaw(name: str, values: Tensor, is_field: bool) -> str | None:
+    """The first entry of `values`, of the parameter `name`, that is not finite: `density at voxel
+    [x, y, z]`; None if there is none.
+    """
     flaws = torch.nonzero(~torch.isfinite(values.detach()))
     return _named(name, flaws[0].tolist(), is_field) if len(flaws) else None
 
 
-def largest_place(name: str, values: Tensor, is_field: bool) -> str:
+def describe_largest(name: str, values: Tensor, is_field: bool) -> str:
     """The entry of the parameter `name` of largest magnitude, and its value."""
     values = values.detach()
     flat = int(values.abs().flatten().argmax())
@@ -21,7 +23,9 @@ def largest_place(name: str, values: Tensor, is_field: bool) -> str:
 
 
 def _named(name: str, index: list[int], is_field: bool) -> str:
-    """`index` into the array of the parameter `name` in world order: the last three of a field, the last two of a map."""
+    """`index` into the array of the parameter `name` in world order: the last three of a field, the
+    last two of a map.
+    """
     if is_field:
         *color, z, y, x = index
         return f"{name} at voxel [{x}, {y}, {z}]{_color(color)}"

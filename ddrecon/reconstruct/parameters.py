@@ -1,4 +1,6 @@
-"""What is optimized: a value with its bounds and regularizers, its Adam state, and its way through the resolutions."""
+"""What is optimized: a value with its bounds and regularizers, its Adam state, and its way through
+the resolutions.
+"""
 
 from __future__ import annotations
 
@@ -9,24 +11,32 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.levels import resampled
-from ddrecon.reconstruct.losses import total_variation
-from ddrecon.scene.parameter_kinds import KINDS, pattern_of
-from ddrecon.scene.schema import ParameterSettings
+from ddrecon.losses import total_variation
+from ddrecon.reconstruct.levels import resample
+from ddrecon.settings import ParameterSettings
+from ddrecon.variables.kinds import KINDS, pattern_of
 
 BETAS = (0.9, 0.99)
-"""Decay of Adam's first and second moments; the second forgets sooner than customary, since runs are short."""
+"""Decay of Adam's first and second moments; the second forgets sooner than customary, since runs
+are short.
+"""
 TINY = 1e-15
-"""Adam's epsilon: derivatives of a mean over pixels with respect to one cell are far smaller than the customary 1e-8."""
+"""Adam's epsilon: derivatives of a mean over pixels with respect to one cell are far smaller than
+the customary 1e-8.
+"""
 
 
 class Parameter:
-    """The value of one variable and the optimizer that moves it (Adam: Kingma and Ba 2015, arXiv:1412.6980), within its bounds.
+    """The value of one variable and the optimizer that moves it (Adam: Kingma and Ba 2015,
+    arXiv:1412.6980), within its bounds.
 
-    A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at every resolution.
+    A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
+    every resolution.
     """
 
-    def __init__(self, name: str, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid):
+    def __init__(
+        self, name: str, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid
+    ):
         kind = KINDS[pattern_of(name)]
         self.name, self.rate, self.grid = name, rate, grid
         self.low = kind.low if settings.min is None else settings.min
@@ -39,14 +49,18 @@ class Parameter:
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
     def penalty(self) -> Tensor:
-        """What its regularizers add to the loss, in units of the targets' mean square; see `ParameterSettings`."""
+        """What its regularizers add to the loss, in units of the targets' mean square; see
+        `ParameterSettings`.
+        """
         total = self.value.new_zeros(())
         if self.tv:
             total = total + self.tv * total_variation(self.value, self.grid)
         return total + self.l1 * self.value.abs().mean() if self.l1 else total
 
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Moves the value against `gradient` by `rate` times its learning rate, and back within its bounds."""
+        """Moves the value against `gradient` by `rate` times its learning rate, and back within its
+        bounds.
+        """
         length = self.value.detach().norm()
         first, second = self.moments
         with torch.no_grad():
@@ -70,19 +84,26 @@ class Parameter:
                 self.value.mul_(length / self.value.norm())
 
     def refine(self, grid: Grid) -> None:
-        """Carries field and moments to `grid`; a derivative with respect to a cell shrinks with the cell's volume."""
+        """Carries field and moments to `grid`; a derivative with respect to a cell shrinks with the
+        cell's volume.
+        """
         share = self.grid.cells / grid.cells
         self.grid = grid
         if not self.is_field:
             return
-        self.value = resampled(self.value.detach(), grid).clone().requires_grad_()
-        first, second = (resampled(moment, grid) for moment in self.moments)
+        self.value = resample(self.value.detach(), grid).clone().requires_grad_()
+        first, second = (resample(moment, grid) for moment in self.moments)
         self.moments = first * share, second * share**2
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it, untouched by further steps."""
         moments = [moment.clone() for moment in self.moments]
-        return {"value": self.value.detach().clone(), "shape": list(self.grid.shape), "steps": self.steps.clone(), "moments": moments}
+        return {
+            "value": self.value.detach().clone(),
+            "shape": list(self.grid.shape),
+            "steps": self.steps.clone(),
+            "moments": moments,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""

@@ -1,8 +1,8 @@
 """One color of a scene as a gray scene.
 
-Paths that red, green and blue share are chosen by the extinction of one of them and weighted for the others. Where extinctions differ
-that makes five times the noise, and Mitsuba 3.9 drops samples whose weight comes out a rounding below zero, so there each color is traced
-by itself.
+Paths that red, green and blue share are chosen by the extinction of one of them and weighted for
+the others. Where extinctions differ that makes five times the noise, and Mitsuba 3.9 drops samples
+whose weight comes out a rounding below zero, so there each color is traced by itself.
 """
 
 from __future__ import annotations
@@ -11,27 +11,33 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
-from ddrecon.world import Scene
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
+from ddrecon.scene import Scene
 
 
-def of_color(scene: Scene, color: int) -> Scene:
-    """`scene` as seen in `color` (0, 1, 2 for red, green, blue) alone; views keep their cameras only."""
-    volume = replace(scene.volume, sigma_a=_picked(scene.volume.sigma_a, color), sigma_s=_picked(scene.volume.sigma_s, color))
+def pick_color(scene: Scene, color: int) -> Scene:
+    """`scene` as seen in `color` (0, 1, 2 for red, green, blue) alone; views keep their cameras
+    only.
+    """
+    volume = replace(
+        scene.volume,
+        sigma_a=_pick(scene.volume.sigma_a, color),
+        sigma_s=_pick(scene.volume.sigma_s, color),
+    )
     return replace(scene, volume=volume, lights=[_light(light, color) for light in scene.lights])
 
 
 def _light(light: Light, color: int) -> Light:
     if isinstance(light, DirectionalLight):
-        return replace(light, irradiance=_picked(light.irradiance, color))
+        return replace(light, irradiance=_pick(light.irradiance, color))
     if isinstance(light, AmbientLight):
-        return replace(light, radiance=_picked(light.radiance, color))
+        return replace(light, radiance=_pick(light.radiance, color))
     if isinstance(light, EnvironmentLight):
-        return replace(light, radiance=_picked(light.radiance, color))
-    return replace(light, intensity=_picked(light.intensity, color))
+        return replace(light, radiance=_pick(light.radiance, color))
+    return replace(light, intensity=_pick(light.intensity, color))
 
 
-def _picked(value: Tensor, color: int) -> Tensor:
+def _pick(value: Tensor, color: int) -> Tensor:
     """The entry of `value` [C, ...] that belongs to `color`, still with a leading axis."""
     index = color % value.shape[0]
     return value[index : index + 1]

@@ -1,4 +1,6 @@
-"""A scene as files that Mitsuba opens: XML, and beside it its volumes (.vol) and its environment map (.exr). Mitsuba is not needed."""
+"""A scene as files that Mitsuba opens: XML, and beside it its volumes (.vol) and its environment
+map (.exr). Mitsuba is not needed.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +11,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ddrecon.errors import SceneError
-from ddrecon.io.atomic import replacing
-from ddrecon.io.exr import write_exr
-from ddrecon.io.volumes import write_field
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.images.exr import write_exr
+from ddrecon.io.volumes.table import write_field
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 KINDS = {
     "volpath": "integrator",
@@ -42,7 +44,8 @@ Arrays = dict[Path, np.ndarray]
 def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
     """Writes `scene` to `path` (.xml) and files named like it beside it, and returns their paths.
 
-    Raises SceneError where one exists and `may_exist` is False, the folder does not exist, or for what Mitsuba cannot show.
+    Raises SceneError where one exists and `may_exist` is False, the folder does not exist, or for
+    what Mitsuba cannot show.
     """
     arrays: Arrays = {}
     root = ElementTree.Element("scene", version="3.0.0")
@@ -54,7 +57,9 @@ def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
     written = [path, *arrays]
     taken = [str(file) for file in written if file.exists()]
     if taken and not may_exist:
-        raise SceneError(f"{', '.join(taken)}: already there; choose another name, or say --overwrite")
+        raise SceneError(
+            f"{', '.join(taken)}: already there; choose another name, or say --overwrite"
+        )
     bounds = np.array(scene.volume.grid.bounds_xyz)
     for file, array in arrays.items():
         if array.ndim == 4:
@@ -62,13 +67,15 @@ def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
         else:
             write_exr(file, array)
     ElementTree.indent(root, "    ")
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
     return written
 
 
 def _element(name: str, value: Any, naming: str, path: Path, arrays: Arrays) -> ElementTree.Element:
-    """`value` as XML, called `name` in the attribute `naming`; what belongs in a file of its own is added to `arrays`."""
+    """`value` as XML, called `name` in the attribute `naming`; what belongs in a file of its own is
+    added to `arrays`.
+    """
     if isinstance(value, dict):
         return _plugin(name, value, naming, path, arrays)
     if isinstance(value, tuple):
@@ -79,10 +86,16 @@ def _element(name: str, value: Any, naming: str, path: Path, arrays: Arrays) -> 
         transform = ElementTree.Element("transform", name=name)
         ElementTree.SubElement(transform, "matrix", value=_numbers(value.ravel().tolist()))
         return transform
-    return ElementTree.Element(NUMBERS[type(value)], name=name, value=str(value).lower() if isinstance(value, bool) else str(value))
+    return ElementTree.Element(
+        NUMBERS[type(value)],
+        name=name,
+        value=str(value).lower() if isinstance(value, bool) else str(value),
+    )
 
 
-def _plugin(name: str, value: dict[str, Any], naming: str, path: Path, arrays: Arrays) -> ElementTree.Element:
+def _plugin(
+    name: str, value: dict[str, Any], naming: str, path: Path, arrays: Arrays
+) -> ElementTree.Element:
     if value["type"] == "ref":
         return ElementTree.Element("ref", name=name, id=value["id"])
     element = ElementTree.Element(KINDS[value["type"]], {"type": value["type"], naming: name})

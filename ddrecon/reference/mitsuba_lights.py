@@ -1,6 +1,7 @@
 """Lights in Mitsuba's words, as `mitsuba_scene` has them.
 
-Mitsuba takes one light from infinitely far all around, so ambient light is added to the pixels of an environment map.
+Mitsuba takes one light from infinitely far all around, so ambient light is added to the pixels of
+an environment map.
 """
 
 from __future__ import annotations
@@ -12,26 +13,50 @@ import numpy as np
 from torch import Tensor
 
 from ddrecon.errors import SceneError
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 
 Color = tuple[float, float, float]
 
 
 def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
-    """What Mitsuba makes of `lights`, by names of their own; raises SceneError for more than one environment map."""
-    near = {f"light_{index}": _light(light) for index, light in enumerate(lights) if isinstance(light, DirectionalLight | PointLight)}
+    """What Mitsuba makes of `lights`, by names of their own; raises SceneError for more than one
+    environment map.
+    """
+    near = {
+        f"light_{index}": _light(light)
+        for index, light in enumerate(lights)
+        if isinstance(light, DirectionalLight | PointLight)
+    }
     maps = [light for light in lights if isinstance(light, EnvironmentLight)]
     if len(maps) > 1:
-        raise SceneError(f"the scene has {len(maps)} environment maps, and Mitsuba takes one; give it the one they sum to")
-    ambient = np.sum([_color(light.radiance) for light in lights if isinstance(light, AmbientLight)] or [(0.0, 0.0, 0.0)], axis=0)
-    around = _environment(maps[0], ambient) if maps else {"type": "constant", "radiance": tuple(ambient.tolist())}
+        raise SceneError(
+            f"the scene has {len(maps)} environment maps, and Mitsuba takes one; give it the one they sum to"
+        )
+    ambient = np.sum(
+        [_color(light.radiance) for light in lights if isinstance(light, AmbientLight)]
+        or [(0.0, 0.0, 0.0)],
+        axis=0,
+    )
+    around = (
+        _environment(maps[0], ambient)
+        if maps
+        else {"type": "constant", "radiance": tuple(ambient.tolist())}
+    )
     return near | ({"around": around} if maps or ambient.any() else {})
 
 
 def _light(light: DirectionalLight | PointLight) -> dict[str, Any]:
     if isinstance(light, DirectionalLight):
-        return {"type": "directional", "direction": light.direction.tolist(), "irradiance": _color(light.irradiance)}
-    return {"type": "point", "position": light.position.tolist(), "intensity": _color(light.intensity)}
+        return {
+            "type": "directional",
+            "direction": light.direction.tolist(),
+            "irradiance": _color(light.irradiance),
+        }
+    return {
+        "type": "point",
+        "position": light.position.tolist(),
+        "intensity": _color(light.intensity),
+    }
 
 
 def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]:

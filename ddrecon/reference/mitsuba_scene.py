@@ -1,10 +1,12 @@
-"""A scene in Mitsuba's words: nested dictionaries as its `load_dict` takes them, but of plain values, so that Mitsuba is not needed here.
+"""A scene in Mitsuba's words: nested dictionaries as its `load_dict` takes them, but of plain
+values, so that Mitsuba is not needed here.
 
-The one convention: arrays are told apart by their axes. [4, 4] is a transform, [h, w, 3] a picture, [z, y, x, C] a volume, all float32
-but the transform; a tuple is a color and a list a vector.
+The one convention: arrays are told apart by their axes. [4, 4] is a transform, [h, w, 3] a picture,
+[z, y, x, C] a volume, all float32 but the transform; a tuple is a color and a list a vector.
 
-Where albedo differs from cell to cell, Mitsuba interpolates it where we interpolate the scattering coefficient, so it is handed over on
-`FINER` times finer cells (in grids of at most `MANY`), between whose centers little is left of that difference.
+Where albedo differs from cell to cell, Mitsuba interpolates it where we interpolate the scattering
+coefficient, so it is handed over on `FINER` times finer cells (in grids of at most `MANY`), between
+whose centers little is left of that difference.
 """
 
 from __future__ import annotations
@@ -18,33 +20,41 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from ddrecon.cameras import Camera, rays
+from ddrecon.cameras import Camera, cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.medium import Volume
+from ddrecon.medium.coefficients import Volume
 from ddrecon.reference.mitsuba_lights import mitsuba_lights
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 LONGEST = 1024
-"""Segments of the longest path. There is no Russian roulette: Mitsuba ends a twentieth of all paths at each scattering, whatever they
-carry, and what is left over of the long paths in dense media weighs so much that noise was ten times higher."""
+"""Segments of the longest path. There is no Russian roulette: Mitsuba ends a twentieth of all paths
+at each scattering, whatever they carry, and what is left over of the long paths in dense media
+weighs so much that noise was ten times higher.
+"""
 SAMPLES = 256
 """Paths a pixel where nobody says otherwise."""
 GRAY = 1e-5
-"""Colors whose extinctions differ by less, relatively, are of one extinction: red, green and blue then share their paths."""
+"""Colors whose extinctions differ by less, relatively, are of one extinction: red, green and blue
+then share their paths.
+"""
 FINER, MANY = 3, 2**20
 NEAR = 1e-4
 """How far from the eye Mitsuba's rays start, in diagonals of the box; it wants more than 0."""
 SQUARE = 1e-5
-"""Pixels this little off square are taken for square, which is an error of as many parts of the image's height."""
+"""Pixels this little off square are taken for square, which is an error of as many parts of the
+image's height.
+"""
 MEDIUM = "medium"
 
 
 def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[str, Any]:
-    """`scene` seen by the cameras of `views`, by paths of at most `depth` segments (2: scattered once; -1: up to `LONGEST`).
+    """`scene` seen by the cameras of `views`, by paths of at most `depth` segments (2: scattered
+    once; -1: up to `LONGEST`).
 
-    The cameras are `sensor_0`, `sensor_1`, ... Raises SceneError for what Mitsuba cannot show: several environment maps, pixels that are
-    not square, and views of whose rays only some start inside the volume.
+    The cameras are `sensor_0`, `sensor_1`, ... Raises SceneError for what Mitsuba cannot show:
+    several environment maps, pixels that are not square, and views of whose rays only some start
+    inside the volume.
     """
     return {
         "type": "scene",
@@ -91,8 +101,13 @@ def _medium(volume: Volume) -> dict[str, Any]:
 
 
 def _plain(volume: Volume) -> Volume:
-    """`volume` in double precision on the CPU, without derivatives; cross sections [C, z, y, x] or [C, 1, 1, 1]."""
-    density, sigma_a, sigma_s, g = (value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s, volume.g))
+    """`volume` in double precision on the CPU, without derivatives; cross sections [C, z, y, x] or
+    [C, 1, 1, 1].
+    """
+    density, sigma_a, sigma_s, g = (
+        value.detach().cpu().double()
+        for value in (volume.density, volume.sigma_a, volume.sigma_s, volume.g)
+    )
     return Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), g)
 
 
@@ -101,14 +116,20 @@ def _fields(sigma: Tensor) -> Tensor:
 
 
 def _albedo(volume: Volume) -> Any:
-    """The part of extinction that scatters: a number, a color or a volume; 0 where nothing is extinguished."""
+    """The part of extinction that scatters: a number, a color or a volume; 0 where nothing is
+    extinguished.
+    """
     absorbing, scattering = torch.broadcast_tensors(volume.sigma_a, volume.sigma_s)
     if absorbing[0].numel() > 1:
         times = FINER if volume.grid.cells <= MANY else 1
         fields = (sigma * volume.density for sigma in (absorbing, scattering))
-        absorbing, scattering = (interpolate(field[None], scale_factor=times, mode="trilinear")[0] for field in fields)
+        absorbing, scattering = (
+            interpolate(field[None], scale_factor=times, mode="trilinear")[0] for field in fields
+        )
     extinction = absorbing + scattering
-    albedo = torch.where(extinction > 0, scattering / torch.where(extinction > 0, extinction, 1), 0).clamp(max=1)
+    albedo = torch.where(
+        extinction > 0, scattering / torch.where(extinction > 0, extinction, 1), 0
+    ).clamp(max=1)
     if albedo[0].numel() > 1:
         return _grid_volume(albedo, volume.grid)
     return albedo.item() if albedo.numel() == 1 else tuple(albedo.flatten().tolist())
@@ -118,13 +139,23 @@ def _grid_volume(values: Tensor, grid: Grid) -> dict[str, Any]:
     """`values` [C, z, y, x] on the box of `grid`."""
     array = np.ascontiguousarray(values.permute(1, 2, 3, 0).float().numpy())
     lower, upper = (np.array(corner) for corner in grid.bounds_xyz)
-    return {"type": "gridvolume", "grid": array, "raw": True, "to_world": _placed(lower, upper - lower)}
+    return {
+        "type": "gridvolume",
+        "grid": array,
+        "raw": True,
+        "to_world": _placed(lower, upper - lower),
+    }
 
 
 def _box(grid: Grid) -> dict[str, Any]:
     """The box, whose faces do nothing but hold the medium; Mitsuba's cube runs from -1 to 1."""
     place = _placed(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2)
-    return {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": {"type": "ref", "id": MEDIUM}}
+    return {
+        "type": "cube",
+        "to_world": place,
+        "bsdf": {"type": "null"},
+        "interior": {"type": "ref", "id": MEDIUM},
+    }
 
 
 def _placed(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -134,7 +165,9 @@ def _placed(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:
-    """The camera: Mitsuba's looks along +z with +x to the left, and its film keeps the mean of each pixel."""
+    """The camera: Mitsuba's looks along +z with +x to the left, and its film keeps the mean of each
+    pixel.
+    """
     camera = view.camera
     height, width = camera.size
     right, up, backward, origin = camera.pose.detach().cpu().double().numpy().T
@@ -142,7 +175,13 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     matrix[:3] = np.stack([-right, up, -backward, origin], axis=1)
     diagonal = math.hypot(*grid.extent)
     sensor: dict[str, Any] = {
-        "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32", "rfilter": {"type": "box"}},
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
         "sampler": {"type": "independent", "sample_count": SAMPLES},
         "near_clip": NEAR * diagonal,
         "far_clip": 2 * (diagonal + math.dist(origin, grid.center_xyz)),
@@ -155,17 +194,29 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
                 f"view {view.name!r}: Mitsuba's pixels are square, those of this camera {camera.pixel_aspect:.6g} times as high as wide"
             )
         fov = 2 * math.degrees(math.atan(camera.half_width))
-        offsets = {f"principal_point_offset_{axis}": 0.5 - place for axis, place in zip("xy", camera.principal_point, strict=True)}
-        return {"type": "perspective", "fov": fov, "fov_axis": "x", **offsets, "to_world": matrix, **sensor}
+        offsets = {
+            f"principal_point_offset_{axis}": 0.5 - place
+            for axis, place in zip("xy", camera.principal_point, strict=True)
+        }
+        return {
+            "type": "perspective",
+            "fov": fov,
+            "fov_axis": "x",
+            **offsets,
+            "to_world": matrix,
+            **sensor,
+        }
     scale = np.diag([camera.half_width, camera.half_width, 1.0, 1.0])
     return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
 
 
 def _starts_inside(name: str, camera: Camera, grid: Grid) -> bool:
     """Whether view rays start inside the box of `grid`; Mitsuba is told so once for all of them."""
-    start = rays(camera).origin.detach()
+    start = cast_rays(camera).origin.detach()
     lower, upper = (start.new_tensor(corner) for corner in (grid.lower, grid.upper))
     is_inside = ((start > lower) & (start < upper)).all(1)
     if bool(is_inside.any()) and not bool(is_inside.all()):
-        raise SceneError(f"view {name!r}: Mitsuba cannot show rays of which only some start inside the volume; move the camera back")
+        raise SceneError(
+            f"view {name!r}: Mitsuba cannot show rays of which only some start inside the volume; move the camera back"
+        )
     return bool(is_inside.any())

@@ -1,4 +1,6 @@
-"""Path-traced images (Mitsuba 3, extra `reference`): passes with seeds of their own, whose scatter tells how noisy their mean is."""
+"""Path-traced images (Mitsuba 3, extra `reference`): passes with seeds of their own, whose scatter
+tells how noisy their mean is.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from ddrecon.extras import load_extra
-from ddrecon.reference.colors import of_color
+from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import is_gray, mitsuba_scene, sensor_id
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,27 +27,45 @@ class Tracer:
     scenes: tuple[Any, ...]
 
     def trace(self, view: int, seed: int, samples: int) -> np.ndarray:
-        """The image [h, w, 3], float64, of view number `view` by `samples` paths a pixel; each `seed` >= 0 has paths of its own."""
-        images = [self._render(scene, view, len(self.scenes) * seed + index, samples) for index, scene in enumerate(self.scenes)]
+        """The image [h, w, 3], float64, of view number `view` by `samples` paths a pixel; each
+        `seed` >= 0 has paths of its own.
+        """
+        images = [
+            self._render(scene, view, len(self.scenes) * seed + index, samples)
+            for index, scene in enumerate(self.scenes)
+        ]
         return images[0] if len(images) == 1 else np.stack([image.mean(-1) for image in images], -1)
 
     def _render(self, scene: Any, view: int, seed: int, samples: int) -> np.ndarray:
         (sensor,) = (sensor for sensor in scene.sensors() if sensor.id() == sensor_id(view))
-        return np.array(self.module.render(scene, sensor=sensor, seed=seed, spp=samples), np.float64)
+        return np.array(
+            self.module.render(scene, sensor=sensor, seed=seed, spp=samples), np.float64
+        )
 
 
-def open_tracer(scene: Scene, views: Sequence[View], depth: int = -1, threads: int | None = None) -> Tracer:
-    """What traces `views` of `scene` on `threads` threads (None: all), by paths of at most `depth` segments (-1: practically any number).
+def open_tracer(
+    scene: Scene, views: Sequence[View], depth: int = -1, threads: int | None = None
+) -> Tracer:
+    """What traces `views` of `scene` on `threads` threads (None: all), by paths of at most `depth`
+    segments (-1: practically any number).
 
-    Colors whose extinctions differ are traced one by one. Raises MissingExtraError without Mitsuba, SceneError for what it cannot show.
+    Colors whose extinctions differ are traced one by one. Raises MissingExtraError without Mitsuba,
+    SceneError for what it cannot show.
     """
     module = load_mitsuba(threads)
-    scenes = [scene] if is_gray(scene.volume) else [of_color(scene, color) for color in range(3)]
-    return Tracer(module, tuple(module.load_dict(translated(module, mitsuba_scene(one, views, depth))) for one in scenes))
+    scenes = [scene] if is_gray(scene.volume) else [pick_color(scene, color) for color in range(3)]
+    return Tracer(
+        module,
+        tuple(
+            module.load_dict(translate_errors(module, mitsuba_scene(one, views, depth)))
+            for one in scenes
+        ),
+    )
 
 
 def load_mitsuba(threads: int | None = None) -> ModuleType:
-    """Mitsuba, set to the variant `llvm_ad_rgb` where DRJIT_LIBLLVM_PATH names an LLVM for it, else to `scalar_rgb`.
+    """Mitsuba, set to the variant `llvm_ad_rgb` where DRJIT_LIBLLVM_PATH names an LLVM for it, else
+    to `scalar_rgb`.
 
     Raises MissingExtraError where it is not installed.
     """
@@ -59,14 +79,16 @@ def load_mitsuba(threads: int | None = None) -> ModuleType:
     return mitsuba
 
 
-def translated(module: ModuleType, value: Any) -> Any:
+def translate_errors(module: ModuleType, value: Any) -> Any:
     """A description by `mitsuba_scene` with Mitsuba's own objects in it."""
     if isinstance(value, dict):
-        return {key: translated(module, entry) for key, entry in value.items()}
+        return {key: translate_errors(module, entry) for key, entry in value.items()}
     if isinstance(value, tuple):
         return {"type": "rgb", "value": list(value)}
     if isinstance(value, np.ndarray):
-        return {2: module.ScalarTransform4f, 3: module.Bitmap, 4: module.VolumeGrid}[value.ndim](value)
+        return {2: module.ScalarTransform4f, 3: module.Bitmap, 4: module.VolumeGrid}[value.ndim](
+            value
+        )
     return value
 
 
@@ -74,7 +96,8 @@ def translated(module: ModuleType, value: Any) -> Any:
 class Traced:
     """The mean `image` [h, w] or [h, w, 3] of several passes, and its `noise`.
 
-    That is the standard error of its pixels (root mean square), relative to the root mean square of the image; 0 for a black image.
+    That is the standard error of its pixels (root mean square), relative to the root mean square of
+    the image; 0 for a black image.
     """
 
     image: np.ndarray
@@ -92,7 +115,9 @@ class Traced:
         return math.sqrt(self._square(image))
 
     def error(self, image: np.ndarray) -> float:
-        """The `distance` of `image` less the noise, in quadrature: what would be left were this one free of noise; at least 0."""
+        """The `distance` of `image` less the noise, in quadrature: what would be left were this one
+        free of noise; at least 0.
+        """
         return math.sqrt(max(0.0, self._square(image) - self.noise**2))
 
     def _square(self, image: np.ndarray) -> float:

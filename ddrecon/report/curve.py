@@ -1,4 +1,6 @@
-"""Curves as SVG within a page. (matplotlib is an extra and takes seconds to start; a report is written after every run.)"""
+"""Curves as SVG within a page. (matplotlib is an extra and takes seconds to start; a report is
+written after every run.)
+"""
 
 from __future__ import annotations
 
@@ -16,26 +18,46 @@ MOST = 500
 """Points of a curve that are drawn."""
 
 
-def curve(title: str, series: Mapping[str, Sequence[Point]], across: str, is_logarithmic: bool = False) -> str:
-    """The `series` of points (x, y) as lines, with a legend; `across` says what x is. `is_logarithmic`: y by its logarithm, if > 0.
+def draw_curve(
+    title: str, series: Mapping[str, Sequence[Point]], across: str, is_logarithmic: bool = False
+) -> str:
+    """The `series` of points (x, y) as lines, with a legend; `across` says what x is.
+    `is_logarithmic`: y by its logarithm, if > 0.
 
     There must be at least one point; those that are not finite are left out.
     """
-    drawn = {name: _thinned([p for p in points if _is_shown(p[1], is_logarithmic)]) for name, points in series.items()}
+    drawn = {
+        name: _thin([p for p in points if _is_shown(p[1], is_logarithmic)])
+        for name, points in series.items()
+    }
     drawn = {name: points for name, points in drawn.items() if points}
     xs = [x for points in drawn.values() for x, _ in points] or [0.0]
-    ys = [math.log10(y) if is_logarithmic else y for points in drawn.values() for _, y in points] or [0.0]
-    horizontal, vertical = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT), _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP)
+    ys = [
+        math.log10(y) if is_logarithmic else y for points in drawn.values() for _, y in points
+    ] or [0.0]
+    horizontal, vertical = (
+        _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT),
+        _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP),
+    )
     parts = [_text(LEFT, 16, title, "start", bold=True)]
     for value in (logarithmic_ticks if is_logarithmic else ticks)(vertical.low, vertical.high):
         y = vertical.place(value)
-        parts += [_line(LEFT, y, WIDTH - RIGHT, y, 0.2), _text(LEFT - 6, y + 4, f"{10**value if is_logarithmic else value:.4g}", "end")]
+        parts += [
+            _line(LEFT, y, WIDTH - RIGHT, y, 0.2),
+            _text(LEFT - 6, y + 4, f"{10**value if is_logarithmic else value:.4g}", "end"),
+        ]
     for value in ticks(horizontal.low, horizontal.high):
         parts.append(_text(horizontal.place(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
-    parts += [_line(LEFT, HEIGHT - BOTTOM, WIDTH - RIGHT, HEIGHT - BOTTOM, 0.7), _text(WIDTH - RIGHT, HEIGHT - 6, across, "end")]
+    parts += [
+        _line(LEFT, HEIGHT - BOTTOM, WIDTH - RIGHT, HEIGHT - BOTTOM, 0.7),
+        _text(WIDTH - RIGHT, HEIGHT - 6, across, "end"),
+    ]
     for index, (name, points) in enumerate(drawn.items()):
         color = COLORS[index % len(COLORS)]
-        placed = [(horizontal.place(x), vertical.place(math.log10(y) if is_logarithmic else y)) for x, y in points]
+        placed = [
+            (horizontal.place(x), vertical.place(math.log10(y) if is_logarithmic else y))
+            for x, y in points
+        ]
         parts.append(_path(placed, color))
         parts.append(_text(WIDTH - RIGHT - LEGEND * index, 16, name, "end", color=color))
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">{"".join(parts)}</svg>'
@@ -45,7 +67,10 @@ class _Axis:
     """Values from `low` to `high` at places from `first` to `last`."""
 
     def __init__(self, low: float, high: float, first: float, last: float):
-        middle, half = (low + high) / 2, max((high - low) / 2, 1e-9 * max(abs(low), abs(high), 1e-3))
+        middle, half = (
+            (low + high) / 2,
+            max((high - low) / 2, 1e-9 * max(abs(low), abs(high), 1e-3)),
+        )
         self.low, self.high, self.first, self.last = middle - half, middle + half, first, last
 
     def place(self, value: float) -> float:
@@ -56,11 +81,16 @@ def ticks(low: float, high: float) -> list[float]:
     """About five round values in [`low`, `high`], `low` < `high`."""
     step = 10.0 ** math.floor(math.log10((high - low) / 4))
     step *= next((factor for factor in (1, 2, 5) if (high - low) / (step * factor) <= 5), 10)
-    return [index * step for index in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+    return [
+        index * step
+        for index in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    ]
 
 
 def logarithmic_ticks(low: float, high: float) -> list[float]:
-    """The decimal logarithms of some round values in [10^`low`, 10^`high`], `low` < `high`: 1, 2, 5, 10, ..., or powers of ten."""
+    """The decimal logarithms of some round values in [10^`low`, 10^`high`], `low` < `high`: 1, 2,
+    5, 10, ..., or powers of ten.
+    """
     decades = range(math.floor(low), math.ceil(high) + 1)
     factors = (1, 2, 5) if high - low < 2 else (1,)
     every = -(-len(decades) // 6)
@@ -73,7 +103,7 @@ def _is_shown(y: float, is_logarithmic: bool) -> bool:
     return math.isfinite(y) and (y > 0 or not is_logarithmic)
 
 
-def _thinned(points: Sequence[Point]) -> list[Point]:
+def _thin(points: Sequence[Point]) -> list[Point]:
     """Every so many of `points` and the last, at most about `MOST`."""
     every = max(1, len(points) // MOST)
     return [*points[: len(points) - 1 : every], *points[-1:]]
@@ -91,6 +121,8 @@ def _line(x1: float, y1: float, x2: float, y2: float, opacity: float) -> str:
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="currentColor" stroke-opacity="{opacity}"/>'
 
 
-def _text(x: float, y: float, text: str, anchor: str, color: str = "currentColor", bold: bool = False) -> str:
+def _text(
+    x: float, y: float, text: str, anchor: str, color: str = "currentColor", bold: bool = False
+) -> str:
     weight = ' font-weight="600"' if bold else ""
     return f'<text x="{x:.1f}" y="{y:.1f}" font-size="12.5" text-anchor="{anchor}" fill="{color}"{weight}>{escape(text)}</text>'

@@ -1,4 +1,6 @@
-"""Pages of HTML from headings, tables and pictures. Text is escaped here; parts made here are put together as they are."""
+"""Pages of HTML from headings, tables and pictures. Text is escaped here; parts made here are put
+together as they are.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ddrecon.io.atomic import replacing
+from ddrecon.io.files.atomic import replace_file
 
 STYLE = """
 :root { color-scheme: light dark; --line: #8885; --soft: #8882; }
@@ -24,10 +26,12 @@ pre { overflow-x: auto; background: var(--soft); padding: 0.75rem; font-size: 0.
 
 
 def write_page(path: Path, title: str, lead: str, sections: Sequence[str]) -> None:
-    """Writes the page of `sections` under `title`, with `lead`, a sentence, between them, to `path`."""
+    """Writes the page of `sections` under `title`, with `lead`, a sentence, between them, to
+    `path`.
+    """
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
     body = f"<h1>{escape(title)}</h1>\n<p>{escape(lead)}</p>\n" + "\n".join(sections)
-    with replacing(path) as temporary:
+    with replace_file(path) as temporary:
         text = f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n'
         temporary.write_text(text, encoding="utf-8")
 
@@ -62,10 +66,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 def picture(png: bytes, caption: str, width: int = 600) -> str:
     """The picture `png`, `width` pixels wide where there is room, above `caption`."""
     data = base64.b64encode(png).decode("ascii")
-    image = f'<img src="data:image/png;base64,{data}" alt="{escape(caption)}" style="width: {width}px">'
+    image = (
+        f'<img src="data:image/png;base64,{data}" alt="{escape(caption)}" style="width: {width}px">'
+    )
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def folded(summary: str, text: str) -> str:
+def fold(summary: str, text: str) -> str:
     """`text` as it stands, shown when `summary` is clicked."""
     return f"<details><summary>{escape(summary)}</summary><pre>{escape(text)}</pre></details>"

@@ -1,6 +1,8 @@
-"""How well a solution of the diffusion equation satisfies it, by a system put together here face by face (docs/theory.md E4, E6, E7).
+"""How well a solution of the diffusion equation satisfies it, by a system put together here face by
+face (docs/theory.md E4, E6, E7).
 
-Iterations update their residual rather than compute it, so that rounding hides from them; here it is b - A u itself.
+Iterations update their residual rather than compute it, so that rounding hides from them; here it
+is b - A u itself.
 """
 
 from __future__ import annotations
@@ -12,18 +14,19 @@ from torch import Tensor
 
 from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance, face_fluxes
-from ddrecon.medium import scaled_medium
-from ddrecon.reduced import ambient_radiance, reduced_light
-from ddrecon.renderer import has_flux
-from ddrecon.sky import sources
-from ddrecon.world import Scene
+from ddrecon.light.reduced import ambient_radiance, reduced_light
+from ddrecon.light.sky import decompose_lights
+from ddrecon.medium.coefficients import has_flux, scale_medium
+from ddrecon.scene import Scene
 
 
 @dataclass(frozen=True)
 class Balance:
-    """`residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by; `attainable`: what rounding u makes of it.
+    """`residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by;
+    `attainable`: what rounding u makes of it.
 
-    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces. All are 0 where there is no source.
+    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces. All
+    are 0 where there is no source.
     """
 
     residual: float
@@ -32,19 +35,34 @@ class Balance:
 
 
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
-    """The balance of `solution`, L0 [C, z, y, x], in `scene`, whose lights are beams and ambient light."""
-    medium, grid, lights = scaled_medium(scene.volume), scene.volume.grid, sources(scene.lights)
+    """The balance of `solution`, L0 [C, z, y, x], in `scene`, whose lights are beams and ambient
+    light.
+    """
+    medium, grid, lights = (
+        scale_medium(scene.volume),
+        scene.volume.grid,
+        decompose_lights(scene.lights),
+    )
     source = reduced_light(medium, lights, has_flux(medium)).source
-    diffusion = CLOSURES[scene.diffusion.closure](medium.transport_extinction, grid, scene.diffusion.floor)
+    diffusion = CLOSURES[scene.diffusion.closure](
+        medium.transport_extinction, grid, scene.diffusion.floor
+    )
     escape = boundary_loss(diffusion, grid)
     z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
     operator = Operator((z, y, x), medium.absorption.value + escape)
-    injected = medium.remaining_scattering * source.mean + escape * ambient_radiance(lights, solution)
+    injected = medium.remaining_scattering * source.mean + escape * ambient_radiance(
+        lights, solution
+    )
     right, leaked = injected, torch.zeros((), dtype=torch.float64, device=solution.device)
     for axis, flux in zip(AXES, source.flux or (None,) * 3, strict=True):
-        scattered, step = None if flux is None else medium.remaining_scattering * flux, grid.spacing[axis - 1]
+        scattered, step = (
+            None if flux is None else medium.remaining_scattering * flux,
+            grid.spacing[axis - 1],
+        )
         if scattered is not None:
-            right = right - face_fluxes(None, scattered, diffusion, grid, axis).diff(dim=axis) / step
+            right = (
+                right - face_fluxes(None, scattered, diffusion, grid, axis).diff(dim=axis) / step
+            )
         faces = face_fluxes(solution, scattered, diffusion, grid, axis).double()
         leaked = leaked + (faces.select(axis, -1) - faces.select(axis, 0)).sum() / step
     if not right.any():
@@ -55,7 +73,9 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
 
 
 def _residual(operator: Operator, right: Tensor, u: Tensor) -> tuple[float, float]:
-    """The relative residual, and what a rounding of the size of one unit in the last place of every entry of `u` adds to it."""
+    """The relative residual, and what a rounding of the size of one unit in the last place of every
+    entry of `u` adds to it.
+    """
     scale = operator.diagonal.rsqrt()
     size = (scale * right).norm()
     rounding = torch.finfo(u.dtype).eps * (scale * operator.diagonal * u).norm()

@@ -1,4 +1,6 @@
-"""The hard cases run: finite, single precision close to double, solved as far as rounding allows, no light lost, none below zero."""
+"""The hard cases run: finite, single precision close to double, solved as far as rounding allows,
+no light lost, none below zero.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 @dataclass(frozen=True)
 class Rendered:
-    """One case in one precision: `image` [3, h, w], `gradient` of its mean by density [z, y, x], iterations and balance of the solve."""
+    """One case in one precision: `image` [3, h, w], `gradient` of its mean by density [z, y, x],
+    iterations and balance of the solve.
+    """
 
     image: Tensor
     gradient: Tensor
@@ -43,7 +47,9 @@ class Rendered:
 
 @dataclass(frozen=True)
 class HardResult:
-    """What a case came to. `iterations` to `energy` are of float32; errors are relative RMS; `lowest` is over the brightest pixel."""
+    """What a case came to. `iterations` to `energy` are of float32; errors are relative RMS;
+    `lowest` is over the brightest pixel.
+    """
 
     case: str
     is_finite: bool
@@ -64,15 +70,31 @@ class HardResult:
             "image": self.image_error <= SINGLE_FROM_DOUBLE,
             "gradient": self.gradient_error <= SINGLE_FROM_DOUBLE,
             "radiance": self.lowest >= -NEGATIVE,
-            "energy": self.energy <= ENERGY[torch.float32] and self.energy_double <= ENERGY[torch.float64],
+            "energy": self.energy <= ENERGY[torch.float32]
+            and self.energy_double <= ENERGY[torch.float64],
         }
         return [name for name, is_kept in kept.items() if not is_kept]
 
     def row(self) -> str:
         """The case as a line of the table."""
-        numbers = (self.residual, self.attainable, self.image_error, self.gradient_error, self.lowest, self.energy, self.energy_double)
+        numbers = (
+            self.residual,
+            self.attainable,
+            self.image_error,
+            self.gradient_error,
+            self.lowest,
+            self.energy,
+            self.energy_double,
+        )
         verdict = f"FAIL: {', '.join(self.failures())}" if self.failures() else "pass"
-        return " | ".join([f"| {self.case:<41}", f"{self.iterations:>10}", *(f"{number:>14.1e}" for number in numbers), f"{verdict} |"])
+        return " | ".join(
+            [
+                f"| {self.case:<41}",
+                f"{self.iterations:>10}",
+                *(f"{number:>14.1e}" for number in numbers),
+                f"{verdict} |",
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -99,7 +121,7 @@ def run_cases(device: torch.device, progress: Progress) -> list[HardResult | Uns
 def run_case(name: str, case: HardCase, device: torch.device) -> HardResult | Unsolved:
     """The result of `case`, called `name`, rendered in both precisions."""
     try:
-        single, double = (_rendered(case, dtype, device) for dtype in (torch.float32, torch.float64))
+        single, double = (_render(case, dtype, device) for dtype in (torch.float32, torch.float64))
     except SolveError as error:
         return Unsolved(name, str(error))
     brightest = float(single.image.max().clamp(min=torch.finfo(torch.float32).tiny))
@@ -119,26 +141,42 @@ def run_case(name: str, case: HardCase, device: torch.device) -> HardResult | Un
 
 def table(results: Sequence[HardResult | Unsolved]) -> list[str]:
     """The results as a table, and how many cases failed."""
-    names = [field.name.replace("_", " ") for field in fields(HardResult) if field.name not in ("case", "is_finite", "iterations")]
-    header = " | ".join([f"| {'case':<41}", "iterations", *(f"{name:>14}" for name in names), "verdict |"])
+    names = [
+        field.name.replace("_", " ")
+        for field in fields(HardResult)
+        if field.name not in ("case", "is_finite", "iterations")
+    ]
+    header = " | ".join(
+        [f"| {'case':<41}", "iterations", *(f"{name:>14}" for name in names), "verdict |"]
+    )
     rule = "|" + "---|" * (header.count("|") - 1)
     failed = sum(bool(result.failures()) for result in results)
-    return [header, rule, *(result.row() for result in results), f"{len(results)} cases, {failed} failed"]
+    return [
+        header,
+        rule,
+        *(result.row() for result in results),
+        f"{len(results)} cases, {failed} failed",
+    ]
 
 
 def describe(results: Sequence[HardResult | Unsolved]) -> dict[str, Any]:
     """The results as plain values, for a JSON file."""
-    cases = [{**asdict(result), "failures": result.failures(), "passed": not result.failures()} for result in results]
+    cases = [
+        {**asdict(result), "failures": result.failures(), "passed": not result.failures()}
+        for result in results
+    ]
     return {"passed": all(case["passed"] for case in cases), "cases": cases}
 
 
-def _rendered(case: HardCase, dtype: torch.dtype, device: torch.device) -> Rendered:
+def _render(case: HardCase, dtype: torch.dtype, device: torch.device) -> Rendered:
     scene, memory = case.scene(dtype, device), SolveMemory()
     density = scene.volume.density.requires_grad_()
     image = render(scene, memory=memory)[0]
     (gradient,) = torch.autograd.grad(image.mean(), density)
     density.requires_grad_(False)
-    balance = balance_of(scene, memory.last["forward", 0]) if memory.records else Balance(0.0, 0.0, 0.0)
+    balance = (
+        balance_of(scene, memory.last["forward", 0]) if memory.records else Balance(0.0, 0.0, 0.0)
+    )
     iterations = sum(record.iterations for record in memory.records)
     return Rendered(image.detach(), gradient, iterations, balance)
 

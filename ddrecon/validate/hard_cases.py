@@ -1,6 +1,8 @@
-"""Small scenes at the edges of what is allowed, each in any precision: `CASES` is the table that `ddrecon bench --hard` and the tests run.
+"""Small scenes at the edges of what is allowed, each in any precision: `CASES` is the table that
+`ddrecon bench --hard` and the tests run.
 
-Everything is written here in double precision and rounded once, as the scene loader does it. Shapes and sides are in array order (z, y, x).
+Everything is written here in double precision and rounded once, as the scene loader does it. Shapes
+and sides are in array order (z, y, x).
 """
 
 from __future__ import annotations
@@ -13,15 +15,17 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid, Triple
-from ddrecon.lights import AmbientLight, DirectionalLight, Light
-from ddrecon.medium import Volume
+from ddrecon.light.lights import AmbientLight, DirectionalLight, Light
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables import cross_sections
-from ddrecon.world import Scene, View
+from ddrecon.variables.values import cross_sections
 
 Shape = tuple[int, int, int]
 TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-12}
-"""Relative residual asked of the solves: small against the bounds of a case, and within what each precision can reach."""
+"""Relative residual asked of the solves: small against the bounds of a case, and within what each
+precision can reach.
+"""
 IRRADIANCE = 3.0
 
 
@@ -51,9 +55,11 @@ def layer(shape: Shape) -> Tensor:
 
 @dataclass(frozen=True)
 class HardCase:
-    """A scene in words: a medium of `shape` cells in a box of `sides` [u] about the origin, a beam and a camera of 16 x 16 pixels.
+    """A scene in words: a medium of `shape` cells in a box of `sides` [u] about the origin, a beam
+    and a camera of 16 x 16 pixels.
 
-    `depth`: optical depth of a cell of density 1 along its shortest side. `travel`, `eye` and `target` are (x, y, z).
+    `depth`: optical depth of a cell of density 1 along its shortest side. `travel`, `eye` and
+    `target` are (x, y, z).
     """
 
     density: Callable[[Shape], Tensor] = ball
@@ -76,15 +82,24 @@ class HardCase:
             return torch.tensor(values, dtype=torch.float64).to(device, dtype)
 
         grid = self._grid()
-        sigma = cross_sections(*(torch.tensor([value], dtype=torch.float64) for value in (self.depth / min(grid.spacing), self.albedo)))
+        sigma = cross_sections(
+            *(
+                torch.tensor([value], dtype=torch.float64)
+                for value in (self.depth / min(grid.spacing), self.albedo)
+            )
+        )
         sigma_a, sigma_s = (value.to(device, dtype) for value in sigma)
-        volume = Volume(grid, self.density(self.shape).to(device, dtype), sigma_a, sigma_s, tensor(self.g))
+        volume = Volume(
+            grid, self.density(self.shape).to(device, dtype), sigma_a, sigma_s, tensor(self.g)
+        )
         lights: list[Light] = [DirectionalLight(tensor(self.travel), tensor([IRRADIANCE]))]
         if self.ambient:
             lights.append(AmbientLight(tensor([self.ambient])))
         pose = look_at(tensor(self.eye), tensor(self.target), tensor((0.0, 1.0, 0.0)))
         views = [View("view", Camera(pose, (16, 16), self.half_width, self.is_perspective))]
-        return Scene(volume, lights, views, RenderSettings(), DiffusionSettings(tolerance=TOLERANCE[dtype]))
+        return Scene(
+            volume, lights, views, RenderSettings(), DiffusionSettings(tolerance=TOLERANCE[dtype])
+        )
 
     def _grid(self) -> Grid:
         z, y, x = self.sides
@@ -99,7 +114,10 @@ CASES: dict[str, HardCase] = {
     "vacuum, g 0.9, ambient light": HardCase(empty, g=0.9, ambient=0.5),
     "density jumps by 1e6": HardCase(layer, depth=10),
     "density jumps by 1e6, albedo 1, g 0.7": HardCase(layer, depth=10, albedo=1, g=0.7),
-    **{f"optical depth 1e{power:+d} a cell": HardCase(full, depth=10.0**power) for power in (-8, -4, -2, 0, 1, 2, 4)},
+    **{
+        f"optical depth 1e{power:+d} a cell": HardCase(full, depth=10.0**power)
+        for power in (-8, -4, -2, 0, 1, 2, 4)
+    },
     "optical depth 1e+4 a cell, albedo 1": HardCase(full, depth=1e4, albedo=1),
     "optical depth 1e+4 a cell, ball in vacuum": HardCase(ball, depth=1e4),
     "albedo 0": HardCase(depth=3, albedo=0, ambient=0.5, shape=(8, 8, 8)),
@@ -109,12 +127,22 @@ CASES: dict[str, HardCase] = {
     "g -0.99": HardCase(depth=3, g=-0.99),
     "g 0.99, albedo 1, full box": HardCase(full, depth=10, albedo=1, g=0.99),
     "g 0.99, density jumps by 1e6": HardCase(layer, depth=100, albedo=0.5, g=0.99),
-    "g -0.99, density jumps by 1e6": HardCase(layer, depth=0.2, albedo=0.5, g=-0.99, eye=(0.1, 2.5, 0.3)),
+    "g -0.99, density jumps by 1e6": HardCase(
+        layer, depth=0.2, albedo=0.5, g=-0.99, eye=(0.1, 2.5, 0.3)
+    ),
     "thin slab, 1 cell along x": HardCase(shape=(24, 24, 1), sides=(1, 1, SLAB), g=0.4),
     "thin slab, 1 cell along z": HardCase(shape=(1, 24, 24), sides=(SLAB, 1, 1), depth=40, g=0.4),
-    "long box, 256 x 8 x 8": HardCase(full, shape=(8, 8, 256), sides=(BAR, BAR, 1), albedo=0.999, eye=(0.3, 0.5, 1.5)),
+    "long box, 256 x 8 x 8": HardCase(
+        full, shape=(8, 8, 256), sides=(BAR, BAR, 1), albedo=0.999, eye=(0.3, 0.5, 1.5)
+    ),
     "long box, light and view along it": HardCase(
-        full, shape=(8, 8, 256), sides=(BAR, BAR, 1), albedo=0.999, travel=(-1, 0, 0), eye=(1.5, 0, 0), half_width=0.03
+        full,
+        shape=(8, 8, 256),
+        sides=(BAR, BAR, 1),
+        albedo=0.999,
+        travel=(-1, 0, 0),
+        eye=(1.5, 0, 0),
+        half_width=0.03,
     ),
     "voxels 1 : 5 : 0.2": HardCase(sides=(1, 5, 0.2), depth=0.3, g=0.4),
     "voxels 1 : 10 : 0.1": HardCase(sides=(1, 10, 0.1), depth=0.3, g=0.4),
@@ -122,6 +150,10 @@ CASES: dict[str, HardCase] = {
     "light along -y": HardCase(travel=(0, -1, 0), g=0.4),
     "light a millionth off -z": HardCase(travel=(1e-6, 0, -1), g=0.4),
     "camera inside the medium": HardCase(eye=(0.1, 0.12, 0.11), half_width=1, g=0.4),
-    "camera at a grazing angle": HardCase(full, eye=(3, 0.505, 0), target=(0, 0.499, 0), half_width=0.2, g=0.4),
-    "camera in the plane of a face": HardCase(full, eye=(3, 0.5, 0), target=(0, 0.5, 0), half_width=0.5, is_perspective=False),
+    "camera at a grazing angle": HardCase(
+        full, eye=(3, 0.505, 0), target=(0, 0.499, 0), half_width=0.2, g=0.4
+    ),
+    "camera in the plane of a face": HardCase(
+        full, eye=(3, 0.5, 0), target=(0, 0.5, 0), half_width=0.5, is_perspective=False
+    ),
 }

@@ -1,8 +1,11 @@
-"""Where derivatives are checked: the values all parameters have there, the loss as a function of them, and the entries looked at.
+"""Where derivatives are checked: the values all parameters have there, the loss as a function of
+them, and the entries looked at.
 
-Where the scene's density is the same everywhere, and above all where it is empty, the check is made at a random density, half of whose
-cells are empty: an empty volume would hide all but density from the camera. Directions of lights are turned a little at random: light along
-a lattice direction meets cell centers exactly, where the slope of interpolation is a mean of two sides and differences converge slowly.
+Where the scene's density is the same everywhere, and above all where it is empty, the check is made
+at a random density, half of whose cells are empty: an empty volume would hide all but density from
+the camera. Directions of lights are turned a little at random: light along a lattice direction
+meets cell centers exactly, where the slope of interpolation is a mean of two sides and differences
+converge slowly.
 """
 
 from __future__ import annotations
@@ -14,47 +17,65 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.reconstruct.losses import image_loss
+from ddrecon.losses import image_loss
 from ddrecon.renderer import render_each
-from ddrecon.scene.parameter_kinds import pattern_of
-from ddrecon.variables import component_names, value_of, with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.kinds import pattern_of
+from ddrecon.variables.values import component_names, value_of, with_values
 
 TOLERANCE = 1e-13
 """Relative residual of the solves."""
 STEPS = (1e-2, 1e-3, 1e-4)
 """Changes by which finite differences are taken, as parts of the parameter's largest value."""
 SHORT_STEPS = (1e-4, 1e-5, 1e-6)
-"""The same for what moves rays or beams, since interpolation has a kink at every cell center and a short step crosses few, and for g, whose
-delta-Eddington scaling has a second derivative that jumps at 0."""
+"""The same for what moves rays or beams, since interpolation has a kink at every cell center and a
+short step crosses few, and for g, whose delta-Eddington scaling has a second derivative that jumps
+at 0.
+"""
 NUDGE = 1e-2
 """The most that a component of a light's direction is changed by, as a part of the largest."""
 SHORT = {"g", "lights.N.direction", "lights.N.position", "lights.N.rotation", "views.NAME.camera"}
 
 
-def starting_point(scene: Scene, names: tuple[str, ...], generator: torch.Generator) -> dict[str, Tensor]:
-    """The value of density (the scene's own before that it starts from), of each optimized parameter and of each of `names`."""
+def starting_point(
+    scene: Scene, names: tuple[str, ...], generator: torch.Generator
+) -> dict[str, Tensor]:
+    """The value of density (the scene's own before that it starts from), of each optimized
+    parameter and of each of `names`.
+    """
     wanted = dict.fromkeys([*scene.starts, *names, "density"])
-    point = {name: scene.starts[name] if name in scene.starts else value_of(scene, name) for name in wanted}
+    point = {
+        name: scene.starts[name] if name in scene.starts else value_of(scene, name)
+        for name in wanted
+    }
     own = scene.volume.density
     if point["density"].ndim == 3:
         candidates = [own, point["density"], (2 * random_like(own, generator) - 1).clamp(min=0)]
-        point["density"] = next(density for density in candidates if bool((density != density.flatten()[0]).any()))
+        point["density"] = next(
+            density for density in candidates if bool((density != density.flatten()[0]).any())
+        )
     for name, value in point.items():
         if pattern_of(name) == "lights.N.direction":
-            point[name] = value + NUDGE * value.abs().max() * (2 * random_like(value, generator) - 1)
+            point[name] = value + NUDGE * value.abs().max() * (
+                2 * random_like(value, generator) - 1
+            )
     return point
 
 
-def loss_at(scene: Scene, point: Mapping[str, Tensor], generator: torch.Generator) -> Callable[[Mapping[str, Tensor]], Tensor]:
-    """The image loss of `scene` (float64) as a function of some parameters, the others being as in `point`.
+def loss_at(
+    scene: Scene, point: Mapping[str, Tensor], generator: torch.Generator
+) -> Callable[[Mapping[str, Tensor]], Tensor]:
+    """The image loss of `scene` (float64) as a function of some parameters, the others being as in
+    `point`.
 
     Targets are the views' images where they have them, else random ones.
     """
     exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
     views = [view for view in scene.views if view.image is not None] or scene.views
     targets = [
-        view.image if view.image is not None else random_like(scene.volume.density.new_empty(3, *view.camera.size), generator)
+        view.image
+        if view.image is not None
+        else random_like(scene.volume.density.new_empty(3, *view.camera.size), generator)
         for view in views
     ]
     memory = SolveMemory(is_warm=False)
@@ -64,7 +85,9 @@ def loss_at(scene: Scene, point: Mapping[str, Tensor], generator: torch.Generato
         seen = [world.view(view.name) for view in views]
         images = render_each(world, seen, memory)
         compared = zip(images, targets, seen, strict=True)
-        return torch.stack([image_loss("l2", image, target, view.mask) for image, target, view in compared]).mean()
+        return torch.stack(
+            [image_loss("l2", image, target, view.mask) for image, target, view in compared]
+        ).mean()
 
     return loss
 
@@ -76,19 +99,23 @@ def steps_of(name: str, value: Tensor) -> tuple[float, ...]:
     return tuple(step * (largest if largest > 0 else 1.0) for step in steps)
 
 
-def chosen_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:
+def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:
     """Flat indices of `samples` random entries, of density half of them empty where enough are."""
     order = torch.randperm(value.numel(), generator=generator)
     if name != "density":
         return sorted(order[:samples].tolist())
     is_empty = (value.flatten().cpu()[order] == 0).tolist()
     empty = [i for i, e in zip(order.tolist(), is_empty, strict=True) if e][: samples // 2]
-    filled = [i for i, e in zip(order.tolist(), is_empty, strict=True) if not e][: samples - len(empty)]
+    filled = [i for i, e in zip(order.tolist(), is_empty, strict=True) if not e][
+        : samples - len(empty)
+    ]
     return filled + empty
 
 
 def entry_name(name: str, value: Tensor, index: int) -> str:
-    """What a user calls the entry at flat `index`: a component, a cell (x, y, z) or a pixel (x, y), with its color."""
+    """What a user calls the entry at flat `index`: a component, a cell (x, y, z) or a pixel (x, y),
+    with its color.
+    """
     place = []
     for size in reversed(value.shape):
         place.append(index % size)

@@ -27,4 +27,7 @@ optimize:
 
 def contents(folder: Path) -> dict[str, bytes | None]:
     """Every file and folder below `folder`, by path."""
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }

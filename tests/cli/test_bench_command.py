@@ -28,10 +28,16 @@ def test_cases_within_their_bounds_pass(run: Run) -> None:
     result = run(*BENCH, "-o", "out", "--json", "report.json")
     assert (result.exit_code, result.stderr) == (0, "")
     header, _, *rows, verdict = result.stdout.splitlines()
-    assert header.startswith("| case") and [row.split("|")[1].strip() for row in rows] == ["vacuum", "full"]
+    assert header.startswith("| case") and [row.split("|")[1].strip() for row in rows] == [
+        "vacuum",
+        "full",
+    ]
     assert verdict == "2 cases, 0 failed" and all(row.endswith("pass |") for row in rows)
     report = json.loads(Path("report.json").read_text())
-    assert report["passed"] is True and [case["case"] for case in report["cases"]] == ["vacuum", "full"]
+    assert report["passed"] is True and [case["case"] for case in report["cases"]] == [
+        "vacuum",
+        "full",
+    ]
     assert json.loads(Path("out/hard.json").read_text()) == report
 
 
@@ -52,7 +58,9 @@ def test_a_broken_bound_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None
         ([*BENCH, "-o", "scene.yaml"], "is a file"),
     ],
 )
-def test_what_cannot_be_done_is_refused(refuse: Callable[..., list[str]], arguments: list[str], told: str) -> None:
+def test_what_cannot_be_done_is_refused(
+    refuse: Callable[..., list[str]], arguments: list[str], told: str
+) -> None:
     assert told in refuse(2, *arguments)[-1]
 
 
@@ -64,15 +72,26 @@ def test_a_scene_is_measured_by_every_variant(run: Run, monkeypatch: pytest.Monk
     assert report == json.loads(Path("out/bench.json").read_text())
     rows = {row["name"]: row for row in report["rows"]}
     page = Path("out/report.html").read_text()
-    assert all(f"<td>{name}</td>" in page for name in rows) and page.count("<img ") == Path("out/bench.png").is_file()
-    assert [line.split("|")[1].strip() for line in result.stdout.splitlines()[2 : 2 + len(rows)]] == list(rows)
+    assert (
+        all(f"<td>{name}</td>" in page for name in rows)
+        and page.count("<img ") == Path("out/bench.png").is_file()
+    )
+    assert [
+        line.split("|")[1].strip() for line in result.stdout.splitlines()[2 : 2 + len(rows)]
+    ] == list(rows)
     assert rows["tolerance 1e-06"]["iterations"] > rows["tolerance 0.01"]["iterations"]
-    assert rows["solver jacobi"]["iterations"] > rows["solver conjugate_gradient"]["iterations"] > rows["base"]["iterations"]
+    assert (
+        rows["solver jacobi"]["iterations"]
+        > rows["solver conjugate_gradient"]["iterations"]
+        > rows["base"]["iterations"]
+    )
     assert rows["steps 2"]["image_numerical"] < rows["base"]["image_numerical"]
     assert report["truth_noise"] is None and report["environment"]["threads"] >= 1
 
 
-def test_path_tracing_takes_part_where_mitsuba_is_installed(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_path_tracing_takes_part_where_mitsuba_is_installed(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("mitsuba", reason="Mitsuba 3 is not installed (extra `reference`)")
     monkeypatch.setattr("ddrecon.bench.run.QUICK_PATHS", (4, 64))
     result = run("bench", "scene.yaml", "--quick", "-q", "--json", "report.json")

@@ -40,14 +40,26 @@ def test_grid_views_physics_and_memory(succeed: Run, folder: Path) -> None:
         ("diffusion.model=none", "no multiple scattering", "p1 diffusion"),
         ("volume.sigma_s=0", "no multiple scattering", "p1 diffusion"),
         ("lights=[{type: ambient, radiance: 1}]", "ambient light", "directional"),
-        ("lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]", "1 directional light", "ambient"),
-        ("lights=[{type: point, position: [0, 2, 0], intensity: 1}]", "towards 1 point light", "directional"),
+        (
+            "lights=[{type: directional, direction: [0, -1, 0], irradiance: 1}]",
+            "1 directional light",
+            "ambient",
+        ),
+        (
+            "lights=[{type: point, position: [0, 2, 0], intensity: 1}]",
+            "towards 1 point light",
+            "directional",
+        ),
         ("volume.sigma_s=2", "1 color channel", "3 color channels"),
         ("volume.sigma_s=[2, 3, 4]", "3 color channels", "1 color channel"),
     ],
 )
-def test_only_the_physics_a_scene_needs(succeed: Run, override: str, present: str, absent: str) -> None:
-    physics = "\n".join(json.loads(succeed("check", "scene.yaml", "--json", "-D", override).stdout)["physics"])
+def test_only_the_physics_a_scene_needs(
+    succeed: Run, override: str, present: str, absent: str
+) -> None:
+    physics = "\n".join(
+        json.loads(succeed("check", "scene.yaml", "--json", "-D", override).stdout)["physics"]
+    )
     assert present in physics and absent not in physics
 
 
@@ -55,14 +67,21 @@ def test_suns_and_sky_of_an_environment_map(succeed: Run) -> None:
     pixels = np.ones((32, 64, 3), np.float32)
     pixels[[8, 20], [10, 40]] = 3000
     np.save("sky.npy", pixels)
-    report = succeed("check", "scene.yaml", "-D", "lights=[{type: environment, file: sky.npy}]").stdout
-    assert "  environment map 64 x 32: 2 suns as beams, sky by 48 directions, its mean as inflow" in report
+    report = succeed(
+        "check", "scene.yaml", "-D", "lights=[{type: environment, file: sky.npy}]"
+    ).stdout
+    assert (
+        "  environment map 64 x 32: 2 suns as beams, sky by 48 directions, its mean as inflow"
+        in report
+    )
 
 
 def test_json(succeed: Run) -> None:
     report = json.loads(succeed("check", "scene.yaml", "--json").stdout)
     assert report["resolution"] == [6, 5, 4] and report["bounds"] == [[-0.5] * 3, [0.5] * 3]
-    assert [(view["name"], view["width"], view["height"], view["split"]) for view in report["views"]] == [
+    assert [
+        (view["name"], view["width"], view["height"], view["split"]) for view in report["views"]
+    ] == [
         ("front", 8, 6, "train"),
         ("side", 8, 6, "test"),
     ]
@@ -71,7 +90,9 @@ def test_json(succeed: Run) -> None:
 
 def test_memory_grows_with_cells_and_precision(succeed: Run) -> None:
     def memory(*arguments: str) -> int:
-        return json.loads(succeed("check", "scene.yaml", "--json", *arguments).stdout)["memory_bytes"]
+        return json.loads(succeed("check", "scene.yaml", "--json", *arguments).stdout)[
+            "memory_bytes"
+        ]
 
     resolution = ["-D", "volume.resolution=[60, 50, 40]"]
     assert 0 < memory() < memory(*resolution) < memory(*resolution, "--dtype", "float64")
@@ -79,6 +100,11 @@ def test_memory_grows_with_cells_and_precision(succeed: Run) -> None:
 
 def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
     scene = Path("scene.yaml")
-    scene.write_text(scene.read_text().partition("optimize:")[0].replace("image: front.npy, ", "").replace("image: side.npy, ", ""))
+    scene.write_text(
+        scene.read_text()
+        .partition("optimize:")[0]
+        .replace("image: front.npy, ", "")
+        .replace("image: side.npy, ", "")
+    )
     lines = succeed("check", "scene.yaml").stdout.splitlines()
     assert "optimizes: nothing" in lines and "  front: perspective, 8 x 6 pixels, train" in lines

@@ -13,7 +13,7 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.io.volumes import FORMATS, field_names, read_field, write_field
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -26,17 +26,27 @@ def test_a_scene_becomes_xml_and_a_volume(succeed: Run) -> None:
     assert result.stdout == "written: smoke.xml, smoke.sigma_t.vol\n"
     root = ElementTree.parse("smoke.xml").getroot()
     assert [sensor.attrib["id"] for sensor in root.iter("sensor")] == ["sensor_0", "sensor_1"]
-    assert {emitter.attrib["type"] for emitter in root.iter("emitter")} == {"directional", "constant"}
+    assert {emitter.attrib["type"] for emitter in root.iter("emitter")} == {
+        "directional",
+        "constant",
+    }
 
 
 def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
-    assert succeed("export", "scene.yaml", "-o", "transforms.json").stdout == "written: transforms.json\n"
+    assert (
+        succeed("export", "scene.yaml", "-o", "transforms.json").stdout
+        == "written: transforms.json\n"
+    )
     frames = json.loads(Path("transforms.json").read_text())["frames"]
     assert [frame["file_path"] for frame in frames] == ["front.npy", "side.npy"]
     before = succeed("check", "scene.yaml", "--json").stdout
     succeed("export", "scene.yaml", "-o", "transforms.json", "--overwrite")
     Path("again.yaml").write_text(
-        re.sub(r"(?ms)^views:.*?(?=^\w|\Z)", "views: {transforms: transforms.json}\n", Path("scene.yaml").read_text())
+        re.sub(
+            r"(?ms)^views:.*?(?=^\w|\Z)",
+            "views: {transforms: transforms.json}\n",
+            Path("scene.yaml").read_text(),
+        )
     )
     assert succeed("check", "again.yaml", "--json").stdout == before
 
@@ -44,7 +54,10 @@ def test_a_scenes_cameras_become_transforms(succeed: Run) -> None:
 def test_overwrite(succeed: Run, refuse: Refuse) -> None:
     succeed("export", "scene.yaml", "-o", "smoke.xml")
     (line,) = refuse(2, "export", "scene.yaml", "-o", "smoke.xml", "-D", "volume.g=0")
-    assert line == "smoke.xml, smoke.sigma_t.vol: already there; choose another name, or say --overwrite"
+    assert (
+        line
+        == "smoke.xml, smoke.sigma_t.vol: already there; choose another name, or say --overwrite"
+    )
     first = Path("smoke.xml").read_bytes()
     succeed("export", "scene.yaml", "-o", "smoke.xml", "--overwrite", "-D", "volume.g=0")
     assert Path("smoke.xml").read_bytes() != first
@@ -56,10 +69,15 @@ def test_other_suffixes(refuse: Refuse) -> None:
 
 
 def test_one_scene_at_a_time(refuse: Refuse) -> None:
-    assert refuse(2, "export", "scene.yaml", "scene.yaml", "-o", "smoke.xml")[-1] == "Error: one scene at a time is written as .xml"
+    assert (
+        refuse(2, "export", "scene.yaml", "scene.yaml", "-o", "smoke.xml")[-1]
+        == "Error: one scene at a time is written as .xml"
+    )
 
 
-def test_volumes_through_every_format_keep_a_corner_in_its_place(succeed: Run, readable_formats: list[str]) -> None:
+def test_volumes_through_every_format_keep_a_corner_in_its_place(
+    succeed: Run, readable_formats: list[str]
+) -> None:
     values = np.zeros((2, 3, 4), np.float32)
     values[0, 0, 3] = 7
     bounds = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
@@ -80,7 +98,9 @@ def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
     succeed("export", "density.npz", "smoke.albedo.vol", "-o", f"both{suffix}")
     assert field_names(Path(f"both{suffix}")) == ["density", "albedo"]
     for name, source in (("density", "density.npz"), ("albedo", "smoke.albedo.vol")):
-        assert np.array_equal(read_field(Path(f"both{suffix}"), name).values, read_field(Path(source), name).values)
+        assert np.array_equal(
+            read_field(Path(f"both{suffix}"), name).values, read_field(Path(source), name).values
+        )
 
 
 def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
@@ -90,7 +110,10 @@ def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
     np.savez("nowhere.npz", density=np.ones((2, 2, 2)))
     np.savez("none.npz", bounds=box)
     for sources, words in (
-        (["density.npz", "other.npz"], "other.npz: has 7 x 5 x 4 cells (x, y, z), the first field 6 x 5 x 4"),
+        (
+            ["density.npz", "other.npz"],
+            "other.npz: has 7 x 5 x 4 cells (x, y, z), the first field 6 x 5 x 4",
+        ),
         (["density.npz", "moved.npz"], "moved.npz: lies in the box [[-1.0"),
         (["density.npz", "density.npz"], "has a field 'density', and so has a file before it"),
         (["nowhere.npz"], "says no box"),
@@ -99,11 +122,16 @@ def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
         assert words in refuse(3, "export", *sources, "-o", "all.npz")[-1]
         assert not Path("all.npz").exists()
     np.savez("two.npz", density=np.ones((2, 2, 2)), albedo=np.ones((2, 2, 2)), bounds=box)
-    assert "a .vol holds one field, not density, albedo" in refuse(3, "export", "two.npz", "-o", "two.vol")[-1]
+    assert (
+        "a .vol holds one field, not density, albedo"
+        in refuse(3, "export", "two.npz", "-o", "two.vol")[-1]
+    )
     succeed("export", "two.npz", "-o", "two.vti")
     assert "two.vti: already there" in refuse(2, "export", "density.npz", "-o", "two.vti")[-1]
     succeed("export", "density.npz", "-o", "two.vti", "--overwrite")
 
 
 def test_no_folder(refuse: Refuse, folder: Path) -> None:
-    assert refuse(2, "export", "scene.yaml", "-o", "none/smoke.xml") == ["none/smoke.xml: there is no folder none"]
+    assert refuse(2, "export", "scene.yaml", "-o", "none/smoke.xml") == [
+        "none/smoke.xml: there is no folder none"
+    ]

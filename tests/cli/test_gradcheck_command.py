@@ -25,12 +25,22 @@ def test_the_program_passes(run: Run) -> None:
     report = json.loads(Path("report.json").read_text())
     assert report["passed"] is True
     (check,) = report["checks"]
-    assert check["parameter"] == "density" and check["passed"] is True and len(check["entries"]) == 3
+    assert (
+        check["parameter"] == "density" and check["passed"] is True and len(check["entries"]) == 3
+    )
     assert check["modes_error"] < 1e-10 and max(entry["error"] for entry in check["entries"]) < 1e-6
 
 
 def test_the_given_density_is_the_point_of_the_check(succeed: Run) -> None:
-    succeed(*GRADCHECK, "--parameter", "density", "--json", "report.json", "-D", "volume.density={file: density.npz}")
+    succeed(
+        *GRADCHECK,
+        "--parameter",
+        "density",
+        "--json",
+        "report.json",
+        "-D",
+        "volume.density={file: density.npz}",
+    )
     with_file = json.loads(Path("report.json").read_text())["checks"][0]["entries"]
     assert all(entry["value"] > 0 for entry in with_file if entry["value"] is not None)
 
@@ -47,12 +57,16 @@ def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     assert result.stdout.splitlines()[-1].startswith("density: FAIL")
     report = json.loads(Path("report.json").read_text())
     assert report["passed"] is False
-    assert all(entry["error"] == pytest.approx(0.1, abs=1e-3) for entry in report["checks"][0]["entries"])
+    assert all(
+        entry["error"] == pytest.approx(0.1, abs=1e-3) for entry in report["checks"][0]["entries"]
+    )
 
 
 def test_a_wrong_tangent_alone_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     right = implicit._Solve.jvp
-    monkeypatch.setattr(implicit._Solve, "jvp", staticmethod(lambda *arguments: 0.99 * right(*arguments)))
+    monkeypatch.setattr(
+        implicit._Solve, "jvp", staticmethod(lambda *arguments: 0.99 * right(*arguments))
+    )
     result = run(*GRADCHECK, *SMALL, "--json", "report.json")
     assert result.exit_code == 1
     (check,) = json.loads(Path("report.json").read_text())["checks"]

@@ -13,7 +13,7 @@ import torch
 from click.testing import CliRunner
 
 from ddrecon import __version__
-from ddrecon.cli import main
+from ddrecon.cli.commands import main
 
 README = (Path(__file__).parents[2] / "README.md").read_text()
 PROGRAM = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
@@ -33,20 +33,29 @@ def test_help_takes_under_a_third_of_a_second(arguments: list[str]) -> None:
 def test_the_command_line_imports_nothing_heavy() -> None:
     heavy = {"torch", "numpy", "yaml", "imageio", "tqdm"}
     code = f"import sys, ddrecon, ddrecon.cli; print(sorted({heavy!r} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.strip() == "[]"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], check=True, capture_output=True, text=True
+        ).stdout.strip()
+        == "[]"
+    )
 
 
 @pytest.mark.parametrize("command", main.commands)
 def test_a_command_says_what_it_does(command: str) -> None:
     result = CliRunner().invoke(main, [command, "--help"])
-    assert result.exit_code == 0 and main.commands[command].help.splitlines()[0] in " ".join(result.stdout.split())
+    assert result.exit_code == 0 and main.commands[command].help.splitlines()[0] in " ".join(
+        result.stdout.split()
+    )
     assert "-D KEY.PATH=VALUE" in result.stdout
 
 
 def test_version() -> None:
     python = ".".join(map(str, sys.version_info[:3]))
     (line,) = CliRunner().invoke(main, ["--version"]).stdout.splitlines()
-    assert line.startswith(f"ddrecon {__version__}, Python {python}, torch {torch.__version__}, device ")
+    assert line.startswith(
+        f"ddrecon {__version__}, Python {python}, torch {torch.__version__}, device "
+    )
     assert line.endswith(" cpu") or torch.cuda.is_available()
 
 
@@ -59,12 +68,28 @@ def test_version() -> None:
     ],
 )
 def test_a_shell_completes_what_was_typed(typed: str, expected: list[str]) -> None:
-    words = {"_DDRECON_COMPLETE": "bash_complete", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
+    words = {
+        "_DDRECON_COMPLETE": "bash_complete",
+        "COMP_WORDS": typed,
+        "COMP_CWORD": str(typed.count(" ")),
+    }
     program = [*PROGRAM[:2], PROGRAM[2].replace("main()", "main(prog_name='ddrecon')")]
-    assert subprocess.run(program, env=os.environ | words, capture_output=True, text=True).stdout.split() == expected
+    assert (
+        subprocess.run(
+            program, env=os.environ | words, capture_output=True, text=True
+        ).stdout.split()
+        == expected
+    )
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_is_told_how_to_complete(shell: str) -> None:
-    told = CliRunner().invoke(main, env={"_DDRECON_COMPLETE": f"{shell}_source"}, prog_name="ddrecon").stdout
-    assert f"_DDRECON_COMPLETE={shell}_complete" in told and f"_DDRECON_COMPLETE={shell}_source ddrecon" in README
+    told = (
+        CliRunner()
+        .invoke(main, env={"_DDRECON_COMPLETE": f"{shell}_source"}, prog_name="ddrecon")
+        .stdout
+    )
+    assert (
+        f"_DDRECON_COMPLETE={shell}_complete" in told
+        and f"_DDRECON_COMPLETE={shell}_source ddrecon" in README
+    )

@@ -18,7 +18,15 @@ from small_scene import contents
 Run = Callable[..., Result]
 DensityOf = Callable[[str], np.ndarray]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o"]
-COLUMNS = ["iteration", "seconds", "loss", "psnr", "test_psnr", "forward_iterations", "adjoint_iterations"]
+COLUMNS = [
+    "iteration",
+    "seconds",
+    "loss",
+    "psnr",
+    "test_psnr",
+    "forward_iterations",
+    "adjoint_iterations",
+]
 
 
 def rows(folder: str) -> list[dict[str, str]]:
@@ -32,9 +40,28 @@ def read_json(path: str) -> Any:
 
 def test_the_files_of_a_run(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out")
-    expected = ["scene.yaml", "result.yaml", "environment.json", "loss.csv", "parameters.json", "summary.json", "report.html"]
-    expected += ["volumes", "volumes/density.npz", "checkpoints", "checkpoints/last.pt", "checkpoints/previous.pt"]
-    expected += ["previews", "previews/density.slices.png", "previews/front.png", "previews/side.png"]
+    expected = [
+        "scene.yaml",
+        "result.yaml",
+        "environment.json",
+        "loss.csv",
+        "parameters.json",
+        "summary.json",
+        "report.html",
+    ]
+    expected += [
+        "volumes",
+        "volumes/density.npz",
+        "checkpoints",
+        "checkpoints/last.pt",
+        "checkpoints/previous.pt",
+    ]
+    expected += [
+        "previews",
+        "previews/density.slices.png",
+        "previews/front.png",
+        "previews/side.png",
+    ]
     assert set(contents(Path("out"))) == set(expected)
     parameters = read_json("out/parameters.json")
     assert parameters["g"] == pytest.approx(0.3) and parameters["lights.0.irradiance"] == [3]
@@ -60,13 +87,27 @@ def test_the_summary_agrees_with_the_log(succeed: Run) -> None:
     assert summary["iterations"] == 4
     for name in ("seconds", "loss", "psnr", "test_psnr"):
         assert summary[name] == pytest.approx(float(last[name]), rel=1e-6)
-    assert {name: view["split"] for name, view in summary["views"].items()} == {"front": "train", "side": "test"}
+    assert {name: view["split"] for name, view in summary["views"].items()} == {
+        "front": "train",
+        "side": "test",
+    }
 
 
 def test_the_volume_renders_as_the_summary_says(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out", "-D", "diffusion.tolerance=1e-6")
-    succeed("render", "out/scene.yaml", "-o", "pictures", "-q", "-D", "volume.density={file: volumes/density.npz}")
-    rendered, summary = read_json("pictures/render.json")["psnr"], read_json("out/summary.json")["views"]
+    succeed(
+        "render",
+        "out/scene.yaml",
+        "-o",
+        "pictures",
+        "-q",
+        "-D",
+        "volume.density={file: volumes/density.npz}",
+    )
+    rendered, summary = (
+        read_json("pictures/render.json")["psnr"],
+        read_json("out/summary.json")["views"],
+    )
     assert set(rendered) == {"front", "side"}
     for name, quality in rendered.items():
         assert quality == pytest.approx(summary[name]["psnr"], abs=1e-3)
@@ -81,7 +122,9 @@ def test_the_volume_file(succeed: Run, density_of: DensityOf) -> None:
         assert archive["bounds"].tolist() == [[-0.5] * 3, [0.5] * 3]
 
 
-def test_the_resolved_scene_runs_again_to_the_same_bits(succeed: Run, density_of: DensityOf) -> None:
+def test_the_resolved_scene_runs_again_to_the_same_bits(
+    succeed: Run, density_of: DensityOf
+) -> None:
     succeed(*OPTIMIZE, "out", "-D", "volume.g=0.1", "--iterations", "3")
     Path("elsewhere").mkdir()
     scene = Path("out/scene.yaml").rename("elsewhere/scene.yaml")
@@ -94,14 +137,25 @@ def test_same_command_same_bits(succeed: Run, density_of: DensityOf) -> None:
     succeed(*OPTIMIZE, "one")
     succeed(*OPTIMIZE, "two")
     assert np.array_equal(density_of("one"), density_of("two"))
-    timeless = [[{key: value for key, value in row.items() if key != "seconds"} for row in rows(name)] for name in ("one", "two")]
+    timeless = [
+        [{key: value for key, value in row.items() if key != "seconds"} for row in rows(name)]
+        for name in ("one", "two")
+    ]
     assert timeless[0] == timeless[1]
 
 
 def test_the_environment(succeed: Run) -> None:
-    succeed(*OPTIMIZE, "out", "--threads", "1", "--seed", "7", "--dtype", "float64", "--device", "cpu")
+    succeed(
+        *OPTIMIZE, "out", "--threads", "1", "--seed", "7", "--dtype", "float64", "--device", "cpu"
+    )
     environment = read_json("out/environment.json")
-    given = {"threads": 1, "seed": 7, "dtype": "float64", "device": "cpu", "torch": torch.__version__}
+    given = {
+        "threads": 1,
+        "seed": 7,
+        "dtype": "float64",
+        "device": "cpu",
+        "torch": torch.__version__,
+    }
     assert {key: environment[key] for key in given} == given
     assert torch.get_num_threads() == 1
 
@@ -109,7 +163,11 @@ def test_the_environment(succeed: Run) -> None:
 def test_previews_along_the_way(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out", "--preview-every", "2")
     names = {path.stem for path in Path("out/previews").iterdir()}
-    assert names == {f"{name}{mark}" for name in ("density.slices", "front", "side") for mark in ("", "_000002", "_000004")}
+    assert names == {
+        f"{name}{mark}"
+        for name in ("density.slices", "front", "side")
+        for mark in ("", "_000002", "_000004")
+    }
 
 
 def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
@@ -131,10 +189,18 @@ def test_divergence_keeps_the_last_good_state(run: Run) -> None:
     result = run(*OPTIMIZE, "out", "-D", "optimize.parameters.density.lr=1e37")
     assert (result.exit_code, result.stdout) == (4, "")
     (line,) = result.stderr.splitlines()
-    assert re.match(r"iteration 2: .* not finite; at most, density at voxel \[\d, \d, \d\] is \d", line)
-    assert "; lower optimize.parameters.density.lr (now 1e+37); the state after 0 iterations is kept in out/checkpoints/last.pt" in line
+    assert re.match(
+        r"iteration 2: .* not finite; at most, density at voxel \[\d, \d, \d\] is \d", line
+    )
+    assert (
+        "; lower optimize.parameters.density.lr (now 1e+37); the state after 0 iterations is kept in out/checkpoints/last.pt"
+        in line
+    )
     state = torch.load("out/checkpoints/last.pt", weights_only=True)["state"]
-    assert torch.isfinite(state["parameters"]["density"]["value"]).all() and state["total"]["iteration"] == len(rows("out")) - 1
+    assert (
+        torch.isfinite(state["parameters"]["density"]["value"]).all()
+        and state["total"]["iteration"] == len(rows("out")) - 1
+    )
 
 
 def test_the_report_shows_every_view_field_and_setting(succeed: Run) -> None:
@@ -143,20 +209,33 @@ def test_the_report_shows_every_view_field_and_setting(succeed: Run) -> None:
     assert text.count("<img ") == 2 + 2 + 1 and text.count("<svg ") == 2
     for name, view in summary["views"].items():
         assert f"{name} ({view['split']}): {view['psnr']:.2f} dB" in text
-    for told in ("density, middle slices", "means along the axes", "Once around", "irradiance: 3.0", "fluxes Q1 and L1", "torch"):
+    for told in (
+        "density, middle slices",
+        "means along the axes",
+        "Once around",
+        "irradiance: 3.0",
+        "fluxes Q1 and L1",
+        "torch",
+    ):
         assert told in text
 
 
 def test_the_log_goes_to_tensorboard_too_and_goes_on_there(succeed: Run) -> None:
-    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="TensorBoard is an extra")
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator", reason="TensorBoard is an extra"
+    )
     succeed(*OPTIMIZE, "out", "--tensorboard", "--iterations", "3")
     succeed(*OPTIMIZE, "out", "--tensorboard", "--resume", "--iterations", "5")
     events = accumulator.EventAccumulator("out/tensorboard").Reload()
     log = rows("out")
     assert [event.step for event in events.Scalars("loss")] == [1, 2, 3, 4, 5]
-    assert [event.value for event in events.Scalars("loss")] == pytest.approx([float(row["loss"]) for row in log], rel=1e-6)
+    assert [event.value for event in events.Scalars("loss")] == pytest.approx(
+        [float(row["loss"]) for row in log], rel=1e-6
+    )
 
 
-def test_the_camera_of_a_view_that_is_not_looked_at_is_refused(refuse: Callable[..., list[str]]) -> None:
+def test_the_camera_of_a_view_that_is_not_looked_at_is_refused(
+    refuse: Callable[..., list[str]],
+) -> None:
     (told,) = refuse(2, *OPTIMIZE, "out", "-D", "optimize.parameters={views.side.camera: {}}")
     assert "optimize.parameters.views.side.camera" in told and "no training view" in told

@@ -26,7 +26,9 @@ def test_theirs_ours_and_the_difference(succeed: Run) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
     result = succeed(*REFERENCE)
     for name in ("front", "side"):
-        theirs, ours, difference = (pixels(f"{name}.{kind}") for kind in ("reference", "ours", "difference"))
+        theirs, ours, difference = (
+            pixels(f"{name}.{kind}") for kind in ("reference", "ours", "difference")
+        )
         assert theirs.shape == ours.shape == (6, 8, 3)
         np.testing.assert_allclose(ours - theirs, difference, atol=1e-6)
         assert (Path("out") / f"{name}.comparison.png").is_file()
@@ -39,15 +41,23 @@ def test_the_report(succeed: Run) -> None:
     result = succeed(*REFERENCE, "--json")
     report = json.loads(Path("out/reference.json").read_text())
     assert json.loads(result.stdout) == report
-    assert {file for files in report["files"].values() for file in files} | {"reference.json"} == set(contents(Path("out")))
+    assert {file for files in report["files"].values() for file in files} | {
+        "reference.json"
+    } == set(contents(Path("out")))
     assert report["settings"]["samples_per_pixel"] == 8 and report["settings"]["passes"] >= 4
     assert report["environment"]["mitsuba"] and report["environment"]["ddrecon"]
     for name, view in report["views"].items():
         theirs, ours = (pixels(f"{name}.{kind}").astype(float) for kind in ("reference", "ours"))
         mean = np.square(theirs).mean()
-        assert view["distance"] == pytest.approx(np.sqrt(np.square(ours - theirs).mean() / mean), rel=1e-4)
-        assert view["error"] == pytest.approx(np.sqrt(max(0, view["distance"] ** 2 - view["noise"] ** 2)), abs=1e-9)
-        assert view["psnr"] == pytest.approx(10 * np.log10(theirs.max() ** 2 / np.square(ours - theirs).mean()), abs=1e-2)
+        assert view["distance"] == pytest.approx(
+            np.sqrt(np.square(ours - theirs).mean() / mean), rel=1e-4
+        )
+        assert view["error"] == pytest.approx(
+            np.sqrt(max(0, view["distance"] ** 2 - view["noise"] ** 2)), abs=1e-9
+        )
+        assert view["psnr"] == pytest.approx(
+            10 * np.log10(theirs.max() ** 2 / np.square(ours - theirs).mean()), abs=1e-2
+        )
         assert view["brightness"] == pytest.approx(ours.mean() / theirs.mean(), rel=1e-4)
 
 
@@ -56,13 +66,19 @@ def test_ours_is_what_render_makes(succeed: Run) -> None:
     succeed(*REFERENCE, "--view", "side")
     assert not list(Path("out").glob("front*"))
     succeed("render", "scene.yaml", "-o", "rendered", "-q")
-    np.testing.assert_array_equal(pixels("side.ours"), np.load("rendered/side.npy", allow_pickle=False))
+    np.testing.assert_array_equal(
+        pixels("side.ours"), np.load("rendered/side.npy", allow_pickle=False)
+    )
 
 
 def test_views_are_targets(succeed: Run) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
     succeed(*REFERENCE, "--views")
-    assert {name.partition(".")[0] for name in contents(Path("out"))} == {"front", "side", "reference"}
+    assert {name.partition(".")[0] for name in contents(Path("out"))} == {
+        "front",
+        "side",
+        "reference",
+    }
     assert all(name.count(".") == 1 for name in contents(Path("out")))
     targets = ["-D", "views.0.image=out/front.npy", "-D", "views.1.image=out/side.png"]
     succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1", *targets)
@@ -80,14 +96,18 @@ def test_seeds_choose_paths(succeed: Run) -> None:
 
 def test_without_mitsuba(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    assert refuse(3, *REFERENCE) == ['the reference renderer needs mitsuba: pip install "ddrecon[reference]"']
+    assert refuse(3, *REFERENCE) == [
+        'the reference renderer needs mitsuba: pip install "ddrecon[reference]"'
+    ]
 
 
 def test_a_folder_with_something_in_it(refuse: Refuse) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
     Path("out").mkdir()
     Path("out/notes.txt").write_text("mine")
-    assert refuse(2, *REFERENCE) == ["out: the folder is not empty; choose another, or say --overwrite"]
+    assert refuse(2, *REFERENCE) == [
+        "out: the folder is not empty; choose another, or say --overwrite"
+    ]
 
 
 def test_what_mitsuba_cannot_show(refuse: Refuse) -> None:
@@ -99,7 +119,9 @@ def test_what_mitsuba_cannot_show(refuse: Refuse) -> None:
 
 
 def test_unknown_view(refuse: Refuse) -> None:
-    assert refuse(2, *REFERENCE, "--view", "back") == ["--view back: no such view; known: front, side"]
+    assert refuse(2, *REFERENCE, "--view", "back") == [
+        "--view back: no such view; known: front, side"
+    ]
 
 
 @pytest.mark.parametrize("spp", ["3", "0", "many"])

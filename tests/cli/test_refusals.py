@@ -12,7 +12,7 @@ import pytest
 import torch
 from click.testing import Result
 
-from ddrecon.io.volumes import write_field
+from ddrecon.io.volumes.table import write_field
 
 Refuse = Callable[..., list[str]]
 
@@ -27,19 +27,41 @@ COMMANDS = {
 AN_OUTPUT = ["render", "optimize"]
 
 EDITS = {
-    "wrong key": ("sigma_s:", "sigma_S:", ["6:3: volume.sigma_S: unknown key; did you mean 'sigma_s'?", "missing key 'sigma_s'"]),
+    "wrong key": (
+        "sigma_s:",
+        "sigma_S:",
+        ["6:3: volume.sigma_S: unknown key; did you mean 'sigma_s'?", "missing key 'sigma_s'"],
+    ),
     "wrong type": ("g: 0.3", "g: soon", ["7:6: volume.g: expected a number, found 'soon'"]),
     "out of range": ("g: 0.3", "g: 2", ["7:6: volume.g: must be below 1, found 2"]),
-    "repeated key": ("g: 0.3", "g: 0.3\n  g: 0.2", ["8:3: volume.g: repeated key; it is already at scene.yaml:7:3"]),
+    "repeated key": (
+        "g: 0.3",
+        "g: 0.3\n  g: 0.2",
+        ["8:3: volume.g: repeated key; it is already at scene.yaml:7:3"],
+    ),
     "broken YAML": ("[6, 5, 4]", "[6, 5, 4", ["not YAML"]),
     "missing image": ("front.npy", "gone.npy", ["views.0.image: gone.npy does not exist"]),
-    "missing volume": ("density: 0.2", "density: {file: gone.npz}", ["4:19: volume.density.file: gone.npz does not exist"]),
-    "blind camera": ("target: [0, 0, 0]", "target: [9, 0, 2.5]", ["views.0.camera: no pixel of view 'front' looks through the volume"]),
-    "size of an image": ("[8, 6]", "[8, 8]", ["views.0.image: is 8 x 6 pixels, but the camera has 8 x 8"]),
+    "missing volume": (
+        "density: 0.2",
+        "density: {file: gone.npz}",
+        ["4:19: volume.density.file: gone.npz does not exist"],
+    ),
+    "blind camera": (
+        "target: [0, 0, 0]",
+        "target: [9, 0, 2.5]",
+        ["views.0.camera: no pixel of view 'front' looks through the volume"],
+    ),
+    "size of an image": (
+        "[8, 6]",
+        "[8, 8]",
+        ["views.0.image: is 8 x 6 pixels, but the camera has 8 x 8"],
+    ),
     "size of a field": (
         "resolution: [6, 5, 4]\n  density: 0.2",
         "resolution: [4, 5, 6]\n  density: {file: density.npz}",
-        ["volume.density.file: has 6 x 5 x 4 cells in x, y, z, but volume.resolution has 4 x 5 x 6"],
+        [
+            "volume.density.file: has 6 x 5 x 4 cells in x, y, z, but volume.resolution has 4 x 5 x 6"
+        ],
     ),
 }
 
@@ -59,25 +81,46 @@ def test_a_wrong_scene_is_refused_by_every_command(refuse: Refuse, command: str,
 
 
 def test_everything_wrong_is_told_at_once(refuse: Refuse) -> None:
-    wrong = ["volume.g=2", "views.0.split=trian", "optimize.iterations=0", "lights.0.irradiance=bright"]
+    wrong = [
+        "volume.g=2",
+        "views.0.split=trian",
+        "optimize.iterations=0",
+        "lights.0.irradiance=bright",
+    ]
     lines = refuse(2, *COMMANDS["render"], *(word for text in wrong for word in ("-D", text)))
     assert sorted(line.split(":")[0] for line in lines) == sorted(f"-D {text}" for text in wrong)
 
 
 def test_every_missing_file_is_told_at_once(refuse: Refuse) -> None:
-    lines = refuse(2, *COMMANDS["render"], "-D", "volume.density={file: gone.npz}", "-D", "views.0.image=gone.npy")
-    assert len(lines) == 2 and "gone.npz does not exist" in lines[0] and "gone.npy does not exist" in lines[1]
+    lines = refuse(
+        2,
+        *COMMANDS["render"],
+        "-D",
+        "volume.density={file: gone.npz}",
+        "-D",
+        "views.0.image=gone.npy",
+    )
+    assert (
+        len(lines) == 2
+        and "gone.npz does not exist" in lines[0]
+        and "gone.npy does not exist" in lines[1]
+    )
 
 
 def test_unreadable_files_are_told_at_once(refuse: Refuse) -> None:
     for name in ("one.npy", "two.npy"):
         Path(name).write_bytes(b"no picture")
-    lines = refuse(3, *COMMANDS["render"], "-D", "views.0.image=one.npy", "-D", "views.1.image=two.npy")
+    lines = refuse(
+        3, *COMMANDS["render"], "-D", "views.0.image=one.npy", "-D", "views.1.image=two.npy"
+    )
     assert [line.split(":")[0] for line in lines] == ["one.npy", "two.npy"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize(("scene", "what"), [("gone.yaml", "cannot be read: No such file or directory"), (".", "holds no result.yaml")])
+@pytest.mark.parametrize(
+    ("scene", "what"),
+    [("gone.yaml", "cannot be read: No such file or directory"), (".", "holds no result.yaml")],
+)
 def test_no_scene(refuse: Refuse, command: str, scene: str, what: str) -> None:
     (line,) = refuse(2, *(scene if word == "scene.yaml" else word for word in COMMANDS[command]))
     assert line.startswith(f"{scene}: {what}")
@@ -104,7 +147,9 @@ def spoil_image(name: str) -> None:
     pixels[3, 4, 1] = np.nan
     if name.endswith(".exr"):
         exr = pytest.importorskip("OpenEXR")
-        exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"RGB": pixels}).write(name)
+        exr.File(
+            {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"RGB": pixels}
+        ).write(name)
     else:
         np.save(name, pixels)
 
@@ -125,7 +170,11 @@ def cut(name: str, source: str) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize(
     ("source", "override"),
-    [("density.npz", "volume.density={{file: {}}}"), ("front.npy", "views.0.image={}"), ("front.npy", "views.0.mask={}")],
+    [
+        ("density.npz", "volume.density={{file: {}}}"),
+        ("front.npy", "views.0.image={}"),
+        ("front.npy", "views.0.mask={}"),
+    ],
 )
 def test_a_damaged_file(refuse: Refuse, command: str, source: str, override: str) -> None:
     name = f"cut_{source}"
@@ -146,11 +195,15 @@ def test_a_folder_with_something_in_it(refuse: Refuse, command: str) -> None:
 def test_a_file_for_a_folder(refuse: Refuse, command: str) -> None:
     Path("out").write_text("mine")
     assert refuse(2, *COMMANDS[command]) == ["out: is a file; name a folder for the output"]
-    assert refuse(2, *COMMANDS[command], "--overwrite") == ["out: is a file; name a folder for the output"]
+    assert refuse(2, *COMMANDS[command], "--overwrite") == [
+        "out: is a file; name a folder for the output"
+    ]
 
 
 def test_unknown_view(refuse: Refuse) -> None:
-    assert refuse(2, *COMMANDS["render"], "--view", "back") == ["--view back: no such view; known: front, side"]
+    assert refuse(2, *COMMANDS["render"], "--view", "back") == [
+        "--view back: no such view; known: front, side"
+    ]
 
 
 def test_unknown_parameter(refuse: Refuse) -> None:
@@ -218,7 +271,9 @@ def test_resume_of_another_scene(refuse: Refuse, succeed: Callable[..., object])
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "gone"])
-def test_resume_from_damaged_checkpoints(refuse: Refuse, succeed: Callable[..., object], damage: str) -> None:
+def test_resume_from_damaged_checkpoints(
+    refuse: Refuse, succeed: Callable[..., object], damage: str
+) -> None:
     succeed(*COMMANDS["optimize"], "--iterations", "1")
     path = Path("out/checkpoints/last.pt")
     for each in (path, path.with_name("previous.pt")):
@@ -242,7 +297,10 @@ def test_a_solve_that_diverges(run: Callable[..., Result], folder: Path, command
     result = run(*COMMANDS[command], *dense_block, "-D", "diffusion.scheme=printed")
     (line,) = result.stderr.splitlines()
     assert (result.exit_code, result.stdout) == (4, "")
-    assert re.search(r"kappa changes by a factor \d+\.\d between neighbors at cell \(\d, \d, \d\).*diffusion\.scheme=conservative", line)
+    assert re.search(
+        r"kappa changes by a factor \d+\.\d between neighbors at cell \(\d, \d, \d\).*diffusion\.scheme=conservative",
+        line,
+    )
 
 
 def test_debug_shows_where_an_error_comes_from(run: Callable[..., object]) -> None:

@@ -13,7 +13,7 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.io.images import read_image
+from ddrecon.io.images.table import read_image
 
 Run = Callable[..., Result]
 RENDER = ["render", "scene.yaml", "-o", "out", "-q"]
@@ -26,13 +26,18 @@ def pixels(name: str) -> np.ndarray:
 def encoded(linear: np.ndarray) -> np.ndarray:
     """8-bit sRGB, written out from IEC 61966-2-1."""
     clipped = linear.clip(0, 1)
-    return np.round(255 * np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055))
+    return np.round(
+        255 * np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    )
 
 
 def test_every_view_becomes_an_array_a_float_picture_and_a_preview(succeed: Run) -> None:
     pytest.importorskip("OpenEXR")
     succeed(*RENDER)
-    assert set(contents(Path("out"))) == {"render.json", *(f"{name}.{end}" for name in ("front", "side") for end in ("exr", "npy", "png"))}
+    assert set(contents(Path("out"))) == {
+        "render.json",
+        *(f"{name}.{end}" for name in ("front", "side") for end in ("exr", "npy", "png")),
+    }
     for name in ("front", "side"):
         image = pixels(name)
         assert (image.shape, image.dtype) == ((6, 8, 3), np.float32)
@@ -51,7 +56,11 @@ def test_the_preview_is_srgb(succeed: Run) -> None:
 
 def numbers(value: Any) -> list[float]:
     """All numbers in nested mappings: of `seconds`, the light's and each view's."""
-    return [number for entry in value.values() for number in numbers(entry)] if isinstance(value, dict) else [value]
+    return (
+        [number for entry in value.values() for number in numbers(entry)]
+        if isinstance(value, dict)
+        else [value]
+    )
 
 
 @pytest.mark.parametrize("g", [-0.4, 0, 0.6])
@@ -61,7 +70,9 @@ def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
         parts = [pixels(f"{name}.{part}") for part in ("reduced", "single", "multiple")]
         assert np.array_equal(parts[0] + parts[1] + parts[2], pixels(name))
         assert all(part.any() for part in parts)
-        assert all(Path(f"out/{name}.{part}.png").is_file() for part in ("reduced", "single", "multiple"))
+        assert all(
+            Path(f"out/{name}.{part}.png").is_file() for part in ("reduced", "single", "multiple")
+        )
 
 
 def test_components_do_not_change_the_image(succeed: Run) -> None:
@@ -76,7 +87,9 @@ def test_the_report(succeed: Run) -> None:
     report = json.loads(Path("out/render.json").read_text())
     assert json.loads(result.stdout) == report
     assert len(numbers(report["seconds"])) == 3 and min(numbers(report["seconds"])) >= 0
-    assert [solve["iterations"] > 0 and solve["residual"] <= 1e-5 for solve in report["solves"]] == [True]
+    assert [
+        solve["iterations"] > 0 and solve["residual"] <= 1e-5 for solve in report["solves"]
+    ] == [True]
     named = {file for files in report["files"].values() for file in files}
     assert named | {"render.json"} == set(contents(Path("out")))
     target = np.load("front.npy").astype(float)
@@ -94,7 +107,9 @@ def test_one_view_of_several(succeed: Run) -> None:
     assert not list(Path("out").glob("front*")) and Path("out/side.npy").is_file()
 
 
-def test_float_tiff_where_openexr_is_not_installed(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_float_tiff_where_openexr_is_not_installed(
+    succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     result = succeed(*RENDER)
     assert not list(Path("out").glob("*.exr"))
@@ -139,17 +154,28 @@ def test_a_ring_is_a_movie_of_the_volume_from_around(succeed: Run) -> None:
     said = succeed(*RENDER, "--ring", "5", "--view", "front").stdout
     report = json.loads(Path("out/render.json").read_text())
     movie = iio.imread("out/ring.png", index=..., plugin="pillow")[..., :3]
-    assert "around: ring.png" in said and report["ring"]["files"] == ["ring.png"] and report["psnr"] == {}
+    assert (
+        "around: ring.png" in said
+        and report["ring"]["files"] == ["ring.png"]
+        and report["psnr"] == {}
+    )
     assert list(report["files"]) == [f"ring_{index:03d}" for index in range(5)]
     for frame, name in zip(movie, report["files"], strict=True):
-        assert np.abs(frame - encoded(pixels(name).astype(float) / report["ring"]["white"])).max() <= 1
+        assert (
+            np.abs(frame - encoded(pixels(name).astype(float) / report["ring"]["white"])).max() <= 1
+        )
     succeed("render", "scene.yaml", "-o", "front", "-q", "--view", "front")
     assert np.allclose(pixels("ring_000"), np.load("front/front.npy"), rtol=1e-4)
 
 
 def test_another_light_is_as_if_the_scene_had_it(succeed: Run) -> None:
-    lights = ["{type: ambient, radiance: 0.3}", "{type: point, position: [0, 2, 0], intensity: [1, 2, 3]}"]
-    said = succeed(*RENDER, *(argument for light in lights for argument in ("--light", light))).stdout
+    lights = [
+        "{type: ambient, radiance: 0.3}",
+        "{type: point, position: [0, 2, 0], intensity: [1, 2, 3]}",
+    ]
+    said = succeed(
+        *RENDER, *(argument for light in lights for argument in ("--light", light))
+    ).stdout
     relit = pixels("front")
     succeed(*RENDER, "--overwrite", "-D", f"lights=[{', '.join(lights)}]")
     assert np.array_equal(pixels("front"), relit) and "PSNR" not in said
@@ -159,7 +185,9 @@ def test_a_finished_run_is_rendered_as_it_was_found(succeed: Run) -> None:
     succeed("optimize", "scene.yaml", "-o", "found", "-q")
     told = json.loads(Path("found/summary.json").read_text())["views"]
     report = json.loads(succeed("render", "found", "-o", "out", "-q", "--json").stdout)
-    assert report["psnr"] == {name: pytest.approx(view["psnr"], abs=1e-3) for name, view in told.items()}
+    assert report["psnr"] == {
+        name: pytest.approx(view["psnr"], abs=1e-3) for name, view in told.items()
+    }
 
 
 @pytest.mark.parametrize(
@@ -171,5 +199,7 @@ def test_a_finished_run_is_rendered_as_it_was_found(succeed: Run) -> None:
         (["scene.yaml", "--light", "{type: sun}"], "lights.0.type: expected one of directional"),
     ],
 )
-def test_what_cannot_be_shown_is_refused(refuse: Callable[..., list[str]], arguments: list[str], told: str) -> None:
+def test_what_cannot_be_shown_is_refused(
+    refuse: Callable[..., list[str]], arguments: list[str], told: str
+) -> None:
     assert told in refuse(2, "render", *arguments, "-o", "out")[-1]

@@ -25,11 +25,15 @@ OPTIMIZE = ["optimize", "scene.yaml", "-q", "--iterations", "4", *FINER, "-o"]
 
 
 def iterations(folder: str) -> list[int]:
-    return [int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]]
+    return [
+        int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]
+    ]
 
 
 def cells(folder: str) -> list[int]:
-    return [int(line.split(",")[-1]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]]
+    return [
+        int(line.split(",")[-1]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]
+    ]
 
 
 def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int) -> None:
@@ -55,7 +59,13 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
     ],
 )
 def test_an_interrupted_run_goes_on_to_the_same_bits(
-    run: Run, succeed: Run, density_of: DensityOf, monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int
+    run: Run,
+    succeed: Run,
+    density_of: DensityOf,
+    monkeypatch: pytest.MonkeyPatch,
+    owner: Any,
+    name: str,
+    call: int,
 ) -> None:
     succeed(*OPTIMIZE, "whole")
     with monkeypatch.context() as patch:
@@ -99,8 +109,12 @@ def test_the_folders_own_scene_resumes_it(succeed: Run) -> None:
     assert iterations("out") == [1, 2, 3]
 
 
-def test_overwriting_discards_the_old_checkpoint(run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run killed before it could write a checkpoint must not be resumed from that of the run it overwrote."""
+def test_overwriting_discards_the_old_checkpoint(
+    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run killed before it could write a checkpoint must not be resumed from that of the run it
+    overwrote.
+    """
     succeed("optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out")
 
     def killed(*_: Any) -> None:
@@ -108,7 +122,12 @@ def test_overwriting_discards_the_old_checkpoint(run: Run, succeed: Run, monkeyp
 
     with monkeypatch.context() as patch:
         patch.setattr(loop, "render_each", killed)
-        assert run("optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out", "--overwrite").exit_code == 2
+        assert (
+            run(
+                "optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out", "--overwrite"
+            ).exit_code
+            == 2
+        )
     path = Path("out/checkpoints/last.pt")
     assert torch.load(path, weights_only=True)["state"]["total"]["iteration"] == 0
 
@@ -134,7 +153,11 @@ def test_ctrl_c_in_a_terminal(folder: Path, succeed: Run) -> None:
         "100000",
     ]
     process = subprocess.Popen(
-        command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+        command,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         wait_for_rows(process, Path("out/loss.csv"), 3)

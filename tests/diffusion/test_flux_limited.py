@@ -1,4 +1,6 @@
-"""Flux-limited diffusion: its fixed point, the derivatives of that, and what it says when it does not get there."""
+"""Flux-limited diffusion: its fixed point, the derivatives of that, and what it says when it does
+not get there.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import math
 
 import pytest
 import torch
+from media import box_grid, half_empty, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -17,20 +20,24 @@ from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.renderer import render, solve_light
-from ddrecon.variables import with_values
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.variables.values import with_values
 
 each_limiter = pytest.mark.parametrize("limiter", LIMITERS)
 SHAPE = (3, 4, 3)
 
 
 @pytest.fixture
-def make(make_scene, half_empty):
+def make():
     """A half-empty scene of three colors."""
 
     def scene(density: Tensor | None = None, **changes) -> Scene:
         density = half_empty(*SHAPE) if density is None else density
-        return make_scene(density, **{"model": "flux_limited", "g": 0.4, "ambient": (0.3, 0.2, 0.1), "tolerance": 1e-12} | changes)
+        return make_scene(
+            density,
+            **{"model": "flux_limited", "g": 0.4, "ambient": (0.3, 0.2, 0.1), "tolerance": 1e-12}
+            | changes,
+        )
 
     return scene
 
@@ -41,75 +48,111 @@ def make_solve(tolerance: float, memory: SolveMemory | None = None) -> Solve:
 
 def test_steepness_of_exponential_light_is_its_rate():
     grid = Grid((1, 40, 1), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    light = torch.exp(-2 * grid.centers(torch.zeros((), dtype=torch.float64))[1]).expand(1, 1, 40, 1)
+    light = torch.exp(-2 * grid.centers(torch.zeros((), dtype=torch.float64))[1]).expand(
+        1, 1, 40, 1
+    )
     step = 1 / 40
     inside = steepness_square(light, grid)[:, :, 1:-1]
-    torch.testing.assert_close(inside.sqrt(), torch.full_like(inside, math.sinh(2 * step) / step), rtol=1e-9, atol=0)
+    torch.testing.assert_close(
+        inside.sqrt(), torch.full_like(inside, math.sinh(2 * step) / step), rtol=1e-9, atol=0
+    )
 
 
-def test_even_light_and_no_light_have_no_steepness(box):
+def test_even_light_and_no_light_have_no_steepness():
     for value in (0.0, 2.0):
         u = torch.full((2, 3, 4, 2), value, dtype=torch.float64, requires_grad=True)
-        q = steepness_square(u, box((3, 4, 2)))
+        q = steepness_square(u, box_grid((3, 4, 2)))
         (slope,) = torch.autograd.grad(q.sum(), u)
         assert bool((q == 0).all()) and bool((slope == 0).all())
 
 
 @each_limiter
-def test_the_light_found_balances(limiter: str, make, box, random):
-    balance = Balance(box(SHAPE), LIMITERS[limiter])
-    fields = [5 * random(2, *SHAPE, seed=seed) for seed in range(3)]
+def test_the_light_found_balances(limiter: str, make):
+    balance = Balance(box_grid(SHAPE), LIMITERS[limiter])
+    fields = [5 * random_values(2, *SHAPE, seed=seed) for seed in range(3)]
     outside = torch.tensor([0.5, 1.0], dtype=torch.float64).view(2, 1, 1, 1)
     u = flux_limited._Solve.apply(make_solve(1e-13), balance, *fields, outside)
     assert float(balance.residual(u, *fields, outside).abs().max()) < 1e-11 * float(u.abs().max())
 
 
 @each_limiter
-def test_dense_media_diffuse_as_without_a_limit(limiter: str, make, box):
+def test_dense_media_diffuse_as_without_a_limit(limiter: str, make):
     """Uniform and 4000 optical depths thick: R is small, and what is added to the medium as well."""
     dense = torch.full(SHAPE, 500.0, dtype=torch.float64)
     ways = {"limiter": limiter}, {"model": "p1"}
-    ours, theirs = (solve_light(make(dense, directional=None, **way), SolveMemory()).outgoing.mean for way in ways)
+    ours, theirs = (
+        solve_light(make(dense, directional=None, **way), SolveMemory()).outgoing.mean
+        for way in ways
+    )
     torch.testing.assert_close(ours, theirs, rtol=0.03, atol=1e-6)
 
 
 @each_limiter
 @pytest.mark.parametrize("g", [0.0, 0.6])
 def test_a_white_furnace_is_white(limiter: str, g: float, make):
-    scene = make(sigma_a=(0.0,), sigma_s=(6.0,), g=g, directional=None, ambient=(1.0, 2.0, 3.0), limiter=limiter)
+    scene = make(
+        sigma_a=(0.0,),
+        sigma_s=(6.0,),
+        g=g,
+        directional=None,
+        ambient=(1.0, 2.0, 3.0),
+        limiter=limiter,
+    )
     image = render(scene)
-    torch.testing.assert_close(image, torch.tensor([1.0, 2.0, 3.0]).double().view(1, 3, 1, 1).expand_as(image), rtol=1e-10, atol=0)
+    torch.testing.assert_close(
+        image,
+        torch.tensor([1.0, 2.0, 3.0]).double().view(1, 3, 1, 1).expand_as(image),
+        rtol=1e-10,
+        atol=0,
+    )
 
 
 @each_limiter
-def test_both_derivatives_agree_with_differences(limiter: str, random, box):
+def test_both_derivatives_agree_with_differences(limiter: str):
     shape = (2, 3, 2)
-    inputs = [4 * random(1, *shape, seed=seed) * (seed > 0 or random(1, *shape, seed=9) > 0.5) for seed in range(3)]
-    flux = [random(1, *shape, seed=seed) for seed in (4, 5, 6)]
-    arguments = [t.double().requires_grad_() for t in (*inputs, torch.full((1, 1, 1, 1), 0.5), *flux)]
-    balance = Balance(box(shape), LIMITERS[limiter])
+    inputs = [
+        4
+        * random_values(1, *shape, seed=seed)
+        * (seed > 0 or random_values(1, *shape, seed=9) > 0.5)
+        for seed in range(3)
+    ]
+    flux = [random_values(1, *shape, seed=seed) for seed in (4, 5, 6)]
+    arguments = [
+        t.double().requires_grad_() for t in (*inputs, torch.full((1, 1, 1, 1), 0.5), *flux)
+    ]
+    balance = Balance(box_grid(shape), LIMITERS[limiter])
 
     def solved(*coefficients: Tensor) -> Tensor:
-        return flux_limited._Solve.apply(make_solve(1e-14, SolveMemory(is_warm=False)), balance, *coefficients)
+        return flux_limited._Solve.apply(
+            make_solve(1e-14, SolveMemory(is_warm=False)), balance, *coefficients
+        )
 
-    assert torch.autograd.gradcheck(solved, arguments, eps=1e-5, atol=1e-8, rtol=1e-6, check_forward_ad=True, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        solved, arguments, eps=1e-5, atol=1e-8, rtol=1e-6, check_forward_ad=True, fast_mode=True
+    )
 
 
 @each_limiter
-def test_the_tangent_is_the_transpose_of_the_adjoint(limiter: str, make, half_empty, random):
-    density, direction = half_empty(*SHAPE), random(*SHAPE, seed=3) - 0.5
+def test_the_tangent_is_the_transpose_of_the_adjoint(limiter: str, make):
+    density, direction = half_empty(*SHAPE), random_values(*SHAPE, seed=3) - 0.5
     scene, leaf = make(limiter=limiter), density.clone().requires_grad_()
     image = render(with_values(scene, {"density": leaf}))
     image_bar = torch.randn_like(image)
     (bar,) = torch.autograd.grad(image, leaf, image_bar)
     with forward_ad.dual_level():
-        tangent = forward_ad.unpack_dual(render(with_values(scene, {"density": forward_ad.make_dual(density, direction)}))).tangent
+        tangent = forward_ad.unpack_dual(
+            render(with_values(scene, {"density": forward_ad.make_dual(density, direction)}))
+        ).tangent
     along, across = (bar * direction).sum(), (image_bar * tangent).sum()
     assert float((along - across).abs()) < 1e-10 * float((image_bar * tangent).abs().sum())
 
 
 @each_limiter
-@pytest.mark.parametrize("lights", [{}, {"ambient": None}, {"ambient": None, "directional": None}], ids=["lit", "sun", "dark"])
+@pytest.mark.parametrize(
+    "lights",
+    [{}, {"ambient": None}, {"ambient": None, "directional": None}],
+    ids=["lit", "sun", "dark"],
+)
 def test_an_empty_box_has_finite_derivatives(limiter: str, lights: dict[str, None], make):
     density = torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True)
     scene = with_values(make(density.detach(), limiter=limiter, **lights), {"density": density})
@@ -128,5 +171,7 @@ def test_iterations_are_recorded_and_resumed(make):
 
 def test_giving_up_says_what_may_help(make, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(flux_limited, "MAX_ITERATIONS", 3)
-    with pytest.raises(SolveError, match=r"flux-limited .*after 3 iterations .*diffusion\.model=p1"):
+    with pytest.raises(
+        SolveError, match=r"flux-limited .*after 3 iterations .*diffusion\.model=p1"
+    ):
         render(make())

@@ -1,4 +1,6 @@
-"""Derivatives of a solve: tangent and adjoint agree with differences and with each other, and solves are remembered."""
+"""Derivatives of a solve: tangent and adjoint agree with differences and with each other, and
+solves are remembered.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from media import random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -13,22 +16,36 @@ from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers import SOLVERS, hierarchy
 
-CASES = [("conjugate_gradient", shape) for shape in [(2, 3, 2), (1, 2, 4), (1, 1, 1)]] + [(solver, (2, 1, 2)) for solver in SOLVERS]
+CASES = [("conjugate_gradient", shape) for shape in [(2, 3, 2), (1, 2, 4), (1, 1, 1)]] + [
+    (solver, (2, 1, 2)) for solver in SOLVERS
+]
 
 
-def solving(memory: SolveMemory | None = None, solver: str = "conjugate_gradient") -> Callable[..., Tensor]:
+def solving(
+    memory: SolveMemory | None = None, solver: str = "conjugate_gradient"
+) -> Callable[..., Tensor]:
     """u as a function of source, loss and the three conductances, solved to rounding."""
     solve = Solve(SOLVERS[solver], 1e-14, memory or SolveMemory())
-    return lambda source, loss, *conductances: solve_diffusion(solve, Operator(conductances, loss), source)
+    return lambda source, loss, *conductances: solve_diffusion(
+        solve, Operator(conductances, loss), source
+    )
 
 
 @pytest.fixture
-def inputs(random):
-    """source, loss and conductances of a small system of two colors, or of a gray operator under a colored source."""
+def inputs():
+    """source, loss and conductances of a small system of two colors, or of a gray operator under a
+    colored source.
+    """
 
     def make(shape: tuple[int, int, int] = (2, 3, 2), colors: int = 2) -> list[Tensor]:
         faces = [[n - (axis == other) for other, n in enumerate(shape)] for axis in range(3)]
-        return [random(2, *shape) - 0.5, *(1 + random(colors, *size, seed=1 + i) for i, size in enumerate([shape, *faces]))]
+        return [
+            random_values(2, *shape) - 0.5,
+            *(
+                1 + random_values(colors, *size, seed=1 + i)
+                for i, size in enumerate([shape, *faces])
+            ),
+        ]
 
     return make
 
@@ -36,18 +53,24 @@ def inputs(random):
 @pytest.mark.parametrize(("solver", "shape"), CASES, ids=str)
 def test_both_derivatives_agree_with_differences(solver: str, shape: tuple[int, int, int], inputs):
     arguments = [tensor.requires_grad_(tensor.numel() > 0) for tensor in inputs(shape)]
-    assert torch.autograd.gradcheck(solving(solver=solver), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        solving(solver=solver), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True
+    )
 
 
 @pytest.mark.parametrize("wanted", range(5))
 def test_each_argument_can_be_differentiated_by_itself(wanted: int, inputs):
     arguments = [tensor.requires_grad_(i == wanted) for i, tensor in enumerate(inputs())]
-    assert torch.autograd.gradcheck(solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True
+    )
 
 
 def test_a_gray_operator_serves_a_colored_source(inputs):
     arguments = [tensor.requires_grad_() for tensor in inputs(colors=1)]
-    assert torch.autograd.gradcheck(solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True
+    )
 
 
 def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
@@ -56,14 +79,23 @@ def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
     leaves = [tensor.clone().requires_grad_() for tensor in arguments]
     u = solving()(*leaves)
     u_bar = torch.randn_like(u)
-    along = sum((bar * d).sum() for bar, d in zip(torch.autograd.grad(u, leaves, u_bar), directions, strict=True))
+    along = sum(
+        (bar * d).sum()
+        for bar, d in zip(torch.autograd.grad(u, leaves, u_bar), directions, strict=True)
+    )
     with forward_ad.dual_level():
-        duals = [forward_ad.make_dual(tensor, d) for tensor, d in zip(arguments, directions, strict=True)]
+        duals = [
+            forward_ad.make_dual(tensor, d) for tensor, d in zip(arguments, directions, strict=True)
+        ]
         tangent = forward_ad.unpack_dual(solving()(*duals)).tangent
-    assert float(((u_bar * tangent).sum() - along).abs()) < 1e-10 * float((u_bar * tangent).abs().sum())
+    assert float(((u_bar * tangent).sum() - along).abs()) < 1e-10 * float(
+        (u_bar * tangent).abs().sum()
+    )
 
 
-def test_the_adjoint_takes_what_the_forward_solve_made_of_the_operator(inputs, monkeypatch: pytest.MonkeyPatch):
+def test_the_adjoint_takes_what_the_forward_solve_made_of_the_operator(
+    inputs, monkeypatch: pytest.MonkeyPatch
+):
     source, loss, *conductances = (tensor.requires_grad_() for tensor in inputs())
     operator = Operator(tuple(conductances), loss)
     solve = Solve(SOLVERS["multigrid"], 1e-12, SolveMemory())
@@ -73,7 +105,7 @@ def test_the_adjoint_takes_what_the_forward_solve_made_of_the_operator(inputs, m
     def refuse(*_: object) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr(hierarchy, "coarsened", refuse)
+    monkeypatch.setattr(hierarchy, "coarsen", refuse)
     monkeypatch.setattr(hierarchy.Coarsest, "of", refuse)
     solve_diffusion(solve, operator, 2 * source)
     torch.autograd.grad(u.sum(), loss)
@@ -86,7 +118,12 @@ def test_every_solve_is_recorded(inputs):
     u.sum().backward()
     with forward_ad.dual_level():
         solving(memory)(forward_ad.make_dual(source.detach(), source.detach()), *coefficients)
-    assert [record.kind for record in memory.records] == ["forward", "adjoint", "forward", "tangent"]
+    assert [record.kind for record in memory.records] == [
+        "forward",
+        "adjoint",
+        "forward",
+        "tangent",
+    ]
     assert all(record.residual <= 1e-14 and record.seconds > 0 for record in memory.records)
 
 

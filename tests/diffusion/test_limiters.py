@@ -32,7 +32,10 @@ def test_light_in_empty_space_flows_no_faster_than_it_may(name: str):
 
 @each_limiter
 def test_flux_never_exceeds_radiance(limiter):
-    extinction, steepness = torch.logspace(-6, 6, 61, dtype=torch.float64), torch.logspace(-6, 6, 49, dtype=torch.float64)[:, None]
+    extinction, steepness = (
+        torch.logspace(-6, 6, 61, dtype=torch.float64),
+        torch.logspace(-6, 6, 49, dtype=torch.float64)[:, None],
+    )
     assert bool((steepness * limiter(extinction, steepness**2) < 1).all())
 
 
@@ -46,5 +49,8 @@ def test_derivatives(limiter, square: float):
 
 
 def test_the_series_meets_the_closed_form():
-    below, above = (levermore_pomraning(number(1.0), number(SERIES_BELOW * factor)) for factor in (1 - 1e-12, 1 + 1e-12))
+    below, above = (
+        levermore_pomraning(number(1.0), number(SERIES_BELOW * factor))
+        for factor in (1 - 1e-12, 1 + 1e-12)
+    )
     assert float((below - above).abs()) < 1e-12

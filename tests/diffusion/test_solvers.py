@@ -1,4 +1,6 @@
-"""Every solver reaches its tolerance on every system, agrees with a dense solve, and says so when it cannot."""
+"""Every solver reaches its tolerance on every system, agrees with a dense solve, and says so when
+it cannot.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import sys
 
 import pytest
 import torch
+from media import box_grid, dense_matrix, make_operator, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
@@ -19,20 +22,28 @@ each_dtype = pytest.mark.parametrize("dtype", TOLERANCES, ids=str)
 
 
 @pytest.fixture
-def system(box, random, make_operator):
-    """An operator whose first color has equal conductances everywhere and whose last spans `contrast`, and a source."""
+def system():
+    """An operator whose first color has equal conductances everywhere and whose last spans
+    `contrast`, and a source.
+    """
 
     def make(dtype: torch.dtype, contrast: float = 1e3, colors: int = 2) -> tuple[Operator, Tensor]:
         spread = torch.linspace(0, 1, colors, dtype=torch.float64).view(-1, 1, 1, 1)
-        diffusion = 0.1 * contrast ** -(spread * random(colors, *SHAPE, seed=1))
-        operator = make_operator(box(SHAPE), diffusion.to(dtype), (0.1 * random(colors, *SHAPE, seed=2)).to(dtype))
-        return operator, random(colors, *SHAPE, seed=3, dtype=dtype)
+        diffusion = 0.1 * contrast ** -(spread * random_values(colors, *SHAPE, seed=1))
+        operator = make_operator(
+            box_grid(SHAPE),
+            diffusion.to(dtype),
+            (0.1 * random_values(colors, *SHAPE, seed=2)).to(dtype),
+        )
+        return operator, random_values(colors, *SHAPE, seed=3, dtype=dtype)
 
     return make
 
 
 def relative_residual(operator: Operator, u: Tensor, source: Tensor) -> float:
-    """The residual the solvers promise: scaled by diagonal^(-1/2), relative to the source, largest over colors; in float64."""
+    """The residual the solvers promise: scaled by diagonal^(-1/2), relative to the source, largest
+    over colors; in float64.
+    """
     operator = Operator(tuple(c.double() for c in operator.conductances), operator.loss.double())
     source, scale = source.double(), operator.diagonal.rsqrt()
     residual = (scale * (source - operator.apply(u.double()))).flatten(1).norm(dim=1)
@@ -49,9 +60,11 @@ def test_the_residual_is_reached(solve, dtype: torch.dtype, contrast: float, sys
 
 
 @each_dtype
-def test_the_solution_is_that_of_a_dense_solve(solve, dtype: torch.dtype, system, dense):
+def test_the_solution_is_that_of_a_dense_solve(solve, dtype: torch.dtype, system):
     operator, source = system(dtype)
-    exact = torch.linalg.solve(dense(operator).double(), source.double().flatten(1)).view_as(source)
+    exact = torch.linalg.solve(dense_matrix(operator).double(), source.double().flatten(1)).view_as(
+        source
+    )
     found = solve(operator, source, None, TOLERANCES[dtype]).value
     assert float((found - exact).norm() / exact.norm()) < 100 * TOLERANCES[dtype]
 
@@ -61,7 +74,9 @@ def test_colors_do_not_mix(solve, system):
     together = solve(operator, source, None, 1e-11).value
     for c in range(3):
         one = Operator(tuple(k[c : c + 1] for k in operator.conductances), operator.loss[c : c + 1])
-        torch.testing.assert_close(solve(one, source[c : c + 1], None, 1e-11).value, together[c : c + 1], rtol=1e-8, atol=0)
+        torch.testing.assert_close(
+            solve(one, source[c : c + 1], None, 1e-11).value, together[c : c + 1], rtol=1e-8, atol=0
+        )
 
 
 @each_dtype
@@ -76,15 +91,20 @@ def test_starting_from_the_solution_takes_no_iteration(solve, dtype: torch.dtype
 def test_a_start_closer_by_takes_fewer_iterations(solve, system):
     operator, source = system(torch.float64)
     solved = solve(operator, source, None, 1e-11).value
-    assert solve(operator, source, solved * (1 + 1e-6), 1e-8).iterations < solve(operator, source, None, 1e-8).iterations
+    assert (
+        solve(operator, source, solved * (1 + 1e-6), 1e-8).iterations
+        < solve(operator, source, None, 1e-8).iterations
+    )
 
 
 @pytest.mark.parametrize("is_fitting", [True, False])
-def test_a_useless_start_does_no_harm(solve, is_fitting: bool, system, random):
+def test_a_useless_start_does_no_harm(solve, is_fitting: bool, system):
     """A guess that is worse than zero, or of another grid, is not used."""
     operator, source = system(torch.float64)
-    guess = 1e9 * random(*source.shape) if is_fitting else random(2, 3, 3, 3)
-    assert torch.equal(solve(operator, source, guess, 1e-8).value, solve(operator, source, None, 1e-8).value)
+    guess = 1e9 * random_values(*source.shape) if is_fitting else random_values(2, 3, 3, 3)
+    assert torch.equal(
+        solve(operator, source, guess, 1e-8).value, solve(operator, source, None, 1e-8).value
+    )
 
 
 def test_no_source_no_light(solve, system):
@@ -101,7 +121,9 @@ def test_a_color_without_source_stays_dark_beside_another(solve, system):
 
 
 def test_a_source_makes_light_everywhere(solve, system):
-    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance of the solve."""
+    """An inverse M-matrix is positive: light spreads from one cell to all, up to the tolerance of
+    the solve.
+    """
     operator, source = system(torch.float64, contrast=10.0)
     source = torch.zeros_like(source)
     source[:, 0, 0, 0] = 1

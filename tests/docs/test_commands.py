@@ -1,4 +1,6 @@
-"""Every command line of the README and the documentation runs, in the order in which it stands there, on fewer cells, paths and samples."""
+"""Every command line of the README and the documentation runs, in the order in which it stands
+there, on fewer cells, paths and samples.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,10 @@ import pytest
 from click.testing import CliRunner
 
 from ddrecon.bench import run as bench_run
-from ddrecon.cli import main
-from ddrecon.reconstruct.levels import at_level
+from ddrecon.cli.commands import main
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.scene import Scene
 from ddrecon.validate.hard_cases import CASES
-from ddrecon.world import Scene
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -24,15 +26,25 @@ def commands(page: Path) -> list[str]:
     """Every `ddrecon ...` in a code block of `page`."""
     text = page.read_text(encoding="utf-8")
     blocks = re.findall(r"^```(?:bash|sh|console)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    parts = [part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&")]
+    parts = [
+        part.strip() for block in blocks for line in block.splitlines() for part in line.split("&&")
+    ]
     return [part for part in parts if part.startswith("ddrecon ")]
 
 
 def fewer_cells(scene: str) -> list[str]:
-    """Overrides that leave `scene` about 8 cells along its shortest side, where it says how many it has."""
-    found = re.search(r"^  resolution: \[(\d+), (\d+), (\d+)\]", Path(scene).read_text(encoding="utf-8"), re.MULTILINE)
+    """Overrides that leave `scene` about 8 cells along its shortest side, where it says how many it
+    has.
+    """
+    found = re.search(
+        r"^  resolution: \[(\d+), (\d+), (\d+)\]",
+        Path(scene).read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
     sizes = [int(size) for size in found.groups()] if found else []
-    return ["-D", f"volume.resolution={[size * 8 // min(sizes) for size in sizes]}"] if sizes else []
+    return (
+        ["-D", f"volume.resolution={[size * 8 // min(sizes) for size in sizes]}"] if sizes else []
+    )
 
 
 def quick(command: str) -> list[str]:
@@ -47,12 +59,14 @@ def quick(command: str) -> list[str]:
 
 
 def coarse(load: Callable[..., Scene]) -> Callable[..., Scene]:
-    return lambda *arguments: at_level(load(*arguments), 4)
+    return lambda *arguments: scene_at_level(load(*arguments), 4)
 
 
 @pytest.fixture
 def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder with the project's configs and data in it; few hard cases; a bench of few cells, without path tracing."""
+    """A folder with the project's configs and data in it; few hard cases; a bench of few cells,
+    without path tracing.
+    """
     monkeypatch.chdir(tmp_path)
     for name in ("configs", "data"):
         (tmp_path / name).symlink_to(ROOT / name)

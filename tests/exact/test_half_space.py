@@ -1,28 +1,31 @@
-"""A half-space that scatters isotropically, whose reflected radiance Chandrasekhar's H-functions give exactly.
+"""A half-space that scatters isotropically, whose reflected radiance Chandrasekhar's H-functions
+give exactly.
 
-I(mu) = w / (4 pi) E mu0 / (mu + mu0) H(mu) H(mu0), with albedo w and irradiance E on a plane facing the light (Chandrasekhar, Radiative
-Transfer, 1950, chapter III). Only optical depth matters, so the half-space is one column of cells, 1e9 times as wide as deep
-(nothing leaves sideways), whose density grows downwards: from a few thousandths of an optical depth a cell at the surface to hundreds at
-the bottom. The closure's floor is set to nothing: what is compared is P1 itself, or what transport rounds make of it.
+I(mu) = w / (4 pi) E mu0 / (mu + mu0) H(mu) H(mu0), with albedo w and irradiance E on a plane facing
+the light (Chandrasekhar, Radiative Transfer, 1950, chapter III). Only optical depth matters, so the
+half-space is one column of cells, 1e9 times as wide as deep (nothing leaves sideways), whose
+density grows downwards: from a few thousandths of an optical depth a cell at the surface to
+hundreds at the bottom. The closure's floor is set to nothing: what is compared is P1 itself, or
+what transport rounds make of it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from media import convergence_order, make_scene
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.renderer import render, solve_light, view_components
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 ALBEDOS = (0.5, 0.9, 0.99, 1.0)
 SUNS = (1.0, 0.6, 0.3)
@@ -37,13 +40,17 @@ ERRORS = {
     1: {0.5: 0.006, 0.9: 0.006, 0.99: 0.006, 1.0: 0.006},
     4: {0.5: 0.008, 0.9: 0.014, 0.99: 0.015, 1.0: 0.013},
 }
-"""By rounds and albedo, bounds on the relative RMS error over all `SUNS` and `VIEWS`. Measured: 0.0347, 0.0689, 0.0703 and 0.0608 for P1,
-which is 2.6 to 9.3 % too dark everywhere; at most 0.0047 after one round and 0.0138 after four, where 50 directions have converged."""
+"""By rounds and albedo, bounds on the relative RMS error over all `SUNS` and `VIEWS`. Measured:
+0.0347, 0.0689, 0.0703 and 0.0608 for P1, which is 2.6 to 9.3 % too dark everywhere; at most 0.0047
+after one round and 0.0138 after four, where 50 directions have converged.
+"""
 each_albedo = pytest.mark.parametrize("albedo", ALBEDOS)
 
 
-def half_space(make_scene: Callable[..., Scene], albedo: float, sun: float, cells: int = 192, rounds: int = 0) -> Scene:
-    """5,000 optical depths below z = 0, lit by a beam from above at cosine `sun`, seen at all of `VIEWS`."""
+def half_space(albedo: float, sun: float, cells: int = 192, rounds: int = 0) -> Scene:
+    """5,000 optical depths below z = 0, lit by a beam from above at cosine `sun`, seen at all of
+    `VIEWS`.
+    """
     ratio = 1.06 ** (192 / cells)
     layers = ratio ** torch.arange(cells, dtype=torch.float64)
     density = (5000 / layers.sum() * layers * cells).view(-1, 1, 1)
@@ -66,17 +73,27 @@ def half_space(make_scene: Callable[..., Scene], albedo: float, sun: float, cell
 def looking_down(cosine: float) -> Camera:
     """One pixel on the surface that looks into the medium at `cosine` with the normal."""
     target = torch.tensor([0.0, math.sqrt(1 - cosine**2), cosine], dtype=torch.float64)
-    return Camera(look_at(torch.zeros_like(target), target, target.new_tensor([1.0, 0.0, 0.0])), (1, 1), 1e-6, is_perspective=False)
+    return Camera(
+        look_at(torch.zeros_like(target), target, target.new_tensor([1.0, 0.0, 0.0])),
+        (1, 1),
+        1e-6,
+        is_perspective=False,
+    )
 
 
 NODES, WEIGHTS = (
-    scale * values + shift for scale, shift, values in zip((0.5, 0.5), (0.5, 0), np.polynomial.legendre.leggauss(96), strict=True)
+    scale * values + shift
+    for scale, shift, values in zip(
+        (0.5, 0.5), (0.5, 0), np.polynomial.legendre.leggauss(96), strict=True
+    )
 )
 
 
 @cache
 def h_at_nodes(albedo: float) -> np.ndarray:
-    """H at `NODES`: 1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu', iterated with the mean of old and new."""
+    """H at `NODES`: 1 / H(mu) = sqrt(1 - w) + w / 2 int mu' H(mu') / (mu + mu') dmu', iterated with
+    the mean of old and new.
+    """
     values = np.ones_like(NODES)
     for _ in range(2000):
         new = 1 / h_reciprocal(albedo, values, NODES)
@@ -107,7 +124,8 @@ def exact(albedo: float, sun: float, view: float) -> float:
 def p1_multiple(albedo: float, sun: float, view: float) -> float:
     """What P1 with Marshak's boundary adds, in closed form: w int L0 exp(-t / mu) dt / mu.
 
-    With D = 1/3 and E4, L0 = a exp(-t / mu0) + b exp(-k t), k^2 = 3 (1 - w), and L0 / 2 = D L0' at the surface (E6).
+    With D = 1/3 and E4, L0 = a exp(-t / mu0) + b exp(-k t), k^2 = 3 (1 - w), and L0 / 2 = D L0' at
+    the surface (E6).
     """
     decay = math.sqrt(3 * (1 - albedo))
     a = albedo * IRRADIANCE / (4 * math.pi) / ((1 - albedo) - 1 / (3 * sun**2))
@@ -126,37 +144,49 @@ def seen(scene: Scene) -> list[float]:
 
 @each_albedo
 def test_h_has_its_known_integral(albedo: float):
-    assert float(WEIGHTS @ h_at_nodes(albedo)) == pytest.approx(2 / albedo * (1 - math.sqrt(1 - albedo)), rel=1e-5)
+    assert float(WEIGHTS @ h_at_nodes(albedo)) == pytest.approx(
+        2 / albedo * (1 - math.sqrt(1 - albedo)), rel=1e-5
+    )
 
 
-@pytest.mark.parametrize(("cosine", "value"), [(0.0, 1.0), (0.1, 1.2474), (0.5, 2.0128), (1.0, 2.9078)])
+@pytest.mark.parametrize(
+    ("cosine", "value"), [(0.0, 1.0), (0.1, 1.2474), (0.5, 2.0128), (1.0, 2.9078)]
+)
 def test_h_of_a_medium_that_absorbs_nothing_is_the_tabulated_one(cosine: float, value: float):
     assert h_function(1.0, cosine) == pytest.approx(value, abs=1e-4)
 
 
 @each_albedo
 @pytest.mark.parametrize("sun", SUNS)
-def test_light_scattered_once_is_the_closed_form(albedo: float, sun: float, make_scene):
-    scene = half_space(make_scene, albedo, sun)
+def test_light_scattered_once_is_the_closed_form(albedo: float, sun: float):
+    scene = half_space(albedo, sun)
     field = solve_light(scene, SolveMemory())
     found = [float(view_components(field, scene, view.camera).single[0]) for view in scene.views]
     assert found == pytest.approx([single(albedo, sun, view) for view in VIEWS], rel=1e-3)
 
 
 @each_albedo
-def test_p1_is_its_own_closed_form(albedo: float, make_scene, order):
-    """Approached at second order: what departs from the exact radiance is P1's own error, not the discretization's."""
+def test_p1_is_its_own_closed_form(albedo: float):
+    """Approached at second order: what departs from the exact radiance is P1's own error, not the
+    discretization's.
+    """
     counts, errors = (48, 96, 192), []
     for cells in counts:
-        found = [radiance for sun in SUNS for radiance in seen(half_space(make_scene, albedo, sun, cells))]
-        wanted = [single(albedo, sun, view) + p1_multiple(albedo, sun, view) for sun in SUNS for view in VIEWS]
+        found = [radiance for sun in SUNS for radiance in seen(half_space(albedo, sun, cells))]
+        wanted = [
+            single(albedo, sun, view) + p1_multiple(albedo, sun, view)
+            for sun in SUNS
+            for view in VIEWS
+        ]
         errors.append(relative_rms(found, wanted))
-    assert errors[-1] < 2e-4 and order([1 / cells for cells in counts], errors) > 1.8, errors
+    assert errors[-1] < 2e-4 and convergence_order([1 / cells for cells in counts], errors) > 1.8, (
+        errors
+    )
 
 
 @pytest.mark.parametrize("rounds", ROUNDS)
 @each_albedo
-def test_reflected_radiance_is_chandrasekhars(albedo: float, rounds: int, make_scene):
-    found = [radiance for sun in SUNS for radiance in seen(half_space(make_scene, albedo, sun, rounds=rounds))]
+def test_reflected_radiance_is_chandrasekhars(albedo: float, rounds: int):
+    found = [radiance for sun in SUNS for radiance in seen(half_space(albedo, sun, rounds=rounds))]
     wanted = [exact(albedo, sun, view) for sun in SUNS for view in VIEWS]
     assert relative_rms(found, wanted) < ERRORS[rounds][albedo]

@@ -10,18 +10,27 @@ import pytest
 import torch
 
 from ddrecon.reconstruct.loop import optimize
-from ddrecon.scene.build import load_scene
+from ddrecon.scene_file.build import load_scene
 
 ROOT = Path(__file__).parents[2]
-CONFIGS = [config for config in sorted((ROOT / "configs").glob("*.yaml")) if config.stem != "gradcheck_all"]
-"""Those with images to reconstruct from; the derivatives of the other are checked in tests/validate."""
+CONFIGS = [
+    config for config in sorted((ROOT / "configs").glob("*.yaml")) if config.stem != "gradcheck_all"
+]
+"""Those with images to reconstruct from; the derivatives of the other are checked in
+tests/validate.
+"""
 
 
 def small(config: Path) -> list[str]:
     """Overrides that leave the config about 8 cells along its shortest side."""
-    (sizes,) = re.findall(r"^  resolution: \[(\d+), (\d+), (\d+)\]", config.read_text(), re.MULTILINE)
+    (sizes,) = re.findall(
+        r"^  resolution: \[(\d+), (\d+), (\d+)\]", config.read_text(), re.MULTILINE
+    )
     cells = [int(size) for size in sizes]
-    return [f"volume.resolution={[size * 8 // min(cells) for size in cells]}", "optimize.iterations=2"]
+    return [
+        f"volume.resolution={[size * 8 // min(cells) for size in cells]}",
+        "optimize.iterations=2",
+    ]
 
 
 def test_there_are_configs() -> None:
@@ -38,4 +47,8 @@ def test_a_config_runs_small(config: Path) -> None:
     density = result.scene.volume.density
     assert [row.iteration for row in result.rows] == [1, 2]
     assert result.rows[1].loss < result.rows[0].loss
-    assert torch.isfinite(density).all() and density.min() >= 0 and (density != scene.starts["density"]).any()
+    assert (
+        torch.isfinite(density).all()
+        and density.min() >= 0
+        and (density != scene.starts["density"]).any()
+    )

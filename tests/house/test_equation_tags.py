@@ -13,20 +13,38 @@ TAG = re.compile(r"\bE(\d+)(?:-E?(\d+))?\b")
 
 def tags(text: str) -> set[int]:
     """Numbers of the tags in `text`; E4-E6 stands for E4, E5 and E6."""
-    return {number for first, last in TAG.findall(text) for number in range(int(first), int(last or first) + 1)}
+    return {
+        number
+        for first, last in TAG.findall(text)
+        for number in range(int(first), int(last or first) + 1)
+    }
 
 
-STATED = {int(number) for number in re.findall(r"^\W*E(\d+)\b", (ROOT / "docs" / "theory.md").read_text(), re.MULTILINE)}
-CITED = {path.relative_to(ROOT): tags(path.read_text()) for path in sorted((ROOT / "ddrecon").rglob("*.py"))}
+STATED = {
+    int(number)
+    for number in re.findall(
+        r"^\W*E(\d+)\b", (ROOT / "docs" / "theory.md").read_text(), re.MULTILINE
+    )
+}
+CITED = {
+    path.relative_to(ROOT): tags(path.read_text())
+    for path in sorted((ROOT / "ddrecon").rglob("*.py"))
+}
 
 
-@pytest.mark.parametrize(("text", "found"), [("by E3.", {3}), ("E4-E6 and E9", {4, 5, 6, 9}), ("1E5, PE4, 0xE1", set())])
+@pytest.mark.parametrize(
+    ("text", "found"), [("by E3.", {3}), ("E4-E6 and E9", {4, 5, 6, 9}), ("1E5, PE4, 0xE1", set())]
+)
 def test_tags_are_found(text: str, found: set[int]) -> None:
     assert tags(text) == found
 
 
-def test_theory_states_the_equations() -> None:
-    assert set(range(1, 11)) <= STATED
+ABOUT_DERIVATIVES = {10}
+"""Stated for readers alone: what is differentiated, which no single line computes."""
+
+
+def test_theory_states_the_equations_without_a_gap() -> None:
+    assert set(range(1, max(STATED) + 1)) == STATED and len(STATED) >= 13
 
 
 def test_every_tag_in_the_code_is_stated() -> None:
@@ -35,4 +53,4 @@ def test_every_tag_in_the_code_is_stated() -> None:
 
 
 def test_every_equation_of_the_model_is_cited_in_the_code() -> None:
-    assert set(range(1, 10)) - set().union(*CITED.values()) == set()
+    assert set().union(*CITED.values()) | ABOUT_DERIVATIVES == STATED

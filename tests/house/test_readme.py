@@ -1,4 +1,5 @@
-"""What the configs' first lines tell people to type is understood by the program, and scenes on the pages are legal.
+"""What the configs' first lines tell people to type is understood by the program, and scenes on the
+pages are legal.
 
 (The commands on the pages are run by tests/docs.)
 """
@@ -12,8 +13,8 @@ from pathlib import Path
 import click
 import pytest
 
-from ddrecon.cli import main
-from ddrecon.scene.load import read_scene
+from ddrecon.cli.commands import main
+from ddrecon.scene_file.load import read_scene
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -22,17 +23,29 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 def scenes() -> list[str]:
     """Every block of YAML on a page that is a whole scene."""
     texts = [page.read_text(encoding="utf-8") for page in PAGES]
-    return [block for text in texts for block in re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)]
+    return [
+        block
+        for text in texts
+        for block in re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    ]
 
 
 def commands() -> list[str]:
     """Every `ddrecon ...` in comments of configs."""
     configs = sorted((ROOT / "configs").rglob("*.yaml"))
-    return [line for config in configs for line in re.findall(r"^#.*?(ddrecon .*)$", config.read_text(encoding="utf-8"), re.MULTILINE)]
+    return [
+        line
+        for config in configs
+        for line in re.findall(
+            r"^#.*?(ddrecon .*)$", config.read_text(encoding="utf-8"), re.MULTILINE
+        )
+    ]
 
 
 def parsed(line: str) -> click.Context:
-    """The command line parsed, not run; raises click.UsageError for a command or an option that does not exist."""
+    """The command line parsed, not run; raises click.UsageError for a command or an option that
+    does not exist.
+    """
     name, *arguments = shlex.split(line, comments=True)[1:]
     command = main.get_command(click.Context(main), name)
     if command is None:
@@ -49,7 +62,9 @@ def test_a_command_is_understood(line: str) -> None:
     assert (ROOT / parsed(line).params["scene"]).is_file()
 
 
-@pytest.mark.parametrize("line", ["ddrecon paint a.yaml", "ddrecon check a.yaml --colour", "ddrecon render a.yaml"])
+@pytest.mark.parametrize(
+    "line", ["ddrecon paint a.yaml", "ddrecon check a.yaml --colour", "ddrecon render a.yaml"]
+)
 def test_a_wrong_command_is_not(line: str) -> None:
     with pytest.raises(click.UsageError):
         parsed(line)

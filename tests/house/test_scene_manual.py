@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from ddrecon.scene import schema
+from ddrecon.scene_file import schema
 
 DOCS = Path(__file__).parents[2] / "docs"
 ELSEWHERE = {schema.Constant, schema.Bounds, schema.PoseSection, schema.SceneTree}
@@ -26,11 +26,15 @@ def manual() -> ModuleType:
 
 
 def test_the_page_is_what_the_schema_makes_of_it(manual: ModuleType) -> None:
-    assert (DOCS / "scene_file.md").read_text() == manual.page(), "run: python docs/make_scene_file.py"
+    assert (DOCS / "scene_file.md").read_text() == manual.page(), (
+        "run: python docs/make_scene_file.py"
+    )
 
 
 def test_every_key_of_every_record_is_told_of(manual: ModuleType) -> None:
-    records = {value for value in vars(schema).values() if isinstance(value, type) and is_dataclass(value)} - ELSEWHERE
+    records = {
+        value for value in vars(schema).values() if isinstance(value, type) and is_dataclass(value)
+    } - ELSEWHERE
     told = {record: set(texts) for _, record, _, texts in manual.SECTIONS}
     assert set(told) == records
     pose = {field.name for field in fields(schema.PoseSection)}

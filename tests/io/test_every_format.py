@@ -1,4 +1,6 @@
-"""A grid of three different sizes with one hot corner goes through every format, and comes back in its place."""
+"""A grid of three different sizes with one hot corner goes through every format, and comes back in
+its place.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +10,17 @@ import numpy as np
 import openvdb_python
 import pytest
 
-from ddrecon.io.field import Field
-from ddrecon.io.volumes import FORMATS, field_names, read_field, write_field
+from ddrecon.io.volumes.field import Field
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
 
 BOUNDS = np.array([[-1.0, -2.0, 8.0], [1.5, 2.5, 11.0]])
 PACKAGES = {".tif": "tifffile", ".tiff": "tifffile", ".nc": "netCDF4"}
 
 
 def corner(colors: int) -> np.ndarray:
-    """Zero but for the last cell along x, the first along y and z; more cells along x than a leaf of OpenVDB's tree has."""
+    """Zero but for the last cell along x, the first along y and z; more cells along x than a leaf
+    of OpenVDB's tree has.
+    """
     values = np.zeros((3, 5, 19, colors), np.float32)
     values[0, 0, -1] = np.arange(1, colors + 1)
     return values[..., 0] if colors == 1 else values

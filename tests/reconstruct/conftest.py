@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 
 BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
 

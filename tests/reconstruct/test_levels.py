@@ -2,28 +2,28 @@
 
 import torch
 
-from ddrecon.cameras import Camera, rays
+from ddrecon.cameras import Camera, cast_rays
 from ddrecon.grid import Grid
-from ddrecon.reconstruct.levels import at_level, factors, resampled, stage_of
+from ddrecon.reconstruct.levels import factors, resample, scene_at_level, stage_of
 
 
 def test_coarsening_keeps_the_mass(ball_scene) -> None:
     density = torch.rand(ball_scene.volume.grid.shape, dtype=torch.float64)
-    coarse = resampled(density, ball_scene.volume.grid.coarsened(2))
+    coarse = resample(density, ball_scene.volume.grid.coarsen(2))
     assert torch.isclose(coarse.mean(), density.mean(), rtol=1e-12)
 
 
 def test_refining_keeps_constants_and_linear_fields_inside() -> None:
     fine = Grid((8, 8, 8), (0.0,) * 3, (1.0,) * 3)
-    coarse = fine.coarsened(2)
+    coarse = fine.coarsen(2)
     z = coarse.centers(torch.zeros(1, dtype=torch.float64))[0].expand(*coarse.shape)
-    refined = resampled(z, fine)
+    refined = resample(z, fine)
     expected = fine.centers(torch.zeros(1, dtype=torch.float64))[0].expand(*fine.shape)
     assert torch.allclose(refined[1:-1], expected[1:-1], atol=1e-12)
 
 
 def test_targets_are_averaged_over_the_larger_pixels(ball_scene) -> None:
-    coarse = at_level(ball_scene, 2)
+    coarse = scene_at_level(ball_scene, 2)
     for fine_view, view in zip(ball_scene.views, coarse.views, strict=True):
         assert torch.allclose(view.image.mean(), fine_view.image.mean(), rtol=1e-5)
         assert tuple(view.image.shape[1:]) == view.camera.size
@@ -31,7 +31,10 @@ def test_targets_are_averaged_over_the_larger_pixels(ball_scene) -> None:
 
 def test_a_coarser_camera_sees_the_same_frame(ball_scene) -> None:
     camera: Camera = ball_scene.views[0].camera
-    corners = rays(camera, (0.0, 0.0)).direction[0], rays(camera.resized(2), (0.0, 0.0)).direction[0]
+    corners = (
+        cast_rays(camera, (0.0, 0.0)).direction[0],
+        cast_rays(camera.resize(2), (0.0, 0.0)).direction[0],
+    )
     assert torch.allclose(*corners, atol=1e-6)
 
 

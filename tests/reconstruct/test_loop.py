@@ -1,4 +1,6 @@
-"""The loop: it gets closer, it stays within bounds, it stops cleanly, and it goes on as if it had never stopped."""
+"""The loop: it gets closer, it stays within bounds, it stops cleanly, and it goes on as if it had
+never stopped.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,10 +9,10 @@ import pytest
 import torch
 
 from ddrecon.errors import FormatError, SceneError, SolveError
-from ddrecon.io.volumes import read_field
-from ddrecon.reconstruct.checkpoint import load_checkpoint, save_checkpoint
+from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction, optimize
-from ddrecon.world import Scene
+from ddrecon.run.checkpoint import load_checkpoint, save_checkpoint
+from ddrecon.scene import Scene
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
 
@@ -40,7 +42,9 @@ def test_the_scene_itself_is_left_alone(ball_scene: Scene) -> None:
 
 def test_bounds_hold_at_every_step(ball_scene: Scene) -> None:
     settings = replace(ball_scene.optimize.parameters["density"], min=0.01, max=0.3, lr=1.0)
-    scene = replace(ball_scene, optimize=replace(ball_scene.optimize, parameters={"density": settings}))
+    scene = replace(
+        ball_scene, optimize=replace(ball_scene.optimize, parameters={"density": settings})
+    )
     run = Reconstruction(scene)
     for _ in range(3):
         run.step()
@@ -49,13 +53,18 @@ def test_bounds_hold_at_every_step(ball_scene: Scene) -> None:
 
 
 def test_test_views_do_not_influence_the_result(ball_scene: Scene) -> None:
-    views = [replace(view, image=view.image * 0 if view.is_test else view.image) for view in ball_scene.views]
+    views = [
+        replace(view, image=view.image * 0 if view.is_test else view.image)
+        for view in ball_scene.views
+    ]
     spoiled = optimize(replace(ball_scene, views=views), iterations=3)
-    assert torch.equal(spoiled.scene.volume.density, optimize(ball_scene, iterations=3).scene.volume.density)
+    assert torch.equal(
+        spoiled.scene.volume.density, optimize(ball_scene, iterations=3).scene.volume.density
+    )
 
 
 def test_brightness_of_the_light_does_not_matter(ball_scene: Scene) -> None:
-    from ddrecon.lights import AmbientLight, DirectionalLight
+    from ddrecon.light.lights import AmbientLight, DirectionalLight
 
     def brighter(light: DirectionalLight | AmbientLight) -> DirectionalLight | AmbientLight:
         if isinstance(light, DirectionalLight):
@@ -63,13 +72,17 @@ def test_brightness_of_the_light_does_not_matter(ball_scene: Scene) -> None:
         return AmbientLight(16 * light.radiance)
 
     views = [replace(view, image=16 * view.image) for view in ball_scene.views]
-    bright = replace(ball_scene, views=views, lights=[brighter(light) for light in ball_scene.lights])
+    bright = replace(
+        ball_scene, views=views, lights=[brighter(light) for light in ball_scene.lights]
+    )
     plain, scaled = optimize(ball_scene, iterations=3), optimize(bright, iterations=3)
     assert torch.allclose(plain.scene.volume.density, scaled.scene.volume.density, atol=1e-3)
 
 
 @pytest.mark.parametrize("stop", [2, 5])
-def test_resuming_gives_the_same_bits_as_not_stopping(ball_scene: Scene, tmp_path: Path, stop: int) -> None:
+def test_resuming_gives_the_same_bits_as_not_stopping(
+    ball_scene: Scene, tmp_path: Path, stop: int
+) -> None:
     through = optimize(ball_scene)
     first = Reconstruction(ball_scene)
     for _ in range(stop):
@@ -104,7 +117,11 @@ def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
 
 def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
     assert ball_scene.optimize is not None
-    run = Reconstruction(replace(ball_scene, optimize=replace(ball_scene.optimize, views_per_iteration=0, refine_at=())))
+    run = Reconstruction(
+        replace(
+            ball_scene, optimize=replace(ball_scene.optimize, views_per_iteration=0, refine_at=())
+        )
+    )
     run.step()
     good = run.parameters[0].value.detach().clone()
     run.step()
@@ -117,6 +134,8 @@ def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
 
 def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
     with pytest.raises(SceneError, match="nothing to reconstruct from"):
-        Reconstruction(replace(ball_scene, views=[view for view in ball_scene.views if view.is_test]))
+        Reconstruction(
+            replace(ball_scene, views=[view for view in ball_scene.views if view.is_test])
+        )
     with pytest.raises(SceneError, match="missing section"):
         Reconstruction(replace(ball_scene, optimize=None))

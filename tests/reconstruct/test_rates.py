@@ -1,4 +1,6 @@
-"""Learning rates: a rise, a fall, and the same run whatever the units; which views an iteration sees."""
+"""Learning rates: a rise, a fall, and the same run whatever the units; which views an iteration
+sees.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +10,9 @@ import pytest
 import torch
 
 from ddrecon.reconstruct.rates import default_rate, rate_at
-from ddrecon.reconstruct.views import chosen
-from ddrecon.variables import value_of, variable_names
-from ddrecon.world import Scene
+from ddrecon.reconstruct.views import pick_views
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, variable_names
 
 
 def test_rates_rise_then_fall_and_never_exceed_their_value() -> None:
@@ -26,17 +28,27 @@ def test_every_variable_has_a_rate(ball_scene: Scene) -> None:
 
 
 def test_brighter_light_moves_faster_in_proportion(ball_scene: Scene) -> None:
-    one, ten = (default_rate(ball_scene, "lights.0.irradiance", torch.full((3,), value)) for value in (1.0, 10.0))
+    one, ten = (
+        default_rate(ball_scene, "lights.0.irradiance", torch.full((3,), value))
+        for value in (1.0, 10.0)
+    )
     assert ten == pytest.approx(10 * one)
 
 
 def test_all_views_where_no_number_is_asked_for() -> None:
-    assert chosen(5, 0, 3, 0) == chosen(5, 5, 3, 0) == chosen(5, 9, 3, 0) == [0, 1, 2, 3, 4]
+    assert (
+        pick_views(5, 0, 3, 0)
+        == pick_views(5, 5, 3, 0)
+        == pick_views(5, 9, 3, 0)
+        == [0, 1, 2, 3, 4]
+    )
 
 
 @pytest.mark.parametrize(("count", "wanted"), [(10, 3), (7, 1), (4, 3), (6, 2)])
 def test_every_view_is_seen_once_before_any_comes_again(count: int, wanted: int) -> None:
-    seen = [index for iteration in range(count) for index in chosen(count, wanted, iteration, 0)]
+    seen = [
+        index for iteration in range(count) for index in pick_views(count, wanted, iteration, 0)
+    ]
     assert len(seen) == count * wanted
     for start in range(0, len(seen), count):
         assert sorted(seen[start : start + count]) == list(range(count))
@@ -44,7 +56,12 @@ def test_every_view_is_seen_once_before_any_comes_again(count: int, wanted: int)
 
 
 def test_the_order_differs_from_round_to_round_and_follows_the_seed() -> None:
-    rounds = [tuple(index for iteration in range(8) for index in chosen(8, 1, 8 * turn + iteration, 0)) for turn in range(4)]
+    rounds = [
+        tuple(
+            index for iteration in range(8) for index in pick_views(8, 1, 8 * turn + iteration, 0)
+        )
+        for turn in range(4)
+    ]
     assert len(set(rounds)) > 1
-    other = [chosen(8, 1, iteration, 1) for iteration in range(8)]
-    assert other == [chosen(8, 1, iteration, 1) for iteration in range(8)]
+    other = [pick_views(8, 1, iteration, 1) for iteration in range(8)]
+    assert other == [pick_views(8, 1, iteration, 1) for iteration in range(8)]

@@ -1,4 +1,6 @@
-"""What was changed is found again: scenes rendered by this program, started from wrong values of one kind or of all."""
+"""What was changed is found again: scenes rendered by this program, started from wrong values of
+one kind or of all.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,20 @@ from torch import Tensor
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight
-from ddrecon.medium import Volume
+from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.medium.coefficients import Volume
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.renderer import render_each
-from ddrecon.scene.schema import OptimizeSettings, ParameterSettings
-from ddrecon.settings import DiffusionSettings
-from ddrecon.variables import value_of, with_values
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
+from ddrecon.settings import DiffusionSettings, OptimizeSettings, ParameterSettings
+from ddrecon.variables.values import value_of, with_values
 
-BLOBS = ((0.0, 0.0, 0.0, 0.3), (0.15, 0.1, 0.05, 0.2), (-0.2, -0.05, 0.1, 0.18), (0.0, 0.15, -0.15, 0.2))
+BLOBS = (
+    (0.0, 0.0, 0.0, 0.3),
+    (0.15, 0.1, 0.05, 0.2),
+    (-0.2, -0.05, 0.1, 0.18),
+    (0.0, 0.15, -0.15, 0.2),
+)
 
 
 def cloud(cells: int) -> Volume:
@@ -33,12 +39,20 @@ def cloud(cells: int) -> Volume:
         distance = ((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2).sqrt()
         density = torch.maximum(density, torch.sigmoid(25 * (radius - distance)))
     density = torch.where(density > 0.02, density, 0)
-    return Volume(grid, density, torch.tensor([0.5, 1.0, 2.0]), torch.tensor([12.0, 10.0, 8.0]), torch.tensor(0.2))
+    return Volume(
+        grid,
+        density,
+        torch.tensor([0.5, 1.0, 2.0]),
+        torch.tensor([12.0, 10.0, 8.0]),
+        torch.tensor(0.2),
+    )
 
 
 def camera(turn: float, height: float, pixels: int) -> Camera:
     eye = torch.tensor([2.5 * math.sin(turn), height, 2.5 * math.cos(turn)])
-    return Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), (pixels, pixels), 0.27)
+    return Camera(
+        look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), (pixels, pixels), 0.27
+    )
 
 
 def scene_of(volume: Volume, views: int, pixels: int) -> Scene:
@@ -46,7 +60,9 @@ def scene_of(volume: Volume, views: int, pixels: int) -> Scene:
         DirectionalLight(torch.tensor([-1.0, -2.0, -1.0]), torch.tensor([3.0, 2.5, 2.0])),
         AmbientLight(torch.tensor([0.1, 0.12, 0.15])),
     ]
-    cameras = [camera(2 * math.pi * index / views, 0.5 * (-1) ** index, pixels) for index in range(views)]
+    cameras = [
+        camera(2 * math.pi * index / views, 0.5 * (-1) ** index, pixels) for index in range(views)
+    ]
     seen = [View(f"view_{index}", item) for index, item in enumerate(cameras)]
     return Scene(volume, lights, seen, diffusion=DiffusionSettings(tolerance=1e-5))
 
@@ -55,11 +71,18 @@ def photographed(scene: Scene) -> Scene:
     """`scene` with its own pictures as targets."""
     with torch.no_grad():
         images = render_each(scene, scene.views, SolveMemory())
-    return replace(scene, views=[replace(view, image=image) for view, image in zip(scene.views, images, strict=True)])
+    return replace(
+        scene,
+        views=[replace(view, image=image) for view, image in zip(scene.views, images, strict=True)],
+    )
 
 
-def recovered(scene: Scene, starts: dict[str, Tensor], iterations: int, **settings: ParameterSettings) -> Scene:
-    """What the loop makes of `scene` from `starts`, at one resolution, with default settings unless given."""
+def recovered(
+    scene: Scene, starts: dict[str, Tensor], iterations: int, **settings: ParameterSettings
+) -> Scene:
+    """What the loop makes of `scene` from `starts`, at one resolution, with default settings unless
+    given.
+    """
     parameters = {name: settings.get(name, ParameterSettings()) for name in starts}
     wanted = OptimizeSettings(parameters, iterations, refine_at=())
     return optimize(replace(scene, starts=starts, optimize=wanted)).scene
@@ -67,7 +90,9 @@ def recovered(scene: Scene, starts: dict[str, Tensor], iterations: int, **settin
 
 def image_error(scene: Scene, truth: Scene) -> float:
     with torch.no_grad():
-        found, wanted = (torch.stack(render_each(item, item.views, SolveMemory())) for item in (scene, truth))
+        found, wanted = (
+            torch.stack(render_each(item, item.views, SolveMemory())) for item in (scene, truth)
+        )
     return float((found - wanted).norm() / wanted.norm())
 
 
@@ -77,7 +102,9 @@ def degrees_between(one: Tensor, other: Tensor) -> float:
 
 def test_the_color_of_a_light() -> None:
     scene = photographed(scene_of(cloud(12), 3, 16))
-    found = value_of(recovered(scene, {"lights.0.irradiance": torch.ones(3)}, 200), "lights.0.irradiance")
+    found = value_of(
+        recovered(scene, {"lights.0.irradiance": torch.ones(3)}, 200), "lights.0.irradiance"
+    )
     assert float((found / value_of(scene, "lights.0.irradiance") - 1).abs().max()) < 1e-3
 
 
@@ -90,16 +117,26 @@ def test_the_direction_of_a_light() -> None:
 
 def test_a_phase_function_that_scatters_backward() -> None:
     """The paper's cloud: started at 0.67, the truth being -0.802 (it found -0.813)."""
-    volume = replace(cloud(12), sigma_a=torch.full((3,), 0.1), sigma_s=torch.full((3,), 40.0), g=torch.tensor(-0.802))
+    volume = replace(
+        cloud(12),
+        sigma_a=torch.full((3,), 0.1),
+        sigma_s=torch.full((3,), 40.0),
+        g=torch.tensor(-0.802),
+    )
     scene = photographed(scene_of(volume, 3, 16))
-    assert abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 140), "g")) + 0.802) < 0.02
+    assert (
+        abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 140), "g")) + 0.802) < 0.02
+    )
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_a_camera_turned_by_three_degrees_where_it_stands(is_perspective: bool) -> None:
     scene = scene_of(cloud(12), 1, 24)
     (view,) = scene.views
-    view.camera.is_perspective, view.camera.half_width = is_perspective, 0.27 if is_perspective else 0.6
+    view.camera.is_perspective, view.camera.half_width = (
+        is_perspective,
+        0.27 if is_perspective else 0.6,
+    )
     scene = photographed(scene)
     pose = view.camera.pose
     axis = torch.tensor([1.0, 0.5, 0.7])
@@ -126,12 +163,16 @@ def test_absorption_and_scattering_fields_of_a_cloud_of_known_density() -> None:
     truth = colored(scene.volume)
     scene = photographed(with_values(scene, truth))
     starts = {name: torch.full_like(field, float(field.mean())) for name, field in truth.items()}
-    settings = {"sigma_a": ParameterSettings(lr=0.05, tv=1e-4), "sigma_s": ParameterSettings(lr=0.5, tv=1e-5)}
+    settings = {
+        "sigma_a": ParameterSettings(lr=0.05, tv=1e-4),
+        "sigma_s": ParameterSettings(lr=0.5, tv=1e-5),
+    }
     found = recovered(scene, starts, 150, **settings)
     amount = scene.volume.density
     for name, field in truth.items():
         error, start = (
-            float(((value - field).abs() * amount).sum() / (field * amount).sum()) for value in (value_of(found, name), starts[name])
+            float(((value - field).abs() * amount).sum() / (field * amount).sum())
+            for value in (value_of(found, name), starts[name])
         )
         assert start > 0.15 and error < 0.1, name
 

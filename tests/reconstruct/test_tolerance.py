@@ -11,14 +11,14 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.tolerance import GRADIENT_ERROR, enough
-from ddrecon.world import Scene
+from ddrecon.reconstruct.tolerance import GRADIENT_ERROR, solve_tolerances
+from ddrecon.scene import Scene
 
 
 def test_the_forward_solve_follows_the_misfit_and_the_adjoint_does_not():
-    assert enough(0.1)["forward"] == pytest.approx(0.1 * enough(1.0)["forward"])
-    assert enough(0.1)["adjoint"] == enough(1.0)["adjoint"]
-    assert enough(50.0) == enough(1.0)
+    assert solve_tolerances(0.1)["forward"] == pytest.approx(0.1 * solve_tolerances(1.0)["forward"])
+    assert solve_tolerances(0.1)["adjoint"] == solve_tolerances(1.0)["adjoint"]
+    assert solve_tolerances(50.0) == solve_tolerances(1.0)
 
 
 def differentiated(scene: Scene, targets: dict[str, Tensor], memory: SolveMemory) -> Differentiated:
@@ -27,7 +27,9 @@ def differentiated(scene: Scene, targets: dict[str, Tensor], memory: SolveMemory
     def loss_of(view, image: Tensor) -> Tensor:
         return (image - targets.get(view.name, 0)).square().sum()
 
-    return differentiate(scene, [view.name for view in scene.views], {"density": density}, loss_of, memory)
+    return differentiate(
+        scene, [view.name for view in scene.views], {"density": density}, loss_of, memory
+    )
 
 
 @pytest.mark.parametrize("misfit", [1.0, 0.1, 0.01])
@@ -38,19 +40,27 @@ def test_the_gradient_is_as_exact_as_promised(misfit: float, ball_scene: Scene):
     signs = [torch.where(torch.arange(image.shape[-1]) % 2 == 0, 1.0, -0.5) for image in images]
     changed = [image * (1 - misfit * sign) for image, sign in zip(images, signs, strict=True)]
     targets = dict(zip([view.name for view in scene.views], changed, strict=True))
-    exact, loose = SolveMemory(), SolveMemory(enough=enough(misfit))
-    known, found = (differentiated(scene, targets, memory).gradients["density"] for memory in (exact, loose))
+    exact, loose = SolveMemory(), SolveMemory(enough=solve_tolerances(misfit))
+    known, found = (
+        differentiated(scene, targets, memory).gradients["density"] for memory in (exact, loose)
+    )
     assert float((found - known).norm()) < GRADIENT_ERROR * float(known.norm())
-    assert sum(record.iterations for record in loose.records) < sum(record.iterations for record in exact.records)
+    assert sum(record.iterations for record in loose.records) < sum(
+        record.iterations for record in exact.records
+    )
 
 
 def test_a_run_solves_as_its_last_misfit_asks_and_test_views_as_the_scene_does(ball_scene: Scene):
-    scene = replace(ball_scene, diffusion=replace(ball_scene.diffusion, tolerance=1e-6, warm_start=False))
+    scene = replace(
+        ball_scene, diffusion=replace(ball_scene.diffusion, tolerance=1e-6, warm_start=False)
+    )
     run = Reconstruction(scene, 3)
     while not run.is_done:
-        asked = enough(run.misfit)
+        asked = solve_tolerances(run.misfit)
         run.step()
         *train, last = run.memory.records
-        assert all(asked[record.kind] / 100 < record.residual <= asked[record.kind] for record in train)
+        assert all(
+            asked[record.kind] / 100 < record.residual <= asked[record.kind] for record in train
+        )
     assert last.residual <= 1e-6
     assert 0 < run.misfit < 1

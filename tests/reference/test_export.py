@@ -13,17 +13,22 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
 
 from ddrecon.errors import SceneError
-from ddrecon.io.volumes import read_field
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.io.volumes.table import read_field
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.export import export_scene
 from ddrecon.reference.trace import Traced, Tracer, open_tracer
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
 
 NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
 COLOR = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
-NEAR: list[Light] = [DirectionalLight(-COLOR, COLOR), PointLight(COLOR, 2 * COLOR), AmbientLight(COLOR)]
+NEAR: list[Light] = [
+    DirectionalLight(-COLOR, COLOR),
+    PointLight(COLOR, 2 * COLOR),
+    AmbientLight(COLOR),
+]
 
 
 OPEN = """
@@ -37,11 +42,15 @@ np.save(path + ".npy", np.array(mitsuba.render(mitsuba.load_file(path), **json.l
 
 
 def opened(path: Path, **options: Any) -> np.ndarray:
-    """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes its EXR reader has hung.
+    """The scene at `path` as a user's Mitsuba shows it, in a process of its own: after other scenes
+    its EXR reader has hung.
 
-    On two threads, as `tracer_of` traces: the random numbers of the variant `scalar_rgb` depend on how many there are.
+    On two threads, as `tracer_of` traces: the random numbers of the variant `scalar_rgb` depend on
+    how many there are.
     """
-    subprocess.run([sys.executable, "-c", OPEN, str(path), json.dumps(options)], check=True, timeout=120)
+    subprocess.run(
+        [sys.executable, "-c", OPEN, str(path), json.dumps(options)], check=True, timeout=120
+    )
     return np.load(f"{path}.npy")
 
 
@@ -54,12 +63,18 @@ def sky() -> EnvironmentLight:
     return EnvironmentLight(radiance, COLOR[2], 25 * COLOR[2])
 
 
-def with_an_orthographic_view(scene: Scene, make_camera) -> Scene:
-    return replace(scene, views=[*scene.views, View("other", make_camera(eye=(2.0, 0.5, 0.1), is_perspective=False, half_width=0.6))])
+def with_an_orthographic_view(scene: Scene) -> Scene:
+    return replace(
+        scene,
+        views=[
+            *scene.views,
+            View("other", make_camera(eye=(2.0, 0.5, 0.1), is_perspective=False, half_width=0.6)),
+        ],
+    )
 
 
-def test_volumes_and_the_box_are_those_of_the_scene(make_scene, random, tmp_path: Path) -> None:
-    scene = make_scene(random(3, 4, 5), sigma_a=random(3, 3, 4, 5, seed=1))
+def test_volumes_and_the_box_are_those_of_the_scene(tmp_path: Path) -> None:
+    scene = make_scene(random_values(3, 4, 5), sigma_a=random_values(3, 3, 4, 5, seed=1))
     written = export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in written)
     field = read_field(tmp_path / "scene.sigma_t.vol", "sigma_t")
@@ -67,28 +82,36 @@ def test_volumes_and_the_box_are_those_of_the_scene(make_scene, random, tmp_path
     np.testing.assert_allclose(field.values, expected.permute(1, 2, 3, 0), rtol=1e-6)
     np.testing.assert_allclose(field.bounds, scene.volume.grid.bounds_xyz, rtol=1e-6)
     assert {
-        Path(node.attrib["value"]) for node in ElementTree.parse(tmp_path / "scene.xml").iter("string") if "vol" in node.attrib["value"]
+        Path(node.attrib["value"])
+        for node in ElementTree.parse(tmp_path / "scene.xml").iter("string")
+        if "vol" in node.attrib["value"]
     }
 
 
 @pytest.mark.parametrize("with_sky", [False, True])
-def test_a_gray_scene_opened_is_the_scene_traced(make_scene, make_camera, random, tmp_path: Path, with_sky: bool) -> None:
+def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
     lights = NEAR
     if with_sky:
         pytest.importorskip("OpenEXR")
         lights = [*NEAR, sky()]
-    scene = with_an_orthographic_view(make_scene(random(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4), make_camera)
+    scene = with_an_orthographic_view(
+        make_scene(random_values(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4)
+    )
     scene = replace(scene, lights=lights)
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     tracer = tracer_of(scene)
     for index in range(2):
-        np.testing.assert_allclose(opened(tmp_path / "scene.xml", sensor=index, seed=5, spp=16), tracer.trace(index, 5, 16), rtol=1e-4)
+        np.testing.assert_allclose(
+            opened(tmp_path / "scene.xml", sensor=index, seed=5, spp=16),
+            tracer.trace(index, 5, 16),
+            rtol=1e-4,
+        )
 
 
-def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(make_scene, random, tmp_path: Path) -> None:
+def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
-    scene = make_scene(0.3 * random(3, 4, 5))
+    scene = make_scene(0.3 * random_values(3, 4, 5))
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     tracer = tracer_of(scene)
     theirs, ours = (
@@ -99,8 +122,8 @@ def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(make_scene, random
     assert ours.distance(theirs.image) < 1.5 * np.hypot(theirs.noise, ours.noise)
 
 
-def test_what_is_there_stays(make_scene, random, tmp_path: Path) -> None:
-    scene, path = make_scene(random(3, 4, 5)), tmp_path / "scene.xml"
+def test_what_is_there_stays(tmp_path: Path) -> None:
+    scene, path = make_scene(random_values(3, 4, 5)), tmp_path / "scene.xml"
     (tmp_path / "scene.sigma_t.vol").write_text("mine")
     with pytest.raises(SceneError, match=r"scene.sigma_t.vol: already there"):
         export_scene(scene, path, may_exist=False)
@@ -109,6 +132,8 @@ def test_what_is_there_stays(make_scene, random, tmp_path: Path) -> None:
     assert read_field(tmp_path / "scene.sigma_t.vol", "sigma_t").resolution == (5, 4, 3)
 
 
-def test_no_folder(make_scene, random, tmp_path: Path) -> None:
+def test_no_folder(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="there is no folder"):
-        export_scene(make_scene(random(3, 4, 5)), tmp_path / "none" / "scene.xml", may_exist=False)
+        export_scene(
+            make_scene(random_values(3, 4, 5)), tmp_path / "none" / "scene.xml", may_exist=False
+        )

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
 from torch import Tensor
 
-from ddrecon.cameras import rays
+from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.reference.colors import of_color
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
-from ddrecon.world import Scene
+from ddrecon.scene import Scene
 
 SHAPE = (3, 4, 5)
 
@@ -32,8 +33,8 @@ def moved(matrix: np.ndarray, point: tuple[float, float, float]) -> np.ndarray:
     return (matrix @ [*point, 1.0])[:3]
 
 
-def test_the_box_and_its_volume_lie_where_the_grid_lies(make_scene, random) -> None:
-    scene = make_scene(random(*SHAPE))
+def test_the_box_and_its_volume_lie_where_the_grid_lies() -> None:
+    scene = make_scene(random_values(*SHAPE))
     lower, upper = scene.volume.grid.bounds_xyz
     description = described(scene)
     for place, corners in (
@@ -45,54 +46,83 @@ def test_the_box_and_its_volume_lie_where_the_grid_lies(make_scene, random) -> N
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_the_middle_of_a_films_edges_is_seen_along_our_rays(make_scene, make_camera, random, is_perspective: bool) -> None:
+def test_the_middle_of_a_films_edges_is_seen_along_our_rays(is_perspective: bool) -> None:
     camera = make_camera(size=(1, 2), half_width=0.4, is_perspective=is_perspective)
-    sensor = described(make_scene(random(*SHAPE), camera=camera))["sensor_0"]
-    ours = rays(camera)
+    sensor = described(make_scene(random_values(*SHAPE), camera=camera))["sensor_0"]
+    ours = cast_rays(camera)
     for ray, left in enumerate((0.5, -0.5)):
         if is_perspective:
             away = np.tan(np.radians(sensor["fov"] / 2)) * left
             start, along = (0.0, 0.0, 0.0), (away, 0.0, 1.0)
         else:
             start, along = (left, 0.0, 0.0), (left, 0.0, 1.0)
-        theirs = moved(sensor["to_world"], along) - moved(sensor["to_world"], (0, 0, 0) if is_perspective else start)
-        np.testing.assert_allclose(moved(sensor["to_world"], start), ours.origin[ray].flip(-1), atol=1e-12)
-        np.testing.assert_allclose(theirs / np.linalg.norm(theirs), ours.direction[ray].flip(-1), atol=1e-12)
+        theirs = moved(sensor["to_world"], along) - moved(
+            sensor["to_world"], (0, 0, 0) if is_perspective else start
+        )
+        np.testing.assert_allclose(
+            moved(sensor["to_world"], start), ours.origin[ray].flip(-1), atol=1e-12
+        )
+        np.testing.assert_allclose(
+            theirs / np.linalg.norm(theirs), ours.direction[ray].flip(-1), atol=1e-12
+        )
 
 
-def test_pixels_that_are_not_square_are_refused(make_scene, make_camera, random) -> None:
-    with pytest.raises(SceneError, match=r"pixels are square, those of this camera 1\.1 times as high as wide"):
-        described(make_scene(random(*SHAPE), camera=replace(make_camera(), pixel_aspect=1.1)))
+def test_pixels_that_are_not_square_are_refused() -> None:
+    with pytest.raises(
+        SceneError, match=r"pixels are square, those of this camera 1\.1 times as high as wide"
+    ):
+        described(
+            make_scene(random_values(*SHAPE), camera=replace(make_camera(), pixel_aspect=1.1))
+        )
 
 
 @pytest.mark.parametrize("sigma", [(0.5,), (0.5, 1.0, 2.0)])
-def test_constant_cross_sections(make_scene, random, sigma: tuple[float, ...]) -> None:
-    scene = make_scene(random(*SHAPE), sigma_a=sigma, sigma_s=tuple(3 * value for value in reversed(sigma)))
+def test_constant_cross_sections(sigma: tuple[float, ...]) -> None:
+    scene = make_scene(
+        random_values(*SHAPE), sigma_a=sigma, sigma_s=tuple(3 * value for value in reversed(sigma))
+    )
     volume, medium = scene.volume, described(scene)["medium"]
     expected = (volume.sigma_a + volume.sigma_s).view(-1, 1, 1, 1) * volume.density
     np.testing.assert_allclose(extinction(medium), expected.permute(1, 2, 3, 0), rtol=1e-6)
-    np.testing.assert_allclose(np.array(medium["albedo"]), (volume.sigma_s / (volume.sigma_a + volume.sigma_s)).squeeze(), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.array(medium["albedo"]),
+        (volume.sigma_s / (volume.sigma_a + volume.sigma_s)).squeeze(),
+        rtol=1e-12,
+    )
 
 
 @pytest.mark.parametrize("absorbing", [(3, *SHAPE), (1, *SHAPE), (3, 1, 1, 1), (1, 1, 1, 1)])
-def test_cross_sections_per_cell(make_scene, random, absorbing: tuple[int, ...]) -> None:
-    sigma_a, scattering = random(*absorbing, seed=1), random(3, *SHAPE, seed=2)
+def test_cross_sections_per_cell(absorbing: tuple[int, ...]) -> None:
+    sigma_a, scattering = random_values(*absorbing, seed=1), random_values(3, *SHAPE, seed=2)
     constant = sigma_a.flatten() if absorbing[1:] == (1, 1, 1) else sigma_a
-    scene = make_scene(random(*SHAPE), sigma_a=constant, sigma_s=scattering)
+    scene = make_scene(random_values(*SHAPE), sigma_a=constant, sigma_s=scattering)
     medium = described(scene)["medium"]
-    np.testing.assert_allclose(extinction(medium), ((sigma_a + scattering) * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-6)
+    np.testing.assert_allclose(
+        extinction(medium),
+        ((sigma_a + scattering) * scene.volume.density).permute(1, 2, 3, 0),
+        rtol=1e-6,
+    )
     found = extinction(medium) * medium["albedo"]["grid"][(slice(FINER // 2, None, FINER),) * 3]
-    np.testing.assert_allclose(found, (scattering * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-5)
+    np.testing.assert_allclose(
+        found, (scattering * scene.volume.density).permute(1, 2, 3, 0), rtol=1e-5
+    )
 
 
-def test_nothing_scatters_where_nothing_is(make_scene, random) -> None:
+def test_nothing_scatters_where_nothing_is() -> None:
     fields = dict.fromkeys(("sigma_a", "sigma_s"), torch.zeros(1, *SHAPE, dtype=torch.float64))
-    assert not described(make_scene(random(*SHAPE), **fields))["medium"]["albedo"]["grid"].any()
-    assert described(make_scene(random(*SHAPE), sigma_a=(0.0,), sigma_s=(0.0,)))["medium"]["albedo"] == 0
+    assert not described(make_scene(random_values(*SHAPE), **fields))["medium"]["albedo"][
+        "grid"
+    ].any()
+    assert (
+        described(make_scene(random_values(*SHAPE), sigma_a=(0.0,), sigma_s=(0.0,)))["medium"][
+            "albedo"
+        ]
+        == 0
+    )
 
 
-def test_gray_is_told_through_rounding(make_scene, random) -> None:
-    density, albedo = random(*SHAPE), torch.tensor([0.95, 0.9, 0.8])
+def test_gray_is_told_through_rounding() -> None:
+    density, albedo = random_values(*SHAPE), torch.tensor([0.95, 0.9, 0.8])
     scene = make_scene(density.float(), sigma_a=12 * (1 - albedo), sigma_s=12 * albedo)
     assert is_gray(scene.volume) and extinction(described(scene)["medium"]).shape == (*SHAPE, 1)
     assert not is_gray(make_scene(density, sigma_a=12 * (1 - albedo), sigma_s=(9.0,)).volume)
@@ -102,41 +132,63 @@ def every_light(like: Tensor) -> list[Any]:
     values = like.new_tensor
     color = values([1.0, 2.0, 3.0])
     sky = EnvironmentLight(color.view(3, 1, 1).expand(3, 2, 3), values(2.0), values(30.0))
-    return [DirectionalLight(color, color), AmbientLight(values([0.5])), AmbientLight(color), sky, PointLight(color, color)]
+    return [
+        DirectionalLight(color, color),
+        AmbientLight(values([0.5])),
+        AmbientLight(color),
+        sky,
+        PointLight(color, color),
+    ]
 
 
-def test_one_color_of_a_scene_is_that_color(make_scene, random) -> None:
-    scene = replace(make_scene(random(*SHAPE)), lights=every_light(random(1)))
+def test_one_color_of_a_scene_is_that_color() -> None:
+    scene = replace(make_scene(random_values(*SHAPE)), lights=every_light(random_values(1)))
     whole = described(scene)
     for color in range(3):
-        one = described(of_color(scene, color))
-        np.testing.assert_allclose(extinction(one["medium"])[..., 0], extinction(whole["medium"])[..., color], rtol=1e-6)
+        one = described(pick_color(scene, color))
+        np.testing.assert_allclose(
+            extinction(one["medium"])[..., 0], extinction(whole["medium"])[..., color], rtol=1e-6
+        )
         assert one["medium"]["albedo"] == pytest.approx(whole["medium"]["albedo"][color])
         assert one["light_0"]["irradiance"] == (whole["light_0"]["irradiance"][color],) * 3
         assert one["light_4"]["intensity"] == (whole["light_4"]["intensity"][color],) * 3
-        np.testing.assert_array_equal(one["around"]["bitmap"], np.repeat(whole["around"]["bitmap"][..., color, None], 3, -1))
+        np.testing.assert_array_equal(
+            one["around"]["bitmap"], np.repeat(whole["around"]["bitmap"][..., color, None], 3, -1)
+        )
 
 
-def test_ambient_light_is_part_of_an_environment_map(make_scene, random) -> None:
-    scene = replace(make_scene(random(*SHAPE)), lights=every_light(random(1)))
-    np.testing.assert_allclose(described(scene)["around"]["bitmap"], np.broadcast_to([3.5, 6.5, 9.5], (2, 3, 3)), rtol=1e-6)
-    alone = replace(scene, lights=[light for light in scene.lights if isinstance(light, AmbientLight)])
+def test_ambient_light_is_part_of_an_environment_map() -> None:
+    scene = replace(make_scene(random_values(*SHAPE)), lights=every_light(random_values(1)))
+    np.testing.assert_allclose(
+        described(scene)["around"]["bitmap"], np.broadcast_to([3.5, 6.5, 9.5], (2, 3, 3)), rtol=1e-6
+    )
+    alone = replace(
+        scene, lights=[light for light in scene.lights if isinstance(light, AmbientLight)]
+    )
     assert described(alone)["around"] == {"type": "constant", "radiance": (1.5, 2.5, 3.5)}
 
 
-def test_two_environment_maps_are_refused(make_scene, random) -> None:
-    lights = every_light(random(1))
+def test_two_environment_maps_are_refused() -> None:
+    lights = every_light(random_values(1))
     with pytest.raises(SceneError, match="2 environment maps"):
-        described(replace(make_scene(random(*SHAPE)), lights=[*lights, *lights]))
+        described(replace(make_scene(random_values(*SHAPE)), lights=[*lights, *lights]))
 
 
-def test_a_camera_inside_the_volume_is_in_its_medium(make_scene, make_camera, random) -> None:
+def test_a_camera_inside_the_volume_is_in_its_medium() -> None:
     inside, outside = ((0.1, 0.1, 0.2), (0.1, 0.1, 2.0))
-    assert "medium" in described(make_scene(random(*SHAPE), camera=make_camera(eye=inside)))["sensor_0"]
-    assert "medium" not in described(make_scene(random(*SHAPE), camera=make_camera(eye=outside)))["sensor_0"]
+    assert (
+        "medium"
+        in described(make_scene(random_values(*SHAPE), camera=make_camera(eye=inside)))["sensor_0"]
+    )
+    assert (
+        "medium"
+        not in described(make_scene(random_values(*SHAPE), camera=make_camera(eye=outside)))[
+            "sensor_0"
+        ]
+    )
 
 
-def test_rays_of_which_only_some_start_inside_are_refused(make_scene, make_camera, random) -> None:
+def test_rays_of_which_only_some_start_inside_are_refused() -> None:
     camera = make_camera(eye=(0.1, 0.1, 0.2), half_width=1.0, is_perspective=False)
     with pytest.raises(SceneError, match="view 'view'"):
-        described(make_scene(random(*SHAPE), camera=camera))
+        described(make_scene(random_values(*SHAPE), camera=camera))

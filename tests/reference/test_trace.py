@@ -9,23 +9,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
 from torch import Tensor
 
-from ddrecon.cameras import Camera, look_at, rays
+from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
-from ddrecon.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
 from ddrecon.renderer import render
+from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
-from ddrecon.world import Scene
 
 pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)")
 
 LOWER, UPPER = (-0.2, -0.8, -0.3), (0.8, 0.4, 0.5)
 """A box around (0.3, -0.2, 0.1), whose sides differ."""
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
-ONES, COLORS = torch.ones(3, dtype=torch.float64), torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
+ONES, COLORS = (
+    torch.ones(3, dtype=torch.float64),
+    torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64),
+)
 SIDES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -34,18 +38,34 @@ def passes(scene: Scene, count: int, samples: int, depth: int = -1) -> list[np.n
     return [tracer.trace(0, seed, samples) for seed in range(count)]
 
 
-def seen_from(side: tuple[float, float, float], half_width: float, size: int, is_perspective: bool = False, away: float = 2.0) -> Camera:
+def seen_from(
+    side: tuple[float, float, float],
+    half_width: float,
+    size: int,
+    is_perspective: bool = False,
+    away: float = 2.0,
+) -> Camera:
     towards = CENTER.new_tensor(side)
     up = towards.roll(1) if 1.0 in side else CENTER.new_tensor((0.0, 1.0, 0.0))
-    return Camera(look_at(CENTER + away * towards, CENTER, up), (size, size), half_width, is_perspective)
+    return Camera(
+        look_at(CENTER + away * towards, CENTER, up), (size, size), half_width, is_perspective
+    )
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(make_scene, side: str) -> None:
+def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(side: str) -> None:
     density, sigma = torch.full((2, 3, 2), 1.5, dtype=torch.float64), np.array([0.5, 1.0, 2.0])
     grid = Grid.from_xyz((2, 3, 2), LOWER, UPPER)
     camera = seen_from(SIDES[side], 0.2, 4)
-    scene = make_scene(density, grid=grid, sigma_a=tuple(sigma), sigma_s=(0.0,), directional=None, ambient=(1.0, 0.5, 0.2), camera=camera)
+    scene = make_scene(
+        density,
+        grid=grid,
+        sigma_a=tuple(sigma),
+        sigma_s=(0.0,),
+        directional=None,
+        ambient=(1.0, 0.5, 0.2),
+        camera=camera,
+    )
     length = dict(zip("xyz", np.subtract(UPPER, LOWER), strict=True))[side]
     means = np.array([image.mean((0, 1)) for image in passes(scene, 8, 256)])
     error = np.abs(means.mean(0) - [1.0, 0.5, 0.2] * np.exp(-1.5 * sigma * length))
@@ -55,13 +75,23 @@ def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(make_scen
 
 @pytest.mark.parametrize("corner", [(0, 0, 0), (2, 0, 4), (2, 3, 0)])
 @pytest.mark.parametrize("side", SIDES)
-def test_a_voxel_darkens_the_place_it_has(make_scene, side: str, corner: tuple[int, int, int]) -> None:
+def test_a_voxel_darkens_the_place_it_has(side: str, corner: tuple[int, int, int]) -> None:
     density = torch.zeros(3, 4, 5, dtype=torch.float64)
     density[corner] = 8.0
     grid = Grid.from_xyz((5, 4, 3), LOWER, UPPER)
     camera = seen_from(SIDES[side], 0.65, 26)
-    scene = make_scene(density, grid=grid, sigma_a=(1.0,), sigma_s=(0.0,), directional=None, ambient=(1.0,), camera=camera)
-    z, y, x = (axis.flatten()[index] for axis, index in zip(grid.centers(density), corner, strict=True))
+    scene = make_scene(
+        density,
+        grid=grid,
+        sigma_a=(1.0,),
+        sigma_s=(0.0,),
+        directional=None,
+        ambient=(1.0,),
+        camera=camera,
+    )
+    z, y, x = (
+        axis.flatten()[index] for axis, index in zip(grid.centers(density), corner, strict=True)
+    )
     right, up, _ = camera.pose[:, :3].T @ (torch.stack([x, y, z]) - camera.pose[:, 3])
     darkness = 1 - passes(scene, 1, 64)[0].mean(-1)
     line = (np.arange(26) + 0.5 - 13) / 13 * 0.65
@@ -79,7 +109,9 @@ def soft_ball(cells: int) -> tuple[Grid, Tensor]:
 
 def sky() -> Tensor:
     """A map [3, 8, 16] without symmetry, one pixel of it bright."""
-    radiance = COLORS.view(3, 1, 1) * torch.linspace(1, 0.1, 8, dtype=torch.float64).view(1, 8, 1).repeat(1, 1, 16)
+    radiance = COLORS.view(3, 1, 1) * torch.linspace(1, 0.1, 8, dtype=torch.float64).view(
+        1, 8, 1
+    ).repeat(1, 1, 16)
     radiance[:, 2, 5] += 40
     return radiance
 
@@ -88,18 +120,29 @@ LIGHTS: dict[str, Callable[[], list[Light]]] = {
     "directional": lambda: [DirectionalLight(-torch.tensor([2.0, 2.0, 1.0]).double(), COLORS)],
     "ambient": lambda: [AmbientLight(COLORS)],
     "environment": lambda: [EnvironmentLight(sky(), ONES[0], 40 * ONES[0])],
-    "environment and ambient": lambda: [EnvironmentLight(sky(), 0.5 * ONES[0], -70 * ONES[0]), AmbientLight(COLORS)],
+    "environment and ambient": lambda: [
+        EnvironmentLight(sky(), 0.5 * ONES[0], -70 * ONES[0]),
+        AmbientLight(COLORS),
+    ],
     "point": lambda: [PointLight(CENTER + torch.tensor([1.0, 1.5, 0.5]), COLORS)],
 }
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 @pytest.mark.parametrize("light", LIGHTS)
-def test_light_scattered_once_is_ours_to_4_percent(make_scene, light: str, is_perspective: bool) -> None:
+def test_light_scattered_once_is_ours_to_4_percent(light: str, is_perspective: bool) -> None:
     grid, density = soft_ball(12)
     half_width = 0.25 if is_perspective else 0.5
     camera = seen_from((0.5, 0.3, 0.8), half_width, 16, is_perspective)
-    scene = make_scene(density, grid=grid, sigma_a=(0.5, 1.0, 2.0), sigma_s=(3.0, 2.0, 1.0), g=0.3, camera=camera, model="none")
+    scene = make_scene(
+        density,
+        grid=grid,
+        sigma_a=(0.5, 1.0, 2.0),
+        sigma_s=(3.0, 2.0, 1.0),
+        g=0.3,
+        camera=camera,
+        model="none",
+    )
     settings = RenderSettings(samples_per_pixel=16, steps_per_voxel=2, background=False)
     scene = replace(scene, lights=LIGHTS[light](), render=settings)
     traced = Traced.of(passes(scene, 8, 128, depth=2))
@@ -109,35 +152,43 @@ def test_light_scattered_once_is_ours_to_4_percent(make_scene, light: str, is_pe
     assert ours.mean() == pytest.approx(traced.image.mean(), rel=0.03)
 
 
-def test_the_background_is_seen_where_we_see_it(make_scene) -> None:
+def test_the_background_is_seen_where_we_see_it() -> None:
     grid, density = soft_ball(8)
     camera = seen_from((0.5, 0.3, 0.8), 1.2, 16, True)
-    scene = make_scene(density, grid=grid, sigma_a=(20.0,), sigma_s=(0.0,), camera=camera, model="none")
-    scene = replace(scene, lights=LIGHTS["environment"](), render=RenderSettings(samples_per_pixel=64))
+    scene = make_scene(
+        density, grid=grid, sigma_a=(20.0,), sigma_s=(0.0,), camera=camera, model="none"
+    )
+    scene = replace(
+        scene, lights=LIGHTS["environment"](), render=RenderSettings(samples_per_pixel=64)
+    )
     traced = Traced.of(passes(scene, 8, 64))
     assert traced.error(render(scene)[0].permute(1, 2, 0).numpy()) < 0.02
 
 
-def test_seeds(make_scene, random) -> None:
-    scene = make_scene(random(3, 4, 5))
+def test_seeds() -> None:
+    scene = make_scene(random_values(3, 4, 5))
     first, second = passes(scene, 2, 4)
     assert np.array_equal(first, passes(scene, 1, 4)[0]) and not np.array_equal(first, second)
 
 
-def test_nothing_and_nothing_that_shines(make_scene) -> None:
+def test_nothing_and_nothing_that_shines() -> None:
     empty = make_scene(torch.zeros(2, 2, 2, dtype=torch.float64), ambient=(0.5,))
     np.testing.assert_allclose(passes(empty, 1, 4)[0], 0.5, rtol=1e-6)
     assert not passes(replace(empty, lights=[]), 1, 4)[0].any()
 
 
-def test_an_off_center_camera_is_theirs(make_scene, make_camera, random) -> None:
+def test_an_off_center_camera_is_theirs() -> None:
     """Mitsuba's own rays through the corners of the film are ours."""
     mitsuba = load_mitsuba()
     camera = replace(make_camera(size=(4, 6), half_width=0.4), principal_point=(0.3, 0.65))
-    scene = make_scene(random(3, 4, 5), camera=camera)
+    scene = make_scene(random_values(3, 4, 5), camera=camera)
     sensor = mitsuba_scene(scene, scene.views)["sensor_0"]
     sensor["to_world"] = mitsuba.ScalarTransform4f(sensor["to_world"])
     theirs = mitsuba.load_dict(sensor)
     for corner, index in (((0.0, 0.0), 0), ((1.0, 1.0), -1)):
-        ray, _ = theirs.sample_ray(0.0, 0.5, mitsuba.ScalarPoint2f(*corner), mitsuba.ScalarPoint2f(0.5))
-        np.testing.assert_allclose(np.array(ray.d).ravel(), rays(camera, corner).direction[index].flip(-1), atol=1e-6)
+        ray, _ = theirs.sample_ray(
+            0.0, 0.5, mitsuba.ScalarPoint2f(*corner), mitsuba.ScalarPoint2f(0.5)
+        )
+        np.testing.assert_allclose(
+            np.array(ray.d).ravel(), cast_rays(camera, corner).direction[index].flip(-1), atol=1e-6
+        )

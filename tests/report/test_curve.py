@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ddrecon.report.curve import MOST, curve, logarithmic_ticks, ticks
+from ddrecon.report.curve import MOST, draw_curve, logarithmic_ticks, ticks
 
 FINITE = st.floats(-1e3, 1e3)
 
@@ -18,7 +18,10 @@ FINITE = st.floats(-1e3, 1e3)
 def places(svg: str) -> list[list[tuple[float, float]]]:
     """The points of every line."""
     lines = re.findall(r'<polyline points="([^"]*)"', svg)
-    return [[(float(x), float(y)) for x, y in (pair.split(",") for pair in line.split())] for line in lines]
+    return [
+        [(float(x), float(y)) for x, y in (pair.split(",") for pair in line.split())]
+        for line in lines
+    ]
 
 
 @given(FINITE, st.floats(1e-2, 1e6))
@@ -40,25 +43,39 @@ def test_logarithmic_ticks_lie_within_and_ascend(low: float, span: float) -> Non
 
 
 def test_a_straight_line_stays_straight_and_a_power_becomes_one() -> None:
-    linear = places(curve("a", {"": [(float(x), 3 * x - 1.0) for x in range(9)]}, "x"))
-    power = places(curve("a", {"": [(float(x), 10.0**-x) for x in range(9)]}, "x", is_logarithmic=True))
+    linear = places(draw_curve("a", {"": [(float(x), 3 * x - 1.0) for x in range(9)]}, "x"))
+    power = places(
+        draw_curve("a", {"": [(float(x), 10.0**-x) for x in range(9)]}, "x", is_logarithmic=True)
+    )
     for (line,), sign in ((linear, -1), (power, 1)):
         slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in itertools.pairwise(line)]
-        assert all(slope * sign > 0 and slope == pytest.approx(slopes[0], abs=0.01) for slope in slopes)
+        assert all(
+            slope * sign > 0 and slope == pytest.approx(slopes[0], abs=0.01) for slope in slopes
+        )
 
 
 def test_what_cannot_be_drawn_is_left_out() -> None:
-    (line,) = places(curve("a", {"": [(0.0, 1.0), (1.0, math.nan), (2.0, -1.0), (3.0, math.inf), (4.0, 2.0)]}, "x", is_logarithmic=True))
+    (line,) = places(
+        draw_curve(
+            "a",
+            {"": [(0.0, 1.0), (1.0, math.nan), (2.0, -1.0), (3.0, math.inf), (4.0, 2.0)]},
+            "x",
+            is_logarithmic=True,
+        )
+    )
     assert len(line) == 2
-    assert "polyline" not in curve("a", {"": [(0.0, math.nan)]}, "x")
+    assert "polyline" not in draw_curve("a", {"": [(0.0, math.nan)]}, "x")
 
 
 def test_a_long_log_is_thinned_and_keeps_its_ends() -> None:
     points = [(float(x), float(x % 7)) for x in range(20_003)]
-    (line,), ends = places(curve("a", {"": points}, "x")), places(curve("a", {"": [points[0], (points[-1][0], 6.0)]}, "x"))[0]
+    (line,), ends = (
+        places(draw_curve("a", {"": points}, "x")),
+        places(draw_curve("a", {"": [points[0], (points[-1][0], 6.0)]}, "x"))[0],
+    )
     assert len(line) <= MOST + 20
     assert (line[0][0], line[-1][0]) == (ends[0][0], ends[-1][0])
 
 
 def test_names_are_text_not_markup() -> None:
-    assert "<script>" not in curve("<script>", {"<script>": [(0.0, 1.0)]}, "<script>")
+    assert "<script>" not in draw_curve("<script>", {"<script>": [(0.0, 1.0)]}, "<script>")

@@ -7,7 +7,16 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-from ddrecon.report.page import folded, items, paragraph, picture, section, side_by_side, table, write_page
+from ddrecon.report.page import (
+    fold,
+    items,
+    paragraph,
+    picture,
+    section,
+    side_by_side,
+    table,
+    write_page,
+)
 
 NASTY = '<script>alert("&")</script>'
 VOID = {"meta", "img", "line", "circle", "polyline"}
@@ -33,7 +42,13 @@ class Balance(HTMLParser):
 
 
 def test_a_page_is_whole_and_escapes_what_it_is_told(tmp_path: Path) -> None:
-    parts = [paragraph(NASTY), items([NASTY]), table([NASTY], [[NASTY]]), folded(NASTY, NASTY), picture(b"PNG", NASTY)]
+    parts = [
+        paragraph(NASTY),
+        items([NASTY]),
+        table([NASTY], [[NASTY]]),
+        fold(NASTY, NASTY),
+        picture(b"PNG", NASTY),
+    ]
     write_page(tmp_path / "report.html", NASTY, NASTY, [section(NASTY, side_by_side(*parts))])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     reader = Balance()
@@ -46,5 +61,7 @@ def test_a_page_names_no_other_file(tmp_path: Path) -> None:
     write_page(tmp_path / "report.html", "a", "b", [picture(b"\x89PNG...", "c")])
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     sources = re.findall(r'(?:src|href)="([^"]*)"', text)
-    assert [base64.b64decode(source.removeprefix("data:image/png;base64,")) for source in sources] == [b"\x89PNG..."]
+    assert [
+        base64.b64decode(source.removeprefix("data:image/png;base64,")) for source in sources
+    ] == [b"\x89PNG..."]
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

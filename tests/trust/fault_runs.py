@@ -1,8 +1,10 @@
-"""Runs that are killed, interrupted or out of disk space at random moments, until they are done all the same.
+"""Runs that are killed, interrupted or out of disk space at random moments, until they are done all
+the same.
 
     python fault_runs.py kill|full FOLDER COUNT
 
-One process imports torch and forks a child for every fault, so that each costs a fraction of a second. Prints as JSON what happened.
+One process imports torch and forks a child for every fault, so that each costs a fraction of a
+second. Prints as JSON what happened.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from pathlib import Path
 import torch
 from tiny_scene import write_scene
 
-from ddrecon.cli import main
-from ddrecon.reconstruct import run_folder
+from ddrecon.cli.commands import main
+from ddrecon.run import run_folder
 
 SIGNALS = [*[signal.SIGKILL] * 10, signal.SIGTERM, signal.SIGINT]
 TOO_EARLY = "\nAborted!\n"
@@ -62,7 +64,18 @@ def start(folder: Path, out: Path, prepare: Callable[[], None]) -> int:
 def optimize(folder: Path, out: Path) -> None:
     """The command that a user gives, at first and again."""
     going_on = ["--resume"] if any(out.glob("checkpoints/*.pt")) else ["--overwrite"]
-    main(["optimize", str(folder / "scene.yaml"), "-q", "--preview-every", "4", "-o", str(out), *going_on])
+    main(
+        [
+            "optimize",
+            str(folder / "scene.yaml"),
+            "-q",
+            "--preview-every",
+            "4",
+            "-o",
+            str(out),
+            *going_on,
+        ]
+    )
 
 
 def ended(pid: int) -> int:
@@ -75,11 +88,23 @@ def result_of(out: Path) -> dict[str, object]:
     rows = [line.split(",") for line in (out / "loss.csv").read_text().splitlines()]
     seconds = rows[0].index("seconds")
     log = [row[:seconds] + row[seconds + 1 :] for row in rows]
-    files = {str(path.relative_to(out)): path.read_bytes().hex() for path in sorted(out.glob("previews/*"))}
+    files = {
+        str(path.relative_to(out)): path.read_bytes().hex()
+        for path in sorted(out.glob("previews/*"))
+    }
     state = torch.load(out / "checkpoints" / "last.pt", weights_only=True)["state"]
-    moments = {name: [moment.tolist() for moment in entry["moments"]] for name, entry in state["parameters"].items()}
+    moments = {
+        name: [moment.tolist() for moment in entry["moments"]]
+        for name, entry in state["parameters"].items()
+    }
     values = {name: entry["value"].tolist() for name, entry in state["parameters"].items()}
-    return {"log": log, "files": files, "moments": moments, "values": values, "parameters": (out / "parameters.json").read_text()}
+    return {
+        "log": log,
+        "files": files,
+        "moments": moments,
+        "values": values,
+        "parameters": (out / "parameters.json").read_text(),
+    }
 
 
 def nothing() -> None:
@@ -87,7 +112,9 @@ def nothing() -> None:
 
 
 def kill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
-    """Runs that receive `count` signals, each within a quarter of the time a whole run takes from its start."""
+    """Runs that receive `count` signals, each within a quarter of the time a whole run takes from
+    its start.
+    """
     faults, wrong, finished, number = 0, list[str](), 0, 0
     out = folder / "out_0"
     while faults < count or not finished:
@@ -112,15 +139,25 @@ def kill(folder: Path, count: int, whole: dict[str, object], duration: float) ->
 
 
 def fill(folder: Path, count: int, whole: dict[str, object], duration: float) -> dict[str, object]:
-    """A run whose files cannot grow beyond a random size, `count` times, and then can; checkpoints are the largest of them."""
+    """A run whose files cannot grow beyond a random size, `count` times, and then can; checkpoints
+    are the largest of them.
+    """
     out, wrong, faults = folder / "out_0", list[str](), 0
     largest = (folder / "whole" / "checkpoints" / "last.pt").stat().st_size
     for _ in range(count):
         most = int(random.uniform(0.02, 1.0) * largest)
-        code = ended(start(folder, out, lambda most=most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))))
+        code = ended(
+            start(
+                folder,
+                out,
+                lambda most=most: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)),
+            )
+        )
         lines = (folder / "stderr").read_text().splitlines()
         faults += code == 3
-        if code != 0 and (code != 3 or "cannot be written: File too large" not in lines[-1] or len(lines) > 2):
+        if code != 0 and (
+            code != 3 or "cannot be written: File too large" not in lines[-1] or len(lines) > 2
+        ):
             wrong.append(f"at most {most} bytes: {code}: {lines}")
     if code := ended(start(folder, out, nothing)):
         wrong.append(f"with space again: {code}: {(folder / 'stderr').read_text()}")
@@ -134,13 +171,20 @@ def run(kind: str, folder: Path, count: int) -> None:
     random.seed(0)
     run_folder.CHECKPOINT_SECONDS, run_folder.CHECKPOINT_SHARE = 0.0, 1e9
     write_scene(folder)
-    with suppress(SystemExit), redirect_stdout(StringIO()):  # here, so that what is imported on the way is imported once
+    with (
+        suppress(SystemExit),
+        redirect_stdout(StringIO()),
+    ):  # here, so that what is imported on the way is imported once
         optimize(folder, folder / "whole")
     begin = time.monotonic()
     ended(start(folder, folder / "again", nothing))
     duration = time.monotonic() - begin
     faulty = kill if kind == "kill" else fill
-    sys.stdout.write(json.dumps(faulty(folder, count, result_of(folder / "whole"), duration) | {"seconds": duration}))
+    sys.stdout.write(
+        json.dumps(
+            faulty(folder, count, result_of(folder / "whole"), duration) | {"seconds": duration}
+        )
+    )
 
 
 if __name__ == "__main__":

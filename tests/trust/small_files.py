@@ -8,4 +8,8 @@ from pathlib import Path
 
 def files_below(folder: Path) -> set[str]:
     """Every name below `folder`."""
-    return {os.path.join(where, name) for where, folders, names in os.walk(folder) for name in (*folders, *names)}
+    return {
+        os.path.join(where, name)
+        for where, folders, names in os.walk(folder)
+        for name in (*folders, *names)
+    }

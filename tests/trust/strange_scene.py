@@ -1,4 +1,6 @@
-"""A scene with something of everything, as the text of its values, and values that are strange in a scene."""
+"""A scene with something of everything, as the text of its values, and values that are strange in a
+scene.
+"""
 
 # ruff: noqa: RUF001
 
@@ -11,16 +13,28 @@ from hypothesis import strategies as st
 POSE = {"origin": ["0", "0", "2.5"], "target": ["0", "0", "0"], "up": ["0", "1", "0"]}
 MATRIX = [["1", "0", "0", "0"], ["0", "1", "0", "0"], ["0", "0", "1", "2.5"], ["0", "0", "0", "1"]]
 LISTED = [
-    {"name": "front", "image": "front.npy", "camera": {"type": "perspective", **POSE, "fov": "30", "resolution": ["8", "6"]}},
+    {
+        "name": "front",
+        "image": "front.npy",
+        "camera": {"type": "perspective", **POSE, "fov": "30", "resolution": ["8", "6"]},
+    },
     {
         "name": "side",
         "split": "test",
         "mask": "front.npy",
         "weight": "2",
-        "camera": {"type": "orthographic", "matrix": MATRIX, "width": "1", "resolution": ["8", "6"]},
+        "camera": {
+            "type": "orthographic",
+            "matrix": MATRIX,
+            "width": "1",
+            "resolution": ["8", "6"],
+        },
     },
 ]
-RING = {"ring": {"count": "2", "radius": "2.5", "height": "0.1", "fov": "30", "resolution": ["8", "6"]}, "images": '"*o*.npy"'}
+RING = {
+    "ring": {"count": "2", "radius": "2.5", "height": "0.1", "fov": "30", "resolution": ["8", "6"]},
+    "images": '"*o*.npy"',
+}
 SCENE: dict[str, Any] = {
     "volume": {
         "bounds": {"min": ["-0.5", "-0.5", "-0.5"], "max": ["0.5", "0.5", "0.5"]},
@@ -33,12 +47,24 @@ SCENE: dict[str, Any] = {
     "lights": [
         {"type": "directional", "direction": ["-1", "-2", "-1"], "irradiance": "3"},
         {"type": "ambient", "radiance": ["0.1", "0.2", "0.3"]},
-        {"type": "environment", "file": "front.npy", "scale": "1", "rotation": "10", "directions": "6"},
+        {
+            "type": "environment",
+            "file": "front.npy",
+            "scale": "1",
+            "rotation": "10",
+            "directions": "6",
+        },
         {"type": "point", "position": ["0", "2", "0"], "intensity": "5"},
     ],
     "views": LISTED,
     "render": {"samples_per_pixel": "1", "background": "true", "tolerance": "0.05"},
-    "diffusion": {"model": "p1", "closure": "geometric", "solver": "multigrid", "tolerance": "1e-4", "transport_rounds": "1"},
+    "diffusion": {
+        "model": "p1",
+        "closure": "geometric",
+        "solver": "multigrid",
+        "tolerance": "1e-4",
+        "transport_rounds": "1",
+    },
     "optimize": {
         "iterations": "4",
         "loss": "l2",

@@ -1,4 +1,6 @@
-"""Checkpoints: damage is noticed and costs at most one of them, and only a run of the same inputs goes on."""
+"""Checkpoints: damage is noticed and costs at most one of them, and only a run of the same inputs
+goes on.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,10 @@ import torch
 from click.testing import Result
 
 from ddrecon.errors import DataWarning
-from ddrecon.reconstruct import drive, loop
-from ddrecon.reconstruct.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
+from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.run import drive
+from ddrecon.run.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
 
 Run = Callable[..., Result]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o", "out"]
@@ -41,11 +44,16 @@ def density(folder: str = "out") -> np.ndarray:
 
 
 def iterations(folder: str = "out") -> list[int]:
-    return [int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]]
+    return [
+        int(line.split(",")[0]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]
+    ]
 
 
 def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path: Path) -> None:
-    states = [{"field": torch.rand(300), "text": "a text", "total": {"iteration": number}} for number in (1, 2)]
+    states = [
+        {"field": torch.rand(300), "text": "a text", "total": {"iteration": number}}
+        for number in (1, 2)
+    ]
     for state in states:
         save_checkpoint(tmp_path, state, {"g": 0.1})
     whole, chance, fallbacks = (tmp_path / LAST).read_bytes(), random.Random(0), 0
@@ -62,14 +70,19 @@ def test_a_changed_bit_anywhere_is_noticed_or_changes_nothing(tmp_path: Path) ->
     assert fallbacks > 50
 
 
-def test_a_damaged_checkpoint_gives_way_to_the_one_before_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_damaged_checkpoint_gives_way_to_the_one_before_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run(*OPTIMIZE, "--iterations", "4")
     whole = density()
     last = Path("out/checkpoints/last.pt")
     last.write_bytes(last.read_bytes()[:1000])
     result = run(*RESUME, "--iterations", "4")
     assert result.exit_code == 0
-    assert result.stderr == f"warning: {last}: not a usable checkpoint; going on from {last.with_name('previous.pt')}\n"
+    assert (
+        result.stderr
+        == f"warning: {last}: not a usable checkpoint; going on from {last.with_name('previous.pt')}\n"
+    )
     assert np.array_equal(density(), whole) and iterations() == [1, 2, 3, 4]
 
 
@@ -86,7 +99,10 @@ def test_a_log_with_lost_rows_is_told(run: Run) -> None:
     run(*OPTIMIZE, "--iterations", "3")
     log = Path("out/loss.csv")
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
-    assert run(*RESUME, "--iterations", "3").stderr == "warning: out/loss.csv: has 1 of the 3 iterations made\n"
+    assert (
+        run(*RESUME, "--iterations", "3").stderr
+        == "warning: out/loss.csv: has 1 of the 3 iterations made\n"
+    )
 
 
 def test_a_second_ctrl_c_saves_no_torn_state(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,8 +134,14 @@ def test_the_seed_belongs_to_the_state(run: Run) -> None:
     ("change", "difference"),
     [
         (["-D", "views.1.camera.fov=31"], "views.1.camera.fov is 30.0 there, 31.0 now"),
-        (["-D", "optimize.parameters.g.min=0"], "optimize.parameters.g.min is absent there, 0.0 now"),
-        (["-D", "views.0.camera.up=[1, 1, 0]"], "views.0.camera.up is [0.0, 1.0, 0.0] there, [1.0, 1.0, 0.0] now"),
+        (
+            ["-D", "optimize.parameters.g.min=0"],
+            "optimize.parameters.g.min is absent there, 0.0 now",
+        ),
+        (
+            ["-D", "views.0.camera.up=[1, 1, 0]"],
+            "views.0.camera.up is [0.0, 1.0, 0.0] there, [1.0, 1.0, 0.0] now",
+        ),
         (["--dtype", "float64"], '--dtype is "float32" there, "float64" now'),
     ],
 )
@@ -149,11 +171,16 @@ def test_a_state_of_the_wrong_form_is_refused(run: Run) -> None:
     del content["state"]["parameters"]["g"]
     torch.save(content, path)
     result = run(*RESUME)
-    assert (result.exit_code, result.stderr) == (3, f"{path}: not a usable checkpoint; start anew with --overwrite\n")
+    assert (result.exit_code, result.stderr) == (
+        3,
+        f"{path}: not a usable checkpoint; start anew with --overwrite\n",
+    )
 
 
 def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """About as often as they are to be, and not so often that they take more than their share of the time."""
+    """About as often as they are to be, and not so often that they take more than their share of
+    the time.
+    """
     saved: list[int] = []
     original = drive.RunFolder.save
 
@@ -162,11 +189,11 @@ def test_checkpoints_are_written_along_the_way(run: Run, monkeypatch: pytest.Mon
         original(self, run)
 
     monkeypatch.setattr(drive.RunFolder, "save", save)
-    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SECONDS", 0.0)
-    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SHARE", 1e9)
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e9)
     run(*OPTIMIZE, "--iterations", "4")
     assert saved == [0, 0, 1, 2, 3, 4]
     saved.clear()
-    monkeypatch.setattr("ddrecon.reconstruct.run_folder.CHECKPOINT_SHARE", 1e-9)
+    monkeypatch.setattr("ddrecon.run.run_folder.CHECKPOINT_SHARE", 1e-9)
     run(*OPTIMIZE, "--iterations", "4", "--overwrite")
     assert saved == [0, 4]

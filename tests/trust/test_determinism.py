@@ -1,4 +1,6 @@
-"""What a result does not depend on: the run, the number of threads, the order of views, the size of chunks; little on precision."""
+"""What a result does not depend on: the run, the number of threads, the order of views, the size of
+chunks; little on precision.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,12 @@ import torch
 from tiny_scene import write_scene
 from torch import Tensor
 
-from ddrecon import march
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.march import integral as march
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.loop import optimize
-from ddrecon.scene.build import load_scene
-from ddrecon.world import Scene, View
+from ddrecon.scene import Scene, View
+from ddrecon.scene_file.build import load_scene
 
 EQUAL = 1e-5
 """Relative difference that the number of threads may make."""
@@ -30,30 +32,51 @@ def path(tmp_path: Path) -> Path:
     return write_scene(tmp_path)
 
 
-def cloud(path: Path, dtype: torch.dtype = torch.float32, cells: str = "[16, 12, 14]", **settings: str) -> Scene:
+def cloud(
+    path: Path, dtype: torch.dtype = torch.float32, cells: str = "[16, 12, 14]", **settings: str
+) -> Scene:
     """The tiny scene, not so tiny, with a lumpy density."""
-    overrides = [f"volume.resolution={cells}", "diffusion.tolerance=1e-6", "render.tolerance=0", "optimize.refine_at=[]"]
-    scene = load_scene(path, overrides=[*overrides, *(f"{key}={value}" for key, value in settings.items())], dtype=dtype)
-    density = torch.rand(scene.volume.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    overrides = [
+        f"volume.resolution={cells}",
+        "diffusion.tolerance=1e-6",
+        "render.tolerance=0",
+        "optimize.refine_at=[]",
+    ]
+    scene = load_scene(
+        path,
+        overrides=[*overrides, *(f"{key}={value}" for key, value in settings.items())],
+        dtype=dtype,
+    )
+    density = torch.rand(
+        scene.volume.grid.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     return replace(scene, volume=replace(scene.volume, density=density.to(dtype)))
 
 
 def found(scene: Scene) -> dict[str, Tensor]:
     """Images of all views by name, and the derivatives of a loss by density, g and sigma_s."""
-    values = {name: getattr(scene.volume, name).clone().requires_grad_() for name in ("density", "g", "sigma_s")}
+    values = {
+        name: getattr(scene.volume, name).clone().requires_grad_()
+        for name in ("density", "g", "sigma_s")
+    }
     names = [view.name for view in scene.views]
 
     def loss_of(_: View, image: Tensor) -> Tensor:
         return image.square().sum()
 
     result = differentiate(scene, names, values, loss_of, SolveMemory())
-    return dict(zip(names, result.images, strict=True)) | {f"by {name}": bar for name, bar in result.gradients.items()}
+    return dict(zip(names, result.images, strict=True)) | {
+        f"by {name}": bar for name, bar in result.gradients.items()
+    }
 
 
 def distance(one: dict[str, Tensor], other: dict[str, Tensor]) -> float:
     """The largest relative difference, of norms, between results of the same names."""
     assert one.keys() == other.keys()
-    return max(float((one[name].double() - other[name].double()).norm() / other[name].double().norm()) for name in one)
+    return max(
+        float((one[name].double() - other[name].double()).norm() / other[name].double().norm())
+        for name in one
+    )
 
 
 @contextmanager
@@ -71,7 +94,13 @@ def test_same_seed_same_bits(path: Path) -> None:
     for seed in (3, 3, 4):
         torch.manual_seed(seed)
         result = optimize(scene)
-        runs.append([result.scene.volume.density, result.scene.volume.g, torch.tensor([row.loss for row in result.rows])])
+        runs.append(
+            [
+                result.scene.volume.density,
+                result.scene.volume.g,
+                torch.tensor([row.loss for row in result.rows]),
+            ]
+        )
     assert all(torch.equal(one, other) for one, other in zip(runs[0], runs[1], strict=True))
     assert not torch.equal(runs[0][0], runs[2][0])
 
@@ -91,20 +120,37 @@ def test_the_order_of_views_changes_nothing_much(path: Path) -> None:
 
 
 def test_the_order_of_views_changes_no_reconstruction(path: Path) -> None:
-    scene = load_scene(path, overrides=["optimize.iterations=4", "optimize.views_per_iteration=0"], dtype=torch.float64)
-    one, other = (optimize(each).scene.volume for each in (scene, replace(scene, views=scene.views[::-1])))
-    assert torch.allclose(one.density, other.density, rtol=EQUAL) and torch.allclose(one.g, other.g, rtol=EQUAL)
+    scene = load_scene(
+        path,
+        overrides=["optimize.iterations=4", "optimize.views_per_iteration=0"],
+        dtype=torch.float64,
+    )
+    one, other = (
+        optimize(each).scene.volume for each in (scene, replace(scene, views=scene.views[::-1]))
+    )
+    assert torch.allclose(one.density, other.density, rtol=EQUAL) and torch.allclose(
+        one.g, other.g, rtol=EQUAL
+    )
 
 
-def test_the_size_of_chunks_changes_nothing_much(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_chunks_changes_nothing_much(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = cloud(path)
     whole = found(scene)
     monkeypatch.setattr(march, "CHUNK_NODES", 300)
     assert distance(found(scene), whole) < EQUAL
 
 
-@pytest.mark.parametrize("settings", [{}, {"diffusion.transport_rounds": "1"}, {"diffusion.model": "flux_limited"}], ids=str)
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"diffusion.transport_rounds": "1"}, {"diffusion.model": "flux_limited"}],
+    ids=str,
+)
 def test_single_precision_is_close_to_double(path: Path, settings: dict[str, str]) -> None:
     tolerance = {"diffusion.tolerance": "1e-6"}
-    single, double = (found(cloud(path, dtype, cells="[7, 6, 5]", **settings, **tolerance)) for dtype in (torch.float32, torch.float64))
+    single, double = (
+        found(cloud(path, dtype, cells="[7, 6, 5]", **settings, **tolerance))
+        for dtype in (torch.float32, torch.float64)
+    )
     assert distance(single, double) < SINGLE

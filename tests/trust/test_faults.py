@@ -1,4 +1,6 @@
-"""Faults at random moments lose nothing: a run killed, interrupted or out of space ends with the bits of one left alone."""
+"""Faults at random moments lose nothing: a run killed, interrupted or out of space ends with the
+bits of one left alone.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,15 @@ SCRIPT = Path(__file__).parent / "fault_runs.py"
 def test_no_fault_loses_anything(tmp_path: Path, kind: str, count: int) -> None:
     """Of 60 signals 50 are SIGKILL, 5 SIGTERM and 5 Ctrl-C."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    found = subprocess.run([sys.executable, SCRIPT, kind, tmp_path, str(count)], env=environment, capture_output=True, text=True)
+    found = subprocess.run(
+        [sys.executable, SCRIPT, kind, tmp_path, str(count)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert found.returncode == 0, found.stderr
     report = json.loads(found.stdout)
     assert report["wrong"] == []
-    assert report["finished"] >= 1 and (report["faults"] == count or (kind == "full" and report["faults"] >= count // 2))
+    assert report["finished"] >= 1 and (
+        report["faults"] == count or (kind == "full" and report["faults"] >= count // 2)
+    )

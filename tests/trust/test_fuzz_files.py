@@ -1,4 +1,5 @@
-"""Data files by strangers: damaged volumes and images are refused in one line with their path, at once, and pickles never loaded.
+"""Data files by strangers: damaged volumes and images are refused in one line with their path, at
+once, and pickles never loaded.
 
 Every format of the tables `FORMATS` and `READERS` is tried, so that a new one is tried as well.
 """
@@ -25,10 +26,10 @@ from deadline import deadline
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ddrecon.cli import main
+from ddrecon.cli.commands import main
 from ddrecon.errors import FormatError, MissingExtraError
-from ddrecon.io.images import READERS, read_image
-from ddrecon.io.volumes import FORMATS, field_names, read_field, write_field
+from ddrecon.io.images.table import READERS, read_image
+from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
 
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 VALUES = np.random.default_rng(0).random((4, 5, 6), np.float32)
@@ -44,7 +45,9 @@ CASES = settings(
 
 @cache
 def sample(suffix: str, is_volume: bool) -> bytes | None:
-    """A small good file of the format `suffix`; None where it takes a package that is not here, or is only read."""
+    """A small good file of the format `suffix`; None where it takes a package that is not here, or
+    is only read.
+    """
     with TemporaryDirectory() as name:
         path = Path(name, f"density{suffix}")
         try:
@@ -68,11 +71,11 @@ def write_image(path: Path) -> None:
     elif path.suffix == ".hdr":
         path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 6 +X 8\n" + bytes(range(192)))
     elif path.suffix == ".exr":
-        from ddrecon.io.exr import write_exr
+        from ddrecon.io.images.exr import write_exr
 
         write_exr(path, PICTURE)
     elif path.suffix in (".tif", ".tiff"):
-        from ddrecon.io.tiff import write_tiff
+        from ddrecon.io.images.tiff import write_tiff
 
         write_tiff(path, PICTURE)
     else:
@@ -103,7 +106,9 @@ def damages(draw: Callable[..., Any]) -> Callable[[bytes], bytes]:
             middle = {
                 "flip": bytes([data[at] ^ (1 << byte % 8)]),
                 "set": bytes([byte]) * count,
-                "word": struct.pack("<Q", (0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1, byte)[byte % 8])[:count],
+                "word": struct.pack(
+                    "<Q", (0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1, byte)[byte % 8]
+                )[:count],
             }.get(kind, bytes([byte]) * count)
             if kind == "cut":
                 data = data[:at]
@@ -117,7 +122,9 @@ def damages(draw: Callable[..., Any]) -> Callable[[bytes], bytes]:
 
 
 def require_legal_or_refused(path: Path, read: Callable[[Path], np.ndarray]) -> bool:
-    """Reads the file, which must be legal or refused in one line with its path; whether it was refused."""
+    """Reads the file, which must be legal or refused in one line with its path; whether it was
+    refused.
+    """
     with deadline(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -145,7 +152,9 @@ def read_pixels(path: Path) -> np.ndarray:
 SAMPLES = [*((suffix, True) for suffix in FORMATS), *((suffix, False) for suffix in READERS)]
 """Suffix, and whether it is read as a volume: some are read as either."""
 EVERY_FORMAT = pytest.mark.parametrize(
-    ("suffix", "is_volume"), SAMPLES, ids=[f"{kind}{' volume' * is_volume}" for kind, is_volume in SAMPLES]
+    ("suffix", "is_volume"),
+    SAMPLES,
+    ids=[f"{kind}{' volume' * is_volume}" for kind, is_volume in SAMPLES],
 )
 
 
@@ -156,7 +165,9 @@ def reader(is_volume: bool) -> Callable[[Path], np.ndarray]:
 @EVERY_FORMAT
 @CASES
 @given(damaged=damages(), junk=st.binary(max_size=80))
-def test_a_damaged_file(tmp_path: Path, suffix: str, is_volume: bool, damaged: Callable[[bytes], bytes], junk: bytes) -> None:
+def test_a_damaged_file(
+    tmp_path: Path, suffix: str, is_volume: bool, damaged: Callable[[bytes], bytes], junk: bytes
+) -> None:
     path, good = tmp_path / f"density{suffix}", sample(suffix, is_volume)
     path.write_bytes(junk if good is None else damaged(good))
     require_legal_or_refused(path, reader(is_volume))
@@ -178,7 +189,12 @@ def test_the_contents_of_another_format(tmp_path: Path, suffix: str, is_volume: 
         if (content := sample(*other)) is not None:
             path.write_bytes(content)
             require_legal_or_refused(path, reader(is_volume))
-    for content in (b"", b"\0", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", pickle.dumps({"density": 1})):
+    for content in (
+        b"",
+        b"\0",
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n",
+        pickle.dumps({"density": 1}),
+    ):
         path.write_bytes(content)
         assert require_legal_or_refused(path, reader(is_volume))
 
@@ -187,12 +203,18 @@ def test_the_contents_of_another_format(tmp_path: Path, suffix: str, is_volume: 
 @pytest.mark.timeout(60)
 def test_what_is_no_file(tmp_path: Path, suffix: str, is_volume: bool) -> None:
     path = tmp_path / f"density{suffix}"
-    makers: list[Callable[[], object]] = [lambda: os.mkfifo(path), lambda: path.symlink_to(path), lambda: path.symlink_to("/dev/zero")]
+    makers: list[Callable[[], object]] = [
+        lambda: os.mkfifo(path),
+        lambda: path.symlink_to(path),
+        lambda: path.symlink_to("/dev/zero"),
+    ]
     for make in makers:
         make()
         assert require_legal_or_refused(path, reader(is_volume))
         result = CliRunner().invoke(main, ["info", str(path)])
-        assert (result.exit_code, result.stdout) == (3, "") and result.stderr.startswith(f"{path}: ")
+        assert (result.exit_code, result.stdout) == (3, "") and result.stderr.startswith(
+            f"{path}: "
+        )
         path.unlink()
     assert require_legal_or_refused(path, reader(is_volume))
 
@@ -212,7 +234,9 @@ def test_a_pickle_is_never_loaded(tmp_path: Path, suffix: str) -> None:
     objects = np.full((2, 2, 2), None, object)
     objects[0, 0, 0] = Tripwire(tmp_path / "made")
     path = tmp_path / f"density{suffix}"
-    np.save(path, objects, allow_pickle=True) if suffix == ".npy" else np.savez(path, density=objects, allow_pickle=True)
+    np.save(path, objects, allow_pickle=True) if suffix == ".npy" else np.savez(
+        path, density=objects, allow_pickle=True
+    )
     with pytest.raises(FormatError, match="Python objects"):
         (read_image if suffix == ".npy" else read_density)(path)
     path.write_bytes(pickle.dumps(Tripwire(tmp_path / "made")))
@@ -223,11 +247,15 @@ def test_a_pickle_is_never_loaded(tmp_path: Path, suffix: str) -> None:
 
 def npy(shape: tuple[int, ...], data: bytes) -> bytes:
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        stream, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
     return stream.getvalue() + data
 
 
-@pytest.mark.parametrize("shape", [(1024, 1024, 1023), (2**40, 2**20, 1), (-2, -3, 1), (0, 2**70, 1), (2**31, 2**31, 4)])
+@pytest.mark.parametrize(
+    "shape", [(1024, 1024, 1023), (2**40, 2**20, 1), (-2, -3, 1), (0, 2**70, 1), (2**31, 2**31, 4)]
+)
 def test_a_header_that_promises_more_than_there_is(tmp_path: Path, shape: tuple[int, ...]) -> None:
     with zipfile.ZipFile(tmp_path / "density.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("density.npy", npy(shape, bytes(24)))
@@ -237,18 +265,26 @@ def test_a_header_that_promises_more_than_there_is(tmp_path: Path, shape: tuple[
 
 
 @EVERY_FORMAT
-def test_what_is_too_large_is_refused_by_its_header(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, is_volume: bool) -> None:
+def test_what_is_too_large_is_refused_by_its_header(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, is_volume: bool
+) -> None:
     """A zip bomb among them: what its directory says is enough."""
     if (good := sample(suffix, is_volume)) is None:
         pytest.skip(f"no {suffix} can be written here")
     path = tmp_path / f"density{suffix}"
     path.write_bytes(good)
-    monkeypatch.setattr("ddrecon.io.arrays.MAX_BYTES", 100)
+    monkeypatch.setattr("ddrecon.io.files.arrays.MAX_BYTES", 100)
     with pytest.raises(FormatError, match="at most"):
         reader(is_volume)(path)
 
 
-@pytest.mark.parametrize("entity", ['<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>', '<!DOCTYPE x SYSTEM "file:///etc/passwd">'])
+@pytest.mark.parametrize(
+    "entity",
+    [
+        '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>',
+        '<!DOCTYPE x SYSTEM "file:///etc/passwd">',
+    ],
+)
 def test_xml_with_entities_is_refused(tmp_path: Path, entity: str) -> None:
     path = tmp_path / "density.vti"
     path.write_text(f'<?xml version="1.0"?>{entity}<VTKFile type="ImageData">&b;</VTKFile>')
@@ -257,10 +293,16 @@ def test_xml_with_entities_is_refused(tmp_path: Path, entity: str) -> None:
 
 
 def test_nan_negative_and_infinite_cells_are_named(tmp_path: Path) -> None:
-    for wrong, what in ((math.nan, "NaN or infinite"), (math.inf, "NaN or infinite"), (-1.0, "negative")):
+    for wrong, what in (
+        (math.nan, "NaN or infinite"),
+        (math.inf, "NaN or infinite"),
+        (-1.0, "negative"),
+    ):
         values = VALUES.copy()
         values[1, 2, 3] = wrong
         path = tmp_path / "density.npz"
         np.savez(path, density=values, bounds=BOUNDS)
-        with pytest.raises(FormatError, match=rf"density is {what} at cell \(x, y, z\) = \(3, 2, 1\)"):
+        with pytest.raises(
+            FormatError, match=rf"density is {what} at cell \(x, y, z\) = \(3, 2, 1\)"
+        ):
             read_field(path, "density")

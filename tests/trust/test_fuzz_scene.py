@@ -1,4 +1,6 @@
-"""Scene files by strangers: whatever they say, `check` takes them or refuses them in lines that name the place, at once."""
+"""Scene files by strangers: whatever they say, `check` takes them or refuses them in lines that
+name the place, at once.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +20,26 @@ from hypothesis import strategies as st
 from small_files import files_below
 from strange_scene import KEYS, NESTED, RING, SCENE, VALUES, WORDS
 
-from ddrecon.cli import main
-from ddrecon.io.volumes import write_field
-from ddrecon.scene.load import MAX_BYTES
+from ddrecon.cli.commands import main
+from ddrecon.io.volumes.table import write_field
+from ddrecon.scene_file.load import MAX_BYTES
 
 CASES = settings(
-    derandomize=True, database=None, deadline=None, max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    derandomize=True,
+    database=None,
+    deadline=None,
+    max_examples=400,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 PLACE = re.compile(r"(scene\.yaml(:\d+:\d+)?|-D |and more: |/).*")
-"""How every line begins: with the place in the scene or override, or with the path of a data file."""
+"""How every line begins: with the place in the scene or override, or with the path of a data file.
+"""
 
 
 def in_a_ring(scene: dict[str, Any]) -> dict[str, Any]:
-    """`scene` with a ring of views, and so without the parameter that is one of its own views' camera."""
+    """`scene` with a ring of views, and so without the parameter that is one of its own views'
+    camera.
+    """
     scene = copy.deepcopy({**scene, "views": RING})
     del scene["optimize"]["parameters"]["views.front.camera"]
     return scene
@@ -38,7 +47,13 @@ def in_a_ring(scene: dict[str, Any]) -> dict[str, Any]:
 
 def places(tree: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The path of everything in `tree` but its root."""
-    entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    entries = (
+        tree.items()
+        if isinstance(tree, dict)
+        else enumerate(tree)
+        if isinstance(tree, list)
+        else ()
+    )
     return [path for key, value in entries for path in [(*here, key), *places(value, (*here, key))]]
 
 
@@ -79,24 +94,36 @@ def trees(draw: Callable[..., Any]) -> str:
 
 @st.composite
 def texts(draw: Callable[..., Any]) -> bytes:
-    """The scene's text with characters replaced, removed or put in, or cut off; not always UTF-8."""
+    """The scene's text, cut off or with characters changed, removed or added; not always UTF-8."""
     data = bytearray(block(SCENE).encode())
     for _ in range(draw(st.integers(1, 4))):
         start = draw(st.integers(0, len(data)))
         end = start + draw(st.sampled_from([0, 0, 1, 1, 2, 30, 100000]))
         data[start:end] = draw(
-            st.one_of(st.sampled_from(WORDS + NESTED).map(str.encode), st.binary(max_size=4), st.just(b"\n"), st.just(b": "))
+            st.one_of(
+                st.sampled_from(WORDS + NESTED).map(str.encode),
+                st.binary(max_size=4),
+                st.just(b"\n"),
+                st.just(b": "),
+            )
         )
     return bytes(data)
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with the files that scenes name: good ones, a pipe, a loop of links, a folder."""
+    """The current folder, with the files that scenes name: good ones, a pipe, a loop of links, a
+    folder.
+    """
     monkeypatch.chdir(tmp_path)
     np.save("front.npy", np.full((6, 8, 3), 0.5, np.float32))
     np.save("to.npy", np.full((6, 8, 3), 0.5, np.float32))
-    write_field(Path("density.npz"), "density", np.random.default_rng(0).random((4, 5, 6)), np.array([[-0.5] * 3, [0.5] * 3]))
+    write_field(
+        Path("density.npz"),
+        "density",
+        np.random.default_rng(0).random((4, 5, 6)),
+        np.array([[-0.5] * 3, [0.5] * 3]),
+    )
     os.mkfifo("pipe.npy")
     os.mkfifo("pipe.npz")
     os.symlink("loop.npy", "loop.npy")
@@ -106,7 +133,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def require_taken_or_refused(folder: Path, *arguments: str) -> int:
-    """Runs a command that must end at once, with 0, 2 or 3, lines that name the place, and no new file; its exit code."""
+    """Runs a command that must end at once, with 0, 2 or 3, lines that name the place, and no new
+    file; its exit code.
+    """
     before = files_below(folder)
     with deadline():
         result = CliRunner().invoke(main, list(arguments))
@@ -116,8 +145,12 @@ def require_taken_or_refused(folder: Path, *arguments: str) -> int:
     assert files_below(folder) == before
     if result.exit_code:
         assert result.stdout == ""
-        lines = [line for line in result.stderr.split("\n")[:-1] if not line.startswith("warning: ")]
-        assert lines and all(PLACE.fullmatch(line) and len(line) <= 1100 for line in lines), result.stderr
+        lines = [
+            line for line in result.stderr.split("\n")[:-1] if not line.startswith("warning: ")
+        ]
+        assert lines and all(PLACE.fullmatch(line) and len(line) <= 1100 for line in lines), (
+            result.stderr
+        )
     return result.exit_code
 
 
@@ -152,16 +185,22 @@ def test_overrides(folder: Path, path: str, value: str, extra: str) -> None:
     require_taken_or_refused(folder, "check", "scene.yaml", "-D", f"{path}{extra}={value}")
 
 
-@pytest.mark.parametrize("empty", ["volume.sigma_t", "volume.albedo", "views.0.camera.origin", "views.1.camera.matrix"])
+@pytest.mark.parametrize(
+    "empty", ["volume.sigma_t", "volume.albedo", "views.0.camera.origin", "views.1.camera.matrix"]
+)
 def test_empty_alternatives_are_missing(folder: Path, empty: str) -> None:
-    """What fuzzing found: one of two keys that belong together was there, but empty, and was taken for given."""
+    """What fuzzing found: one of two keys that belong together was there, but empty, and was taken
+    for given.
+    """
     Path("scene.yaml").write_text(block(SCENE))
     assert require_taken_or_refused(folder, "check", "scene.yaml", "-D", f"{empty}=~") == 2
 
 
 def bomb(count: int) -> str:
-    """Each anchor is a list of nine of the one before: nine to the power of `count` entries in all."""
-    return "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, count))
+    """Each anchor is a list of nine of the one before: 9 to the power of `count` entries in all."""
+    return "a0: &a0 [x]\n" + "".join(
+        f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, count)
+    )
 
 
 LARGE = {
@@ -190,7 +229,18 @@ def test_large_scenes(folder: Path, kind: str) -> None:
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize(
-    "scene", ["pipe.npy", "loop.npy", "folder.npy", "/dev/zero", "/dev/stdin", "gone.yaml", "front.npy", "a\nb", "a" * 300]
+    "scene",
+    [
+        "pipe.npy",
+        "loop.npy",
+        "folder.npy",
+        "/dev/zero",
+        "/dev/stdin",
+        "gone.yaml",
+        "front.npy",
+        "a\nb",
+        "a" * 300,
+    ],
 )
 def test_what_is_no_scene_file(folder: Path, scene: str) -> None:
     result = CliRunner().invoke(main, ["check", scene])

@@ -1,4 +1,6 @@
-"""Memory is predicted before it is taken: too much is refused with what would fit, and a shortage is told in one line."""
+"""Memory is predicted before it is taken: too much is refused with what would fit, and a shortage
+is told in one line.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,13 @@ import pytest
 import torch
 from click.testing import Result
 
-from ddrecon import memory, render_folder
-from ddrecon.io.volumes import write_field
+from ddrecon import memory
+from ddrecon.cli.check import memory_estimate
+from ddrecon.io.volumes.table import write_field
 from ddrecon.memory import Needs, is_shortage, memory_of
-from ddrecon.scene import build_volume
-from ddrecon.scene.build import load_scene
-from ddrecon.terms import memory_estimate
+from ddrecon.run import render_folder
+from ddrecon.scene_file import build_volume
+from ddrecon.scene_file.build import load_scene
 
 Run = Callable[..., Result]
 COMMANDS = {
@@ -38,9 +41,18 @@ def test_what_does_not_fit_is_refused_before_it_is_made(run: Run, command: str) 
 
 
 @pytest.mark.parametrize(
-    "change", [[], ["--dtype", "float64"], ["-D", "diffusion.transport_rounds=1"], ["-D", "diffusion.model=flux_limited"]], ids=str
+    "change",
+    [
+        [],
+        ["--dtype", "float64"],
+        ["-D", "diffusion.transport_rounds=1"],
+        ["-D", "diffusion.model=flux_limited"],
+    ],
+    ids=str,
 )
-def test_what_is_said_to_fit_fits(run: Run, monkeypatch: pytest.MonkeyPatch, change: list[str]) -> None:
+def test_what_is_said_to_fit_fits(
+    run: Run, monkeypatch: pytest.MonkeyPatch, change: list[str]
+) -> None:
     """Each of the proposals, made one after another, is taken."""
     large = ["check", "scene.yaml", "-D", "volume.resolution=[96, 64, 64]", *change]
     free = 100 * 2**20
@@ -60,13 +72,18 @@ def test_what_is_said_to_fit_fits(run: Run, monkeypatch: pytest.MonkeyPatch, cha
         [],
         ["volume.sigma_s=[1, 2, 3]", "volume.g=0"],
         ["volume.g=0", "optimize.parameters={density: {}, sigma_s: {field: true}}"],
-        ["volume.sigma_s=[1, 2, 3]", "optimize.parameters={density: {}, sigma_s: {field: true}, sigma_a: {}}"],
+        [
+            "volume.sigma_s=[1, 2, 3]",
+            "optimize.parameters={density: {}, sigma_s: {field: true}, sigma_a: {}}",
+        ],
         ["diffusion.transport_rounds=2", "volume.density={file: density.npz}"],
         ["diffusion.model=flux_limited"],
     ],
     ids=str,
 )
-def test_the_prediction_is_the_estimate(run: Run, monkeypatch: pytest.MonkeyPatch, overrides: list[str]) -> None:
+def test_the_prediction_is_the_estimate(
+    run: Run, monkeypatch: pytest.MonkeyPatch, overrides: list[str]
+) -> None:
     """What is predicted from the scene file alone is what `check` says of the tensors."""
     bounds = torch.tensor([[-0.5, -0.3, -0.3], [0.5, 0.3, 0.3]]).numpy()
     write_field(Path("density.npz"), "density", torch.rand(3, 4, 16).numpy(), bounds)
@@ -83,11 +100,18 @@ def write_group(folder: Path, files: dict[str, str]) -> None:
 
 
 def test_limits_of_control_groups(tmp_path: Path) -> None:
-    write_group(tmp_path / "v2/a/b", {"memory.max": "1000", "memory.current": "700", "memory.stat": "anon 1\ninactive_file 50"})
+    write_group(
+        tmp_path / "v2/a/b",
+        {"memory.max": "1000", "memory.current": "700", "memory.stat": "anon 1\ninactive_file 50"},
+    )
     (tmp_path / "v2/a/memory.max").write_text("max\n")
     write_group(
         tmp_path / "v1/memory/c",
-        {"memory.limit_in_bytes": "900", "memory.usage_in_bytes": "100", "memory.stat": "total_inactive_file 25\ninactive_file 1"},
+        {
+            "memory.limit_in_bytes": "900",
+            "memory.usage_in_bytes": "100",
+            "memory.stat": "total_inactive_file 25\ninactive_file 1",
+        },
     )
     own = tmp_path / "own"
     own.write_text("0::/a/b\n")
@@ -110,4 +134,6 @@ def test_a_shortage_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> No
 def test_other_errors_are_no_shortage() -> None:
     with pytest.raises(RuntimeError) as caught:
         torch.ones(2) @ torch.ones(3)
-    assert not is_shortage(caught.value) and is_shortage(torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"))
+    assert not is_shortage(caught.value) and is_shortage(
+        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
+    )

@@ -1,4 +1,6 @@
-"""A scene small enough to be reconstructed hundreds of times: two levels, a random view an iteration, three kinds of parameters."""
+"""A scene small enough to be reconstructed hundreds of times: two levels, a random view an
+iteration, three kinds of parameters.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,16 @@ volume:
 lights:
   - {type: directional, direction: [-1, -2, -1], irradiance: 3}
 views:
-  - {name: front, image: front.npy, camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
-  - {name: side, image: side.npy, camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
-  - {name: test, image: side.npy, split: test,
-     camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1, resolution: [8, 6]}}
+  - name: front
+    image: front.npy
+    camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30}
+  - name: side
+    image: side.npy
+    camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30}
+  - name: test
+    image: side.npy
+    split: test
+    camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1}
 optimize:
   iterations: 10
   views_per_iteration: 1
@@ -33,7 +41,10 @@ def write_scene(folder: Path) -> Path:
     """Writes the scene and its pictures; returns the scene's path."""
     y, x = np.mgrid[-1:1:6j, -1:1:8j]
     for name, width in (("front", 1.0), ("side", 0.4)):
-        np.save(folder / f"{name}.npy", (np.maximum(0.5 - x**2 / width - y**2, 0)[..., None] * np.ones(3)).astype(np.float32))
+        np.save(
+            folder / f"{name}.npy",
+            (np.maximum(0.5 - x**2 / width - y**2, 0)[..., None] * np.ones(3)).astype(np.float32),
+        )
     path = folder / "scene.yaml"
     path.write_text(SCENE)
     return path

@@ -1,4 +1,6 @@
-"""The derivative check passes for every kind of parameter, alone and together, and catches each derivative that is wrong."""
+"""The derivative check passes for every kind of parameter, alone and together, and catches each
+derivative that is wrong.
+"""
 
 from pathlib import Path
 
@@ -6,14 +8,19 @@ import pytest
 import torch
 from torch.autograd import Function
 
-from ddrecon import decay, sampling
 from ddrecon.diffusion import implicit
 from ddrecon.errors import SceneError
-from ddrecon.scene.build import load_scene
+from ddrecon.numerics import decay
+from ddrecon.numerics import interpolation as sampling
+from ddrecon.scene_file.build import load_scene
 from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
-SMALL = ["volume.resolution=[6, 5, 4]", "views.0.camera.resolution=[7, 6]", "views.1.camera.resolution=[6, 5]"]
+SMALL = [
+    "volume.resolution=[6, 5, 4]",
+    "views.0.camera.resolution=[7, 6]",
+    "views.1.camera.resolution=[6, 5]",
+]
 NAMES = tuple(load_scene(CONFIG).starts)
 
 
@@ -43,7 +50,10 @@ def test_all_at_once_pass() -> None:
 
 def test_empty_cells_are_among_those_of_density() -> None:
     (result,) = check("density", samples=4)
-    assert {entry.value == 0 for entry in result.entries if entry.value is not None} == {True, False}
+    assert {entry.value == 0 for entry in result.entries if entry.value is not None} == {
+        True,
+        False,
+    }
 
 
 def test_forward_peaks_and_backward_scattering_pass() -> None:

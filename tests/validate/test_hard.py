@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.moments import Moments
+from ddrecon.light.moments import Moments
 from ddrecon.renderer import render
 from ddrecon.validate import hard
 from ddrecon.validate.balance import Balance, balance_of
@@ -44,7 +44,10 @@ def test_a_result_within_its_bounds_passes():
 def test_each_broken_bound_is_told(bound: str, change: dict):
     result = replace(KEPT, **change)
     assert result.failures() == [bound] and result.row().endswith(f"FAIL: {bound} |")
-    assert table([KEPT, result])[-1] == "2 cases, 1 failed" and describe([KEPT, result])["passed"] is False
+    assert (
+        table([KEPT, result])[-1] == "2 cases, 1 failed"
+        and describe([KEPT, result])["passed"] is False
+    )
 
 
 def test_a_residual_may_be_what_rounding_makes_of_it():
@@ -74,7 +77,9 @@ def solved(case: HardCase) -> Callable[[float], Balance]:
 
 @pytest.mark.parametrize("ambient", [0.0, 0.5])
 def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
-    """All it has too much of is absorbed or leaks too much; with g not 0, a little of what leaks is none of its own."""
+    """All it has too much of is absorbed or leaks too much; with g not 0, a little of what leaks is
+    none of its own.
+    """
     balance = solved(replace(SMALL, ambient=ambient))
     assert balance(1.0).residual < 1e-11 and balance(1.0).energy < 1e-11
     assert balance(1.001).residual == pytest.approx(1e-3, rel=1e-6)
@@ -82,7 +87,9 @@ def test_a_solution_is_balanced_and_a_wrong_one_is_not(ambient: float):
 
 
 def test_what_rounding_makes_of_a_residual_is_attained():
-    """The solution in double precision, rounded to single, has a residual of that size and no more than the tests allow."""
+    """The solution in double precision, rounded to single, has a residual of that size and no more
+    than the tests allow.
+    """
     case = CASES["optical depth 1e-4 a cell"]
     memory = SolveMemory()
     render(case.scene(torch.float64, CPU), memory=memory)

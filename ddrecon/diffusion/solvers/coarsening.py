@@ -1,9 +1,12 @@
-"""Half the cells along one axis: what multigrid's coarser grids are made by, one axis after another.
+"""Half the cells along one axis: what multigrid's coarser grids are made by, one axis after
+another.
 
-Conductances are read as a network of resistors, so that no spacing is needed and cells may be of any form. Along the axis a coarse face
-is half of either pair's inner resistor in series with the one between the pairs; across the axis conductances are in parallel. Light
-between two coarse cells changes from resistor to resistor as a current's voltage does, which is how corrections are interpolated: where
-the medium jumps they jump with it (operator-dependent transfers: Alcouffe, Brandt, Dendy and Painter 1981, doi:10.1137/0902035).
+Conductances are read as a network of resistors, so that no spacing is needed and cells may be of
+any form. Along the axis a coarse face is half of either pair's inner resistor in series with the
+one between the pairs; across the axis conductances are in parallel. Light between two coarse cells
+changes from resistor to resistor as a current's voltage does, which is how corrections are
+interpolated: where the medium jumps they jump with it (operator-dependent transfers: Alcouffe,
+Brandt, Dendy and Painter 1981, doi:10.1137/0902035).
 """
 
 from __future__ import annotations
@@ -13,15 +16,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, difference, lower, upper
+from ddrecon.diffusion.operator import AXES, Operator, difference, lower_cells, upper_cells
 
 
 @dataclass(frozen=True)
 class Coarsening:
-    """Pairs of neighbors along `axis` become one cell; a last one without a neighbor stays alone. `cells`: how many there were.
+    """Pairs of neighbors along `axis` become one cell; a last one without a neighbor stays alone.
+    `cells`: how many there were.
 
-    On the faces between pairs, `below` and `above` say where the cells next to the face stand between the coarse cells on either side:
-    0 is their own coarse cell, 1 the other, and evenly spread resistors make 1/4.
+    On the faces between pairs, `below` and `above` say where the cells next to the face stand
+    between the coarse cells on either side: 0 is their own coarse cell, 1 the other, and evenly
+    spread resistors make 1/4.
     """
 
     axis: int
@@ -34,14 +39,18 @@ class Coarsening:
         total = _sum_of_pairs(residual, self.axis)
         moved = self.below * _below(residual, self.axis)
         moved.addcmul_(self.above, _above(residual, self.axis), value=-1)
-        lower(total, self.axis).sub_(moved)
-        upper(total, self.axis).add_(moved)
+        lower_cells(total, self.axis).sub_(moved)
+        upper_cells(total, self.axis).add_(moved)
         return total
 
     def prolong(self, u: Tensor) -> Tensor:
-        """`u` of the coarse cells, interpolated; where `u` is the same everywhere, so is the result."""
+        """`u` of the coarse cells, interpolated; where `u` is the same everywhere, so is the
+        result.
+        """
         rise = difference(u, self.axis)
-        result = u.new_empty([self.cells if axis == self.axis else size for axis, size in enumerate(u.shape)])
+        result = u.new_empty(
+            [self.cells if axis == self.axis else size for axis, size in enumerate(u.shape)]
+        )
         _first(result, self.axis).copy_(u)
         _second(result, self.axis).copy_(u.narrow(self.axis, 0, self.cells // 2))
         _below(result, self.axis).addcmul_(self.below, rise)
@@ -49,12 +58,17 @@ class Coarsening:
         return result
 
 
-def coarsened(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
+def coarsen(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
     """`operator` on half as many cells along `axis`, and the way there and back."""
     along = operator.conductances[axis - 1]
-    half = _padded(0.5 / _first(along, axis), axis, (along.shape[axis] + 2) // 2)
-    resistance = lower(half, axis) + 1 / _second(along, axis) + upper(half, axis)
-    way = Coarsening(axis, along.shape[axis] + 1, lower(half, axis) / resistance, upper(half, axis) / resistance)
+    half = _pad(0.5 / _first(along, axis), axis, (along.shape[axis] + 2) // 2)
+    resistance = lower_cells(half, axis) + 1 / _second(along, axis) + upper_cells(half, axis)
+    way = Coarsening(
+        axis,
+        along.shape[axis] + 1,
+        lower_cells(half, axis) / resistance,
+        upper_cells(half, axis) / resistance,
+    )
     coarse = [_sum_of_pairs(c, axis) for c in operator.conductances]
     coarse[axis - 1] = _stiffened(1 / resistance, way, operator)
     z, y, x = coarse
@@ -62,10 +76,12 @@ def coarsened(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
 
 
 def _stiffened(along: Tensor, way: Coarsening, operator: Operator) -> Tensor:
-    """`along` with what neighbors across the axis add, where one leans to this side of the face and one to the other.
+    """`along` with what neighbors across the axis add, where one leans to this side of the face and
+    one to the other.
 
-    A difference u of coarse cells then makes one of (w - w') u between such neighbors. Left out, corrections overshoot where conductances
-    are random: ten times as many iterations at a contrast of 1e6.
+    A difference u of coarse cells then makes one of (w - w') u between such neighbors. Left out,
+    corrections overshoot where conductances are random: ten times as many iterations at a contrast
+    of 1e6.
     """
     along = along.clone()
     for across in AXES:
@@ -73,8 +89,8 @@ def _stiffened(along: Tensor, way: Coarsening, operator: Operator) -> Tensor:
             conductance = operator.conductances[across - 1]
             energy = _below(conductance, way.axis) * difference(way.below, across) ** 2
             energy += _above(conductance, way.axis) * difference(way.above, across) ** 2
-            lower(along, across).add_(energy, alpha=0.5)
-            upper(along, across).add_(energy, alpha=0.5)
+            lower_cells(along, across).add_(energy, alpha=0.5)
+            upper_cells(along, across).add_(energy, alpha=0.5)
     return along
 
 
@@ -101,10 +117,10 @@ def _below(u: Tensor, axis: int) -> Tensor:
 
 def _above(u: Tensor, axis: int) -> Tensor:
     """The cells on the high side of every face between pairs (a view)."""
-    return upper(_first(u, axis), axis)
+    return upper_cells(_first(u, axis), axis)
 
 
-def _padded(u: Tensor, axis: int, size: int) -> Tensor:
+def _pad(u: Tensor, axis: int, size: int) -> Tensor:
     """`u` with zeros after it, to `size` entries along `axis`."""
     rest = u.new_zeros([size - n if other == axis else n for other, n in enumerate(u.shape)])
     return torch.cat([u, rest], axis)

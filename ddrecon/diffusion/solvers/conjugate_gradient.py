@@ -1,4 +1,6 @@
-"""Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952, doi:10.6028/jres.049.044), all colors at once."""
+"""Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952, doi:10.6028/jres.049.044),
+all colors at once.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,12 @@ CHECK_EVERY = 4
 """Residuals are looked at every few iterations only: on a GPU each look waits for the device."""
 
 
-def conjugate_gradient(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float) -> Solution:
-    """The solution of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError when it is not reached."""
+def conjugate_gradient(
+    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
+) -> Solution:
+    """The solution of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError when it
+    is not reached.
+    """
     system = ScaledSystem.of(operator, source)
     y, residual = system.start(guess)
     direction, square = residual.clone(), inner(residual, residual)

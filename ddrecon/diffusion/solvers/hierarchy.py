@@ -1,7 +1,9 @@
-"""The V-cycle of multigrid: relaxation on each grid, and a correction from a coarser one, down to a few cells that are solved directly.
+"""The V-cycle of multigrid: relaxation on each grid, and a correction from a coarser one, down to a
+few cells that are solved directly.
 
-A cycle is a symmetric positive definite matrix, as a preconditioner of conjugate gradients must be: relaxation after the correction is
-the transpose of that before it, restriction that of interpolation, and each relaxation makes every error smaller.
+A cycle is a symmetric positive definite matrix, as a preconditioner of conjugate gradients must be:
+relaxation after the correction is the transpose of that before it, restriction that of
+interpolation, and each relaxation makes every error smaller.
 """
 
 from __future__ import annotations
@@ -12,19 +14,25 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, lower, upper
-from ddrecon.diffusion.solvers.coarsening import Coarsening, coarsened
+from ddrecon.diffusion.operator import AXES, Operator, lower_cells, upper_cells
+from ddrecon.diffusion.solvers.coarsening import Coarsening, coarsen
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 
 FEW_CELLS = 128
 """So many cells are solved directly."""
 STRONG = 0.5
-"""Axes whose conductances are weaker than this part of the strongest are not coarsened yet: relaxation is slow along them."""
+"""Axes whose conductances are weaker than this part of the strongest are not coarsened yet:
+relaxation is slow along them.
+"""
 SMOOTHEST = 1 / 3
-"""The least eigenvalue that relaxation has to take care of: that of an error that alternates along one axis of cubic cells."""
+"""The least eigenvalue that relaxation has to take care of: that of an error that alternates along
+one axis of cubic cells.
+"""
 CENTER, REACH = (2 + SMOOTHEST) / 2, (2 - SMOOTHEST) / 2 * math.cos(math.pi / 4)
 STEPS = (1 / (CENTER - REACH), 1 / (CENTER + REACH))
-"""The two relaxations of Chebyshev's polynomial on [`SMOOTHEST`, 2]; no eigenvalue of a scaled M-matrix is above 2."""
+"""The two relaxations of Chebyshev's polynomial on [`SMOOTHEST`, 2]; no eigenvalue of a scaled
+M-matrix is above 2.
+"""
 
 
 @dataclass(frozen=True)
@@ -35,14 +43,20 @@ class Coarsest:
 
     @staticmethod
     def of(operator: Operator) -> Coarsest:
-        """The direct solve of `operator`, made in double precision, in which differences of its entries are exact enough."""
+        """The direct solve of `operator`, made in double precision, in which differences of its
+        entries are exact enough.
+        """
         shape = operator.loss.shape[1:]
         number = torch.arange(math.prod(shape), device=operator.loss.device).view(1, *shape)
-        matrix = torch.diag_embed(Operator(_double(operator.conductances), operator.loss.double()).diagonal.flatten(1))
+        matrix = torch.diag_embed(
+            Operator(_double(operator.conductances), operator.loss.double()).diagonal.flatten(1)
+        )
         for axis, conductance in zip(AXES, operator.conductances, strict=True):
-            low, high = lower(number, axis).flatten(), upper(number, axis).flatten()
+            low, high = lower_cells(number, axis).flatten(), upper_cells(number, axis).flatten()
             matrix[:, low, high] = matrix[:, high, low] = -conductance.flatten(1).double()
-        return Coarsest(torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L).to(operator.loss.dtype))
+        return Coarsest(
+            torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L).to(operator.loss.dtype)
+        )
 
     def correction(self, residual: Tensor) -> Tensor:
         """A^-1 `residual`."""
@@ -53,9 +67,10 @@ class Coarsest:
 class Level:
     """A grid: its matrix, and the way to the next coarser one, axis by axis.
 
-    `taken` [C, z, y, x]: S times what a cell exchanges with its neighbors, the sum of its conductances. Corrections from the coarser grid
-    are multiplied by it: by 1/S where nothing is lost, by nearly nothing where light is absorbed before it gets to the next cell. Else they
-    would carry errors of bright cells into dark ones, where light then falls below zero.
+    `taken` [C, z, y, x]: S times what a cell exchanges with its neighbors, the sum of its
+    conductances. Corrections from the coarser grid are multiplied by it: by 1/S where nothing is
+    lost, by nearly nothing where light is absorbed before it gets to the next cell. Else they would
+    carry errors of bright cells into dark ones, where light then falls below zero.
     """
 
     matrix: ScaledMatrix
@@ -69,13 +84,17 @@ class Level:
         matrix, ways = operator.once(ScaledMatrix.of), []
         taken = matrix.scale * (operator.diagonal - operator.loss)
         for axis in _strong_axes(matrix):
-            way, operator = coarsened(operator, axis)
+            way, operator = coarsen(operator, axis)
             ways.append(way)
         has_few = operator.loss[0].numel() <= FEW_CELLS
-        return Level(matrix, taken, tuple(ways), Coarsest.of(operator) if has_few else Level.of(operator))
+        return Level(
+            matrix, taken, tuple(ways), Coarsest.of(operator) if has_few else Level.of(operator)
+        )
 
     def cycle(self, source: Tensor) -> Tensor:
-        """Roughly y with S A S y = `source` [C, z, y, x]: linear in `source`, symmetric and positive definite."""
+        """Roughly y with S A S y = `source` [C, z, y, x]: linear in `source`, symmetric and
+        positive definite.
+        """
         y = STEPS[0] * source
         for step in STEPS[1:]:
             y = self.matrix.relaxed(y, source, step)
@@ -99,8 +118,16 @@ def _strong_axes(matrix: ScaledMatrix) -> list[int]:
     """The axes to coarsen, all that have more than one cell and are not weak."""
     sizes = matrix.scale.shape
     axes = [axis for axis in AXES if sizes[axis] > 1]
-    strengths = torch.stack([matrix.conductances[axis - 1].mean() for axis in axes]).tolist() if axes else []
-    return [axis for axis, strength in zip(axes, strengths, strict=True) if not strength < STRONG * max(strengths)]
+    strengths = (
+        torch.stack([matrix.conductances[axis - 1].mean() for axis in axes]).tolist()
+        if axes
+        else []
+    )
+    return [
+        axis
+        for axis, strength in zip(axes, strengths, strict=True)
+        if not strength < STRONG * max(strengths)
+    ]
 
 
 def _double(conductances: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:

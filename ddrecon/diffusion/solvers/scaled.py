@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, lower, subtract_neighbors, upper
+from ddrecon.diffusion.operator import AXES, Operator, lower_cells, subtract_neighbors, upper_cells
 from ddrecon.errors import SolveError
 
 
 @dataclass(frozen=True)
 class Solution:
-    """`value` [C, z, y, x] solves the system to `residual` (relative, largest over the colors), found in `iterations`."""
+    """`value` [C, z, y, x] solves the system to `residual` (relative, largest over the colors),
+    found in `iterations`.
+    """
 
     value: Tensor
     iterations: int
@@ -31,7 +33,10 @@ class ScaledMatrix:
     def of(operator: Operator) -> ScaledMatrix:
         """The scaled form of `operator`."""
         scale = operator.diagonal.rsqrt()
-        scaled = tuple(c * lower(scale, axis) * upper(scale, axis) for axis, c in zip(AXES, operator.conductances, strict=True))
+        scaled = tuple(
+            c * lower_cells(scale, axis) * upper_cells(scale, axis)
+            for axis, c in zip(AXES, operator.conductances, strict=True)
+        )
         return ScaledMatrix(scale, scaled)
 
     def apply(self, y: Tensor) -> Tensor:
@@ -63,7 +68,9 @@ class ScaledSystem:
         return ScaledSystem(matrix, scaled, norm(scaled))
 
     def start(self, guess: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The first iterate, from a guess of u, and its residual; where the guess is worse than zero, zero."""
+        """The first iterate, from a guess of u, and its residual; where the guess is worse than
+        zero, zero.
+        """
         nothing = torch.zeros_like(self.source)
         if guess is None or guess.shape != self.source.shape:
             return nothing, self.source.clone()
@@ -73,8 +80,12 @@ class ScaledSystem:
         return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
 
     def relative(self, residual: Tensor) -> float:
-        """The norm of `residual` over that of the right side, largest over the colors; 0 for a color without source."""
-        return float((norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)).max())
+        """The norm of `residual` over that of the right side, largest over the colors; 0 for a
+        color without source.
+        """
+        return float(
+            (norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)).max()
+        )
 
     def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
         """The solution that y is."""
@@ -82,7 +93,12 @@ class ScaledSystem:
 
     def give_up(self, name: str, iterations: int, residual: float) -> SolveError:
         """The error of a solve that did not converge."""
-        return SolveError(f"{name} did not reach its tolerance", iterations, residual, "raise diffusion.tolerance or use --dtype float64")
+        return SolveError(
+            f"{name} did not reach its tolerance",
+            iterations,
+            residual,
+            "raise diffusion.tolerance or use --dtype float64",
+        )
 
 
 def inner(a: Tensor, b: Tensor) -> Tensor:

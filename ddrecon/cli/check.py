@@ -1,0 +1,91 @@
+"""What `ddrecon check` reports of a scene."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from ddrecon.memory import Needs, gibibytes, memory_of
+from ddrecon.scene import Scene, View
+from ddrecon.terms import needed_terms
+from ddrecon.variables.values import with_values
+
+
+def memory_estimate(scene: Scene) -> int:
+    """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to
+    be optimized, without torch itself.
+    """
+    volume, grid = scene.volume, scene.volume.grid
+    fields = [start for start in scene.starts.values() if tuple(start.shape[-3:]) == grid.shape]
+    needs = Needs(
+        (grid.shape[2], grid.shape[1], grid.shape[0]),
+        max(volume.sigma_a.shape[0], volume.sigma_s.shape[0]),
+        torch.finfo(volume.density.dtype).bits // 8,
+        sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
+        has_flux=bool(volume.g != 0) or "g" in scene.starts,
+        has_rounds=scene.diffusion.transport_rounds > 0,
+        is_limited=scene.diffusion.model == "flux_limited",
+        varied=None
+        if scene.optimize is None
+        else sum(field.numel() for field in fields) / grid.cells,
+    )
+    return memory_of(needs)
+
+
+def describe(scene: Scene) -> dict[str, Any]:
+    """What `ddrecon check` reports of `scene`: grid, views, physics and memory, where what it
+    optimizes starts.
+    """
+    scene = with_values(scene, scene.starts)
+    grid = scene.volume.grid
+    low, high = grid.bounds_xyz
+    return {
+        "resolution": list(reversed(grid.shape)),
+        "bounds": [list(low), list(high)],
+        "voxel": list(reversed(grid.spacing)),
+        "views": [_describe_view(view) for view in scene.views],
+        "physics": needed_terms(scene),
+        "optimizes": {name: scene.starts[name].numel() for name in scene.optimize.parameters}
+        if scene.optimize
+        else {},
+        "memory_bytes": memory_estimate(scene),
+    }
+
+
+def lines(report: dict[str, Any]) -> list[str]:
+    """The report of `describe` as lines of text."""
+    low, high = report["bounds"]
+    views = [
+        f"  {v['name']}: {v['camera']}, {v['width']} x {v['height']} pixels, {v['split']}{', with image' * v['has_image']}"
+        for v in report["views"]
+    ]
+    return [
+        f"grid: {_by(report['resolution'])} cells of {_by(report['voxel'])} u, from {low} to {high}",
+        f"views: {len(views)}",
+        *views,
+        "physics:",
+        *(f"  {term}" for term in report["physics"]),
+        f"optimizes: {', '.join(_counted_entries(*item) for item in report['optimizes'].items()) or 'nothing'}",
+        f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
+    ]
+
+
+def _counted_entries(name: str, count: int) -> str:
+    return f"{name} ({count:,} number{'s' if count > 1 else ''})"
+
+
+def _by(sizes: list[float]) -> str:
+    return " x ".join(f"{size:.4g}" for size in sizes)
+
+
+def _describe_view(view: View) -> dict[str, Any]:
+    height, width = view.camera.size
+    return {
+        "name": view.name,
+        "camera": "perspective" if view.camera.is_perspective else "orthographic",
+        "width": width,
+        "height": height,
+        "split": "test" if view.is_test else "train",
+        "has_image": view.image is not None,
+    }

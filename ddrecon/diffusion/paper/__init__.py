@@ -1,0 +1,1 @@
+"""The scheme the paper prints, for comparison."""

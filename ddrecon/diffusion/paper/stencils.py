@@ -1,0 +1,109 @@
+"""Central differences as 3 x 3 x 3 convolutions, on arrays extended by one layer of ghost cells
+around the box.
+
+The stencils of the paper's Appendix B, for cells that need not be cubes: each axis carries its own
+1 / h^2 or 1 / (2 h), which the paper, whose h is the same along all axes, leaves in front. In its
+numbering, with d for a derivative and kappa = 3 D:
+
+- Sigma3 / h^2, the Laplacian, is the sum of neighbors minus the diagonal; Sigma5 / h^2 is that sum by itself, the first of `terms`;
+- Sigma4 / (4 h^2), grad kappa . grad L0, is the product of two `gradient`s; Sigma1 has d kappa in it and Sigma2 d L0;
+- Sigma7, div Q1, is `divergence`, Sigma8 the same of d Q1; Sigma6 and Sigma9 are the derivatives of S and of L1, which autograd takes.
+
+Convolution is 30 to 50 times slower than slicing on a CPU (`benchmarks/stencil.py`); it is how the
+paper's sums are written down here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv3d, conv_transpose3d, pad
+
+from ddrecon.diffusion.operator import AXES
+from ddrecon.grid import Grid
+
+
+@dataclass(frozen=True)
+class Stencils:
+    """Convolution kernels on one grid, each `[n, 1, 3, 3, 3]`.
+
+    `coefficients`: the value itself and its gradient along z, y, x; `terms`: the sum of neighbors,
+    each over its h^2, and the gradient.
+    """
+
+    grid: Grid
+    coefficients: Tensor
+    terms: Tensor
+
+    @staticmethod
+    def on(grid: Grid, like: Tensor) -> Stencils:
+        """The stencils of `grid`, in the precision and on the device of `like`."""
+        itself, neighbors, gradient = (like.new_zeros(n, 1, 3, 3, 3) for n in (1, 1, 3))
+        itself[0, 0, 1, 1, 1] = 1
+        for kernel, axis, step in zip(gradient, range(3), grid.spacing, strict=True):
+            low, high = ([1 + side * (axis == other) for other in range(3)] for side in (-1, 1))
+            for place, sign in ((low, -1), (high, 1)):
+                kernel[0, *place] = sign / (2 * step)
+                neighbors[0, 0, *place] = 1 / step**2
+        return Stencils(grid, torch.cat([itself, gradient]), torch.cat([neighbors, gradient]))
+
+    @property
+    def gradient(self) -> Tensor:
+        """The central differences along z, y, x."""
+        return self.terms[1:]
+
+
+def extend(u: Tensor) -> Tensor:
+    """`u` [C, z, y, x] with a layer of ghost cells, each holding what its neighbor in the box does."""
+    return pad(u, (1,) * 6, mode="replicate")
+
+
+def fold(extended: Tensor) -> Tensor:
+    """The transpose of `extend`: what ghost cells hold is added to their neighbors in the box."""
+    for axis in AXES:
+        low, inside, high = extended.split([1, extended.shape[axis] - 2, 1], dim=axis)
+        extended = inside.clone()
+        extended.narrow(axis, 0, 1).add_(low)
+        extended.narrow(axis, extended.shape[axis] - 1, 1).add_(high)
+    return extended
+
+
+def convolve(extended: Tensor, kernels: Tensor) -> Tensor:
+    """Each of the n `kernels` on `extended` [C, z + 2, y + 2, x + 2]: `[C, n, z, y, x]`."""
+    return conv3d(extended[:, None], kernels)
+
+
+def convolve_transposed(values: Tensor, kernels: Tensor) -> Tensor:
+    """The transpose of `convolve`: `values` [C, n, z, y, x] spread to the extended cells they came
+    from.
+    """
+    return conv_transpose3d(values, kernels)[:, 0]
+
+
+def divergence(vector: list[Tensor], stencils: Stencils) -> Tensor:
+    """div of `vector`, three components `[C, z, y, x]` along z, y, x, constant across the faces of
+    the box (Eq. 44).
+    """
+    extended = torch.stack([extend(component) for component in vector], 1)
+    return conv3d(extended, stencils.gradient.transpose(0, 1))[:, 0]
+
+
+def outward(like: Tensor) -> Tensor:
+    """Components along z, y, x of the normal that points out of the box at every ghost cell, 0 in
+    the box: `[3, z + 2, y + 2, x + 2]`.
+
+    Ghost cells at edges and corners of the box lie outside two or three faces; no stencil reaches
+    them.
+    """
+    normals = []
+    for axis, cells in zip(AXES, like.shape[1:], strict=True):
+        line = like.new_zeros(cells + 2)
+        line[0], line[-1] = -1, 1
+        normals.append(
+            line.view([-1 if other == axis else 1 for other in AXES]).expand(
+                [n + 2 for n in like.shape[1:]]
+            )
+        )
+    return torch.stack(normals)

@@ -1,0 +1,1 @@
+"""Transport rounds: sweeps that take diffusion towards transport."""

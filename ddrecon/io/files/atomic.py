@@ -1,0 +1,71 @@
+"""Writing files so that a reader, or an interrupted run, never sees half of one."""
+
+from __future__ import annotations
+
+import os
+import re
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ddrecon.errors import FormatError
+
+TEMPORARY = re.compile(r"\..*\.partial-[0-9a-f]{12}(\..*)?")
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path`, with its suffix, that becomes `path` when the block ends well
+    and vanishes when not.
+
+    Raises FormatError where the system refuses to write.
+    """
+    temporary = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:12]}{path.suffix}")
+    with refusals(path):
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
+    """As `replace_file`, but safe from a loss of power once it has ended; what `path` was until
+    then is kept as `kept_as`.
+    """
+    with replace_file(path) as temporary:
+        yield temporary
+        flush(temporary)
+        with suppress(FileNotFoundError):
+            os.replace(path, kept_as)
+    flush(path.parent)
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Removes what processes that were killed while writing have left in `folder`."""
+    for path in folder.iterdir():
+        if TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
+
+
+def flush(path: Path) -> None:
+    """Has the system put the file or folder at `path` on its disk; raises FormatError where it
+    cannot.
+    """
+    with refusals(path):
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+@contextmanager
+def refusals(path: Path) -> Iterator[None]:
+    """An OSError inside the block becomes a FormatError that says `path` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise FormatError(path, f"cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,184 @@
+"""Images by suffix, in linear radiance. Row 0 is the top.
+
+Float formats (.exr, .hdr, .npy, .tif) are linear and, where they have alpha, premultiplied; 8- and
+16-bit ones (.png, .jpg, .webp) are decoded from sRGB and multiplied by their alpha. Either way a
+pixel of alpha 0 is empty: black. Previews have exposure 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ddrecon.errors import FormatError
+from ddrecon.io.files.arrays import as_float32, check_size, read_npy
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.reading import guard_reading
+from ddrecon.io.images import srgb
+from ddrecon.io.images.exr import has_exr, read_exr, write_exr
+from ddrecon.io.images.hdr import read_hdr
+from ddrecon.io.images.png16 import has_deep_colors, read_deep_png
+from ddrecon.io.images.tiff import read_tiff, write_tiff
+
+PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
+"""How the .png of an image is to be read."""
+BEGINNINGS = ((b"\x89PNG\r\n\x1a\n", b""), (b"\xff\xd8\xff", b""), (b"RIFF", b"WEBP"))
+"""How the first 12 bytes of encoded images begin and end. Pillow would look at nothing but the
+content, and run Ghostscript on some.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """`pixels` float32 [h, w, 3], linear radiance, finite, black where empty; `coverage` float32
+    [h, w], the alpha, where given.
+    """
+
+    pixels: np.ndarray
+    coverage: np.ndarray | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.pixels.shape[0], self.pixels.shape[1]
+
+
+def read_image(path: Path) -> Image:
+    """The image at `path`; raises FormatError when it is damaged, of an unknown kind, or has NaN or
+    infinite pixels.
+    """
+    values = _read_values(path)
+    if values.ndim == 2:
+        return Image(np.repeat(values[..., None], 3, axis=2))
+    if values.shape[2] == 3:
+        return Image(values)
+    coverage = values[..., 3]
+    return Image(np.where(coverage[..., None] > 0, values[..., :3], np.float32(0)), coverage)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """The mask at `path`: float32 [h, w], 0 where its image is black (ignore the pixel) or empty
+    and 1 elsewhere.
+    """
+    brightest: np.ndarray = read_image(path).pixels.max(axis=2)
+    return as_float32(brightest > 0)
+
+
+def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
+    """Writes `pixels` [h, w, 3] as float32 to `stem`.exr (.tif where OpenEXR is not installed) and
+    `stem`.npy; returns these paths.
+    """
+    suffix, write = (".exr", write_exr) if has_exr() else (".tif", write_tiff)
+    picture, array = (stem.with_name(stem.name + ending) for ending in (suffix, ".npy"))
+    write(picture, pixels)
+    with replace_file(array) as temporary:
+        np.save(temporary, as_float32(pixels), allow_pickle=False)
+    return [picture, array]
+
+
+def write_preview(path: Path, pixels: np.ndarray) -> None:
+    """Writes `pixels` [h, w, 3], linear, as an 8-bit sRGB .png at `path`, clipped to [0, 1]."""
+    with replace_file(path) as temporary:
+        temporary.write_bytes(png_of(pixels))
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
+    import imageio.v3 as iio
+
+    encoded = np.round(255 * srgb.encode(np.clip(np.nan_to_num(pixels), 0, 1))).astype(np.uint8)
+    content: bytes = iio.imwrite("<bytes>", encoded, plugin="pillow", extension=".png")
+    return content
+
+
+def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
+    """Writes `pixels` [h, w, 3] as `write_linear` does, and `preview` [h, w, 3] (None: `pixels`
+    again) to `stem`.png; returns all paths.
+    """
+    path = stem.with_name(stem.name + ".png")
+    write_preview(path, pixels if preview is None else preview)
+    return [*write_linear(stem, pixels), path]
+
+
+def _read_values(path: Path) -> np.ndarray:
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise FormatError(
+            path, f"unknown image format {path.suffix!r}; known: {', '.join(READERS)}"
+        )
+    with guard_reading(path):
+        values = reader(path)
+    if (
+        values.ndim not in (2, 3)
+        or (values.ndim == 3 and values.shape[2] not in (3, 4))
+        or values.size == 0
+    ):
+        raise FormatError(
+            path, f"has shape {list(values.shape)}; expected [h, w], [h, w, 3] or [h, w, 4]"
+        )
+    return _finite(as_float32(values), path)
+
+
+def _finite(values: np.ndarray, path: Path) -> np.ndarray:
+    flawed = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(axis=2)
+    if flawed.any():
+        row, column = np.argwhere(flawed)[0]
+        what = "NaN" if np.isnan(values[row, column]).any() else "an infinite value"
+        where = f"row {row}, column {column} ({np.count_nonzero(flawed)} such pixels)"
+        raise FormatError(
+            path, f"{what} at {where}; repair it: a pixel to ignore may hold any finite number"
+        )
+    return values
+
+
+def _read_array(path: Path) -> np.ndarray:
+    with path.open("rb") as stream:
+        return read_npy(stream, path.stat().st_size, path, "the image")
+
+
+def _read_encoded(path: Path) -> np.ndarray:
+    import imageio.v3 as iio
+    from PIL import Image as Pillow
+
+    with path.open("rb") as stream:
+        start = stream.read(12)
+    if not any(
+        start.startswith(beginning) and start.endswith(end) for beginning, end in BEGINNINGS
+    ):
+        raise FormatError(path, "is no PNG, JPEG or WebP image")
+    if has_deep_colors(path):
+        return _decode(read_deep_png(path))
+    with Pillow.open(path) as picture:
+        width, height = picture.size
+    check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
+    mode = iio.immeta(path, plugin="pillow", exclude_applied=False)["mode"]
+    stored = iio.imread(path, plugin="pillow", index=0)
+    if mode not in {"1", "L", "LA", "P", "RGB", "RGBA"} and stored.dtype != np.uint16:
+        raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
+    return _decode(stored)
+
+
+def _decode(stored: np.ndarray) -> np.ndarray:
+    """Linear values of `stored` [h, w] or [h, w, c], multiplied by the alpha that the last of 2 or
+    4 channels is.
+    """
+    values = stored / (1 if stored.dtype == bool else np.iinfo(stored.dtype).max)
+    if values.ndim == 2 or values.shape[2] == 3:
+        return srgb.decode(values)
+    colors, alpha = values[..., :-1], values[..., -1:]
+    return np.concatenate(
+        [np.broadcast_to(srgb.decode(colors) * alpha, (*alpha.shape[:2], 3)), alpha], axis=2
+    )
+
+
+READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".exr": read_exr,
+    ".hdr": read_hdr,
+    ".npy": _read_array,
+    ".tif": read_tiff,
+    ".tiff": read_tiff,
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp"), _read_encoded),
+}

@@ -1,0 +1,83 @@
+"""A field on a grid as files hold it, and the rules every volume format shares.
+
+Values are `[z, y, x]` or `[z, y, x, 3]`, cell-centered; bounds are in world order (x, y, z).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ddrecon.errors import FormatError
+from ddrecon.io.files.arrays import as_float32
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """`values` float32 [z, y, x] or [z, y, x, 3], finite and >= 0; `bounds` float64 [2, 3], corners
+    (x, y, z) [u], where known.
+    """
+
+    values: np.ndarray
+    bounds: np.ndarray | None = None
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Cells along (x, y, z)."""
+        z, y, x = self.values.shape[:3]
+        return x, y, z
+
+
+Fields = Mapping[str, np.ndarray]
+"""Values of several fields of the same cells, by name."""
+
+
+def name_from_file(path: Path) -> list[str]:
+    """The one name of the field at `path`, where the file does not say it: what its own name ends
+    with.
+    """
+    return [path.stem.rpartition(".")[2]]
+
+
+def require_only_field(path: Path, fields: Fields) -> np.ndarray:
+    """The values of the one of `fields`, for a format that holds no more."""
+    if len(fields) != 1:
+        raise FormatError(
+            path,
+            f"a {path.suffix} holds one field, not {', '.join(fields)}; write each into a file of its own",
+        )
+    (values,) = fields.values()
+    return values
+
+
+def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | None) -> Field:
+    """The field of `values` and `bounds` as a file at `path` gave them; raises FormatError unless
+    they are legal.
+    """
+    if values.ndim not in (3, 4) or (values.ndim == 4 and values.shape[3] != 3) or values.size == 0:
+        raise FormatError(
+            path,
+            f"{name} has shape {list(values.shape)}; expected [z, y, x] or [z, y, x, 3], at least one cell",
+        )
+    values = as_float32(values)
+    for legal, what in ((np.isfinite(values), "NaN or infinite"), (values >= 0, "negative")):
+        if not legal.all():
+            z, y, x = np.argwhere(~legal)[0, :3]
+            count = np.count_nonzero(~legal)
+            raise FormatError(
+                path,
+                f"{name} is {what} at cell (x, y, z) = ({x}, {y}, {z}) ({count} such values); clean it first",
+            )
+    return Field(values, None if bounds is None else _check_bounds(path, bounds))
+
+
+def _check_bounds(path: Path, bounds: np.ndarray) -> np.ndarray:
+    if bounds.shape != (2, 3) or not np.isfinite(bounds).all() or not (bounds[0] < bounds[1]).all():
+        raise FormatError(
+            path,
+            "bounds must be [[xmin, ymin, zmin], [xmax, ymax, zmax]] with each minimum below its maximum",
+        )
+    return bounds.astype(np.float64)

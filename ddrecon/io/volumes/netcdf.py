@@ -1,0 +1,207 @@
+"""Volumes as netCDF, for atmospheric fields: variables on axes x, y and z in any order, through
+`netCDF4` (extra `netcdf`).
+
+An axis is told by the attribute `axis` of its coordinate (CF conventions), else by its name.
+Coordinates are centers of cells, evenly spaced, in the unit of x; what they are in is the scene's
+unit of length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddrecon.errors import FormatError
+from ddrecon.extras import load_for_file
+from ddrecon.io.files.arrays import as_float32, check_size
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.volumes.field import Field, Fields, check_field
+
+COLOR = "color"
+NAMES = {
+    "x": ("x", "west_east", "nx"),
+    "y": ("y", "south_north", "ny"),
+    "z": ("z", "height", "altitude", "bottom_top", "lev", "nz"),
+}
+"""What the names of axes begin with."""
+METERS = {
+    "m": 1.0,
+    "meter": 1.0,
+    "meters": 1.0,
+    "metre": 1.0,
+    "metres": 1.0,
+    "km": 1000.0,
+    "kilometer": 1000.0,
+    "kilometers": 1000.0,
+}
+EVEN = 0.05
+"""How far off even spacing a coordinate may be, in cells: they are often rounded to a few digits.
+"""
+
+
+def write_netcdf(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+    """Writes `fields`, [z, y, x] or [z, y, x, 3], as float32 variables, and `bounds` [2, 3] (x, y,
+    z) as coordinates and their bounds.
+    """
+    netcdf = load_for_file("netCDF4", path)
+    z, y, x = next(iter(fields.values())).shape[:3]
+    with replace_file(path) as temporary, netcdf.Dataset(temporary, "w") as file:
+        file.Conventions = "CF-1.11"
+        for axis, count, low, high in zip(
+            "xyz", (x, y, z), *np.asarray(bounds, np.float64), strict=True
+        ):
+            _write_axis(file, axis, np.linspace(low, high, count + 1))
+        for name, values in fields.items():
+            if values.ndim == 4 and COLOR not in file.dimensions:
+                file.createDimension(COLOR, 3)
+            variable = file.createVariable(
+                name, "f4", ("z", "y", "x", COLOR)[: values.ndim], compression="zlib", shuffle=True
+            )
+            variable[:] = as_float32(values)
+
+
+def _write_axis(file: Any, axis: str, edges: np.ndarray) -> None:
+    file.createDimension(axis, len(edges) - 1)
+    if "corner" not in file.dimensions:
+        file.createDimension("corner", 2)
+    centers, corners = (
+        file.createVariable(axis, "f8", (axis,)),
+        file.createVariable(f"{axis}_bounds", "f8", (axis, "corner")),
+    )
+    centers.setncatts(
+        {"axis": axis.upper(), "long_name": f"{axis} of cell centers", "bounds": corners.name}
+    )
+    centers[:] = (edges[:-1] + edges[1:]) / 2
+    corners[:] = np.column_stack([edges[:-1], edges[1:]])
+
+
+def netcdf_names(path: Path) -> list[str]:
+    """The variables of the file at `path` that have axes x, y and z; raises FormatError when it
+    cannot be read.
+    """
+    with _open(path) as file:
+        return _names(file)
+
+
+def read_netcdf(path: Path, name: str) -> Field:
+    """The variable `name` of the file at `path`; raises FormatError when it is damaged, absent,
+    unevenly spaced or not a legal field.
+    """
+    with _open(path) as file:
+        if name not in file.variables:
+            raise FormatError(
+                path,
+                f"has no variable {name!r}; on axes x, y and z it has {', '.join(map(repr, _names(file))) or 'none'}",
+            )
+        variable = file.variables[name]
+        check_size(int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize, path, name)
+        values, axes = _arrange(path, file, variable)
+        edges = [_edges(path, file, dimension) for dimension in axes]
+    flips = tuple(
+        slice(None, None, -1 if edge is not None and edge[0] > edge[1] else 1) for edge in edges
+    )
+    known = [sorted(edge) for edge in edges if edge is not None]
+    bounds = np.array(known[::-1]).T if len(known) == 3 else None
+    return check_field(path, name, values[flips], bounds)
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[Any]:
+    netcdf = load_for_file("netCDF4", path)
+    try:
+        path.stat()
+        with netcdf.Dataset(path) as file:
+            yield file
+    except FormatError:
+        raise
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    except (RuntimeError, ValueError, IndexError, AttributeError) as error:
+        raise FormatError(path, f"not a netCDF file that can be read: {error}") from error
+
+
+def _axis_of(file: Any, dimension: str) -> str | None:
+    """Which of x, y, z, or color, the `dimension` is."""
+    told = str(getattr(file.variables.get(dimension), "axis", "")).lower()
+    if told in NAMES or dimension == COLOR:
+        return told or COLOR
+    return next(
+        (axis for axis, names in NAMES.items() if dimension.lower().startswith(names)), None
+    )
+
+
+def _names(file: Any) -> list[str]:
+    return [
+        name
+        for name, variable in file.variables.items()
+        if {"x", "y", "z"} <= {_axis_of(file, one) for one in variable.dimensions}
+    ]
+
+
+def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str]]:
+    """The values as [z, y, x] or [z, y, x, colors], and the names of the dimensions z, y and x;
+    others must have one entry.
+    """
+    values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
+    kept, places = [], {}
+    for index, dimension in enumerate(variable.dimensions):
+        axis = _axis_of(file, dimension)
+        if axis is None and values.shape[index] > 1:
+            raise FormatError(
+                path,
+                f"{variable.name} has {values.shape[index]} entries along {dimension!r}; choose one (ncks -d {dimension},0)",
+            )
+        if axis is not None:
+            places[axis] = dimension
+            kept.append(axis)
+    if sorted(kept) not in (["x", "y", "z"], [COLOR, "x", "y", "z"]):
+        raise FormatError(
+            path,
+            f"{variable.name} has the dimensions {', '.join(variable.dimensions)}; expected x, y and z: rename them so",
+        )
+    values = values.reshape([len(file.dimensions[places[axis]]) for axis in kept])
+    order = ["z", "y", "x", COLOR][: len(kept)]
+    return values.transpose([kept.index(axis) for axis in order]), [places[axis] for axis in "zyx"]
+
+
+def _edges(path: Path, file: Any, dimension: str) -> tuple[float, float] | None:
+    """Where cells along `dimension` begin and end, as they are ordered; None where the file does
+    not say.
+    """
+    if dimension not in file.variables:
+        return None
+    coordinate = file.variables[dimension]
+    centers = np.asarray(coordinate[:], np.float64)
+    steps = np.diff(centers)
+    even = np.linspace(centers[0], centers[-1], len(centers))
+    if len(steps) and not np.abs(centers - even).max() <= EVEN * abs(steps.mean()):
+        least, most = np.abs(steps).min(), np.abs(steps).max()
+        raise FormatError(
+            path,
+            f"{dimension} is not evenly spaced ({least:g} to {most:g}); interpolate it first (xarray: .interp)",
+        )
+    scale = _scale(file, coordinate)
+    corners = file.variables.get(getattr(coordinate, "bounds", ""))
+    if corners is not None:
+        return float(corners[0, 0]) * scale, float(corners[-1, -1]) * scale
+    if not len(steps):
+        return None
+    return (centers[0] - steps.mean() / 2) * scale, (centers[-1] + steps.mean() / 2) * scale
+
+
+def _scale(file: Any, coordinate: Any) -> float:
+    """What takes `coordinate` to the unit of the first axis of x, where both units are known."""
+    first = next(
+        (
+            file.variables[name]
+            for name in file.variables
+            if name in file.dimensions and _axis_of(file, name) == "x"
+        ),
+        coordinate,
+    )
+    units = [METERS.get(str(getattr(one, "units", "")).lower()) for one in (coordinate, first)]
+    return units[0] / units[1] if units[0] and units[1] else 1.0

@@ -1,0 +1,1 @@
+"""Light that has not been scattered yet: beams, skies, and their moments."""

@@ -1,0 +1,55 @@
+"""Lights. Vectors are (x, y, z); colors are `[1]` or `[3]`. Every tensor may be varied, in reverse
+and in forward mode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(eq=False)
+class DirectionalLight:
+    """Parallel light: `direction` [3] the way it travels (any length > 0), `irradiance` [C] on a
+    plane facing it.
+    """
+
+    direction: Tensor
+    irradiance: Tensor
+
+
+@dataclass(eq=False)
+class AmbientLight:
+    """The same `radiance` [C] from every direction."""
+
+    radiance: Tensor
+
+
+@dataclass(eq=False)
+class EnvironmentLight:
+    """A latitude-longitude map of light from infinitely far away; `ddrecon.environment` says which
+    pixel lies where.
+
+    `radiance` [C, h, w] >= 0 of every pixel, h >= 2; `scale`: scalar factor on it; `rotation`:
+    scalar, about +y [degrees]; `directions`: how many directions the light on the volume is
+    gathered into.
+    """
+
+    radiance: Tensor
+    scale: Tensor
+    rotation: Tensor
+    directions: int = 48
+
+
+@dataclass(eq=False)
+class PointLight:
+    """Light from one point, inside or outside the box: `position` [3] in u, `intensity` [C], power
+    per solid angle.
+    """
+
+    position: Tensor
+    intensity: Tensor
+
+
+Light = DirectionalLight | AmbientLight | EnvironmentLight | PointLight

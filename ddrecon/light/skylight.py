@@ -1,0 +1,90 @@
+"""Light of skies not yet scattered, direction by direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.light.sky import Sky
+from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.phase import henyey_greenstein
+from ddrecon.numerics.autodiff import is_varied, recompute
+from ddrecon.numerics.quadrature import sphere_quadrature
+
+
+def ambient_sky(radiance: Tensor) -> Sky:
+    """Ambient light of `radiance` [C, 1, 1, 1] as light from the directions of a quadrature over
+    the sphere.
+    """
+    directions, weights = sphere_quadrature(radiance)
+    irradiance = 4 * math.pi * weights[:, None] * radiance.flatten()
+    return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
+
+
+def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments:
+    """Light of all skies in `lights` not yet scattered, to first order in angle: int L_ri and 3 int
+    L_ri w over the sphere, over 4 pi.
+
+    One direction at a time, so that memory does not grow with their number.
+    """
+    total = Moments(torch.zeros_like(medium.extinction.value))
+    for sky in _lit_skies(lights):
+        vectors = sky.vector if has_flux else [None] * len(sky.travel)
+        for travel, irradiance, vector in zip(sky.travel, sky.irradiance, vectors, strict=True):
+            total = total.plus(recompute(_attenuate_direction, medium, travel, irradiance, vector))
+    return total.scaled(1 / (4 * math.pi), 3 / (4 * math.pi))
+
+
+def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
+    """What one scattering turns `towards` a camera (unit, its components broadcast to cells) of the
+    light of `skies`, `[C, z, y, x]`.
+
+    Per unit length and kappa_s, by the exact phase function: sum of p E tau / (4 pi), one direction
+    at a time.
+    """
+    total = torch.zeros_like(medium.extinction.value)
+    for sky in _lit_skies(skies):
+        for travel, irradiance in zip(sky.travel, sky.irradiance, strict=True):
+            total = total + recompute(_scatter_direction, medium, travel, irradiance, towards)
+    return total / (4 * math.pi)
+
+
+def _lit_skies(lights: Sequence[object]) -> list[Sky]:
+    """The skies that differ from their mean, or may come to do so because they are being varied."""
+    skies = [light for light in lights if isinstance(light, Sky)]
+    return [
+        sky
+        for sky in skies
+        if is_varied(sky.irradiance) or bool((sky.irradiance.detach() != 0).any())
+    ]
+
+
+def _scatter_direction(
+    medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector
+) -> Tensor:
+    visible = _attenuate_direction(medium, travel, irradiance, None).mean
+    z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
+    return visible * henyey_greenstein(z + y + x, medium.g)
+
+
+def _attenuate_direction(
+    medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None
+) -> Moments:
+    """`irradiance` ([C] or scalar) and `vector` [3, C], each times the transmittance along
+    `direction`, averaged over cells.
+    """
+    visible = medium.extinction.mean_transmittance(
+        *sum_mass_to_cells(
+            medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound
+        )
+    )
+    mean = visible * irradiance.view(-1, 1, 1, 1)
+    if vector is None:
+        return Moments(mean)
+    z, y, x = (visible * component.view(-1, 1, 1, 1) for component in vector)
+    return Moments(mean, (z, y, x))

@@ -1,0 +1,103 @@
+"""How far rendered images are from their targets, and how rough a field is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+
+ROUNDING = 1e-2
+"""Gradients below this, in units of one over the box's shortest side, are penalized quadratically
+rather than as total variation.
+"""
+
+
+HUBER = 0.05
+"""Errors above this part of the targets' root mean square count linearly in the Huber loss."""
+RELATIVE = 0.05
+"""The same part, added to a pixel's target, keeps relative errors finite where targets are black.
+"""
+
+
+def l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The square of `error`, entry by entry; `scale`, the root mean square of the target, plays no
+    part.
+    """
+    return error**2
+
+
+def l1(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The magnitude of `error` times `scale`, so that it is in units of radiance squared, as all
+    losses are.
+    """
+    return error.abs() * scale
+
+
+def huber(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The square of `error` up to `HUBER` `scale`, and a straight line beyond (Huber 1964,
+    doi:10.1214/aoms/1177703732).
+    """
+    return (
+        2
+        * torch.nn.functional.huber_loss(
+            error / scale, torch.zeros_like(error), reduction="none", delta=HUBER
+        )
+        * scale**2
+    )
+
+
+def relative_l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+    """The square of `error` over the target, times `scale`: dark pixels count as much as bright
+    ones.
+    """
+    return (error / (target.abs() + RELATIVE * scale)) ** 2 * scale**2
+
+
+LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "l2": l2,
+    "l1": l1,
+    "huber": huber,
+    "relative_l2": relative_l2,
+}
+
+
+def image_loss(loss: str, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean of `loss` over the pixels and colors of `image` [3, h, w]; pixels where `mask` [h,
+    w] is 0 do not count.
+    """
+    seen = torch.ones_like(image[0]) if mask is None else mask
+    count = (3 * seen.sum()).clamp(min=1)
+    scale = (
+        ((target.square() * seen).sum() / count)
+        .sqrt()
+        .clamp(min=torch.finfo(target.dtype).tiny ** 0.25)
+    )
+    return (LOSSES[loss](image - target, target, scale) * seen).sum() / count
+
+
+def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    """Peak signal-to-noise ratio [dB] of `image` against `target`, both [3, h, w]; the peak is the
+    target's largest value.
+    """
+    error = image_loss("l2", image.detach(), target, mask)
+    tiny = torch.finfo(target.dtype).tiny
+    return float(10 * torch.log10(target.max().clamp(min=tiny) ** 2 / error.clamp(min=tiny)))
+
+
+def total_variation(field: Tensor, grid: Grid) -> Tensor:
+    """Mean over the cells of `grid` of the length of the gradient of `field` [..., z, y, x], times
+    the box's shortest side.
+
+    Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), the
+    same at every resolution and world scale, and rounded off at zero so that its derivative is
+    finite in flat regions.
+    """
+    side = min(grid.extent)
+    square = torch.full_like(field, ROUNDING**2)
+    for axis, spacing in zip((-3, -2, -1), grid.spacing, strict=True):
+        slope = (field.diff(dim=axis) * (side / spacing)) ** 2
+        square = square + torch.cat([slope, torch.zeros_like(field.narrow(axis, 0, 1))], axis)
+    return (square.sqrt() - ROUNDING).mean()

@@ -1,0 +1,1 @@
+"""The integral along view rays."""

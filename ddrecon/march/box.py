@@ -1,0 +1,46 @@
+"""Where rays run inside the box of a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import Rays
+from ddrecon.grid import Grid
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """The part of each ray inside the box: where rays `hit` it (indices), and distances [u] to
+    `near` and `far` there.
+    """
+
+    hit: Tensor
+    near: Tensor
+    far: Tensor
+
+    def select(self, is_chosen: Tensor) -> Crossing:
+        """Some of the rays that hit."""
+        return Crossing(self.hit[is_chosen], self.near[is_chosen], self.far[is_chosen])
+
+
+def cross_box(grid: Grid, rays: Rays) -> Crossing:
+    """Where `rays` run inside the box of `grid`, in front of the camera."""
+    near, far = intersect_box(grid, rays)
+    hit = (far > near).nonzero()[:, 0]
+    return Crossing(hit, near[hit], far[hit])
+
+
+def intersect_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
+    """Distances [u] at which each of `rays` enters the box of `grid`, in front of the camera, and
+    leaves it: less far where it misses.
+    """
+    low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
+    tiny = torch.finfo(rays.direction.dtype).tiny
+    safe = torch.where(
+        rays.direction.abs() < tiny, torch.full_like(rays.direction, tiny), rays.direction
+    )
+    one, other = (low - rays.origin) / safe, (high - rays.origin) / safe
+    return torch.minimum(one, other).amax(-1).clamp(min=0), torch.maximum(one, other).amin(-1)

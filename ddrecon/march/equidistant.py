@@ -1,0 +1,53 @@
+"""Values at equal steps along view rays, by three-dimensional interpolation."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import Rays
+from ddrecon.grid import Grid
+from ddrecon.numerics.interpolation import sample_volume
+from ddrecon.numerics.third_order import ThirdOrder
+
+CELLS_PER_NODE = 16
+"""In large volumes rays at equal steps have at least a node for so many cells at a time: each time
+the backward pass fills an array of all cells.
+"""
+
+
+class Equidistant:
+    """Values at equal steps along rays, wherever these run."""
+
+    def __init__(
+        self, fields: Tensor, smooth: ThirdOrder | None, grid: Grid, longest: float, steps: int
+    ):
+        self.smooth = smooth
+        self.fields, self.lower, self.extent = (
+            fields,
+            fields.new_tensor(grid.lower),
+            fields.new_tensor(grid.extent),
+        )
+        self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
+
+    def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Equidistant]]:
+        """All of `rays`, `count` at a time or in large volumes more: their indices, and what they
+        meet.
+        """
+        size = max(count, self.fields[0].numel() // (CELLS_PER_NODE * self.nodes))
+        return [
+            (chunk, self)
+            for chunk in torch.arange(len(rays.direction), device=rays.direction.device).split(size)
+        ]
+
+    def sample(
+        self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Values [N, channels, R] and distances [N, R] at the nodes of rays."""
+        part = torch.linspace(0, 1, self.nodes, dtype=near.dtype, device=near.device)[:, None]
+        distance = near + part * (far - near)
+        points = 2 * (origin + distance[..., None] * direction - self.lower) / self.extent - 1
+        values = sample_volume(self.fields, points.flip(-1), self.smooth)
+        return values.transpose(0, 1), distance

@@ -1,0 +1,1 @@
+"""What scatters and absorbs: coefficients and phase function."""

@@ -1,0 +1,100 @@
+"""Checkpoints: the state of a run in one file of tensors and plain values, never a pickle of
+anything else. The last two are kept.
+"""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ddrecon.errors import DataWarning, FormatError, SceneError
+from ddrecon.io.files.atomic import replace_file_durably
+from ddrecon.run.differences import differences
+
+FORMAT = 3
+"""What a checkpoint holds; counts up when that changes."""
+LAST, PREVIOUS = "last.pt", "previous.pt"
+"""The names of the last checkpoint and of the one before it."""
+
+
+def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any]) -> None:
+    """Writes `state`, and a description of the `scene` it belongs to, as the last checkpoint in
+    `folder`.
+    """
+    with (
+        replace_file_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary,
+        temporary.open("wb") as stream,
+    ):
+        try:
+            torch.save({"format": FORMAT, "scene": scene, "state": state}, stream)
+        except RuntimeError as error:  # in which torch's writer wraps that the disk is full
+            raise error.__context__ if isinstance(error.__context__, OSError) else error from None
+
+
+def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
+    """The state in the last checkpoint in `folder`, or in the one before it where that is damaged,
+    with a warning; and its file.
+
+    Raises FormatError if neither can be used, SceneError if there is none, or it is not of this
+    `scene`.
+    """
+    last, previous = folder / LAST, folder / PREVIOUS
+    if not last.exists() and not previous.exists():
+        raise SceneError(f"{last}: there is no checkpoint to resume from; run without --resume")
+    try:
+        return _check(last, _load(last), scene), last
+    except FormatError as error:
+        if not previous.exists():
+            raise
+        state = _check(previous, _load(previous), scene)
+        warnings.warn(
+            f"{error.path}: {error.reason.partition(';')[0]}; going on from {previous}",
+            DataWarning,
+            2,
+        )
+        return state, previous
+
+
+def forget_checkpoints(folder: Path) -> None:
+    """Removes the checkpoints in `folder`."""
+    for name in (LAST, PREVIOUS):
+        (folder / name).unlink(missing_ok=True)
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """What is in the file at `path`: torch itself does not notice changed bytes, but they are in a
+    zip archive with checksums.
+    """
+    if not path.is_file():
+        raise FormatError(path, "is missing; start anew with --overwrite")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            is_whole = archive.testzip() is None
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises whatever its reader stumbles on
+        raise FormatError(path, "not a usable checkpoint; start anew with --overwrite") from error
+    if not is_whole or not isinstance(content, dict):
+        raise FormatError(path, "not a usable checkpoint; start anew with --overwrite")
+    return content
+
+
+def _check(path: Path, content: dict[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
+    if content.get("format") != FORMAT:
+        written = content.get("format")
+        raise FormatError(
+            path,
+            f"a checkpoint of format {written}; this version reads {FORMAT}; start anew with --overwrite",
+        )
+    if changes := differences(content["scene"], scene):
+        raise SceneError(
+            [
+                f"{path}: belongs to another scene: {change}; use another output folder"
+                for change in changes
+            ]
+        )
+    return dict(content["state"])

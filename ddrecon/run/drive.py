@@ -1,0 +1,153 @@
+"""Driving a reconstruction to its end: one progress line, the log, previews, and nothing lost on
+the way.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from tqdm import tqdm
+
+from ddrecon.errors import DivergenceError, FormatError, SceneError
+from ddrecon.io.files.folders import claim_folder
+from ddrecon.io.files.json_file import write_json
+from ddrecon.reconstruct.loop import Reconstruction, Row
+from ddrecon.run.checkpoint import LAST, load_checkpoint
+from ddrecon.run.differences import fingerprint
+from ddrecon.run.events import event_log
+from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
+from ddrecon.scene import Scene
+from ddrecon.scene_file.dump import dump_scene
+from ddrecon.scene_file.load import SceneFile
+
+
+@contextmanager
+def open_run(
+    scene: Scene,
+    scene_file: SceneFile,
+    path: Path,
+    environment: dict[str, Any],
+    *,
+    may_exist: bool,
+    resume: bool,
+) -> Iterator[tuple[Reconstruction, RunFolder]]:
+    """A run of `scene` and its folder `path`, this process's alone until the block ends, with the
+    resolved scene and environment in it.
+
+    Raises SceneError for a folder that another process writes to or that is not empty, unless it
+    may be or the run goes on from the checkpoint in it.
+    """
+    try:
+        run = Reconstruction(scene)
+    except SceneError as error:
+        raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
+    result_of = fingerprint(scene_file, scene.volume.density.dtype)
+    loaded = _resume(run, path, result_of) if resume else None
+    with claim_folder(path, may_exist=may_exist or resume):
+        folder = RunFolder(path, scene_file, result_of, environment | {"seed": run.seed})
+        if loaded is None:
+            folder.start(run)
+        else:
+            folder.resume(run, loaded)
+        dump_scene(scene_file, path / "scene.yaml")
+        write_json(path / "environment.json", folder.environment)
+        yield run, folder
+
+
+def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
+    """Restores `run` from the run folder `path`; returns the file it took."""
+    state, loaded = load_checkpoint(path / CHECKPOINTS, scene)
+    try:
+        run.restore(state)
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        raise FormatError(loaded, "not a usable checkpoint; start anew with --overwrite") from error
+    if run.iteration > run.settings.iterations:
+        raise SceneError(
+            f"{path}: {run.iteration} iterations are made already; ask for more than that, in all, with --iterations"
+        )
+    return loaded
+
+
+def drive_run(
+    run: Reconstruction,
+    folder: RunFolder,
+    preview_every: int | None,
+    is_quiet: bool,
+    has_events: bool = False,
+) -> dict[str, Any]:
+    """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as
+    well; returns the summary.
+
+    An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
+    before it is passed on. So does a divergence; any other failure leaves the checkpoints written
+    so far.
+    """
+    total = run.settings.iterations
+    try:
+        with (
+            defer_interrupt() as asked,
+            event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
+            tqdm(
+                total=total,
+                initial=run.iteration,
+                desc="optimize",
+                file=sys.stderr,
+                disable=is_quiet,
+            ) as bar,
+        ):
+            while not run.is_done:
+                folder.save_in_time(run)
+                row = run.step()
+                folder.log.add(row)
+                if events is not None:
+                    events.log(row)
+                bar.set_postfix_str(progress_text(run.total, row), refresh=False)
+                bar.update()
+                if preview_every and row.iteration % preview_every == 0:
+                    folder.preview(run)
+                if asked:
+                    folder.save(run)
+                    raise KeyboardInterrupt(
+                        f"after {run.iteration} iterations; go on with --resume"
+                    )
+    except DivergenceError as error:
+        folder.save(run)
+        kept = folder.checkpoints / LAST
+        raise error.with_advice(
+            f"the state after {run.iteration} iterations is kept in {kept}: go on from it with --resume"
+        ) from error
+    return folder.finish(run)
+
+
+@contextmanager
+def defer_interrupt() -> Iterator[list[int]]:
+    """A list that fills when the process is asked to stop, so that an iteration is never torn;
+    asked twice, it stops at once.
+    """
+    asked: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        if asked:
+            raise KeyboardInterrupt("at once; go on from the last checkpoint with --resume")
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def progress_text(total: Row, row: Row) -> str:
+    """Loss, PSNR of training and (last known) test views, and solver iterations, for the progress
+    line.
+    """
+    test = "" if total.test_psnr is None else f"/{total.test_psnr:.1f}"
+    return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {row.forward_iterations}+{row.adjoint_iterations}"

@@ -1,0 +1,65 @@
+"""What a scene is once it is tensors: a volume, its lights and its views, with the settings they
+are rendered by.
+
+Records here are values the physics and the reconstruction read; how they are written in a file is
+`ddrecon.scene_file`'s business.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from ddrecon.cameras import Camera
+from ddrecon.light.lights import Light
+from ddrecon.medium.coefficients import Volume
+from ddrecon.settings import DiffusionSettings, RenderSettings
+
+if TYPE_CHECKING:
+    from ddrecon.settings import OptimizeSettings
+
+
+@dataclass(eq=False)
+class View:
+    """One view: its camera, and its target `image` [3, h, w] (linear radiance) where it has one.
+
+    `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views
+    are never optimized on; `weight` > 0 is how much a training view counts.
+    """
+
+    name: str
+    camera: Camera
+    image: Tensor | None = None
+    mask: Tensor | None = None
+    is_test: bool = False
+    weight: float = 1.0
+
+
+@dataclass(eq=False)
+class Scene:
+    """A loaded scene. `optimize`, `starts` and `path` are what its file says of reconstruction, and
+    where that file lies.
+
+    `starts` holds, for each optimized parameter, the value it starts from.
+    """
+
+    volume: Volume
+    lights: list[Light]
+    views: list[View]
+    render: RenderSettings = field(default_factory=RenderSettings)
+    diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
+    optimize: OptimizeSettings | None = None
+    starts: dict[str, Tensor] = field(default_factory=dict)
+    path: Path | None = None
+
+    def view(self, name: str) -> View:
+        """The view called `name`; raises KeyError with the known names."""
+        for view in self.views:
+            if view.name == name:
+                return view
+        raise KeyError(
+            f"no view {name!r}; the views are {', '.join(view.name for view in self.views)}"
+        )

@@ -1,0 +1,58 @@
+"""Scene files as tensors: the front door `load_scene`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import replace
+
+import torch
+
+from ddrecon.light.lights import Light
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build_lights import build_lights
+from ddrecon.scene_file.build_starts import build_starts, require_start_files
+from ddrecon.scene_file.build_views import build_views
+from ddrecon.scene_file.build_volume import build_volume
+from ddrecon.scene_file.load import SceneFile, read_scene
+from ddrecon.scene_file.problems import Problems
+
+
+def load_scene(
+    path: str | os.PathLike[str],
+    *,
+    overrides: Iterable[str] = (),
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Scene:
+    """The scene in the file at `path`, with `overrides` (`key.path=value`), as tensors of `dtype`
+    on `device`.
+
+    Raises SceneError with one line per problem of the scene, or FormatError for a file it names
+    that cannot be used.
+    """
+    return build_scene(read_scene(path, overrides), dtype=dtype, device=device)
+
+
+def build_scene(
+    scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Scene:
+    """The scene of a file that was read, as tensors of `dtype` on `device`; raises as `load_scene`
+    does.
+    """
+    place, tree, problems = torch.device(device), scene_file.tree, Problems()
+    volume, grid = None, None
+    with problems.collecting():
+        volume = build_volume(scene_file, dtype, place)
+        grid = volume.grid
+    with problems.collecting():
+        views = build_views(scene_file, grid, dtype, place)
+    lights: list[Light] = []
+    with problems.collecting():
+        lights = build_lights(scene_file, dtype, place)
+    require_start_files(scene_file, problems)
+    problems.raise_any()
+    scene = Scene(
+        volume, lights, views, tree.render, tree.diffusion, tree.optimize, {}, scene_file.path
+    )
+    return replace(scene, starts=build_starts(scene_file, scene))

@@ -1,0 +1,211 @@
+"""The volume section as tensors: its grid, agreed on by the scene and every field file, its density
+and its cross sections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ddrecon.errors import FormatError
+from ddrecon.grid import Grid, Triple
+from ddrecon.io.volumes.field import Field
+from ddrecon.io.volumes.table import read_field
+from ddrecon.medium.coefficients import Volume
+from ddrecon.memory import Needs, shortage
+from ddrecon.scene_file.files import read_referenced
+from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.problems import Problems
+from ddrecon.scene_file.schema import Color
+from ddrecon.settings import FieldFile, ParameterSettings
+from ddrecon.variables.values import cross_sections
+
+QUANTITIES = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo")
+Fields = Mapping[str, Field]
+
+
+def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> Volume:
+    """The volume of the scene in `dtype` on `device`; raises SceneError with all its problems, or
+    FormatError.
+    """
+    section = scene_file.tree.volume
+    fields = _read_fields(scene_file)
+    grid = _agree_on_grid(scene_file, fields)
+    if too_much := shortage(_needs(scene_file, fields, grid, dtype), device):
+        raise scene_file.refused("volume.resolution", too_much)
+
+    def quantity(name: str) -> Tensor:
+        if name in fields:
+            return _channels_first(fields[name])
+        value: Color = getattr(section, name)
+        return torch.tensor([value] if isinstance(value, float) else value, dtype=torch.float64)
+
+    if section.sigma_t is None:
+        sigma_a, sigma_s = quantity("sigma_a"), quantity("sigma_s")
+    else:
+        sigma_a, sigma_s = cross_sections(quantity("sigma_t"), quantity("albedo"))
+    sigma_a, sigma_s = _same_colors(sigma_a, sigma_s)
+    density = quantity("density")
+    density = (
+        density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
+    )
+    tensors = [
+        tensor.to(device, dtype)
+        for tensor in (density, sigma_a, sigma_s, torch.tensor(section.g, dtype=torch.float64))
+    ]
+    return Volume(grid, *tensors)
+
+
+def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype) -> Needs:
+    """What the scene's memory depends on; views that are as large as their images count as nothing,
+    since those are not read yet.
+    """
+    tree, section = scene_file.tree, scene_file.tree.volume
+    given = [
+        fields[name].values.ndim == 4
+        if name in fields
+        else isinstance(getattr(section, name), tuple)
+        for name in QUANTITIES
+    ]
+    colors = 3 if any(given) else 1
+    optimized = tree.optimize.parameters if tree.optimize else {}
+    sizes = [view.camera.resolution for view in tree.views if view.camera.resolution is not None]
+    return Needs(
+        (grid.shape[2], grid.shape[1], grid.shape[0]),
+        colors,
+        torch.finfo(dtype).bits // 8,
+        sum(width * height for width, height in sizes),
+        has_flux=section.g != 0 or "g" in optimized,
+        has_rounds=tree.diffusion.transport_rounds > 0,
+        is_limited=tree.diffusion.model == "flux_limited",
+        varied=sum(_varied(name, settings, fields, colors) for name, settings in optimized.items())
+        if tree.optimize
+        else None,
+    )
+
+
+def _varied(name: str, settings: ParameterSettings, fields: Fields, colors: int) -> int:
+    """How many numbers a cell the parameter `name` has."""
+    if name == "density":
+        return 1
+    is_field = (
+        name in fields or isinstance(settings.init, FieldFile)
+        if settings.field is None
+        else settings.field
+    )
+    return colors if name in QUANTITIES and is_field else 0
+
+
+def _read_fields(scene_file: SceneFile) -> Fields:
+    problems, fields = Problems(), {}
+    for name in QUANTITIES:
+        value = getattr(scene_file.tree.volume, name)
+        if isinstance(value, FieldFile):
+            with problems.collecting():
+                fields[name] = read_referenced(
+                    scene_file,
+                    f"volume.{name}.file",
+                    value.file,
+                    partial(_read_quantity, name=name, called=value.name or name),
+                )
+    problems.raise_any()
+    return fields
+
+
+def _read_quantity(path: Path, name: str, called: str) -> Field:
+    """The quantity `name`, which the file has as `called`."""
+    field = read_field(path, called)
+    if name == "density" and field.values.ndim != 3:
+        raise FormatError(
+            path,
+            f"density has shape {list(field.values.shape)}; expected [z, y, x]: colors belong to the cross sections",
+        )
+    if name == "albedo" and (highest := field.values.max()) > 1:
+        z, y, x = np.argwhere(field.values > 1)[0, :3]
+        raise FormatError(
+            path,
+            f"albedo is above 1 at cell (x, y, z) = ({x}, {y}, {z}) (the highest is {highest:g})",
+        )
+    return field
+
+
+def _agree_on_grid(scene_file: SceneFile, fields: Fields) -> Grid:
+    section, problems = scene_file.tree.volume, Problems()
+    sizes: dict[str, tuple[int, int, int]] = {
+        f"volume.{name}.file": field.resolution for name, field in fields.items()
+    }
+    boxes = {
+        f"volume.{name}.file": _corners(field.bounds)
+        for name, field in fields.items()
+        if field.bounds is not None
+    }
+    if section.resolution is not None:
+        sizes = {"volume.resolution": section.resolution} | sizes
+    if section.bounds is not None:
+        boxes = {"volume.bounds": (section.bounds.min, section.bounds.max)} | boxes
+    for key, size in sizes.items():
+        first = next(iter(sizes))
+        if size != sizes[first]:
+            problems.note(
+                scene_file.refused(
+                    key, f"has {_by(size)} cells in x, y, z, but {first} has {_by(sizes[first])}"
+                )
+            )
+    for key, box in boxes.items():
+        first = next(iter(boxes))
+        if not _same_box(box, boxes[first]):
+            problems.note(
+                scene_file.refused(
+                    key, f"its bounds are {_box(box)}, but {first} says {_box(boxes[first])}"
+                )
+            )
+    for name, known in (("resolution", sizes), ("bounds", boxes)):
+        if not known:
+            problems.note(
+                scene_file.refused(
+                    "volume", f"missing key {name!r}, which no field file gives either"
+                )
+            )
+    problems.raise_any()
+    return Grid.from_xyz(next(iter(sizes.values())), *next(iter(boxes.values())))
+
+
+def _corners(bounds: np.ndarray) -> tuple[Triple, Triple]:
+    (lx, ly, lz), (ux, uy, uz) = bounds.tolist()
+    return (lx, ly, lz), (ux, uy, uz)
+
+
+def _same_box(one: tuple[Triple, Triple], other: tuple[Triple, Triple]) -> bool:
+    """Whether the corners agree to a hundred-thousandth of the box's sides: files may hold them in
+    single precision.
+    """
+    tolerance = 1e-5 * (np.array(other[1]) - np.array(other[0]))
+    return bool((np.abs(np.array(one) - np.array(other)) <= tolerance).all())
+
+
+def _by(size: tuple[int, int, int]) -> str:
+    return " x ".join(map(str, size))
+
+
+def _box(box: tuple[Triple, Triple]) -> str:
+    return " to ".join(f"({', '.join(f'{side:g}' for side in corner)})" for corner in box)
+
+
+def _channels_first(field: Field) -> Tensor:
+    """The field as float64 [C, z, y, x], with C = 1 or 3."""
+    values = torch.from_numpy(field.values).double()
+    return values[None] if values.ndim == 3 else values.permute(3, 0, 1, 2).contiguous()
+
+
+def _same_colors(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """Both with as many colors as the more colorful."""
+    colors = max(one.shape[0], other.shape[0])
+    wide_one, wide_other = (
+        tensor.expand(colors, *tensor.shape[1:]).contiguous() for tensor in (one, other)
+    )
+    return wide_one, wide_other

@@ -1,0 +1,76 @@
+"""Scenes written back: every default filled in and every path absolute, so that reading the result
+gives the same tree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ddrecon.io.files.atomic import replace_file
+from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.scalars import resolve
+
+
+def describe(scene_file: SceneFile) -> dict[str, Any]:
+    """The resolved scene in plain mappings, lists, numbers and text."""
+    described: dict[str, Any] = _plain(scene_file.tree)
+    return described
+
+
+def dump_scene(scene_file: SceneFile, path: Path) -> None:
+    """Writes the resolved scene to `path` as YAML that `read_scene` reads back as the same tree."""
+    write_described(describe(scene_file), path)
+
+
+def write_described(described: dict[str, Any], path: Path) -> None:
+    """Writes a scene in plain values, as `describe` returns it, to `path`."""
+    text = yaml.dump(
+        described,
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        width=10**6,
+        default_flow_style=None,
+    )
+    with replace_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        tag = {"type": value.type} if hasattr(value, "type") else {}
+        kept = {
+            field.name: getattr(value, field.name)
+            for field in fields(value)
+            if field.name not in _left_out(value)
+        }
+        return tag | {name: _plain(entry) for name, entry in kept.items() if entry is not None}
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _left_out(record: Any) -> set[str]:
+    """Keys of the alternatives that `record` did not take."""
+    groups = getattr(record, "ALTERNATIVES", ())
+    return {name for group in groups if getattr(record, group[0]) is None for name in group}
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what would be read as something else: PyYAML decides by YAML 1.1, where 1e5 is text."""
+
+
+def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    return dumper.represent_scalar(
+        "tag:yaml.org,2002:str", text, style=None if resolve(text) == text else '"'
+    )
+
+
+_Dumper.add_representer(str, _represent_text)

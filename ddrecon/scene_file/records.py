@@ -1,0 +1,246 @@
+"""Reading records: any frozen dataclass of the schema from a mapping, by its fields' types. One
+function per shape of type.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from ddrecon.scene_file.leaves import (
+    LEAVES,
+    Rule,
+    read_color,
+    read_each,
+    read_list,
+    read_number,
+    read_text,
+)
+from ddrecon.scene_file.nodes import Node, describe_found
+from ddrecon.scene_file.problems import Problems, suggestion
+from ddrecon.scene_file.ring import ring_views
+from ddrecon.scene_file.schema import Constant, Density, Quantity, ViewSection, ViewSource
+from ddrecon.scene_file.transforms import read_transforms
+from ddrecon.settings import FieldFile, ParameterSettings, Start
+from ddrecon.variables.kinds import KINDS, Kind, pattern_of
+
+R = TypeVar("R")
+
+
+def read_record(node: Node, kind: type[R], folder: Path) -> R:
+    """The record of type `kind` that the mapping `node` describes; raises SceneError with
+    everything wrong in it.
+    """
+    entries = _mapping(node)
+    declared: dict[str, Field[Any]] = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    known = [*(["type"] if hasattr(kind, "type") else []), *declared]
+    hints, problems, values = get_type_hints(kind), Problems(), {}
+    for what in _absences(kind, declared, entries):
+        problems.note(node.refused(what))
+    for name, child in entries.items():
+        with problems.collecting():
+            if name not in known:
+                raise child.key_refused(f"unknown key{suggestion(name, known)}")
+            if name in declared:
+                values[name] = read_value(child, Rule(hints[name], declared[name].metadata, folder))
+        if problems.are_many:
+            break
+    problems.raise_any()
+    return _check(node, kind(**values))
+
+
+def read_value(node: Node, rule: Rule) -> Any:
+    """The value of `node` by `rule`: a leaf, a record, a list of records, or one of several records
+    told apart by `type`.
+    """
+    if read := READERS.get(rule.hint):
+        return read(node, rule)
+    arguments = get_args(rule.hint)
+    if type(None) in arguments:
+        rest = reduce(or_, (argument for argument in arguments if argument is not type(None)))
+        return (
+            None if node.value is None else read_value(node, Rule(rest, rule.limits, rule.folder))
+        )
+    if is_dataclass(rule.hint):
+        return read_record(node, rule.hint, rule.folder)  # type: ignore[arg-type]
+    if get_origin(rule.hint) is tuple:
+        return read_each(read_list(node), Rule(arguments[0], rule.limits, rule.folder), read_value)
+    return _read_tagged(node, {kind.type: kind for kind in arguments}, rule.folder)
+
+
+def _mapping(node: Node) -> dict[str, Node]:
+    if not isinstance(node.value, dict):
+        raise node.refused(f"expected a mapping, found {describe_found(node)}")
+    return node.value
+
+
+def _absences(
+    kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]
+) -> list[str]:
+    """What is wrong with the set of keys given: required ones missing or, of alternatives, empty,
+    or not exactly one group of those.
+    """
+    required = [
+        name
+        for name, field in declared.items()
+        if field.default is MISSING and field.default_factory is MISSING
+    ]
+    groups: tuple[tuple[str, ...], ...] = getattr(kind, "ALTERNATIVES", ())
+    filled = {name for name, child in entries.items() if child.value is not None}
+    given = [group for group in groups if any(name in filled for name in group)]
+    wrong = [f"missing key {name!r}" for name in required if name not in entries]
+    if len(given) == 1:
+        wrong += [
+            f"missing key {name!r}"
+            for name in given[0]
+            if declared[name].default is None and name not in filled
+        ]
+    if groups and len(given) != 1:
+        names = " or ".join(
+            " and ".join(name for name in group if declared[name].default is None)
+            for group in groups
+        )
+        wrong.append(f"{'give only one of' if given else 'missing'} {names}")
+    return wrong
+
+
+def _check(node: Node, record: R) -> R:
+    """`record`, unless it breaks a rule about several of its values."""
+    problems = Problems()
+    for name, what in getattr(record, "problems", tuple)():
+        problems.note(_mapping(node).get(name, node).refused(what))
+    problems.raise_any()
+    return record
+
+
+def _read_tagged(node: Node, kinds: Mapping[str, type], folder: Path) -> Any:
+    entries = _mapping(node)
+    if "type" not in entries:
+        raise node.refused(f"missing key 'type', one of {', '.join(kinds)}")
+    name = read_text(entries["type"], Rule(str, {"choices": tuple(kinds)}, folder))
+    return read_record(node, kinds[name], folder)
+
+
+def _read_density(node: Node, rule: Rule) -> float | FieldFile:
+    if isinstance(node.value, dict) and "file" in node.value:
+        return read_record(node, FieldFile, rule.folder)
+    if isinstance(node.value, dict) and "constant" in node.value:
+        return read_record(node, Constant, rule.folder).constant
+    if node.value is None or isinstance(node.value, str | list | dict):
+        raise node.refused(
+            f"expected a number, {{constant: number}} or {{file: path}}, found {describe_found(node)}"
+        )
+    return read_number(node, rule)
+
+
+def _read_quantity(node: Node, rule: Rule) -> Any:
+    return (
+        read_record(node, FieldFile, rule.folder)
+        if isinstance(node.value, dict)
+        else read_color(node, rule)
+    )
+
+
+def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
+    problems, parameters = Problems(), {}
+    for name, child in _mapping(node).items():
+        with problems.collecting():
+            if (kind := KINDS.get(pattern_of(name))) is None:
+                raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
+            parameters[name] = _legal(
+                child, read_record(child, ParameterSettings, rule.folder), kind
+            )
+    problems.raise_any()
+    if not parameters:
+        raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
+    for name, other in (
+        ("sigma_t", "sigma_a"),
+        ("sigma_t", "sigma_s"),
+        ("albedo", "sigma_a"),
+        ("albedo", "sigma_s"),
+    ):
+        if name in parameters and other in parameters:
+            raise _mapping(node)[name].key_refused(
+                f"cannot be optimized beside {other}: take sigma_a and sigma_s, or sigma_t and albedo"
+            )
+    return parameters
+
+
+def _legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSettings:
+    """`settings`, unless they leave what is legal for a parameter of `kind`."""
+    problems = Problems()
+    numbers = {"min": settings.min, "max": settings.max} | {
+        "init": settings.init if isinstance(settings.init, float) else None
+    }
+    for name, number in numbers.items():
+        if number is not None and not kind.low <= number <= kind.high:
+            problems.note(
+                _mapping(node)[name].refused(
+                    f"must be at least {kind.low:g} and at most {kind.high:g}, found {number:g}"
+                )
+            )
+    if isinstance(settings.init, tuple) and not all(
+        kind.low <= entry <= kind.high for entry in settings.init
+    ):
+        problems.note(
+            _mapping(node)["init"].refused(
+                f"each entry must be at least {kind.low:g} and at most {kind.high:g}"
+            )
+        )
+    if not kind.is_cellwise:
+        for name in ("field", "tv"):
+            if getattr(settings, name):
+                problems.note(_mapping(node)[name].refused("it is not a field, so it has none"))
+    problems.raise_any()
+    return settings
+
+
+def _read_start(node: Node, rule: Rule) -> Any:
+    return (
+        read_each(read_list(node), rule, read_number)
+        if isinstance(node.value, list)
+        else _read_density(node, rule)
+    )
+
+
+def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
+    if isinstance(node.value, dict):
+        source = read_record(node, ViewSource, rule.folder)
+        if source.ring is not None:
+            return ring_views(node, source.ring, source.images, rule.folder)
+        return read_transforms(node.value["transforms"], source.transforms or (), source.test_every)
+    entries = read_list(node)
+    for index, entry in enumerate(entries):
+        if isinstance(entry.value, dict):
+            entry.value.setdefault(
+                "name", Node(entry.child_key("name"), entry.where, entry.where, f"view_{index:02d}")
+            )
+    views = read_each(entries, Rule(ViewSection, {}, rule.folder), read_value)
+    _check_unique(entries, [view.name for view in views])
+    return views
+
+
+def _check_unique(entries: list[Node], names: list[str]) -> None:
+    problems, first = Problems(), dict[str, int]()
+    for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
+        if first.setdefault(name, index) != index:
+            problems.note(
+                _mapping(entry)["name"].refused(
+                    f"{name!r} is already the name of view {first[name]}"
+                )
+            )
+    problems.raise_any()
+
+
+READERS: dict[Any, Callable[[Node, Rule], Any]] = {
+    **LEAVES,
+    Density: _read_density,
+    Quantity: _read_quantity,
+    Start: _read_start,
+    Mapping[str, ParameterSettings]: _read_parameters,
+    tuple[ViewSection, ...]: _read_views,
+}

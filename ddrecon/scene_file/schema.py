@@ -1,0 +1,287 @@
+"""What a scene file may say: one frozen record per section, with its defaults and legal values.
+
+Vectors are (x, y, z). A field's metadata holds the bounds `minimum`, `above`, `maximum`, `below` or
+the `choices` of each number or text in it; `ALTERNATIVES` are groups of keys of which exactly one
+is given; `problems` yields (key, what is wrong) for rules about several values at once. Defaults
+are here and in `ddrecon.settings`, and nowhere else.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ddrecon.grid import Triple
+from ddrecon.settings import (
+    DiffusionSettings,
+    FieldFile,
+    OptimizeSettings,
+    Problem,
+    RenderSettings,
+    bounded,
+    one_of,
+    optional,
+)
+
+Count = tuple[int, int, int]
+Size = tuple[int, int]
+Pair = tuple[float, float]
+Paths = tuple[Path, ...]
+Color = float | Triple
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row, Row]
+
+MAX_CELLS = 2**30
+TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
+"""Endings of the names of output files, which a view's name must not have."""
+
+
+def limited(**limits: float) -> Any:
+    """A required number, or numbers, within `limits`."""
+    return field(metadata=limits)
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same value everywhere."""
+
+    constant: float = limited(minimum=0)
+
+
+Density = float | FieldFile
+Quantity = Color | FieldFile
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The volume's box [u]."""
+
+    min: Triple
+    max: Triple
+
+    def problems(self) -> Iterator[Problem]:
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if low >= high:
+                yield "max", f"{high:g} along {axis} is not above min, {low:g}"
+
+
+@dataclass(frozen=True)
+class VolumeSection:
+    """`bounds` and `resolution` may be left out where a field's file has them."""
+
+    ALTERNATIVES: ClassVar = (("sigma_a", "sigma_s"), ("sigma_t", "albedo"))
+
+    density: Density = limited(minimum=0)
+    bounds: Bounds | None = None
+    resolution: Count | None = optional(minimum=1, maximum=4096)
+    sigma_a: Quantity | None = optional(minimum=0)
+    sigma_s: Quantity | None = optional(minimum=0)
+    sigma_t: Quantity | None = optional(minimum=0)
+    albedo: Quantity | None = optional(minimum=0, maximum=1)
+    g: float = field(default=0.0, metadata={"above": -1, "below": 1})
+
+    def problems(self) -> Iterator[Problem]:
+        x, y, z = self.resolution or (1, 1, 1)
+        if x * y * z > MAX_CELLS:
+            yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
+
+
+@dataclass(frozen=True)
+class DirectionalSection:
+    """`direction`: the way the light travels; `irradiance` on a plane facing it."""
+
+    type: ClassVar[str] = "directional"
+
+    direction: Triple
+    irradiance: Color = limited(minimum=0)
+
+    def problems(self) -> Iterator[Problem]:
+        if not any(self.direction):
+            yield "direction", "must not be zero"
+
+
+@dataclass(frozen=True)
+class AmbientSection:
+    """The same radiance from everywhere."""
+
+    type: ClassVar[str] = "ambient"
+
+    radiance: Color = limited(minimum=0)
+
+
+@dataclass(frozen=True)
+class EnvironmentSection:
+    """A latitude-longitude map, +y up, its pixels times `scale`, turned by `rotation` [degrees]
+    about +y.
+
+    `directions`: how many directions its light on the volume is gathered into.
+    """
+
+    type: ClassVar[str] = "environment"
+
+    file: Path
+    scale: float = bounded(1.0, minimum=0)
+    rotation: float = 0.0
+    directions: int = bounded(48, minimum=1, maximum=1024)
+
+
+@dataclass(frozen=True)
+class PointSection:
+    """Light from one point, inside or outside the box; `intensity`: power per solid angle."""
+
+    type: ClassVar[str] = "point"
+
+    position: Triple
+    intensity: Color = limited(minimum=0)
+
+
+LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseSection:
+    """Where a camera stands: `origin`, `target` and `up` [u], or `matrix`, camera to world with
+    OpenGL axes; its pixels (w, h).
+    """
+
+    ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
+
+    origin: Triple | None = None
+    target: Triple | None = None
+    up: Triple = (0.0, 1.0, 0.0)
+    matrix: Matrix | None = None
+    resolution: Size | None = optional(minimum=1, maximum=16384)
+
+    def problems(self) -> Iterator[Problem]:
+        if self.matrix is not None:
+            yield from _rigidity(np.array(self.matrix))
+
+
+def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
+    turn = matrix[:3, :3]
+    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-4:
+        yield "matrix", "its last row must be [0, 0, 0, 1]"
+    elif np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
+        yield (
+            "matrix",
+            "must be rigid, but its first three columns are not of unit length and perpendicular",
+        )
+    elif np.linalg.det(turn) < 0:
+        yield "matrix", "must be rigid, but it mirrors (determinant -1)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerspectiveSection(PoseSection):
+    """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
+
+    The axis meets the image at `principal_point`, parts of its width and height from the top left.
+    `pixel_aspect`: height of a pixel over its width.
+    """
+
+    type: ClassVar[str] = "perspective"
+
+    fov: float = limited(above=0, below=180)
+    principal_point: Pair = (0.5, 0.5)
+    pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrthographicSection(PoseSection):
+    """`width` of the image [u]."""
+
+    type: ClassVar[str] = "orthographic"
+
+    width: float = limited(above=0)
+
+
+CameraSection = PerspectiveSection | OrthographicSection
+
+
+@dataclass(frozen=True)
+class ViewSection:
+    """One view; `resolution` of its camera may be left out where there is an image. `weight`: how
+    much it counts in the loss.
+    """
+
+    name: str
+    camera: CameraSection
+    image: Path | None = None
+    mask: Path | None = None
+    split: str = one_of("train", ("train", "test"))
+    weight: float = bounded(1.0, above=0)
+
+    def problems(self) -> Iterator[Problem]:
+        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
+            yield (
+                "name",
+                f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.', the last not at its start",
+            )
+        if self.name.endswith(TAKEN):
+            yield (
+                "name",
+                f"{self.name!r} ends as files of other views do; do not end it with {', '.join(TAKEN)}",
+            )
+        if self.image is None and self.camera.resolution is None:
+            yield "camera", "missing key 'resolution'; only a view with an image can go without"
+
+
+@dataclass(frozen=True)
+class RingSection:
+    """Cameras around `target`, in the horizontal plane `height` above it, the first towards +z and
+    the next towards +x.
+    """
+
+    count: int = limited(minimum=1, maximum=10000)
+    radius: float = limited(above=0)
+    fov: float = limited(above=0, below=180)
+    height: float = 0.0
+    target: Triple = (0.0, 0.0, 0.0)
+    up: Triple = (0.0, 1.0, 0.0)
+    resolution: Size | None = optional(minimum=1, maximum=16384)
+
+
+@dataclass(frozen=True)
+class ViewSource:
+    """Views that are not listed one by one: from a ring, or from transforms.json files of NeRF,
+    instant-ngp or nerfstudio.
+
+    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every
+    `test_every` views of files that say nothing of it, the first is a test view.
+    """
+
+    ALTERNATIVES: ClassVar = (("ring",), ("transforms",))
+
+    ring: RingSection | None = None
+    transforms: Paths | None = None
+    images: str | None = None
+    test_every: int | None = optional(minimum=2)
+
+    def problems(self) -> Iterator[Problem]:
+        if self.ring is not None and self.images is None and self.ring.resolution is None:
+            yield "ring", "missing key 'resolution'; only views with images can go without"
+        if self.ring is None and self.images is not None:
+            yield "images", "is for a ring; transforms name their images themselves"
+        if self.ring is not None and self.test_every is not None:
+            yield (
+                "test_every",
+                "is for transforms; list the views of a ring to keep some as test views",
+            )
+
+
+@dataclass(frozen=True)
+class SceneTree:
+    """A whole scene file; a ring of views is already the views it stands for, and paths are
+    absolute.
+    """
+
+    volume: VolumeSection
+    lights: tuple[LightSection, ...]
+    views: tuple[ViewSection, ...]
+    render: RenderSettings = field(default_factory=RenderSettings)
+    diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
+    optimize: OptimizeSettings | None = None

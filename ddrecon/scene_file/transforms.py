@@ -1,0 +1,152 @@
+"""Camera files of NeRF, instant-ngp and nerfstudio (`transforms.json`) as the views they stand for.
+
+What a frame says takes precedence over what the file says. Poses are camera to world with OpenGL
+axes and stay as they stand: what tells other programs how to map them into a box of their own
+(`scale`, `offset`, `aabb_scale`, `applied_transform`) is not for us.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ddrecon.errors import FormatError
+from ddrecon.io.images.table import READERS
+from ddrecon.scene_file.leaves import Rule, read_each, read_list, read_path, read_text
+from ddrecon.scene_file.nodes import Node, describe_found
+from ddrecon.scene_file.problems import Problems
+from ddrecon.scene_file.schema import ViewSection
+from ddrecon.scene_file.transforms_camera import Entries, read_camera
+
+MAX_BYTES = 64 * 2**20
+TEST_NAME = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)
+TRAIN_NAME = re.compile(r"(?<![a-z])train(?![a-z])", re.IGNORECASE)
+
+
+def read_transforms(
+    node: Node, paths: Sequence[Path], test_every: int | None
+) -> tuple[ViewSection, ...]:
+    """The views in the files `paths`, which `node` of a scene names, called as their images.
+
+    Of every `test_every` views of a file that does not say which are test views, the first is one.
+    Raises SceneError or FormatError.
+    """
+    problems, views = Problems(), list[ViewSection]()
+    for path in paths:
+        with problems.collecting():
+            views += _file_views(_document(node, path), path, test_every)
+    problems.raise_any()
+    return tuple(replace(view, name=name) for view, name in zip(views, _names(views), strict=True))
+
+
+def _document(node: Node, path: Path) -> Node:
+    if not path.is_file():
+        raise node.refused(f"{path} does not exist, or is not a file")
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise FormatError(
+                path, f"is larger than {MAX_BYTES // 2**20} MiB; it holds more than cameras"
+            )
+        return _node("", str(path), json.loads(path.read_bytes(), parse_int=_whole))
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise FormatError(path, f"not JSON: {error}") from error
+
+
+def _whole(digits: str) -> int | float:
+    """A whole number; infinite where no arithmetic could be done with it."""
+    return int(digits) if len(digits) < 300 else float(digits)
+
+
+def _node(key: str, where: str, value: Any) -> Node:
+    """`value`, as JSON has it, as a node at `key` and all those below it."""
+    node = Node(key, where, where, None)
+    if isinstance(value, dict):
+        node.value = {
+            name: _node(node.child_key(name), where, entry) for name, entry in value.items()
+        }
+    elif isinstance(value, list):
+        node.value = [
+            _node(node.child_key(index), where, entry) for index, entry in enumerate(value)
+        ]
+    else:
+        node.value = value
+    return node
+
+
+def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSection]:
+    if not isinstance(root.value, dict) or "frames" not in root.value:
+        raise root.refused(
+            "has no 'frames'; expected a transforms.json as of NeRF, instant-ngp or nerfstudio"
+        )
+    frames = read_list(root.value["frames"])
+    rule = Rule(str, {}, path.absolute().parent)
+    tests = _tests(root.value, path, frames, rule, test_every)
+    problems, views = Problems(), []
+    for frame, is_test in zip(frames, tests, strict=True):
+        with problems.collecting():
+            if not isinstance(frame.value, dict):
+                raise frame.refused(f"expected a mapping, found {describe_found(frame)}")
+            image, mask = (
+                _image(frame.value, rule),
+                read_path(frame.value["mask_path"], rule) if frame.value.get("mask_path") else None,
+            )
+            camera = read_camera(frame, root.value | frame.value, rule)
+            if image is None and camera.resolution is None:
+                raise frame.refused(
+                    "has neither file_path nor w and h, so that its number of pixels is unknown"
+                )
+            views.append(ViewSection("", camera, image, mask, "test" if is_test else "train"))
+    problems.raise_any()
+    return views
+
+
+def _tests(
+    entries: Entries, path: Path, frames: list[Node], rule: Rule, test_every: int | None
+) -> list[bool]:
+    """Which frames are test views: as lists of the file say, or its name (`transforms_test.json`),
+    or one in `test_every`.
+    """
+    listed = [
+        name for name in ("train_filenames", "test_filenames", "val_filenames") if name in entries
+    ]
+    if listed:
+        tests = {
+            text
+            for name in listed[listed[0] == "train_filenames" :]
+            for text in read_each(entries[name].children(), rule, read_text)
+        }
+        return [
+            isinstance(frame.value, dict)
+            and "file_path" in frame.value
+            and frame.value["file_path"].value in tests
+            for frame in frames
+        ]
+    if TEST_NAME.search(path.stem) or TRAIN_NAME.search(path.stem) or test_every is None:
+        return [bool(TEST_NAME.search(path.stem))] * len(frames)
+    return [index % test_every == 0 for index in range(len(frames))]
+
+
+def _image(entries: Entries, rule: Rule) -> Path | None:
+    """The frame's image, a .png where its name has no suffix of an image."""
+    if "file_path" not in entries:
+        return None
+    path = read_path(entries["file_path"], rule)
+    return path if path.suffix.lower() in READERS else path.with_name(f"{path.name}.png")
+
+
+def _names(views: Sequence[ViewSection]) -> list[str]:
+    """A name for each view, all different."""
+    paths = [view.image or Path(f"view_{index:02d}") for index, view in enumerate(views)]
+    stems = [re.sub(r"[^A-Za-z0-9_-]", "_", path.stem) for path in paths]
+    longer = [
+        f"{re.sub(r'[^A-Za-z0-9_-]', '_', path.parent.name)}_{stem}"
+        for path, stem in zip(paths, stems, strict=True)
+    ]
+    numbered = [f"{index:03d}_{stem}" for index, stem in enumerate(stems)]
+    return next(names for names in (stems, longer, numbered) if len(set(names)) == len(names))

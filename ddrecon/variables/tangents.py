@@ -1,0 +1,69 @@
+"""Derivative images: how every pixel changes with one number of the scene, by the differential
+diffusion equation (docs/theory.md E8).
+
+One forward-mode pass renders image and derivative together; a field changes uniformly, by one unit
+in every cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ddrecon.scene import Scene
+from ddrecon.variables.values import component_names, value_of, variable_names, with_values
+
+
+def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
+    """The variable that `name` belongs to, and its change [same shape] by one unit of what is
+    named.
+
+    `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
+    or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
+    Directions, positions and cameras change by component only. Raises KeyError.
+    """
+    if name in variable_names(scene):
+        value = value_of(scene, name)
+        if name.rpartition(".")[2] in ("direction", "position", "camera"):
+            raise KeyError(
+                f"{name} changes by component: {', '.join(f'{name}.{part}' for part in component_names(name, value))}"
+            )
+        return name, torch.ones_like(value)
+    owner, _, component = name.rpartition(".")
+    if owner in variable_names(scene):
+        value = value_of(scene, owner)
+        components = component_names(owner, value)
+        if component in components:
+            change = torch.zeros_like(value)
+            change[components.index(component)] = 1
+            return owner, change
+    raise KeyError(f"the scene has no number {name}")
+
+
+Key = TypeVar("Key")
+
+
+def render_tangent(
+    scene: Scene, name: str, images_of: Callable[[Scene], dict[Key, Tensor]]
+) -> dict[Key, tuple[Tensor, Tensor]]:
+    """What `images_of` makes of `scene`, each image with its derivative with respect to `name` (see
+    `variation`).
+    """
+    variable, change = variation(scene, name)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(value_of(scene, variable), change)
+        pairs = {
+            key: forward_ad.unpack_dual(image)
+            for key, image in images_of(with_values(scene, {variable: dual})).items()
+        }
+        return {
+            key: (
+                pair.primal.clone(),
+                torch.zeros_like(pair.primal) if pair.tangent is None else pair.tangent.clone(),
+            )
+            for key, pair in pairs.items()
+        }

@@ -1,0 +1,163 @@
+"""The numbers of a scene by name: what can be differentiated and optimized, read out of a scene and
+put back into it.
+
+`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo` and `g` are the volume's; `lights.0.irradiance`
+is any number of the first light; `views.front.camera` is the twist of a camera. Vectors are (x, y,
+z), colors lead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import twist
+from ddrecon.light.lights import Light
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
+
+VOLUME = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo", "g")
+"""The volume's variables; either sigma_a and sigma_s or sigma_t and albedo are varied, the other
+pair follows.
+"""
+
+
+def variable_names(scene: Scene) -> list[str]:
+    """The name of every variable of `scene`."""
+    lights = [
+        f"lights.{index}.{name}"
+        for index, light in enumerate(scene.lights)
+        for name in _tensors(light)
+    ]
+    return [*VOLUME, *lights, *(f"views.{view.name}.camera" for view in scene.views)]
+
+
+def value_of(scene: Scene, name: str) -> Tensor:
+    """The value of the variable `name`; raises KeyError for a name that is none.
+
+    `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
+    that light holds them; a camera's twist is the change of its pose, [6] and zero: see
+    `ddrecon.cameras.twisted`.
+    """
+    kind, _, rest = name.partition(".")
+    if kind in VOLUME and not rest:
+        return _volume_value(scene.volume, kind)
+    if kind == "lights":
+        index, _, attribute = rest.partition(".")
+        if (
+            index.isdecimal()
+            and int(index) < len(scene.lights)
+            and attribute in _tensors(scene.lights[int(index)])
+        ):
+            value: Tensor = getattr(scene.lights[int(index)], attribute)
+            return value
+    elif kind == "views" and rest.endswith(".camera"):
+        return scene.view(rest.removesuffix(".camera")).camera.pose.new_zeros(6)
+    raise KeyError(name)
+
+
+def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
+    """`scene` with its variables replaced by `values`; a density of one number fills the grid.
+    `scene` itself stays as it is.
+
+    Raises KeyError for a name that is none, ValueError for a density of another shape than the
+    grid's.
+    """
+    known = variable_names(scene)
+    unknown = [name for name in values if name not in known]
+    if unknown:
+        raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(known)}")
+    lights = [
+        _replace_light(
+            light,
+            {
+                name: values[key]
+                for name in _tensors(light)
+                if (key := f"lights.{index}.{name}") in values
+            },
+        )
+        for index, light in enumerate(scene.lights)
+    ]
+    views = [
+        _replace_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views
+    ]
+    volume = _replace_volume(
+        scene.volume, {name: values[name] for name in VOLUME if name in values}
+    )
+    return replace(scene, volume=volume, lights=lights, views=views)
+
+
+def component_names(name: str, value: Tensor) -> tuple[str, ...]:
+    """What the entries of a variable that is a vector, a color or a twist are called; none for a
+    number, a field or a map.
+    """
+    attribute = name.rpartition(".")[2]
+    if attribute == "camera":
+        return "rotation_x", "rotation_y", "rotation_z", "x", "y", "z"
+    if attribute in ("direction", "position"):
+        return "x", "y", "z"
+    return (
+        ("r", "g", "b")
+        if value.ndim in (1, 3, 4) and value.shape[0] == 3 and attribute != "density"
+        else ()
+    )
+
+
+def cross_sections(sigma_t: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
+    """sigma_a and sigma_s [1/u] of `sigma_t` and `albedo`, each `[C]` or `[C, z, y, x]`."""
+    sigma_t, albedo = _same_axes(sigma_t, albedo)
+    return sigma_t * (1 - albedo), sigma_t * albedo
+
+
+def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
+    """Both as [C, z, y, x] if either is; a constant then has one cell."""
+    if one.ndim == other.ndim:
+        return one, other
+    return (one, other.view(-1, 1, 1, 1)) if one.ndim == 4 else (one.view(-1, 1, 1, 1), other)
+
+
+def _tensors(light: Light) -> list[str]:
+    return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
+
+
+def _volume_value(volume: Volume, name: str) -> Tensor:
+    if name not in ("sigma_t", "albedo"):
+        value: Tensor = getattr(volume, name)
+        return value
+    one, other = _same_axes(volume.sigma_a, volume.sigma_s)
+    sigma_t = one + other
+    return (
+        sigma_t if name == "sigma_t" else other / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
+    )
+
+
+def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
+    density, g = values.get("density", volume.density), values.get("g", volume.g)
+    sigma_a, sigma_s = values.get("sigma_a", volume.sigma_a), values.get("sigma_s", volume.sigma_s)
+    if "sigma_t" in values or "albedo" in values:
+        sigma_t, albedo = (
+            values[name] if name in values else _volume_value(volume, name)
+            for name in ("sigma_t", "albedo")
+        )
+        sigma_a, sigma_s = cross_sections(sigma_t, albedo)
+    return Volume(
+        volume.grid,
+        density.expand(volume.grid.shape) if density.ndim == 0 else density,
+        sigma_a,
+        sigma_s,
+        g,
+    )
+
+
+def _replace_light(light: Light, values: Mapping[str, Tensor]) -> Light:
+    changed: Light = replace(light, **values)  # type: ignore[arg-type]
+    return changed
+
+
+def _replace_view(view: View, change: Tensor | None, scene: Scene) -> View:
+    if change is None:
+        return view
+    return replace(view, camera=twist(view.camera, change, scene.volume.grid.center_xyz))

@@ -1,0 +1,210 @@
+"""Transport rounds: where they lead, how fast, that thick cells do not upset them, and what their
+derivatives cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from weakref import WeakSet
+
+import pytest
+import torch
+from media import half_empty, make_scene
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.rounds.sweep import sweep
+from ddrecon.light.moments import Moments
+from ddrecon.light.reduced import reduced_light
+from ddrecon.medium.coefficients import scale_medium
+from ddrecon.numerics.quadrature import DEGREES
+from ddrecon.renderer import render, solve_light
+from ddrecon.scene import Scene
+from ddrecon.variables.tangents import render_tangent
+
+WHITE = {"sigma_a": (0.0,), "sigma_s": (10.0,)}
+
+
+def ball(cells: int = 12, radius: float = 0.35) -> Tensor:
+    """A soft ball of density 1 in a box of unit sides (see `make_scene`)."""
+    x = (torch.arange(cells, dtype=torch.float64) + 0.5) / cells - 0.5
+    distance = (x[:, None, None] ** 2 + x[None, :, None] ** 2 + x**2).sqrt()
+    return ((radius - distance) * cells / 3 + 0.5).clamp(0, 1)
+
+
+def light_after(scene: Scene, rounds: int) -> Tensor:
+    """L0 after so many rounds; for g = 0 what scatters towards every camera."""
+    scene = replace(scene, diffusion=replace(scene.diffusion, transport_rounds=rounds))
+    return solve_light(scene, SolveMemory()).outgoing.mean
+
+
+def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left():
+    scene = make_scene(
+        ball(),
+        sigma_a=(0.0,),
+        sigma_s=(3.0,),
+        directional=(3.0,),
+        tolerance=1e-10,
+        transport_directions=26,
+    )
+    medium = scale_medium(scene.volume)
+    source = reduced_light(medium, scene.lights, False).source
+    last = light_after(scene, 12)
+    swept = sweep(medium, Moments(last).plus(source), None, 26).mean
+    torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
+    left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
+    assert all(after < 0.4 * before for before, after in pairwise(left)), left
+
+
+@pytest.mark.parametrize("thickness", [1e-8, 1.0, 1e2, 1e4])
+@pytest.mark.parametrize("pattern", ["ball", "checkerboard"])
+def test_no_thickness_of_cells_lets_rounds_grow(thickness: float, pattern: str):
+    density = (
+        ball(8)
+        if pattern == "ball"
+        else (torch.arange(512).view(8, 8, 8) + torch.arange(8)[:, None]) % 2 * 1.0 + 1e-6
+    )
+    scene = make_scene(
+        density.double(),
+        sigma_a=(0.0,),
+        sigma_s=(8 * thickness,),
+        directional=(3.0,),
+        tolerance=1e-8,
+    )
+    diffuse, later = (light_after(scene, rounds) for rounds in (0, 10))
+    assert bool(torch.isfinite(later).all()) and float(later.norm()) < 2 * float(diffuse.norm())
+    assert float((later - light_after(scene, 11)).norm()) < 0.05 * float(later.norm())
+
+
+def test_in_the_limit_of_thick_cells_rounds_leave_diffusion_as_it_is():
+    def change(thickness: float) -> float:
+        scene = make_scene(
+            torch.ones(8, 8, 8),
+            sigma_a=(0.0,),
+            sigma_s=(8 * thickness,),
+            directional=(3.0,),
+            tolerance=1e-9,
+        )
+        diffuse = light_after(scene, 0)
+        return float((light_after(scene, 3) - diffuse).norm() / diffuse.norm())
+
+    changes = [change(thickness) for thickness in (30.0, 300.0, 3000.0)]
+    assert changes[2] < 0.2 * changes[1] < 0.04 * changes[0] < 0.04, changes
+
+
+@pytest.mark.parametrize("g", [0.0, 0.6, -0.5])
+def test_a_white_furnace_is_exact_after_any_rounds(g: float):
+    density = half_empty(5, 6, 4)
+    scene = make_scene(
+        density,
+        sigma_a=(0.0,),
+        sigma_s=(20.0,),
+        g=g,
+        directional=None,
+        ambient=(1.0,),
+        transport_rounds=3,
+        tolerance=1e-12,
+    )
+    torch.testing.assert_close(render(scene), torch.ones_like(render(scene)), rtol=0, atol=1e-9)
+
+
+def test_no_rounds_are_no_work(monkeypatch):
+    monkeypatch.setattr("ddrecon.diffusion.rounds.transport.sweep", None)
+    memory = SolveMemory()
+    render(make_scene(ball(6), directional=(3.0,)), memory=memory)
+    assert len(memory.records) == 1
+
+
+@pytest.mark.parametrize("g", [1e-9, -1e-9])
+def test_light_without_direction_is_the_limit_of_light_with(g: float):
+    plain, nearly = (
+        make_scene(ball(8), g=value, directional=(3.0,), transport_rounds=2, tolerance=1e-11)
+        for value in (0.0, g)
+    )
+    torch.testing.assert_close(render(nearly), render(plain), rtol=1e-6, atol=0)
+
+
+def test_light_from_two_beams_is_the_sum_of_both():
+    def lit(*lights: object) -> Tensor:
+        return light_after(replace(scene, lights=list(lights)), 2)
+
+    scene = make_scene(ball(8), directional=(3.0,), ambient=(0.5,), tolerance=1e-11)
+    torch.testing.assert_close(
+        lit(*scene.lights), lit(scene.lights[0]) + lit(scene.lights[1]), rtol=1e-8, atol=0
+    )
+
+
+def test_directions_agree_the_better_the_more_there_are():
+    scene = make_scene(ball(12), **WHITE, directional=(3.0,), transport_rounds=2, tolerance=1e-8)
+    few, some, many = (
+        render(replace(scene, diffusion=replace(scene.diffusion, transport_directions=count)))
+        for count in sorted(DEGREES)
+    )
+    assert (
+        float((some - many).norm()) < 0.6 * float((few - many).norm()) < 0.02 * float(many.norm())
+    )
+
+
+def test_memory_does_not_grow_with_directions():
+    """What is alive at once, of arrays of cells, while a sweep and its backward pass are made."""
+
+    def peak(directions: int) -> int:
+        scene = make_scene(ball(10).requires_grad_(), directional=(3.0,))
+        medium, light = (
+            scale_medium(scene.volume),
+            Moments(torch.ones(3, 10, 10, 10, dtype=torch.float64)),
+        )
+        with ArrayCount(1000) as count:
+            sweep(medium, light, None, directions).mean.sum().backward()
+        return count.most
+
+    assert peak(86) == peak(26)
+
+
+class ArrayCount(TorchDispatchMode):
+    """The most arrays of at least `size` entries, made by operations, that have been alive at once."""
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.size, self.most = size, 0
+        self.alive: WeakSet[object] = WeakSet()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for made in out if isinstance(out, tuple | list) else (out,):
+            if isinstance(made, Tensor) and made.numel() >= self.size:
+                self.alive.add(made.untyped_storage())
+        self.most = max(self.most, len(self.alive))
+        return out
+
+
+@pytest.mark.parametrize("g", [0.0, 0.4])
+def test_tangent_adjoint_and_differences_agree_through_rounds(g: float):
+    scene = make_scene(
+        half_empty(4, 5, 6),
+        g=g,
+        directional=(3.0,),
+        ambient=(0.4,),
+        transport_rounds=2,
+        tolerance=1e-13,
+    )
+
+    def loss(density: Tensor) -> Tensor:
+        return render(replace(scene, volume=replace(scene.volume, density=density))).square().sum()
+
+    leaf = scene.volume.density.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(leaf), leaf)
+    ((image, tangent),) = render_tangent(
+        scene, "density", lambda world: {0: render(world)}
+    ).values()
+    assert (2 * image * tangent).sum().item() == pytest.approx(gradient.sum().item(), rel=1e-10)
+    cell = (leaf.detach() == 0).nonzero()[0]
+    step = torch.zeros_like(leaf)
+    step[tuple(cell)] = 1e-5
+    with torch.no_grad():
+        difference = (
+            4 * (loss(leaf + step) - loss(leaf)) - (loss(leaf + 2 * step) - loss(leaf))
+        ) / 2e-5
+    assert difference.item() == pytest.approx(gradient[tuple(cell)].item(), rel=1e-6)

@@ -1,0 +1,39 @@
+"""Writing leaves the whole new file or the untouched old one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ddrecon.errors import FormatError
+from ddrecon.io.files.atomic import replace_file
+
+
+def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path: Path):
+    path = tmp_path / "a.txt"
+    with replace_file(path) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".txt" and temporary != path
+        temporary.write_text("new")
+        assert not path.exists()
+    assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("interruption", [ValueError, KeyboardInterrupt])
+def test_an_interrupted_write_leaves_the_old_file(
+    tmp_path: Path, interruption: type[BaseException]
+):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(interruption), replace_file(path) as temporary:
+        temporary.write_text("half")
+        raise interruption
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):
+    with (
+        pytest.raises(FormatError, match="cannot be written"),
+        replace_file(tmp_path / "absent" / "a.txt") as temporary,
+    ):
+        temporary.write_text("x")

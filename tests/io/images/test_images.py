@@ -1,0 +1,267 @@
+"""Images: linear round trips, sRGB decoding, alpha, and refusals that say where the flaw is."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image as Pillow
+
+from ddrecon.errors import FormatError
+from ddrecon.io.images import srgb
+from ddrecon.io.images import table as images
+from ddrecon.io.images.exr import write_exr
+from ddrecon.io.images.table import read_image, read_mask, write_linear, write_preview
+from ddrecon.io.images.tiff import write_tiff
+
+SIZES = st.tuples(st.integers(1, 7), st.integers(1, 9))
+
+
+def pixels_of(seed: int, *shape: int) -> np.ndarray:
+    return (10 * np.random.default_rng(seed).standard_normal(shape)).astype(np.float32)
+
+
+def write_npy(path: Path, pixels: np.ndarray) -> None:
+    np.save(path, pixels)
+
+
+WRITERS = {".exr": write_exr, ".tif": write_tiff, ".tiff": write_tiff, ".npy": write_npy}
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+@settings(max_examples=15, deadline=None)
+@given(size=SIZES, seed=st.integers(0, 2**32 - 1))
+def test_float_images_come_back_bit_for_bit(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, size: tuple[int, int], seed: int
+):
+    path = tmp_path_factory.mktemp("image") / f"a{suffix.upper()}"
+    pixels = pixels_of(seed, *size, 3)
+    WRITERS[suffix](path.with_suffix(suffix), pixels)
+    path.with_suffix(suffix).rename(path)
+    image = read_image(path)
+    assert image.pixels.dtype == np.float32 and np.array_equal(image.pixels, pixels)
+    assert image.size == size and image.coverage is None
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".tif"])
+def test_gray_becomes_three_equal_channels(tmp_path: Path, suffix: str):
+    gray = pixels_of(1, 3, 4)
+    WRITERS[suffix](tmp_path / f"a{suffix}", gray)
+    assert np.array_equal(read_image(tmp_path / f"a{suffix}").pixels, np.stack([gray] * 3, -1))
+
+
+def save_exr(path: Path, **channels: np.ndarray) -> Path:
+    module = pytest.importorskip("OpenEXR")
+    header = {"compression": module.ZIP_COMPRESSION, "type": module.scanlineimage}
+    module.File(header, channels).write(str(path))
+    return path
+
+
+EXACT = ("NO", "RLE", "ZIPS", "ZIP", "PIZ")
+LOSSY = ("PXR24", "B44", "B44A", "DWAA", "DWAB")
+"""Compressions of OpenEXR; a lossy one is off by some thousandths in pictures as smooth as this."""
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+@pytest.mark.parametrize("compression", [*EXACT, *LOSSY])
+def test_every_compression_of_exr_is_read(tmp_path: Path, compression: str, dtype: type):
+    module = pytest.importorskip("OpenEXR")
+    x, y = np.meshgrid(np.linspace(0.1, 1, 50), np.linspace(0.2, 1, 40))
+    pixels = np.stack([x * y, 5 * x, y**2], -1).astype(dtype)
+    header = {
+        "compression": getattr(module, f"{compression}_COMPRESSION"),
+        "type": module.scanlineimage,
+    }
+    module.File(header, {"RGB": pixels}).write(str(tmp_path / "a.exr"))
+    found = read_image(tmp_path / "a.exr").pixels
+    assert (
+        np.array_equal(found, pixels)
+        if compression in EXACT
+        else np.allclose(found, pixels, rtol=0.01, atol=0.01)
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+@pytest.mark.parametrize("name", ["Y", "gray"])
+def test_single_channel_exr_is_gray(tmp_path: Path, name: str, dtype: type):
+    gray = pixels_of(2, 3, 4).astype(dtype)
+    image = read_image(save_exr(tmp_path / "a.exr", **{name: gray}))
+    assert np.array_equal(image.pixels, np.stack([gray] * 3, -1).astype(np.float32))
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".npy", ".tif"])
+def test_float_alpha_empties_pixels_and_leaves_premultiplied_ones(tmp_path: Path, suffix: str):
+    rgba = np.ones((2, 2, 4), np.float32)
+    rgba[0, 0, 3], rgba[0, 1, 3] = 0, 0.5
+    path = tmp_path / f"a{suffix}"
+    save_exr(path, RGBA=rgba) if suffix == ".exr" else WRITERS[suffix](path, rgba)
+    image = read_image(path)
+    assert image.coverage is not None and np.array_equal(image.coverage, rgba[..., 3])
+    assert image.pixels[0, 0].tolist() == [0, 0, 0] and image.pixels[0, 1].tolist() == [1, 1, 1]
+
+
+def test_exr_of_other_channels_lists_them(tmp_path: Path):
+    plane = np.ones((2, 2), np.float32)
+    with pytest.raises(FormatError, match="depth, normal"):
+        read_image(save_exr(tmp_path / "a.exr", depth=plane, normal=plane))
+
+
+@pytest.mark.parametrize("suffix", images.READERS)
+def test_damaged_and_absent_files_are_refused(tmp_path: Path, suffix: str):
+    path = tmp_path / f"a{suffix}"
+    with pytest.raises(FormatError):
+        read_image(path)
+    for data in (b"", b"nonsense" * 50):
+        path.write_bytes(data)
+        with pytest.raises(FormatError, match=path.name):
+            read_image(path)
+
+
+@pytest.mark.parametrize("suffix", images.READERS)
+@pytest.mark.parametrize("part", [0.1, 0.5])
+def test_truncated_files_are_refused(tmp_path: Path, suffix: str, part: float):
+    path = tmp_path / f"a{suffix}"
+    pixels = np.abs(pixels_of(3, 40, 40, 3))
+    if suffix in WRITERS:
+        WRITERS[suffix](path, pixels)
+    elif suffix == ".hdr":
+        path.write_bytes(b"#?RADIANCE\n\n-Y 40 +X 40\n" + bytes([100, 128, 0, 130]) * 1600)
+    else:
+        iio.imwrite(path, (pixels * 10 % 255).astype(np.uint8))
+    path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+    with pytest.raises(FormatError):
+        read_image(path)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize(("value", "what"), [(np.nan, "NaN"), (-np.inf, "infinite")])
+def test_flawed_pixels_are_located_and_counted(
+    tmp_path: Path, suffix: str, value: float, what: str
+):
+    pixels = np.zeros((4, 5, 3), np.float32)
+    pixels[1, 2, 1] = pixels[3, 0] = value
+    WRITERS[suffix](tmp_path / f"a{suffix}", pixels)
+    with pytest.raises(
+        FormatError, match=rf"{what}.* at row 1, column 2 \(2 such pixels\); repair"
+    ):
+        read_image(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 2, 2), (2, 2, 5), (1, 2, 2, 3), (0, 2, 3)])
+def test_arrays_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]):
+    np.save(tmp_path / "a.npy", np.zeros(shape))
+    with pytest.raises(FormatError, match=r"expected \[h, w\]"):
+        read_image(tmp_path / "a.npy")
+
+
+def test_pickles_are_refused(tmp_path: Path):
+    np.save(tmp_path / "a.npy", np.array([[{}]], dtype=object), allow_pickle=True)
+    with pytest.raises(FormatError, match="Python objects"):
+        read_image(tmp_path / "a.npy")
+
+
+def test_unknown_suffix_lists_the_known(tmp_path: Path):
+    with pytest.raises(FormatError, match=r"\.exr.*\.png"):
+        read_image(tmp_path / "a.bmp")
+
+
+def test_without_openexr_the_extra_is_named_and_tiff_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    (tmp_path / "a.exr").write_bytes(b"")
+    with pytest.raises(FormatError, match=r'pip install "ddrecon\[exr\]"'):
+        read_image(tmp_path / "a.exr")
+    pixels = pixels_of(4, 2, 3, 3)
+    assert write_linear(tmp_path / "b", pixels) == [tmp_path / "b.tif", tmp_path / "b.npy"]
+    assert np.array_equal(read_image(tmp_path / "b.tif").pixels, pixels)
+
+
+def test_linear_files_keep_dots_in_their_names(tmp_path: Path):
+    pytest.importorskip("OpenEXR")
+    pixels = pixels_of(5, 2, 3, 3).astype(np.float64)
+    paths = write_linear(tmp_path / "front.single", pixels)
+    assert paths == [tmp_path / "front.single.exr", tmp_path / "front.single.npy"] and set(
+        tmp_path.iterdir()
+    ) == set(paths)
+    assert np.load(paths[1]).dtype == np.float32
+    assert all(np.array_equal(read_image(path).pixels, pixels.astype(np.float32)) for path in paths)
+
+
+@given(st.floats(0, 1))
+def test_srgb_decodes_what_it_encodes(linear: float):
+    value = np.array(linear)
+    assert abs(srgb.decode(srgb.encode(value)) - value) < 1e-7
+
+
+def test_srgb_of_middle_gray():
+    assert srgb.encode(np.array([0.0, 0.18, 1.0])) == pytest.approx([0, 0.46136, 1], abs=1e-5)
+
+
+def test_preview_is_8_bit_srgb_and_clipped(tmp_path: Path):
+    write_preview(tmp_path / "a.png", np.array([[[-1, 0.18, 7], [np.nan, 0, 1]]]))
+    assert iio.imread(tmp_path / "a.png").tolist() == [[[0, 118, 255], [0, 0, 255]]]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
+def test_8_bit_colors_are_decoded_from_srgb(tmp_path: Path, suffix: str):
+    stored = np.arange(0, 240, 5, dtype=np.uint8).reshape(4, 4, 3)
+    Pillow.fromarray(stored).save(tmp_path / f"a{suffix}", lossless=True)
+    assert np.allclose(
+        read_image(tmp_path / f"a{suffix}").pixels, srgb.decode(stored / 255), atol=1e-6
+    )
+
+
+def test_8_bit_alpha_multiplies_linear_values(tmp_path: Path):
+    stored = np.full((1, 3, 4), 255, np.uint8)
+    stored[0, :, 3] = 0, 51, 255
+    iio.imwrite(tmp_path / "a.png", stored)
+    image = read_image(tmp_path / "a.png")
+    assert (
+        image.pixels[0, :, 0].tolist() == pytest.approx([0, 0.2, 1]) and image.coverage is not None
+    )
+    assert image.coverage[0].tolist() == pytest.approx([0, 0.2, 1])
+
+
+def test_gray_with_alpha_palette_and_single_bits_are_read(tmp_path: Path):
+    for mode, color in (("LA", (255, 51)), ("P", 0), ("1", 1), ("L", 255)):
+        Pillow.new(mode, (3, 2), color).save(tmp_path / f"{mode}.png")
+        assert read_image(tmp_path / f"{mode}.png").pixels.shape == (2, 3, 3)
+    assert np.allclose(read_image(tmp_path / "LA.png").pixels, 0.2)
+    assert np.allclose(read_image(tmp_path / "1.png").pixels, 1)
+
+
+def test_16_bit_gray_uses_its_whole_range(tmp_path: Path):
+    stored = np.array([[0, 30000, 65535]], np.uint16)
+    iio.imwrite(tmp_path / "a.png", stored)
+    assert np.allclose(
+        read_image(tmp_path / "a.png").pixels[..., 0], srgb.decode(stored / 65535), atol=1e-6
+    )
+
+
+def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):
+    Pillow.new("CMYK", (4, 4)).save(tmp_path / "a.jpg")
+    with pytest.raises(FormatError, match="CMYK"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_mask_ignores_black_and_empty_pixels_only(tmp_path: Path):
+    stored = np.array(
+        [[[0, 0, 0, 255], [255, 255, 255, 0], [1, 0, 0, 255], [255, 255, 255, 255]]], np.uint8
+    )
+    iio.imwrite(tmp_path / "m.png", stored)
+    mask = read_mask(tmp_path / "m.png")
+    assert mask.dtype == np.float32 and mask.tolist() == [[0, 0, 1, 1]]
+
+
+def test_jpeg_is_srgb_up_to_its_compression(tmp_path: Path):
+    stored = np.full((16, 16, 3), (200, 100, 50), np.uint8)
+    for name in ("a.jpg", "a.jpeg"):
+        iio.imwrite(tmp_path / name, stored, quality=95)
+        assert np.allclose(read_image(tmp_path / name).pixels, srgb.decode(stored / 255), atol=0.02)

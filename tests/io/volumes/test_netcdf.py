@@ -1,0 +1,161 @@
+"""netCDF: axes told by CF attributes or by name, in any order, direction and unit of length; what
+does not fit is refused with advice.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ddrecon.errors import FormatError
+from ddrecon.io.volumes.table import field_names, read_field, write_fields
+
+netcdf = pytest.importorskip("netCDF4", reason="netCDF needs netCDF4 (the extra `netcdf`)")
+BOUNDS = np.array([[-1.0, -2.0, 6.0], [1.0, 2.5, 9.0]])
+VALUES = np.random.default_rng(0).random((3, 5, 4)).astype(np.float32)
+CENTERS = {
+    "x": [-0.75, -0.25, 0.25, 0.75],
+    "y": [-1.55, -0.65, 0.25, 1.15, 2.05],
+    "z": [6.5, 7.5, 8.5],
+}
+
+
+def written(
+    path: Path,
+    values: np.ndarray,
+    dimensions: str,
+    kind: str = "NETCDF4",
+    **axes: tuple[Any, dict[str, str]],
+) -> Path:
+    """A file with the variable `QN` on `dimensions`, and a coordinate and its attributes for each
+    of `axes`.
+    """
+    with netcdf.Dataset(path, "w", format=kind) as file:
+        for name, count in zip(dimensions.split(), values.shape, strict=True):
+            file.createDimension(name, count)
+        for name, (numbers, attributes) in axes.items():
+            coordinate = file.createVariable(name, "f8", (name,))
+            coordinate[:] = numbers
+            coordinate.setncatts(attributes)
+        file.createVariable("QN", "f4", tuple(dimensions.split()))[:] = values
+    return path
+
+
+def plain(**units: str) -> dict[str, tuple[Any, dict[str, str]]]:
+    """Coordinates called x, y and z, in these units."""
+    scales = {"km": 1000.0}
+    return {
+        axis: (
+            np.array(CENTERS[axis]) / scales.get(units.get(axis, ""), 1),
+            {"units": units[axis]} if axis in units else {},
+        )
+        for axis in "xyz"
+    }
+
+
+def test_other_programs_find_axes_and_units(tmp_path: Path) -> None:
+    write_fields(
+        tmp_path / "f.nc", {"density": VALUES, "albedo": np.repeat(VALUES[..., None], 3, 3)}, BOUNDS
+    )
+    with netcdf.Dataset(tmp_path / "f.nc") as file:
+        assert file.variables["density"].dimensions == ("z", "y", "x") and file.variables[
+            "albedo"
+        ].dimensions == ("z", "y", "x", "color")
+        for index, axis in enumerate("xyz"):
+            coordinate = file.variables[axis]
+            assert coordinate.axis == axis.upper()
+            np.testing.assert_allclose(coordinate[:], CENTERS[axis], rtol=1e-14)
+            edges = file.variables[coordinate.bounds]
+            assert (
+                edges[0, 0] == BOUNDS[0, index]
+                and edges[-1, 1] == BOUNDS[1, index]
+                and np.array_equal(edges[1:, 0], edges[:-1, 1])
+            )
+    assert field_names(tmp_path / "f.nc") == ["density", "albedo"]
+
+
+@pytest.mark.parametrize("kind", ["NETCDF4", "NETCDF3_CLASSIC"])
+@pytest.mark.parametrize("order", ["z y x", "x y z", "y z x", "time z y x"])
+def test_axes_come_in_any_order(tmp_path: Path, order: str, kind: str) -> None:
+    places = ["zyx".index(name) for name in order.split() if name != "time"]
+    values = VALUES.transpose(places).reshape(
+        [1] * order.startswith("time") + [VALUES.shape[place] for place in places]
+    )
+    field = read_field(written(tmp_path / "f.nc", values, order, kind, **plain()), "QN")
+    assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
+
+
+def test_axes_are_told_by_attribute_before_name(tmp_path: Path) -> None:
+    axes = {
+        name: (CENTERS[axis], {"axis": axis.upper()})
+        for name, axis in (("y", "x"), ("north", "y"), ("height", "z"))
+    }
+    field = read_field(written(tmp_path / "f.nc", VALUES, "height north y", **axes), "QN")
+    assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
+
+
+@pytest.mark.parametrize(
+    ("units", "scale"),
+    [
+        ({"x": "m", "y": "m", "z": "km"}, 1),
+        ({"x": "km", "y": "km", "z": "m"}, 1e-3),
+        ({"z": "km"}, None),
+    ],
+)
+def test_heights_are_in_the_unit_of_x(
+    tmp_path: Path, units: dict[str, str], scale: float | None
+) -> None:
+    """Where both say one; else numbers are taken as they stand."""
+    field = read_field(written(tmp_path / "f.nc", VALUES, "z y x", **plain(**units)), "QN")
+    expected = BOUNDS * scale if scale else BOUNDS * [1, 1, 1e-3]
+    assert np.allclose(field.bounds, expected, rtol=1e-12)
+
+
+def test_downward_axes_are_turned(tmp_path: Path) -> None:
+    """As pressure levels are: the first slice is the uppermost."""
+    axes = plain() | {"z": (CENTERS["z"][::-1], {})}
+    field = read_field(written(tmp_path / "f.nc", VALUES[::-1], "z y x", **axes), "QN")
+    assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
+
+
+def test_a_file_without_coordinates_has_no_box(tmp_path: Path) -> None:
+    field = read_field(written(tmp_path / "f.nc", VALUES, "bottom_top south_north west_east"), "QN")
+    assert np.array_equal(field.values, VALUES) and field.bounds is None
+
+
+def refusal(path: Path, name: str = "QN") -> str:
+    with pytest.raises(FormatError) as caught:
+        read_field(path, name)
+    assert str(path) in str(caught.value)
+    return caught.value.reason
+
+
+def test_what_does_not_fit_is_refused_with_advice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "f.nc"
+    assert "No such file" in refusal(path)
+    path.write_bytes(b"hello")
+    assert "Unknown file format" in refusal(path)
+    assert (
+        refusal(written(path, VALUES, "z y x", **plain()), "density")
+        == "has no variable 'density'; on axes x, y and z it has 'QN'"
+    )
+    assert "QN has 2 entries along 'time'; choose one" in refusal(
+        written(path, np.stack([VALUES] * 2), "time z y x")
+    )
+    assert "has the dimensions a, y, x; expected x, y and z" in refusal(
+        written(path, VALUES[:1], "a y x")
+    )
+    stretched = plain() | {"z": ([6.5, 7.5, 9.0], {})}
+    assert "z is not evenly spaced (1 to 1.5); interpolate it first" in refusal(
+        written(path, VALUES, "z y x", **stretched)
+    )
+    holes = np.ma.masked_less(VALUES, VALUES.max())
+    assert "QN is NaN" in refusal(written(path, holes, "z y x"))
+    monkeypatch.setitem(sys.modules, "netCDF4", None)
+    assert refusal(path) == 'needs netCDF4: pip install "ddrecon[netcdf]"'

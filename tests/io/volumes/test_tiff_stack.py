@@ -1,0 +1,126 @@
+"""TIFF stacks: what Fiji and napari are told of ours, what theirs become, and stacks told from
+images.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ddrecon.errors import FormatError
+from ddrecon.io.images.table import read_image
+from ddrecon.io.images.tiff import write_tiff
+from ddrecon.io.info import describe
+from ddrecon.io.volumes.table import read_field, write_field
+
+tifffile = pytest.importorskip("tifffile", reason="TIFF stacks need tifffile (the extra `tiff`)")
+BOUNDS = np.array([[-1.0, -2.0, 6.0], [1.0, 2.5, 9.0]])
+VALUES = np.random.default_rng(0).random((3, 5, 4, 3)).astype(np.float32)
+
+
+def test_imagej_is_told_where_voxels_lie(tmp_path: Path) -> None:
+    """A voxel's lower corner is (index - origin) times its side, in ImageJ's calibration."""
+    write_field(tmp_path / "smoke.tif", "density", VALUES[..., 0], BOUNDS)
+    with tifffile.TiffFile(tmp_path / "smoke.tif") as file:
+        facts, tags = file.imagej_metadata, file.pages[0].tags
+        assert (
+            len(file.pages) == 3
+            and file.series[0].axes == "ZYX"
+            and np.array_equal(file.pages[1].asarray(), VALUES[1, :, :, 0])
+        )
+        per_unit = [np.divide(*tags[f"{axis}Resolution"].value) for axis in "XY"]
+    size = [1 / per_unit[0], 1 / per_unit[1], facts["spacing"]]
+    low = [-facts[f"{axis}origin"] * side for axis, side in zip("xyz", size, strict=True)]
+    np.testing.assert_allclose(low, BOUNDS[0], rtol=1e-6)
+    np.testing.assert_allclose(low + np.multiply(size, [4, 5, 3]), BOUNDS[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kept", [("spacing", "xorigin", "yorigin", "zorigin"), ("spacing",), ()])
+def test_stacks_of_fiji_have_the_box_of_their_calibration(
+    tmp_path: Path, kept: tuple[str, ...]
+) -> None:
+    facts = {
+        name: value
+        for name, value in {"spacing": 1.0, "xorigin": 2.0, "yorigin": 0.5, "zorigin": -4}.items()
+        if name in kept
+    }
+    tifffile.imwrite(
+        tmp_path / "f.tif",
+        VALUES[..., 0],
+        imagej=True,
+        resolution=(2.0, 4.0),
+        metadata={"axes": "ZYX", **facts},
+    )
+    field = read_field(tmp_path / "f.tif", "density")
+    assert np.array_equal(field.values, VALUES[..., 0])
+    expected = {4: [[-1, -0.125, 4], [1, 1.125, 7]], 1: [[0, 0, 0], [2, 1.25, 3]]}
+    assert (field.bounds is None) if not kept else np.allclose(field.bounds, expected[len(kept)])
+
+
+@pytest.mark.parametrize(
+    ("pages", "options"),
+    [
+        (VALUES, {"photometric": "rgb"}),
+        (VALUES[..., 0], {"photometric": "minisblack", "metadata": None}),
+        (VALUES[..., 0], {"photometric": "minisblack", "compression": "zlib", "bigtiff": True}),
+        (VALUES[..., 0].astype(">f8"), {"photometric": "minisblack", "byteorder": ">"}),
+        ((255 * VALUES[..., 0]).astype(np.uint8), {"photometric": "minisblack"}),
+    ],
+    ids=["rgb", "plain pages", "compressed BigTIFF", "big-endian double", "8 bits"],
+)
+def test_stacks_of_other_programs(
+    tmp_path: Path, pages: np.ndarray, options: dict[str, object]
+) -> None:
+    tifffile.imwrite(tmp_path / "f.tif", pages, **options)
+    assert np.array_equal(
+        read_field(tmp_path / "f.tif", "density").values, pages.astype(np.float32)
+    )
+    assert describe(tmp_path / "f.tif")["resolution"] == [4, 5, 3]
+
+
+def test_a_stack_is_told_from_an_image(tmp_path: Path) -> None:
+    write_field(tmp_path / "one.tif", "density", VALUES[:1, ..., 0], BOUNDS)
+    assert describe(tmp_path / "one.tif")["resolution"] == [4, 5, 1]
+    with pytest.raises(FormatError, match="is a volume"):
+        read_image(tmp_path / "one.tif")
+    for index, pixels in enumerate((VALUES[0], VALUES[0, ..., 0])):
+        write_tiff(tmp_path / f"{index}.tif", pixels)
+        assert describe(tmp_path / f"{index}.tif")["pixels"] == [4, 5]
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(FormatError) as caught:
+        read_field(path, "density")
+    return caught.value.reason
+
+
+def test_what_cannot_be_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "f.tif"
+    assert "No such file" in refusal(path)
+    path.write_bytes(b"hello")
+    assert "not a TIFF stack that can be read" in refusal(path)
+    tifffile.imwrite(
+        path, np.ones((2, 3, 4, 5), np.float32), imagej=True, metadata={"axes": "TZYX"}
+    )
+    assert "has the axes TZYX; expected slices" in refusal(path)
+    tifffile.imwrite(path, np.ones((2, 3, 4), np.complex64), photometric="minisblack")
+    assert "holds values of type complex64" in refusal(path)
+    monkeypatch.setitem(sys.modules, "tifffile", None)
+    assert refusal(path) == 'needs tifffile: pip install "ddrecon[tiff]"'
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_flipped_bytes_are_read_or_refused_but_never_a_crash(tmp_path: Path) -> None:
+    path = tmp_path / "f.tif"
+    write_field(path, "density", np.ones((2, 1, 2)), BOUNDS)
+    data = path.read_bytes()
+    for position in range(0, len(data), 11):
+        path.write_bytes(data[:position] + bytes([data[position] ^ 0x5A]) + data[position + 1 :])
+        with contextlib.suppress(FormatError):
+            read_field(path, "density")
+        with contextlib.suppress(FormatError):
+            describe(path)

@@ -1,0 +1,205 @@
+"""Environment maps: where their pixels lie, and the integrals of what lies between them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from media import random_values
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ddrecon.grid import array_order
+from ddrecon.light.environment import (
+    environment_radiance,
+    pixel_moments,
+    refine_map,
+    turn_directions,
+)
+from ddrecon.light.lights import EnvironmentLight
+
+SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
+
+
+def light_of(radiance: Tensor, scale: float = 1.0, rotation: float = 0.0) -> EnvironmentLight:
+    return EnvironmentLight(radiance, radiance.new_tensor(scale), radiance.new_tensor(rotation))
+
+
+def directions(count: int, seed: int = 0) -> Tensor:
+    """Unit directions (x, y, z)."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1
+    )
+
+
+def seen(light: EnvironmentLight, *direction: float) -> list[float]:
+    """What is seen along one direction (x, y, z), of any length."""
+    vector = torch.nn.functional.normalize(light.radiance.new_tensor(direction), dim=0)
+    return environment_radiance(light, array_order(vector)[None])[:, 0].tolist()
+
+
+def center(row: int, column: int, height: int, width: int) -> tuple[float, float, float]:
+    """The direction (x, y, z) of a pixel, from -z over +x around."""
+    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
+    return math.sin(down) * math.sin(around), math.cos(down), -math.sin(down) * math.cos(around)
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES[1:], ids=str)
+def test_a_pixel_is_seen_in_its_direction(height: int, width: int):
+    light = light_of(random_values(2, height, width))
+    for row, column in ((1, 0), (1, width - 1), (height - 2, 1)):
+        assert seen(light, *center(row, column, height, width)) == pytest.approx(
+            light.radiance[:, row, column].tolist(), rel=1e-12
+        )
+
+
+def test_between_pixels_radiance_is_their_mean_also_across_the_seam():
+    light = light_of(random_values(1, 5, 8))
+    corners = light.radiance[0, 1:3][:, [7, 0]].mean().item()
+    assert seen(light, *center(1.5, -0.5, 5, 8)) == pytest.approx([corners], rel=1e-12)
+
+
+def test_straight_up_and_down_are_the_first_and_last_row():
+    light = light_of(
+        torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64).view(1, 3, 1).expand(1, 3, 4)
+    )
+    assert seen(light, 0, 1, 0) == pytest.approx([2.0]) and seen(light, 0, -1, 0) == pytest.approx(
+        [3.0]
+    )
+
+
+def test_a_quarter_turn_rolls_the_map():
+    radiance, ways = random_values(3, 6, 8), array_order(directions(50))
+    expected = environment_radiance(light_of(radiance.roll(-2, 2)), ways)
+    torch.testing.assert_close(
+        environment_radiance(light_of(radiance, rotation=90.0), ways),
+        expected,
+        rtol=1e-12,
+        atol=1e-13,
+    )
+
+
+def test_turning_the_map_is_turning_the_viewer():
+    radiance, ways = random_values(3, 6, 8), directions(50)
+    light = light_of(radiance, rotation=33.0)
+    found = environment_radiance(light, array_order(turn_directions(ways, light.rotation)))
+    torch.testing.assert_close(
+        found, environment_radiance(light_of(radiance), array_order(ways)), rtol=1e-11, atol=1e-12
+    )
+
+
+def test_what_is_seen_is_linear_in_scale_and_radiance():
+    one, other, ways = (
+        random_values(3, 4, 6, seed=1),
+        random_values(3, 4, 6, seed=2),
+        array_order(directions(20)),
+    )
+    parts = 2 * environment_radiance(light_of(one), ways) + 6 * environment_radiance(
+        light_of(other), ways
+    )
+    torch.testing.assert_close(
+        environment_radiance(light_of(one + 3 * other, scale=2.0), ways), parts, rtol=1e-12, atol=0
+    )
+
+
+@pytest.mark.parametrize("rotation", [0.0, 37.0, 90.0, -200.0])
+def test_maps_look_as_they_do_in_mitsuba(rotation: float):
+    mitsuba = pytest.importorskip(
+        "mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)"
+    )
+    mitsuba.set_variant("scalar_rgb")
+    radiance, ways = random_values(3, 6, 10), directions(300)
+    bitmap = mitsuba.Bitmap(np.ascontiguousarray(radiance.permute(1, 2, 0).float().numpy()))
+    turn = mitsuba.ScalarTransform4f().rotate([0, 1, 0], rotation)
+    environment = mitsuba.load_dict(
+        {
+            "type": "scene",
+            "map": {"type": "envmap", "bitmap": bitmap, "scale": 1.5, "to_world": turn},
+        }
+    ).environment()
+    expected = []
+    for way in ways.tolist():
+        interaction = mitsuba.SurfaceInteraction3f()
+        interaction.wi = mitsuba.Vector3f(*(-component for component in way))
+        expected.append(list(environment.eval(interaction)))
+    found = environment_radiance(light_of(radiance, 1.5, rotation), array_order(ways))
+    torch.testing.assert_close(
+        found, torch.tensor(expected, dtype=torch.float64).T, rtol=1e-5, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES, ids=str)
+def test_solid_angles_sum_to_the_sphere(height: int, width: int):
+    area, *vector = pixel_moments(height, width).sum((1, 2))
+    assert area == pytest.approx(4 * math.pi, rel=1e-13) and vector == pytest.approx(
+        [0, 0, 0], abs=1e-13
+    )
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES[1:3], ids=str)
+def test_moments_integrate_the_bilinear_map(height: int, width: int):
+    """Against a sum over 300 x 600 directions."""
+    light = light_of(random_values(1, height, width))
+    rows, columns = 300, 600
+    down = math.pi * (torch.arange(rows, dtype=torch.float64) + 0.5) / rows
+    around = 2 * math.pi * (torch.arange(columns, dtype=torch.float64) + 0.5) / columns
+    down, around = (part.flatten() for part in torch.meshgrid(down, around, indexing="ij"))
+    ways = torch.stack([down.sin() * around.sin(), down.cos(), -down.sin() * around.cos()], -1)
+    weight = (
+        environment_radiance(light, array_order(ways))[0]
+        * down.sin()
+        * (math.pi / rows)
+        * (2 * math.pi / columns)
+    )
+    expected = torch.cat([weight.sum()[None], weight @ ways])
+    found = (torch.from_numpy(pixel_moments(height, width)) * light.radiance).sum((1, 2))
+    torch.testing.assert_close(found, expected, rtol=2e-4, atol=2e-4)
+
+
+@pytest.mark.parametrize("size", [(9, 9), (24, 48), (25, 10)], ids=str)
+def test_a_refined_map_is_the_same_function(size: tuple[int, int]):
+    radiance, ways = random_values(2, 7, 5), array_order(directions(100))
+    fine = refine_map(radiance, *size)
+    assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
+    torch.testing.assert_close(
+        environment_radiance(light_of(fine), ways),
+        environment_radiance(light_of(radiance), ways),
+        rtol=1e-11,
+        atol=1e-12,
+    )
+
+
+@pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])
+def test_what_is_seen_has_both_derivatives(name: str):
+    values = {
+        "radiance": random_values(2, 4, 5),
+        "scale": random_values(),
+        "rotation": 100 * random_values(seed=1),
+        "direction": array_order(directions(6)),
+    }
+
+    def look(value: Tensor) -> Tensor:
+        parts = values | {name: value}
+        return environment_radiance(
+            EnvironmentLight(parts["radiance"], parts["scale"], parts["rotation"]),
+            parts["direction"],
+        )
+
+    assert torch.autograd.gradcheck(
+        look, values[name].clone().requires_grad_(), check_forward_ad=True
+    )
+
+
+def test_straight_up_has_finite_derivatives():
+    light, way = (
+        light_of(random_values(2, 4, 5)),
+        torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True),
+    )
+    (slope,) = torch.autograd.grad(environment_radiance(light, way).sum(), way)
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(way.detach(), torch.ones_like(way))
+        tangent = forward_ad.unpack_dual(environment_radiance(light, dual)).tangent
+    assert torch.isfinite(slope).all() and torch.isfinite(tangent).all()

@@ -1,0 +1,312 @@
+"""Point lights: the inverse square law, limits in which they are parallel light, and what happens
+at the light itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from media import box_grid, convergence_order, half_empty, make_camera, make_scene
+from torch import Tensor
+
+from ddrecon.cameras import cast_rays
+from ddrecon.grid import Grid, array_order
+from ddrecon.light.lights import DirectionalLight, PointLight
+from ddrecon.light.point_light import follow_point_light
+from ddrecon.light.reduced import reduced_light
+from ddrecon.march.integral import Emission, march
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.renderer import render
+from ddrecon.scene import Scene
+from ddrecon.settings import RenderSettings
+
+SHAPE = (5, 4, 6)
+OUTSIDE, INSIDE = (0.3, 1.7, 1.1), (0.11, 0.13, 0.17)
+
+
+def light_at(
+    position: tuple[float, ...],
+    intensity: tuple[float, ...] = (2.0,),
+    dtype: torch.dtype = torch.float64,
+) -> PointLight:
+    return PointLight(torch.tensor(position, dtype=dtype), torch.tensor(intensity, dtype=dtype))
+
+
+def medium_of(grid: Grid, density: Tensor, g: float = 0.4) -> Medium:
+    return scale_medium(
+        Volume(
+            grid,
+            density,
+            density.new_tensor([0.5]),
+            density.new_tensor([3.0]),
+            density.new_tensor(g),
+        )
+    )
+
+
+def offsets(grid: Grid, position: tuple[float, ...]) -> Tensor:
+    """From the light to the cell centers, `[z, y, x, 3]` in array order."""
+    axes = torch.meshgrid(
+        *(axis.flatten() for axis in grid.centers(torch.zeros(1, dtype=torch.float64))),
+        indexing="ij",
+    )
+    return torch.stack(axes, -1) - torch.tensor(position[::-1], dtype=torch.float64)
+
+
+def cell_center(grid: Grid, z: int, y: int, x: int) -> tuple[float, float, float]:
+    """The center (x, y, z) of a cell."""
+    z, y, x = (
+        float(axis.flatten()[index])
+        for axis, index in zip(
+            grid.centers(torch.zeros(1, dtype=torch.float64)), (z, y, x), strict=True
+        )
+    )
+    return x, y, z
+
+
+@pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
+def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: tuple[float, ...]):
+    """Everywhere but in the light's own cell."""
+    grid = box_grid((10, 12, 9))
+    received = follow_point_light(
+        medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64)), light_at(position), True
+    )[1]
+    offset = offsets(grid, position)
+    distance = offset.norm(dim=-1)
+    is_apart = distance > max(grid.spacing)
+    expected = 2.0 / (4 * math.pi) / distance**2
+    torch.testing.assert_close(received.mean[0][is_apart], expected[is_apart], rtol=1e-13, atol=0)
+    flux = torch.stack(received.flux, -1)[0]
+    torch.testing.assert_close(
+        flux[is_apart],
+        (expected / distance)[is_apart][:, None] * offset[is_apart],
+        rtol=1e-12,
+        atol=1e-16,
+    )
+
+
+@pytest.mark.parametrize("position", [OUTSIDE, INSIDE, (0.0, 3.0, 0.0)], ids=str)
+def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
+    grid = box_grid((7, 6, 5))
+    beam = follow_point_light(
+        medium_of(grid, torch.ones(grid.shape, dtype=torch.float64)), light_at(position), False
+    )[0]
+    for z, y, x in ((0, 0, 0), (6, 5, 4), (3, 1, 2), (6, 0, 1)):
+        end = cell_center(grid, z, y, x)[::-1]
+        start, entered = position[::-1], 0.0
+        for low, high, a, b in zip(grid.lower, grid.upper, start, end, strict=True):
+            if not low <= a <= high:
+                entered = max(entered, ((low if a < low else high) - a) / (b - a))
+        assert beam.mass[0, z, y, x].item() == pytest.approx(
+            (1 - entered) * math.dist(start, end), rel=1e-12
+        )
+
+
+def test_the_depth_of_a_smooth_blob_converges_at_second_order():
+    """From a light inside: the integral of a Gaussian along a line from there, an error function."""
+    width, errors, counts = 0.15, [], [8, 12, 18, 27]
+    for count in counts:
+        grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
+        axes = grid.centers(torch.zeros(1, dtype=torch.float64))
+        density = torch.exp(-sum(axis**2 for axis in axes) / (2 * width**2))
+        beam = follow_point_light(medium_of(grid, density), light_at(INSIDE), False)[0]
+        start, offset = torch.tensor(INSIDE[::-1], dtype=torch.float64), offsets(grid, INSIDE)
+        distance = offset.norm(dim=-1)
+        along = (start * offset).sum(-1) / distance
+        across = torch.exp(-((start**2).sum() - along**2) / (2 * width**2))
+        erf = torch.erf((along + distance) / width / math.sqrt(2)) - torch.erf(
+            along / width / math.sqrt(2)
+        )
+        errors.append(
+            float(
+                (beam.mass[0] - across * width * math.sqrt(math.pi / 2) * erf)
+                .square()
+                .mean()
+                .sqrt()
+            )
+        )
+    assert convergence_order([1 / count for count in counts], errors) >= 1.7, errors
+
+
+def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
+    """kappa_s I / (4 pi) times the integral of 1 / r^2 along a ray: I (angle subtended) / (distance
+    of the ray).
+    """
+    grid, position = Grid((40, 44, 36), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)), (0.02, 0.31, 0.07)
+    medium = medium_of(grid, torch.full(grid.shape, 1e-9, dtype=torch.float64), g=0.0)
+    bundle = cast_rays(make_camera(eye=(0.3, 0.1, 2.5), size=(7, 7), half_width=0.05))
+    beams = reduced_light(medium, [light_at(position)], False).beams
+    dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    emission = Emission(
+        grid, medium.extinction, medium.scattering, beams, dark, medium.g, medium.peak
+    )
+    radiance = march(emission, bundle, RenderSettings())[0][0]
+    light = array_order(torch.tensor(position, dtype=torch.float64))
+    low, high = (light.new_tensor(corner) for corner in (grid.lower, grid.upper))
+    one, other = ((corner - bundle.origin) / bundle.direction for corner in (low, high))
+    near, far = torch.minimum(one, other).amax(-1), torch.maximum(one, other).amin(-1)
+    along = ((light - bundle.origin) * bundle.direction).sum(-1)
+    apart = (bundle.origin + along[:, None] * bundle.direction - light).norm(dim=-1)
+    expected = (
+        3e-9
+        * 2.0
+        / (4 * math.pi)
+        * (torch.atan((far - along) / apart) - torch.atan((near - along) / apart))
+        / apart
+    )
+    torch.testing.assert_close(radiance, expected, rtol=1e-7, atol=0)
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5])
+def test_from_afar_a_point_light_is_a_directional_one(g: float):
+    """With irradiance I / r^2, up to the angle r subtends: first order in 1 / r. The depth is found
+    by another quadrature on this coarse grid, of a density that is the same in every cell.
+    """
+    scene = make_scene(torch.ones(*SHAPE, dtype=torch.float64), g=g)
+    towards, errors, distances = (
+        torch.nn.functional.normalize(torch.tensor([0.5, 1.0, 0.7], dtype=torch.float64), dim=0),
+        [],
+        [1e2, 1e3, 1e4],
+    )
+    images = []
+    for distance in (*distances, 1e8):
+        point = PointLight(
+            distance * towards, torch.tensor([3.0], dtype=torch.float64) * distance**2
+        )
+        images.append(render(replace(scene, lights=[point])))
+    errors = [float((image - images[-1]).norm() / images[-1].norm()) for image in images[:-1]]
+    assert convergence_order([1 / distance for distance in distances], errors) == pytest.approx(
+        1, abs=0.05
+    ), errors
+    parallel = render(
+        replace(
+            scene, lights=[DirectionalLight(-towards, torch.tensor([3.0], dtype=torch.float64))]
+        )
+    )
+    assert float((images[-1] - parallel).norm() / parallel.norm()) < 0.1
+
+
+def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
+    """The two ways to find depths agree as cells shrink."""
+    errors, counts = [], [8, 16, 32]
+    for count in counts:
+        grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))
+        density = 8 * torch.exp(
+            -sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))) / 0.04
+        )
+        scene, towards = (
+            make_scene(density, grid=grid, model="none"),
+            torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64),
+        )
+        intensity = torch.tensor([3.0], dtype=torch.float64)
+        point, parallel = (
+            PointLight(1e6 * towards, 1e12 * intensity),
+            DirectionalLight(-towards, intensity),
+        )
+        images = [render(replace(scene, lights=[light])) for light in (point, parallel)]
+        errors.append(float((images[0] - images[1]).norm() / images[1].norm()))
+    assert (
+        errors[-1] < 1e-2
+        and convergence_order([1 / count for count in counts[1:]], errors[1:]) > 1.5
+    ), errors
+
+
+@pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
+def test_a_moved_world_looks_the_same(position: tuple[float, ...]):
+    scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light_at(position)])
+    image, shift = render(scene), (3.0, -2.0, 5.0)
+    grid, view = scene.volume.grid, scene.views[0]
+    lower, upper = (
+        tuple(c + s for c, s in zip(corner, shift[::-1], strict=True))
+        for corner in (grid.lower, grid.upper)
+    )
+    pose = torch.cat(
+        [
+            view.camera.pose[:, :3],
+            view.camera.pose[:, 3:] + torch.tensor(shift, dtype=torch.float64)[:, None],
+        ],
+        1,
+    )
+    moved = Scene(
+        replace(scene.volume, grid=Grid(SHAPE, lower, upper)),
+        [light_at(tuple(p + s for p, s in zip(position, shift, strict=True)))],
+        [replace(view, camera=replace(view.camera, pose=pose))],
+        scene.render,
+        scene.diffusion,
+    )
+    torch.testing.assert_close(render(moved), image, rtol=1e-9, atol=0)
+
+
+def test_images_are_linear_in_intensity():
+    scene = make_scene(half_empty(*SHAPE), g=0.4)
+    one, other = (
+        render(replace(scene, lights=[light_at(INSIDE, color)]))
+        for color in ((1.0,), (3.0, 2.0, 1.0))
+    )
+    torch.testing.assert_close(
+        other,
+        one * torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64).view(3, 1, 1),
+        rtol=1e-10,
+        atol=0,
+    )
+
+
+@pytest.mark.parametrize("where", ["center", "corner", "face", "face of the box", "eye"])
+def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where: str):
+    scene = make_scene(
+        half_empty(*SHAPE), g=0.4, camera=make_camera(eye=(0.05, 0.1, 0.15), half_width=0.8)
+    )
+    grid = scene.volume.grid
+    (z, y, x), center = grid.spacing, cell_center(grid, 2, 1, 3)
+    shifts = {"center": (0, 0, 0), "corner": (x / 2, y / 2, z / 2), "face": (0, y / 2, 0)}
+    position = {"face of the box": (0.1, 0.6, 0.1), "eye": (0.05, 0.1, 0.15)}.get(where)
+    light = light_at(position or tuple(c + s for c, s in zip(center, shifts[where], strict=True)))
+    numbers = [
+        light.position.requires_grad_(),
+        light.intensity.requires_grad_(),
+        scene.volume.density.requires_grad_(),
+    ]
+    image = render(replace(scene, lights=[light]))
+    slopes = torch.autograd.grad(image.sum(), numbers)
+    assert torch.isfinite(image).all() and image.max() < 1e3
+    assert all(
+        bool(torch.isfinite(slope).all()) and float(slope.abs().max()) < 1e5 for slope in slopes
+    )
+
+
+def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere():
+    """3 / R^2, the mean of 1 / r^2 over a sphere of one cell's volume around the light, and no
+    flux: light leaves on all sides.
+    """
+    grid = box_grid((5, 4, 6))
+    received = follow_point_light(
+        medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64)),
+        light_at(cell_center(grid, 2, 1, 3)),
+        True,
+    )[1]
+    radius = (0.75 / math.pi * math.prod(grid.spacing)) ** (1 / 3)
+    assert received.mean[0, 2, 1, 3].item() == pytest.approx(
+        2.0 / (4 * math.pi) * 3 / radius**2, rel=1e-12
+    )
+    assert max(abs(component[0, 2, 1, 3].item()) for component in received.flux) < 1e-12
+
+
+def test_single_precision_follows_double():
+    images = []
+    for dtype in (torch.float32, torch.float64):
+        scene = make_scene(half_empty(*SHAPE, dtype=dtype), g=0.4)
+        images.append(
+            render(
+                replace(
+                    scene,
+                    lights=[
+                        light_at(INSIDE, dtype=dtype),
+                        light_at((9.0, 800.0, 70.0), (1e6,), dtype),
+                    ],
+                )
+            ).double()
+        )
+    assert float((images[0] - images[1]).norm() / images[1].norm()) < 1e-5

@@ -1,0 +1,289 @@
+"""What an environment map sheds on a volume: its power and first moment, suns, and agreement with
+the simpler lights it can stand for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from media import half_empty, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.cameras import Camera, look_at
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.grid import Grid, array_order
+from ddrecon.light.environment import pixel_moments
+from ddrecon.light.lights import DirectionalLight, EnvironmentLight
+from ddrecon.light.sky import MAX_SUNS, Sky, count_suns, decompose_map, fibonacci_sphere
+from ddrecon.light.skylight import sum_unscattered_sky
+from ddrecon.medium.coefficients import scale_medium
+from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.scene import Scene
+
+SHAPE = (5, 4, 6)
+
+
+def light_of(
+    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, directions: int = 48
+) -> EnvironmentLight:
+    return EnvironmentLight(
+        radiance, radiance.new_tensor(scale), radiance.new_tensor(rotation), directions
+    )
+
+
+def uneven(height: int, width: int, seed: int = 0) -> Tensor:
+    """A map [3, h, w] with one small bright spot in it, which is a sun."""
+    radiance = torch.rand(
+        3, height, width, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
+    radiance[:, height // 3, width // 5] += 3 * height * width
+    return radiance
+
+
+def banded(height: int, width: int) -> Tensor:
+    """A map [3, h, w] without suns, bright on one side and dark on the other."""
+    around = (torch.arange(width, dtype=torch.float64) + 0.5) * (2 * math.pi / width)
+    return (1 + torch.sin(around)).expand(3, height, width) + uneven(height, width).clamp(max=1)
+
+
+def hot_pixel(
+    height: int, width: int, row: int, column: int
+) -> tuple[EnvironmentLight, DirectionalLight]:
+    """A map that is black but for one pixel, and the parallel light that it amounts to, by the
+    pixel's solid angle and center.
+    """
+    radiance = torch.zeros(3, height, width, dtype=torch.float64)
+    radiance[:, row, column] = torch.tensor([300.0, 200.0, 100.0])
+    down, around = math.pi * row / (height - 1), 2 * math.pi * (column + 0.5) / width
+    solid_angle = math.sin(down) * math.pi / (height - 1) * 2 * math.pi / width
+    travel = [
+        -math.sin(down) * math.sin(around),
+        -math.cos(down),
+        math.sin(down) * math.cos(around),
+    ]
+    return light_of(radiance), DirectionalLight(
+        radiance.new_tensor(travel), radiance[:, row, column] * solid_angle
+    )
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    return float((found - expected).norm() / expected.norm())
+
+
+@pytest.mark.parametrize("count", [1, 7, 48])
+def test_directions_are_spread_evenly(count: int):
+    directions = fibonacci_sphere(count)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=1e-14)
+    closest = np.sort(directions @ directions.T, axis=1)[:, -2] if count > 1 else np.array([-1.0])
+    assert np.arccos(closest).min() > 0.6 * math.sqrt(4 * math.pi / count) or count == 1
+
+
+@pytest.mark.parametrize("directions", [1, 6, 48])
+@pytest.mark.parametrize("size", [(2, 3), (5, 8), (32, 64)], ids=str)
+def test_power_and_first_moment_of_a_map_are_those_of_its_parts(
+    size: tuple[int, int], directions: int
+):
+    """All that a map without suns sends in, and the vector along which it goes."""
+    light = light_of(random_values(3, *size), scale=1.3, rotation=25.0, directions=directions)
+    (ambient, sky) = decompose_map(light)
+    moments = 1.3 * (
+        torch.from_numpy(pixel_moments(*size)).flatten(1) @ light.radiance.flatten(1).T
+    )
+    torch.testing.assert_close(
+        4 * math.pi * ambient.radiance + sky.irradiance.sum(0), moments[0], rtol=1e-12, atol=0
+    )
+    turn = math.radians(25.0)
+    x, y, z = -moments[1:]
+    expected = torch.stack(
+        [math.cos(turn) * z - math.sin(turn) * x, y, math.cos(turn) * x + math.sin(turn) * z]
+    )
+    torch.testing.assert_close(sky.vector.sum(0), expected, rtol=1e-11, atol=1e-12)
+    torch.testing.assert_close(
+        sky.irradiance.sum(0), torch.zeros_like(moments[0]), rtol=0, atol=1e-12
+    )
+
+
+def test_with_a_sun_power_is_kept_and_the_sky_is_the_rest():
+    light = light_of(uneven(16, 32))
+    sun, ambient, sky = decompose_map(light)
+    moments = torch.from_numpy(pixel_moments(16, 32)).flatten(1) @ light.radiance.flatten(1).T
+    total = sun.irradiance + 4 * math.pi * ambient.radiance + sky.irradiance.sum(0)
+    torch.testing.assert_close(total, moments[0], rtol=1e-12, atol=0)
+    assert bool((ambient.radiance < 1).all()) and count_suns(light) == (1, len(sky.travel))
+
+
+def test_there_are_at_most_four_suns():
+    radiance = torch.zeros(1, 16, 32, dtype=torch.float64)
+    radiance[0, 8, ::5] = 1 + random_values(7)
+    assert count_suns(light_of(radiance))[0] == MAX_SUNS
+
+
+@pytest.mark.parametrize("directions", [1, 2, 6, 48, 200])
+def test_a_constant_map_is_ambient_light_whatever_the_directions(directions: int):
+    color = torch.tensor([0.7, 0.2, 0.0], dtype=torch.float64)
+    ambient, sky = decompose_map(
+        light_of(color.view(3, 1, 1).expand(3, 6, 8), directions=directions)
+    )
+    assert torch.equal(ambient.radiance, color) and not sky.irradiance.any()
+
+
+@pytest.mark.parametrize("model", ["p1", "none"])
+@pytest.mark.parametrize("g", [0.0, 0.6])
+def test_a_constant_map_looks_as_ambient_light_does(g: float, model: str):
+    scene = make_scene(half_empty(*SHAPE), g=g, model=model, ambient=(0.7, 0.2, 0.4))
+    constant = light_of(
+        torch.tensor([0.7, 0.2, 0.4], dtype=torch.float64).view(3, 1, 1).expand(3, 6, 8),
+        rotation=20.0,
+    )
+    found = render(replace(scene, lights=[scene.lights[0], constant]))
+    torch.testing.assert_close(found, render(scene), rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize(
+    "place", [(32, 64, 9, 40), (32, 64, 16, 0), (16, 32, 8, 19), (16, 32, 12, 31)], ids=str
+)
+@pytest.mark.parametrize("g", [0.0, 0.6])
+def test_a_hot_pixel_is_a_directional_light(g: float, place: tuple[int, int, int, int]):
+    scene = make_scene(half_empty(*SHAPE), g=g)
+    environment, directional = hot_pixel(*place)
+    images = [
+        render(replace(scene, lights=[light], render=replace(scene.render, background=False)))
+        for light in (environment, directional)
+    ]
+    assert relative_error(*images) < 0.02
+
+
+def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance():
+    scene, one, other = (
+        make_scene(half_empty(*SHAPE), g=0.4),
+        random_values(3, 6, 8, seed=1),
+        random_values(3, 6, 8, seed=2),
+    )
+
+    def image(radiance: Tensor, scale: float) -> Tensor:
+        return render(replace(scene, lights=[light_of(radiance, scale, rotation=12.0)]))
+
+    torch.testing.assert_close(
+        image(one + 3 * other, 2.0), 2 * image(one, 1.0) + 6 * image(other, 1.0), rtol=1e-9, atol=0
+    )
+    sunny = uneven(6, 8)
+    torch.testing.assert_close(image(sunny, 2.5), 2.5 * image(sunny, 1.0), rtol=1e-9, atol=0)
+
+
+def test_a_turned_world_looks_the_same():
+    """Map, volume and camera turned by 90 degrees about +y."""
+    grid = Grid((5, 4, 5), (-0.5, -0.6, -0.5), (0.5, 0.6, 0.5))
+    density = torch.rand(5, 4, 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    eye, up = (
+        torch.tensor([0.4, 0.5, 2.5], dtype=torch.float64),
+        torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64),
+    )
+    images = []
+    for rotation, field, origin in (
+        (0.0, density, eye),
+        (90.0, density.transpose(0, 2).flip(0), eye[[2, 1, 0]] * eye.new_tensor([1, 1, -1])),
+    ):
+        camera = Camera(look_at(origin, torch.zeros_like(eye), up), (4, 5), 0.3)
+        scene = make_scene(field.contiguous(), grid=grid, g=0.4, camera=camera)
+        images.append(render(replace(scene, lights=[light_of(uneven(6, 8), rotation=rotation)])))
+    torch.testing.assert_close(images[1], images[0], rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("quarter", [1, 3])
+def test_a_quarter_turn_rolls_the_map(quarter: int):
+    """Up to how the regions lie, which turn with the map."""
+    scene, radiance = make_scene(half_empty(*SHAPE), g=0.3), banded(24, 48)
+    turned, rolled = (
+        light_of(radiance, rotation=90.0 * quarter),
+        light_of(radiance.roll(-12 * quarter, 2)),
+    )
+    assert (
+        relative_error(*(render(replace(scene, lights=[light])) for light in (turned, rolled)))
+        < 0.005
+    )
+
+
+def test_more_directions_change_little():
+    scene, radiance = make_scene(half_empty(*SHAPE), g=0.3), banded(24, 48)
+    images = [
+        render(replace(scene, lights=[light_of(radiance, directions=n)]))
+        for n in (12, 48, 192, 768)
+    ]
+    coarse, middle, fine = (relative_error(image, images[-1]) for image in images[:-1])
+    assert fine < middle / 2 < coarse / 4 and middle < 2e-3
+
+
+def test_components_sum_to_the_image_and_the_background_is_the_map():
+    scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light_of(uneven(6, 8))])
+    parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
+    torch.testing.assert_close(
+        parts.reduced + parts.single + parts.multiple, render(scene)[0], rtol=1e-13, atol=0
+    )
+    assert bool((parts.reduced > 0).all()) and bool((parts.single > 0).any())
+
+
+def saved_bytes(scene: Scene, directions: int) -> int:
+    """Bytes that rendering keeps for its backward pass, each storage once."""
+    storages: dict[int, int] = {}
+
+    def note(tensor: Tensor) -> Tensor:
+        if tensor.device.type == "cpu":
+            storages[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        kept.append(tensor)
+        return tensor
+
+    kept: list[Tensor] = []
+    radiance = uneven(16, 32).requires_grad_()
+    medium = scale_medium(
+        replace(scene.volume, density=scene.volume.density.clone().requires_grad_())
+    )
+    parts = decompose_map(light_of(radiance, directions=directions))
+    with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
+        sum_unscattered_sky(medium, parts, has_flux=True)
+    return sum(storages.values())
+
+
+def test_memory_does_not_grow_with_directions():
+    """But for some hundred bytes of a direction's own numbers; a field of this grid has 32 kB."""
+    scene = make_scene(random_values(16, 16, 16), g=0.3)
+    few, many = saved_bytes(scene, 12), saved_bytes(scene, 96)
+    assert many - few < 84 * 4000, (few, many)
+
+
+@pytest.mark.parametrize("case", ["sunny", "cloudy", "black"])
+def test_images_have_finite_derivatives_by_every_number(case: str):
+    radiance = {
+        "sunny": uneven(6, 8),
+        "cloudy": torch.rand(3, 6, 8).double(),
+        "black": torch.zeros(3, 6, 8, dtype=torch.float64),
+    }[case]
+    light = light_of(radiance.requires_grad_(), 1.3, 20.0, directions=12)
+    numbers = [light.radiance, light.scale.requires_grad_(), light.rotation.requires_grad_()]
+    scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light])
+    slopes = torch.autograd.grad(render(scene).sum(), numbers)
+    assert all(bool(torch.isfinite(slope).all()) for slope in slopes) and bool(slopes[0].any())
+
+
+def test_single_precision_follows_double():
+    images = []
+    for dtype in (torch.float32, torch.float64):
+        scene, light = (
+            make_scene(half_empty(*SHAPE, dtype=dtype), g=0.4),
+            light_of(uneven(6, 8).to(dtype), 1.3, 20.0),
+        )
+        images.append(render(replace(scene, lights=[light])).double())
+    assert relative_error(*images) < 1e-5
+
+
+def test_the_sky_is_in_array_order():
+    """Light from above travels along -y, from +x along -x."""
+    radiance = torch.zeros(1, 33, 64, dtype=torch.float64)
+    radiance[:, :16] = 1
+    sky = next(part for part in decompose_map(light_of(radiance)) if isinstance(part, Sky))
+    above = sky.travel[:, 1] < -0.5
+    assert bool((sky.irradiance[above] > 0).all()) and float(sky.vector.sum((0, 2))[1]) < 0
+    torch.testing.assert_close(array_order(array_order(sky.travel)), sky.travel)

@@ -1,0 +1,193 @@
+"""Pixels interpolated between the rays of a lattice, against rays of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from media import box_grid, make_camera, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.cameras import cast_rays
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.grid import Grid
+from ddrecon.march import integral as march_module
+from ddrecon.march.box import cross_box
+from ddrecon.march.integral import march
+from ddrecon.march.lattice import Lattice, choose_lattice
+from ddrecon.march.samplers import choose_sampler
+from ddrecon.march.slices import Slices
+from ddrecon.renderer import _emission, render, solve_light
+from ddrecon.scene import Scene
+from ddrecon.settings import RenderSettings
+from ddrecon.variables.tangents import render_tangent
+from ddrecon.variables.values import value_of, with_values
+
+CAMERAS = {
+    "perspective": {},
+    "against the axis": {"eye": (0.2, 0.3, -2.5)},
+    "oblique": {"eye": (1.1, 0.6, 2.2)},
+    "orthographic": {"eye": (0.7, -0.4, 2.5), "half_width": 0.8, "is_perspective": False},
+}
+each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
+INTERPOLATED, OWN = RenderSettings(tolerance=1.0), RenderSettings(tolerance=0.0)
+
+
+def blob(grid: Grid) -> Tensor:
+    center = torch.zeros((), dtype=torch.float64)
+    return 3 * torch.exp(-12 * sum(axis**2 for axis in grid.centers(center)))
+
+
+@pytest.fixture
+def scene_of():
+    """A blob in a small grid, before light from behind, seen in many more pixels than rays can tell
+    apart.
+    """
+
+    def scene(view: dict, **changes) -> Scene:
+        camera = make_camera(**({"size": (54, 60), "half_width": 0.3} | view))
+        return make_scene(
+            blob(box_grid((6, 8, 7))), ambient=(0.4,), camera=camera, **({"g": 0.3} | changes)
+        )
+
+    return scene
+
+
+def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
+    bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
+    crossing = cross_box(grid, bundle)
+    slices = choose_sampler(scene.volume.density[None], None, 0, grid, bundle, crossing, 1)
+    return choose_lattice(grid, slices.axis, bundle.select(crossing.hit)), slices
+
+
+def images(scene: Scene) -> tuple[Tensor, Tensor]:
+    """By the lattice wherever it is possible, and without."""
+    return render(replace(scene, render=INTERPOLATED)), render(replace(scene, render=OWN))
+
+
+@each_camera
+def test_places_and_crossings_are_those_of_the_rays(view: dict, scene_of):
+    lattice, slices = lattice_of(scene_of(view))
+    chosen = lattice.rows[2:5]
+    bundle = lattice.rays(chosen, 3.0)
+    rows, columns = torch.meshgrid(
+        torch.arange(2, 5).double(), torch.arange(len(lattice.columns)).double(), indexing="ij"
+    )
+    torch.testing.assert_close(
+        lattice.places(bundle), torch.stack([rows, columns], -1).flatten(0, 1), rtol=0, atol=1e-11
+    )
+    down, along = (
+        lattice.crossings(slices.planes, 0, chosen),
+        lattice.crossings(slices.planes, 1, lattice.columns),
+    )
+    distance = (slices.planes[:, None] - bundle.origin[:, lattice.axis]) / bundle.direction[
+        :, lattice.axis
+    ]
+    points = (bundle.origin + distance[..., None] * bundle.direction).unflatten(1, rows.shape)
+    torch.testing.assert_close(
+        points[..., lattice.across[0]], down[:, :, None].expand(-1, -1, rows.shape[1])
+    )
+    torch.testing.assert_close(
+        points[..., lattice.across[1]], along[:, None, :].expand(-1, rows.shape[0], -1)
+    )
+
+
+@each_camera
+def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
+    """The pixels of the lattice's own rays need no interpolation: they are what marching those rays
+    gives.
+    """
+    scene = scene_of(view)
+    lattice, _ = lattice_of(scene)
+    bundle = lattice.rays(lattice.rows, 3.0)
+    emission = _emission(solve_light(scene, SolveMemory()), bundle)
+    monkeypatch.setattr(march_module, "choose_lattice", lambda *_: lattice)
+    interpolated, own = march(emission, bundle, INTERPOLATED, 1.0), march(emission, bundle, OWN)
+    for one, other in zip(interpolated, own, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
+
+
+@each_camera
+def test_chunks_do_not_matter(view: dict, scene_of, monkeypatch):
+    scene = replace(scene_of(view), render=INTERPOLATED)
+    whole = render(scene)
+    monkeypatch.setattr(march_module, "CHUNK_NODES", 200)
+    torch.testing.assert_close(render(scene), whole, rtol=1e-12, atol=1e-15)
+
+
+@each_camera
+def test_pixels_keep_to_the_tolerance(view: dict, scene_of):
+    """Fewer pixels are interpolated as the tolerance falls; what interpolation costs stays below
+    it, in the image's root mean square.
+    """
+    scene = scene_of(view)
+    own, errors = render(replace(scene, render=OWN)), []
+    for tolerance in (1.0, 0.03, 0.003):
+        image = render(replace(scene, render=RenderSettings(tolerance=tolerance)))
+        errors.append(float((image - own).norm() / own.norm()))
+        assert errors[-1] < tolerance
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_subpixels_share_a_lattice(scene_of):
+    settings = RenderSettings(tolerance=0.05, samples_per_pixel=4)
+    scene = scene_of({"size": (36, 40)})
+    image, own = (
+        render(replace(scene, render=replace(settings, tolerance=tolerance)))
+        for tolerance in (0.05, 0.0)
+    )
+    assert not torch.equal(image, own)
+    assert float((image - own).norm() / own.norm()) < settings.tolerance
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
+        {"eye": (0.9, 0.0, 0.1), "half_width": 4.0},
+        {"size": (4, 5)},
+    ],
+    ids=str,
+)
+def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
+    view: dict, scene_of
+):
+    assert torch.equal(*images(scene_of(view)))
+
+
+@pytest.mark.parametrize(
+    "view", [CAMERAS["oblique"], CAMERAS["orthographic"]], ids=["perspective", "orthographic"]
+)
+@pytest.mark.parametrize(
+    "name", ["density", "g", "views.view.camera.rotation_x", "views.view.camera.y"]
+)
+def test_derivatives_are_those_of_the_interpolated_image(view: dict, name: str, scene_of):
+    """In forward mode as by central differences, and in reverse as in forward mode."""
+    scene = replace(scene_of(view), render=INTERPOLATED)
+    variable = name if name in ("density", "g") else name.rpartition(".")[0]
+    value = value_of(scene, variable)
+    change = torch.ones_like(value)
+    if variable != name:
+        change = torch.eye(6, dtype=value.dtype)[{"rotation_x": 0, "y": 4}[name.rpartition(".")[2]]]
+    tangent = render_tangent(scene, name, lambda world: {"view": render(world)})["view"][1]
+    step = 1e-6
+    plus, minus = (
+        render(with_values(scene, {variable: value + sign * step * change})) for sign in (1, -1)
+    )
+    difference = (plus - minus) / (2 * step)
+    assert float((tangent - difference).norm()) < 1e-6 * float(difference.norm())
+    leaf = value.clone().requires_grad_()
+    weight = random_values(*tangent.shape)
+    (bar,) = torch.autograd.grad(
+        (render(with_values(scene, {variable: leaf})) * weight).sum(), leaf
+    )
+    torch.testing.assert_close((bar * change).sum(), (tangent * weight).sum(), rtol=1e-11, atol=0)
+
+
+def test_an_empty_volume_passes_derivatives_to_every_cell(scene_of):
+    scene = replace(scene_of({"half_width": 0.4}), render=INTERPOLATED)
+    density = torch.zeros_like(scene.volume.density).requires_grad_()
+    image = render(with_values(scene, {"density": density}))
+    (bar,) = torch.autograd.grad(image.sum(), density)
+    assert bool((bar != 0).all())

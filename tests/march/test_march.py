@@ -1,0 +1,413 @@
+"""View rays: what the box lets through and what it scatters towards the camera, in closed form
+where there is one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from media import box_grid, convergence_order, half_empty, make_camera, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.cameras import Camera, Rays, cast_rays
+from ddrecon.grid import Grid
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.reduced import reduced_light
+from ddrecon.march import integral as march_module
+from ddrecon.march import samplers, slices
+from ddrecon.march.integral import Emission, march
+from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.medium.phase import henyey_greenstein
+from ddrecon.numerics.nodes import Nodes
+from ddrecon.renderer import render
+from ddrecon.scene import Scene
+from ddrecon.settings import RenderSettings
+
+CAMERAS = {
+    "perspective": {},
+    "oblique": {"eye": (1.5, 1.2, 1.8)},
+    "orthographic": {"eye": (0.7, -0.4, 2.5), "half_width": 0.8, "is_perspective": False},
+    "inside": {"eye": (0.1, 0.2, 0.15), "half_width": 1.0},
+    "grazing": {"eye": (0.9, 0.0, 0.1), "half_width": 4.0},
+}
+each_camera = pytest.mark.parametrize("view", CAMERAS.values(), ids=CAMERAS.keys())
+
+
+def emission_of(
+    grid: Grid,
+    density: Tensor,
+    sigma_a: float = 0.5,
+    sigma_s: tuple[float, ...] = (2.0, 3.0),
+    g: float = 0.3,
+) -> Emission:
+    """A medium under one oblique beam and some smooth diffuse light that grows along x."""
+    light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
+    medium = scale_medium(
+        Volume(
+            grid,
+            density,
+            density.new_tensor([sigma_a]),
+            density.new_tensor(sigma_s),
+            density.new_tensor(g),
+        )
+    )
+    diffuse = (1 + grid.centers(density)[2]).expand(len(sigma_s), *grid.shape)
+    return Emission(
+        grid,
+        medium.extinction,
+        medium.scattering,
+        reduced_light(medium, [light], False).beams,
+        diffuse,
+        medium.g,
+        medium.peak,
+    )
+
+
+def every_ray(steps: int) -> RenderSettings:
+    """Settings by which all rays are marched themselves."""
+    return RenderSettings(steps_per_voxel=steps, tolerance=0.0)
+
+
+def chord(grid: Grid, origin: list[float], direction: list[float]) -> float:
+    """The length of one ray inside the box, in front of its origin, face by face."""
+    near, far = 0.0, math.inf
+    for low, high, o, d in zip(grid.lower, grid.upper, origin, direction, strict=True):
+        if d == 0 and not low < o < high:
+            return 0.0
+        if d != 0:
+            near, far = (
+                max(near, min((low - o) / d, (high - o) / d)),
+                min(far, max((low - o) / d, (high - o) / d)),
+            )
+    return max(far - near, 0.0)
+
+
+def chords(grid: Grid, bundle: Rays) -> Tensor:
+    pairs = zip(bundle.origin.tolist(), bundle.direction.tolist(), strict=True)
+    return torch.tensor(
+        [chord(grid, origin, direction) for origin, direction in pairs], dtype=torch.float64
+    )
+
+
+@each_camera
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
+    grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera(size=(7, 6), **view))
+    emission = emission_of(grid, torch.full(grid.shape, 0.7, dtype=torch.float64))
+    transmittance = march(emission, bundle, every_ray(steps))[1]
+    lengths = chords(grid, bundle)
+    assert bool((lengths > 0).any())
+    extinction = emission.extinction.value[:, 0, 0, 0]
+    torch.testing.assert_close(
+        transmittance, torch.exp(-extinction[:, None] * lengths), rtol=1e-12, atol=0
+    )
+
+
+@each_camera
+def test_rays_that_miss_the_box_see_nothing(view: dict):
+    grid = box_grid((3, 5, 4))
+    bundle = cast_rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
+    scattered, transmittance = march(
+        emission_of(grid, random_values(*grid.shape)), bundle, every_ray(1)
+    )
+    is_miss = chords(grid, bundle) == 0
+    assert bool(is_miss.any()) or view is CAMERAS["inside"]
+    assert not scattered[:, is_miss].any() and bool((transmittance[:, is_miss] == 1).all())
+    assert bool((scattered[:, ~is_miss] > 0).all()) and bool((transmittance[:, ~is_miss] < 1).all())
+
+
+def test_a_box_behind_the_camera_is_not_seen():
+    grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera())
+    away = Rays(bundle.origin, -bundle.direction, bundle.eye)
+    scattered, transmittance = march(
+        emission_of(grid, random_values(*grid.shape)), away, every_ray(1)
+    )
+    assert not scattered.any() and bool((transmittance == 1).all())
+
+
+@each_camera
+def test_chunks_do_not_matter(view: dict, monkeypatch):
+    """Nor do the bands of slices that they meet: neither to what is seen nor to its derivative."""
+    density = random_values(9, 11, 10).requires_grad_()
+    bundle = cast_rays(make_camera(size=(7, 6), **view))
+
+    def marched() -> list[Tensor]:
+        seen = march(emission_of(box_grid((9, 11, 10)), density), bundle, every_ray(2))
+        return [*seen, *torch.autograd.grad((seen[0] - seen[1]).square().sum(), density)]
+
+    whole = marched()
+    monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
+    monkeypatch.setattr(slices, "BAND", 1)
+    for one, other in zip(whole, marched(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
+
+
+@each_camera
+def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, monkeypatch):
+    """Nothing is left out where the density is being varied."""
+    density = torch.zeros(20, 22, 21, dtype=torch.float64)
+    density[6:9, 12:15, 8:12] = 1 + random_values(3, 3, 4)
+    bundle, integrated, nodes = (
+        cast_rays(make_camera(size=(9, 8), **view)),
+        march_module._integrate,
+        [],
+    )
+
+    def counting(emission: Emission, values: Tensor, places: Nodes) -> Tensor:
+        nodes.append(values[:, 0].numel())
+        return integrated(emission, values, places)
+
+    monkeypatch.setattr(march_module, "_integrate", counting)
+    monkeypatch.setattr(march_module, "CHUNK_NODES", 200)
+    emissions = (
+        emission_of(box_grid((20, 22, 21)), density),
+        emission_of(box_grid((20, 22, 21)), density.clone().requires_grad_()),
+    )
+    seen, counts = [], []
+    for emission in emissions:
+        nodes.clear()
+        seen.append(march(emission, bundle, every_ray(1)))
+        counts.append(sum(nodes))
+    for one, other in zip(*seen, strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-12, atol=1e-15)
+    if view is CAMERAS["inside"]:
+        assert counts[0] == counts[1]  # rays at equal steps leave nothing out
+    else:
+        assert counts[0] < 0.6 * counts[1]
+
+
+@pytest.mark.parametrize("view", ["perspective", "oblique", "orthographic"])
+def test_slices_and_equal_steps_agree_in_the_limit(view: str, monkeypatch):
+    """Both interpolate the same fields, along other nodes: their difference vanishes as steps grow."""
+    emission, bundle = (
+        emission_of(box_grid((3, 5, 4)), random_values(3, 5, 4)),
+        cast_rays(make_camera(size=(7, 6), **CAMERAS[view])),
+    )
+    sliced = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
+    monkeypatch.setattr(samplers, "STEEPEST", 1.0)
+    equal = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
+    for field in (0, 1):
+        coarse, fine = (
+            float((a[field] - b[field]).norm() / a[field].norm())
+            for a, b in zip(sliced, equal, strict=True)
+        )
+        assert 0 < fine < 2e-3 and fine < coarse / 8, (coarse, fine)
+
+
+@each_camera
+def test_radiance_and_transmittance_have_both_derivatives(view: dict):
+    grid, bundle = box_grid((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
+    density = half_empty(*grid.shape, seed=3).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda d: march(emission_of(grid, d), bundle, every_ray(1)),
+        density,
+        atol=1e-8,
+        check_forward_ad=True,
+    )
+
+
+@pytest.mark.parametrize("g", [0.0, 0.6])
+@pytest.mark.parametrize("has_fields", ["absorption", "scattering"])
+def test_a_cross_section_may_be_a_field(has_fields: str, g: float):
+    """The same numbers in every cell give the same image, but for bounds of third-order
+    corrections, which colors share or do not.
+    """
+    grid, density, camera = box_grid((3, 5, 4)), random_values(3, 5, 4), make_camera()
+    constant = Volume(
+        grid, density, random_values(3, seed=1), random_values(3, seed=2), density.new_tensor(g)
+    )
+    field = {"absorption": "sigma_a", "scattering": "sigma_s"}[has_fields]
+    varying = replace(
+        constant, **{field: getattr(constant, field).view(3, 1, 1, 1).expand(3, *grid.shape)}
+    )
+    light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
+    results = []
+    for volume in (constant, varying):
+        medium = scale_medium(volume)
+        beams = reduced_light(medium, [light], False).beams
+        emission = Emission(
+            grid,
+            medium.extinction,
+            medium.scattering,
+            beams,
+            random_values(3, *grid.shape, seed=4),
+            medium.g,
+            medium.peak,
+        )
+        results.append(torch.cat(march(emission, cast_rays(camera), every_ray(1))))
+    torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=0)
+
+
+THICKNESS, SIGMA_S, SIGMA_A = 1.5, 2.0, 0.5
+
+
+def slab(cells: int, g: float, travel: tuple[float, float, float]) -> Scene:
+    """A homogeneous slab seen straight on, along z, by a parallel camera, under parallel light."""
+    grid = Grid((cells, 2, 2), (-THICKNESS / 2, -9.0, -9.0), (THICKNESS / 2, 9.0, 9.0))
+    camera = make_camera(eye=(0.0, 0.0, 5.0), size=(1, 1), half_width=0.1, is_perspective=False)
+    density = torch.ones(grid.shape, dtype=torch.float64)
+    return make_scene(
+        density,
+        grid=grid,
+        sigma_a=(SIGMA_A,),
+        sigma_s=(SIGMA_S,),
+        g=g,
+        directional=(3.0,),
+        travel=travel,
+        camera=camera,
+        model="none",
+    )
+
+
+@pytest.mark.parametrize("g", [0.0, -0.6])
+@pytest.mark.parametrize(
+    "is_behind", [True, False], ids=["lit from behind the camera", "lit towards the camera"]
+)
+def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: bool):
+    """kappa_s p E / (4 pi) times the integral of exp(-2 kappa_t s), or of exp(-kappa_t L);
+    approached at second order.
+    """
+    kappa = SIGMA_A + SIGMA_S
+    phase = henyey_greenstein(
+        torch.tensor(-1.0 if is_behind else 1.0), torch.tensor(g, dtype=torch.float64)
+    ).item()
+    decayed = (
+        -math.expm1(-2 * kappa * THICKNESS) / (2 * kappa)
+        if is_behind
+        else THICKNESS * math.exp(-kappa * THICKNESS)
+    )
+    expected = SIGMA_S * phase * 3.0 / (4 * math.pi) * decayed
+    cells, travel = [8, 16, 32], (0.0, 0.0, -1.0 if is_behind else 1.0)
+    errors = [abs(float(render(slab(n, g, travel)).mean()) / expected - 1) for n in cells]
+    assert errors[-1] < 5e-3 and convergence_order([1 / n for n in cells], errors) >= 1.8, errors
+
+
+def test_forward_scattering_is_brightest_against_the_light():
+    """Through a thin slab, where attenuation hardly matters: p(1) / p(-1) = ((1 + g) / (1 - g))^3."""
+    against, along = (
+        float(render(with_density(slab(8, 0.8, (0.0, 0.0, z)), 1e-6)).mean()) for z in (1.0, -1.0)
+    )
+    assert against / along == pytest.approx(((1 + 0.8) / (1 - 0.8)) ** 3, rel=1e-4)
+
+
+def with_density(scene: Scene, factor: float) -> Scene:
+    return replace(scene, volume=replace(scene.volume, density=factor * scene.volume.density))
+
+
+WIDTH, DENSITY, LIGHT = 0.1, 12.0, (1.0, -0.8, -0.5)
+
+
+def slow_single_scattering(camera: Camera, steps: int = 600) -> Tensor:
+    """Single scattering of a Gaussian ball in the origin, radiance of every pixel, by plain sums
+    along each ray.
+
+    The depth towards the light is the integral of a Gaussian along a line: an error function.
+    """
+    bundle = cast_rays(camera)
+    distance = torch.linspace(1.0, 4.0, steps, dtype=torch.float64)
+    travel = torch.nn.functional.normalize(torch.tensor(LIGHT, dtype=torch.float64), dim=0)
+    pixels = []
+    for origin, direction in zip(bundle.origin.flip(-1), bundle.direction.flip(-1), strict=True):
+        point = origin + distance[:, None] * direction
+        density = DENSITY * torch.exp(-(point**2).sum(1) / (2 * WIDTH**2))
+        along = point @ travel
+        across = torch.exp(-((point**2).sum(1) - along**2) / (2 * WIDTH**2))
+        to_light = (
+            DENSITY
+            * across
+            * WIDTH
+            * math.sqrt(math.pi / 2)
+            * (1 + torch.erf(along / WIDTH / math.sqrt(2)))
+        )
+        to_camera = torch.cat(
+            [torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(density, distance)]
+        )
+        phase = henyey_greenstein(-(direction @ travel), torch.tensor(-0.3, dtype=torch.float64))
+        emitted = (
+            SIGMA_S
+            * density
+            * phase
+            * 3.0
+            / (4 * math.pi)
+            * torch.exp(-(SIGMA_A + SIGMA_S) * (to_camera + to_light))
+        )
+        pixels.append(torch.trapezoid(emitted, distance))
+    return torch.stack(pixels).view(camera.size)
+
+
+@pytest.mark.parametrize("eye", [(0.3, 0.4, 2.5), (1.6, -1.2, 1.5)], ids=str)
+def test_single_scattering_of_a_blob_converges_at_second_order(eye: tuple[float, float, float]):
+    camera, counts, errors = make_camera(eye=eye, size=(9, 9), half_width=0.1), [12, 18, 27, 40], []
+    expected = slow_single_scattering(camera)
+    for n in counts:
+        grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
+        density = DENSITY * torch.exp(
+            -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
+        )
+        scene = make_scene(
+            density,
+            grid=grid,
+            sigma_a=(SIGMA_A,),
+            sigma_s=(SIGMA_S,),
+            g=-0.3,
+            travel=LIGHT,
+            camera=camera,
+            model="none",
+        )
+        errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
+    assert convergence_order([1 / n for n in counts], errors) >= 1.8, errors
+
+
+def test_more_steps_and_samples_keep_a_homogeneous_transmittance():
+    """Background light through an absorbing box: the average over a pixel of exp(-kappa chord)."""
+    scene = make_scene(
+        torch.ones(3, 5, 4, dtype=torch.float64), sigma_s=(0.0,), directional=None, ambient=(1.0,)
+    )
+    image = render(replace(scene, render=RenderSettings(samples_per_pixel=4, steps_per_voxel=2)))[0]
+    bundles = [
+        cast_rays(scene.views[0].camera, offset)
+        for offset in [(a, b) for a in (0.25, 0.75) for b in (0.25, 0.75)]
+    ]
+    for color, sigma in enumerate(scene.volume.sigma_a):
+        expected = (
+            sum(torch.exp(-sigma * chords(box_grid((3, 5, 4)), bundle)) for bundle in bundles) / 4
+        )
+        torch.testing.assert_close(image[color].flatten(), expected, rtol=1e-12, atol=0)
+
+
+def test_the_transmittance_of_a_blob_converges_at_second_order():
+    """Of a Gaussian ball that absorbs: exp(-kappa sqrt(2 pi) w exp(-b^2 / (2 w^2))) along a ray at
+    distance b from its middle.
+    """
+    camera, counts, errors = (
+        make_camera(eye=(0.3, 0.4, 2.5), size=(9, 9), half_width=0.1),
+        [12, 24, 48],
+        [],
+    )
+    bundle = cast_rays(camera)
+    closest = torch.linalg.cross(bundle.origin, bundle.direction).norm(dim=1)
+    depth = (
+        SIGMA_A
+        * DENSITY
+        * WIDTH
+        * math.sqrt(2 * math.pi)
+        * torch.exp(-(closest**2) / (2 * WIDTH**2))
+    )
+    expected = torch.exp(-depth).view(camera.size)
+    for n in counts:
+        grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
+        density = DENSITY * torch.exp(
+            -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
+        )
+        absorbing = {
+            "sigma_a": (SIGMA_A,),
+            "sigma_s": (0.0,),
+            "directional": None,
+            "ambient": (1.0,),
+        }
+        scene = make_scene(density, grid=grid, camera=camera, **absorbing)
+        errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
+    assert errors[-1] < 2e-3 and convergence_order([1 / n for n in counts], errors) >= 1.8, errors

@@ -1,0 +1,78 @@
+"""The sphere rule: exact for every monomial up to its degree, and as symmetric as the cube."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from ddrecon.numerics.quadrature import DEGREES, sphere_quadrature
+
+RULES = {count: sphere_quadrature(torch.zeros(1, dtype=torch.float64), count) for count in DEGREES}
+each_rule = pytest.mark.parametrize("count", RULES)
+
+
+def double_factorial(n: int) -> int:
+    return math.prod(range(n, 0, -2))
+
+
+def sphere_mean(powers: tuple[int, int, int]) -> float:
+    """The mean of x^a y^b z^c over the unit sphere: 0 for an odd power, else (a-1)!! (b-1)!!
+    (c-1)!! / (a+b+c+1)!!.
+    """
+    if any(power % 2 for power in powers):
+        return 0.0
+    return math.prod(double_factorial(power - 1) for power in powers) / double_factorial(
+        sum(powers) + 1
+    )
+
+
+def error(count: int, powers: tuple[int, int, int]) -> float:
+    directions, weights = RULES[count]
+    mean = weights @ torch.stack(
+        [directions[:, axis] ** power for axis, power in enumerate(powers)]
+    ).prod(0)
+    return abs(mean.item() - sphere_mean(powers))
+
+
+@each_rule
+def test_monomials_are_exact_up_to_the_degree_of_the_rule_and_no_further(count: int):
+    top = DEGREES[count] + 1
+    monomials = [
+        (a, b, c)
+        for a in range(top + 1)
+        for b in range(top + 1 - a)
+        for c in range(top + 1 - a - b)
+    ]
+    assert max(error(count, powers) for powers in monomials if sum(powers) < top) < 1e-15
+    assert max(error(count, powers) for powers in monomials if sum(powers) == top) > 1e-5
+
+
+@each_rule
+def test_directions_are_unit_and_weights_are_positive_and_sum_to_one(count: int):
+    directions, weights = RULES[count]
+    assert directions.shape == (count, 3)
+    torch.testing.assert_close(directions.norm(dim=1), torch.ones_like(weights), rtol=0, atol=1e-15)
+    assert weights.sum().item() == pytest.approx(1, abs=1e-15) and bool((weights > 0).all())
+
+
+IMAGES = {
+    "point": lambda points: -points,
+    "diagonal": lambda points: points.flip(1),
+    "turn": lambda points: points.roll(1, 1),
+    "plane": lambda points: points * torch.tensor([1.0, -1.0, 1.0]),
+}
+
+
+@each_rule
+@pytest.mark.parametrize("image", IMAGES.values(), ids=IMAGES.keys())
+def test_every_symmetry_of_the_cube_maps_the_rule_onto_itself(
+    count: int, image: Callable[[Tensor], Tensor]
+):
+    directions, weights = RULES[count]
+    is_same = (image(directions)[:, None] - directions).abs().amax(-1) < 1e-12
+    assert bool((is_same.sum(1) == 1).all()) and bool((is_same.sum(0) == 1).all())
+    assert torch.equal(weights[is_same.to(torch.int8).argmax(1)], weights)

@@ -1,0 +1,79 @@
+"""A Python that has the module `openvdb`: this one, or else the system's, where apt-get has put
+Debian's python3-openvdb.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ddrecon
+from ddrecon.io.volumes.field import Field
+
+CANDIDATES = (sys.executable, "/usr/bin/python3")
+IMPORT = """
+import importlib.util as u, numpy
+exit(not (u.find_spec('openvdb') or u.find_spec('pyopenvdb')))
+"""
+READ = """
+import sys
+from pathlib import Path
+import numpy as np
+from ddrecon.io.volumes.table import field_names, read_field
+path = Path(sys.argv[1])
+arrays = {}
+for name in field_names(path):
+    field = read_field(path, name)
+    arrays |= {f"{name}.values": field.values, f"{name}.bounds": field.bounds}
+np.savez(path.with_suffix(".found.npz"), **arrays)
+"""
+NAMES = """
+import json, sys
+try: import openvdb as vdb
+except ImportError: import pyopenvdb as vdb
+grids = {g.name: g for g in vdb.readAll(sys.argv[1])[0]}
+"""
+
+
+@functools.cache
+def require() -> str:
+    """The path of that Python; the test is skipped where there is none."""
+    for python in CANDIDATES:
+        if (
+            Path(python).exists()
+            and subprocess.run([python, "-c", IMPORT], capture_output=True).returncode == 0
+        ):
+            return python
+    pytest.skip("no Python here has the module openvdb: apt-get install python3-openvdb")
+
+
+def run(code: str, *arguments: object) -> str:
+    """What `code` prints there; raises AssertionError with its stderr where it fails."""
+    environment = {"PYTHONPATH": str(Path(ddrecon.__file__).parents[1])}
+    done = subprocess.run(
+        [require(), "-c", code, *map(str, arguments)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def read_all(path: Path) -> dict[str, Field]:
+    """All fields of the .vdb at `path`, read by our reader."""
+    run(READ, path)
+    with np.load(path.with_suffix(".found.npz")) as found:
+        names = dict.fromkeys(key.rpartition(".")[0] for key in found)
+        return {name: Field(found[f"{name}.values"], found[f"{name}.bounds"]) for name in names}
+
+
+def described(code: str, path: Path) -> object:
+    """The value, by way of JSON, of the expression `code` about `grids`: those in `path` by name."""
+    return json.loads(run(f"{NAMES}print(json.dumps({code}))", path))

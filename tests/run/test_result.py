@@ -1,0 +1,139 @@
+"""The result of a run is a scene file that renders as what was found does, whichever numbers were
+varied.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ddrecon.io.volumes.table import write_field
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.renderer import render
+from ddrecon.run.result import RESULT
+from ddrecon.run.run_folder import RunFolder
+from ddrecon.scene_file.build import build_scene, load_scene
+from ddrecon.scene_file.dump import dump_scene
+from ddrecon.scene_file.load import read_scene
+
+CROSS_SECTIONS = {
+    "sigma_a, sigma_s": "sigma_a: 0.5\n  sigma_s: [6, 5, 4]",
+    "sigma_t, albedo": "sigma_t: 7\n  albedo: [0.9, 0.8, 0.7]",
+}
+SCENE = """\
+volume:
+  bounds: {{min: [-0.5, -0.4, -0.5], max: [0.5, 0.5, 0.6]}}
+  resolution: [6, 5, 4]
+  density: 0.4
+  {cross_sections}
+  g: 0.3
+lights:
+  - {{type: directional, direction: [-1, -2, -1], irradiance: 3}}
+  - {{type: environment, file: sky.npy, scale: 0.5, rotation: 20, directions: 6}}
+  - {{type: point, position: [0.9, 0.8, 0.3], intensity: 1}}
+views:
+  - {{name: front, image: front.npy, camera: {{type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30}}}}
+  - {{name: side, camera: {{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1, resolution: [5, 4]}}}}
+optimize: {{iterations: 2, refine_at: [], parameters: {{{parameters}}}}}
+"""
+VARIED = [
+    ("density: {init: 0.2}", ["density"]),
+    ("sigma_a: {init: [0.5, 1, 2], field: true}, sigma_s: {}", ["sigma_a"]),
+    ("albedo: {init: 0.8, field: true}, density: {}", ["density", "albedo"]),
+    ("sigma_t: {}, g: {}", []),
+    (
+        "lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}, lights.2.position: {}, lights.2.intensity: {}",
+        [],
+    ),
+    ("lights.1.radiance: {}, lights.1.scale: {}, lights.1.rotation: {}", []),
+    ("views.front.camera: {}", []),
+]
+
+
+def moved(value: Tensor) -> Tensor:
+    """`value` a little larger, everywhere by another amount."""
+    return (
+        value
+        * (
+            1.1
+            + 0.1
+            * torch.rand(value.shape, generator=torch.Generator().manual_seed(0), dtype=value.dtype)
+        )
+        + 0.01
+    )
+
+
+def finished(folder: Path, cross_sections: str, parameters: str) -> Any:
+    """The scene found by a run in `folder`/out that ended, all its parameters moved."""
+    path = folder / "scene.yaml"
+    path.write_text(SCENE.format(cross_sections=cross_sections, parameters=parameters))
+    random = np.random.default_rng(0)
+    np.save(folder / "front.npy", random.random((6, 7, 3), dtype=np.float32))
+    np.save(folder / "sky.npy", random.random((4, 8, 3), dtype=np.float32))
+    scene_file = read_scene(path)
+    run = Reconstruction(build_scene(scene_file))
+    row = run.step()
+    for parameter in run.parameters:
+        limit = 0.9 if parameter.name == "albedo" else torch.inf
+        state = parameter.state()
+        parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
+    (folder / "out").mkdir()
+    dump_scene(scene_file, folder / "out" / "scene.yaml")
+    run_folder = RunFolder(folder / "out", scene_file, {}, {})
+    run_folder.start(run)
+    run_folder.log.add(row)
+    run_folder.finish(run)
+    return run.current_scene()
+
+
+@pytest.mark.parametrize("cross_sections", CROSS_SECTIONS.values(), ids=CROSS_SECTIONS)
+@pytest.mark.parametrize(
+    ("parameters", "fields"), VARIED, ids=[parameters.partition(":")[0] for parameters, _ in VARIED]
+)
+def test_a_result_renders_as_what_was_found(
+    tmp_path: Path, cross_sections: str, parameters: str, fields: Sequence[str]
+) -> None:
+    found = finished(tmp_path, cross_sections, parameters)
+    again = load_scene(tmp_path / "out" / RESULT)
+    assert again.optimize is None and [view.name for view in again.views] == ["front", "side"]
+    for view in ("front", "side"):
+        wanted = render(found, view)
+        assert torch.allclose(
+            render(again, view), wanted, rtol=1e-4, atol=1e-5 * float(wanted.max())
+        )
+    assert {"density", *fields} <= {path.stem for path in (tmp_path / "out" / "volumes").iterdir()}
+
+
+def test_a_result_does_not_depend_on_where_its_folder_lies(tmp_path: Path) -> None:
+    finished(tmp_path, CROSS_SECTIONS["sigma_a, sigma_s"], "density: {}")
+    (tmp_path / "out").rename(tmp_path / "moved")
+    assert load_scene(tmp_path / "moved" / RESULT).volume.density.std() > 0
+
+
+def test_a_volume_whose_box_its_file_gave_keeps_it(tmp_path: Path) -> None:
+    write_field(
+        tmp_path / "start.npz",
+        "density",
+        np.full((4, 5, 6), 0.3),
+        np.array([[-0.5, -0.4, -0.5], [0.5, 0.5, 0.6]]),
+    )
+    text = CROSS_SECTIONS["sigma_t, albedo"]
+    found = finished(tmp_path, text, "density: {}")
+    scene = (
+        (tmp_path / "scene.yaml")
+        .read_text()
+        .replace("density: 0.4", "density: {file: start.npz}")
+        .replace("  resolution: [6, 5, 4]\n", "")
+    )
+    (tmp_path / "scene.yaml").write_text(scene)
+    assert (
+        load_scene(tmp_path / "scene.yaml").volume.grid
+        == found.volume.grid
+        == load_scene(tmp_path / "out" / RESULT).volume.grid
+    )

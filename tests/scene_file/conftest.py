@@ -1,0 +1,42 @@
+"""Reading scene text, and the problems found in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ddrecon.errors import SceneError
+from ddrecon.scene_file.load import SceneFile, read_scene
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str], Path]:
+    """Writes text to scene.yaml and returns its path."""
+
+    def write_text(text: str) -> Path:
+        path = tmp_path / "scene.yaml"
+        path.write_text(text)
+        return path
+
+    return write_text
+
+
+@pytest.fixture
+def read(write: Callable[[str], Path]) -> Callable[..., SceneFile]:
+    """Reads text as a scene, with overrides."""
+    return lambda text, *overrides: read_scene(write(text), overrides)
+
+
+@pytest.fixture
+def refusal(write: Callable[[str], Path], tmp_path: Path) -> Callable[..., list[str]]:
+    """The problem lines of text read as a scene, without the folder they begin with."""
+
+    def problems(text: str, *overrides: str) -> list[str]:
+        with pytest.raises(SceneError) as caught:
+            read_scene(write(text), overrides)
+        assert all("\n" not in line for line in caught.value.problems)
+        return [line.replace(f"{tmp_path}/", "") for line in caught.value.problems]
+
+    return problems

@@ -1,0 +1,33 @@
+"""A small legal scene to break in one place at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+CAMERA = (
+    "{type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], fov: 28, resolution: [8, 6]}"
+)
+SCENE = f"""\
+volume:
+  bounds: {{min: [-0.5, -0.75, -0.5], max: [0.5, 0.75, 0.5]}}
+  resolution: [2, 3, 4]
+  density: {{constant: 0.1}}
+  sigma_a: 0.6
+  sigma_s: [11.4, 10.8, 9.6]
+  g: 0.3
+lights:
+  - {{type: directional, direction: [-2, -2, -1], irradiance: 3.14159}}
+  - {{type: ambient, radiance: [0.2, 0.3, 0.5]}}
+views:
+  - {{name: front, camera: {CAMERA}}}
+"""
+
+
+def changed(**sections: Any) -> str:
+    """`SCENE` with whole sections replaced, or, where the value is None, left out."""
+    tree = yaml.safe_load(SCENE) | sections
+    return yaml.safe_dump(
+        {name: value for name, value in tree.items() if value is not None}, sort_keys=False
+    )

@@ -1,0 +1,306 @@
+"""Scenes as tensors: shapes and values, and files that do not fit the scene or cannot be used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from example_scene import SCENE, changed
+
+from ddrecon.errors import FormatError, SceneError
+from ddrecon.io.volumes.table import write_field, write_fields
+from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.scene_file.build import load_scene
+
+Write = Callable[[str], Path]
+BOUNDS = np.array([[-0.5, -0.75, -0.5], [0.5, 0.75, 0.5]])
+VOLUME = yaml.safe_load(SCENE)["volume"]
+VIEW = yaml.safe_load(SCENE)["views"][0]
+
+
+def volume(left_out: tuple[str, ...] = (), **changes: Any) -> str:
+    return changed(
+        volume={name: value for name, value in (VOLUME | changes).items() if name not in left_out}
+    )
+
+
+def view(camera: dict[str, Any] | None = None, **changes: Any) -> str:
+    return changed(views=[VIEW | changes | ({"camera": camera} if camera else {})])
+
+
+def problems(path: Path, *overrides: str) -> list[str]:
+    with pytest.raises(SceneError) as caught:
+        load_scene(path, overrides=overrides)
+    return [line.replace(f"{path.parent}/", "") for line in caught.value.problems]
+
+
+def problem(path: Path, *overrides: str) -> str:
+    (line,) = problems(path, *overrides)
+    return line
+
+
+def save_field(folder: Path, name: str, *shape: int, bounds: np.ndarray = BOUNDS) -> np.ndarray:
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
+    write_field(folder / f"{name}.npz", name, values, bounds)
+    return values
+
+
+def test_constants(write: Write):
+    scene = load_scene(write(SCENE))
+    assert scene.volume.grid.shape == (4, 3, 2) and scene.volume.grid.bounds_xyz == (
+        (-0.5, -0.75, -0.5),
+        (0.5, 0.75, 0.5),
+    )
+    assert torch.equal(scene.volume.density, torch.full((4, 3, 2), 0.1))
+    assert scene.volume.sigma_a.tolist() == pytest.approx(
+        [0.6] * 3
+    ) and scene.volume.sigma_s.tolist() == pytest.approx([11.4, 10.8, 9.6])
+    assert scene.volume.g.item() == pytest.approx(0.3) and scene.volume.g.ndim == 0
+    assert scene.path is not None and scene.path.name == "scene.yaml" and scene.optimize is None
+
+
+def test_lights_keep_their_own_number_of_colors(write: Write):
+    sun, sky = load_scene(write(SCENE)).lights
+    assert (
+        isinstance(sun, DirectionalLight)
+        and sun.direction.tolist() == [-2, -2, -1]
+        and sun.irradiance.tolist() == pytest.approx([3.14159])
+    )
+    assert isinstance(sky, AmbientLight) and sky.radiance.tolist() == pytest.approx([0.2, 0.3, 0.5])
+
+
+def test_gray_scenes_have_one_color(write: Write):
+    scene = load_scene(write(volume(sigma_s=9)))
+    assert scene.volume.sigma_a.shape == scene.volume.sigma_s.shape == (1,)
+
+
+def test_every_tensor_has_the_type_asked_for(write: Write):
+    scene = load_scene(write(SCENE), dtype=torch.float64)
+    tensors = [
+        scene.volume.density,
+        scene.volume.sigma_a,
+        scene.volume.sigma_s,
+        scene.volume.g,
+        scene.views[0].camera.pose,
+    ]
+    assert {
+        tensor.dtype
+        for tensor in [
+            *tensors,
+            *(value for light in scene.lights for value in vars(light).values()),
+        ]
+    } == {torch.float64}
+    assert scene.volume.sigma_a[0].item() == 0.6
+
+
+def test_extinction_and_albedo(write: Write):
+    scene = load_scene(write(volume(("sigma_a", "sigma_s"), sigma_t=12, albedo=[0.95, 0.9, 0.8])))
+    assert scene.volume.sigma_a.tolist() == pytest.approx(
+        [0.6, 1.2, 2.4]
+    ) and scene.volume.sigma_s.tolist() == pytest.approx([11.4, 10.8, 9.6])
+
+
+def test_fields_give_resolution_and_bounds_and_keep_their_order(write: Write, tmp_path: Path):
+    density, sigma_s = (
+        save_field(tmp_path, "density", 5, 4, 3),
+        save_field(tmp_path, "sigma_s", 5, 4, 3, 3),
+    )
+    text = volume(
+        ("resolution", "bounds"), density={"file": "density.npz"}, sigma_s={"file": "sigma_s.npz"}
+    )
+    scene = load_scene(write(text))
+    assert scene.volume.grid.shape == (5, 4, 3) and scene.volume.grid.bounds_xyz[1] == (
+        0.5,
+        0.75,
+        0.5,
+    )
+    assert np.array_equal(scene.volume.density, density) and scene.volume.sigma_a.shape == (3,)
+    assert (
+        np.array_equal(scene.volume.sigma_s, np.moveaxis(sigma_s, -1, 0))
+        and scene.volume.sigma_s.is_contiguous()
+    )
+
+
+def test_gray_fields_take_the_colors_of_constants(write: Write, tmp_path: Path):
+    values = save_field(tmp_path, "albedo", 4, 3, 2)
+    scene = load_scene(
+        write(volume(("sigma_a", "sigma_s"), sigma_t=[1, 2, 3], albedo={"file": "albedo.npz"}))
+    )
+    for color in range(3):
+        assert np.allclose(scene.volume.sigma_s[color], (color + 1) * values)
+        assert np.allclose(scene.volume.sigma_a[color], (color + 1) * (1 - values), atol=1e-6)
+
+
+def test_an_absent_file_is_the_scenes_mistake(write: Write):
+    path = write(
+        SCENE.replace("{constant: 0.1}", "{file: none.npz}")
+        + "optimize: {parameters: {density: {init: {file: no.npz}}}}\n"
+    )
+    assert problems(path, "views.0.image=no.exr", "views.0.mask=.") == [
+        "scene.yaml:4:19: volume.density.file: none.npz does not exist",
+        "-D views.0.image=no.exr: views.0.image: no.exr does not exist",
+        f"-D views.0.mask=.: views.0.mask: {path.parent} is not a file",
+        "scene.yaml:13:48: optimize.parameters.density.init.file: no.npz does not exist",
+    ]
+
+
+def test_an_overlong_path_is_the_scenes_mistake(write: Write):
+    assert "volume.density.file" in problem(write(volume(density={"file": "n" * 5000})))
+
+
+def test_an_unusable_file_is_a_format_error(write: Write, tmp_path: Path):
+    (tmp_path / "a.npz").write_bytes(b"junk")
+    with pytest.raises(FormatError) as caught:
+        load_scene(write(volume(density={"file": "a.npz"})))
+    assert caught.value.exit_code == 3
+    np.save(tmp_path / "a.npy", np.full((6, 8, 3), np.nan))
+    with pytest.raises(FormatError, match="NaN at row 0, column 0"):
+        load_scene(write(view(image="a.npy")))
+
+
+def test_density_has_no_color_and_albedo_is_at_most_one(write: Write, tmp_path: Path):
+    save_field(tmp_path, "density", 4, 3, 2, 3)
+    with pytest.raises(FormatError, match="colors belong"):
+        load_scene(write(volume(density={"file": "density.npz"})))
+    values = np.zeros((4, 3, 2))
+    values[1, 2, 0] = 1.5
+    write_field(tmp_path / "albedo.npz", "albedo", values, BOUNDS)
+    with pytest.raises(FormatError, match=r"above 1 at cell \(x, y, z\) = \(0, 2, 1\)"):
+        load_scene(write(volume(("sigma_a", "sigma_s"), sigma_t=1, albedo={"file": "albedo.npz"})))
+
+
+def test_resolutions_must_agree(write: Write, tmp_path: Path):
+    save_field(tmp_path, "density", 5, 4, 3)
+    save_field(tmp_path, "sigma_a", 5, 4, 2)
+    text = volume(density={"file": "density.npz"}, sigma_a={"file": "sigma_a.npz"})
+    lines = problems(write(text))
+    assert (
+        len(lines) == 2
+        and "volume.density.file: has 3 x 4 x 5 cells in x, y, z, but volume.resolution has 2 x 3 x 4"
+        in lines[0]
+    )
+    assert "volume.sigma_a.file: has 2 x 4 x 5 cells" in lines[1]
+    text = volume(("resolution",), density={"file": "density.npz"}, sigma_a={"file": "sigma_a.npz"})
+    assert (
+        "volume.sigma_a.file: has 2 x 4 x 5 cells in x, y, z, but volume.density.file has 3 x 4 x 5"
+        in problem(write(text))
+    )
+
+
+def test_bounds_must_agree_to_single_precision(write: Write, tmp_path: Path):
+    save_field(tmp_path, "density", 4, 3, 2, bounds=BOUNDS * (1 + 1e-7))
+    text = volume(density={"file": "density.npz"})
+    load_scene(write(text))
+    save_field(tmp_path, "density", 4, 3, 2, bounds=2 * BOUNDS)
+    assert (
+        "volume.density.file: its bounds are (-1, -1.5, -1) to (1, 1.5, 1), but volume.bounds says (-0.5,"
+        in problem(write(text))
+    )
+
+
+def test_resolution_and_bounds_must_come_from_somewhere(write: Write, tmp_path: Path):
+    lines = problems(write(volume(("resolution", "bounds"))))
+    assert [line.split("volume: ")[1] for line in lines] == [
+        "missing key 'resolution', which no field file gives either",
+        "missing key 'bounds', which no field file gives either",
+    ]
+    np.savez(tmp_path / "density.npz", density=np.ones((2, 2, 2)))
+    assert "'bounds'" in problem(
+        write(volume(("resolution", "bounds"), density={"file": "density.npz"}))
+    )
+
+
+def test_images_become_channels_first_and_give_the_resolution(write: Write, tmp_path: Path):
+    pixels = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
+    np.save(tmp_path / "a.npy", pixels)
+    np.save(tmp_path / "m.npy", np.eye(6, 8))
+    camera = {name: value for name, value in VIEW["camera"].items() if name != "resolution"}
+    (built,) = load_scene(write(view(camera, image="a.npy", mask="m.npy", split="test"))).views
+    assert built.image is not None and np.array_equal(built.image, np.moveaxis(pixels, -1, 0))
+    assert built.mask is not None and np.array_equal(built.mask, np.eye(6, 8))
+    assert built.camera.size == (6, 8) and built.is_test and built.name == "front"
+
+
+def test_image_and_mask_sizes_must_be_the_cameras(write: Write, tmp_path: Path):
+    np.save(tmp_path / "a.npy", np.ones((8, 6, 3)))
+    np.save(tmp_path / "m.npy", np.ones((5, 6)))
+    lines = problems(write(SCENE), "views.0.image=a.npy", "views.0.mask=m.npy")
+    assert lines == [
+        "-D views.0.image=a.npy: views.0.image: is 6 x 8 pixels, but the camera has 8 x 6",
+        "-D views.0.mask=m.npy: views.0.mask: is 6 x 5 pixels, but the camera has 8 x 6",
+    ]
+
+
+def test_cameras(write: Write):
+    (perspective,) = load_scene(write(SCENE)).views
+    assert (
+        perspective.camera.half_width == pytest.approx(math.tan(math.radians(14)))
+        and perspective.camera.is_perspective
+    )
+    assert perspective.camera.pose[:, 3].tolist() == pytest.approx([0, 0.3, 3.2])
+    matrix = [[0, 0, 1, 2], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]]
+    (orthographic,) = load_scene(
+        write(view({"type": "orthographic", "width": 3, "matrix": matrix, "resolution": [8, 6]}))
+    ).views
+    assert orthographic.camera.half_width == 1.5 and not orthographic.camera.is_perspective
+    assert orthographic.camera.pose.tolist() == matrix[:3]
+
+
+@pytest.mark.parametrize("changes", [{"target": [0, 0.3, 3.2]}, {"up": [0, 0.3, 3.2]}])
+def test_cameras_need_a_view_direction(write: Write, changes: dict[str, list[float]]):
+    path = write(view(VIEW["camera"] | changes))
+    line = problem(path)
+    assert "views.0.camera: origin, target and up do not span a view" in line
+
+
+@pytest.mark.parametrize(
+    ("target", "cause"), [([0, 0.3, 6], "behind the camera"), ([3, 0, 0], "looks past it")]
+)
+def test_cameras_that_miss_the_volume_are_named_with_the_cause(
+    write: Write, target: list[float], cause: str
+):
+    line = problem(write(view(VIEW["camera"] | {"target": target})))
+    assert (
+        "views.0.camera: no pixel of view 'front' looks through the volume" in line
+        and cause in line
+    )
+
+
+def test_problems_of_volume_and_views_are_told_together(write: Write):
+    lines = problems(
+        write(SCENE.replace("  resolution: [2, 3, 4]\n", "")), "views.0.image=none.exr"
+    )
+    assert len(lines) == 2 and "'resolution'" in lines[0] and "none.exr" in lines[1]
+
+
+def test_ring_problems_lead_to_the_ring(write: Write):
+    ring = {"count": 2, "radius": 3, "fov": 20, "target": [9, 0, 0], "resolution": [4, 4]}
+    lines = problems(write(changed(views={"ring": ring})))
+    assert (
+        len(lines) == 2
+        and "views.0.camera: no pixel of view 'ring_00'" in lines[0]
+        and lines[0].startswith("scene.yaml:")
+    )
+
+
+def test_a_field_may_have_another_name_in_its_file(write: Write, tmp_path: Path):
+    """In the volume and where a parameter starts."""
+    lwc, ice = np.random.default_rng(0).random((2, 4, 3, 2)).astype(np.float32)
+    write_fields(tmp_path / "les.npz", {"lwc": lwc, "ice": ice}, BOUNDS)
+    start = {"parameters": {"density": {"init": {"file": "les.npz", "name": "ice"}}}}
+    scene = load_scene(
+        write(
+            changed(volume=VOLUME | {"density": {"file": "les.npz", "name": "lwc"}}, optimize=start)
+        )
+    )
+    assert np.array_equal(scene.volume.density, lwc) and np.array_equal(
+        scene.starts["density"], ice
+    )
+    with pytest.raises(FormatError, match="has no field 'rain'; it has 'lwc', 'ice'"):
+        load_scene(tmp_path / "scene.yaml", overrides=["volume.density.name=rain"])

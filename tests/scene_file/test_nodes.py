@@ -1,0 +1,149 @@
+"""Strict YAML: what a scalar means, and what text is refused, with its line and column."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ddrecon.errors import SceneError
+from ddrecon.scene_file.load import MAX_BYTES, read_scene
+from ddrecon.scene_file.nodes import parse
+from ddrecon.scene_file.problems import Problems
+from ddrecon.scene_file.scalars import resolve
+
+Refusal = Callable[..., list[str]]
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        *[
+            ("1e-3", 1e-3),
+            ("1E5", 1e5),
+            ("-.5", -0.5),
+            ("+3.", 3.0),
+            ("1e+05", 1e5),
+            ("010", 10),
+            ("0x1F", 31),
+            ("0o17", 15),
+            ("-7", -7),
+        ],
+        *[
+            ("yes", "yes"),
+            ("no", "no"),
+            ("on", "on"),
+            ("1_000", "1_000"),
+            ("1:30", "1:30"),
+            ("1e", "1e"),
+            (".", "."),
+            ("2020-01-01", "2020-01-01"),
+        ],
+        *[
+            ("true", True),
+            ("False", False),
+            ("null", None),
+            ("~", None),
+            ("", None),
+            (".inf", math.inf),
+            ("-.Inf", -math.inf),
+        ],
+    ],
+)
+def test_plain_scalars_follow_yaml_1_2(text: str, value: object):
+    assert resolve(text) == value and type(resolve(text)) is type(value)
+
+
+def test_long_digit_strings_are_not_integers():
+    assert resolve("9" * 10_000) == math.inf
+
+
+@given(st.floats(allow_nan=False))
+def test_every_float_is_read_as_python_or_json_writes_it(number: float):
+    if math.isfinite(number):
+        assert resolve(repr(number)) == number
+
+
+def value_of(text: str) -> object:
+    return parse(text, lambda line, column: f"{line}:{column}", Problems()).value
+
+
+def test_quoted_scalars_are_text():
+    assert (
+        value_of('"1e3"') == "1e3"
+        and value_of("'true'") == "true"
+        and value_of('"\\ud83d\\ude00"') == "\N{GRINNING FACE}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (
+            "a: &x 1\nb: *x\n",
+            "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out",
+        ),
+        (
+            "a: 1\nb: [*x]\n",
+            "scene.yaml:2:5: b.0: anchors and aliases are not supported; write the value out",
+        ),
+        (
+            "a: &x [*x]\n",
+            "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out",
+        ),
+        (
+            "a: !!python/name:os.system x\n",
+            "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:python/name:os.system' are not supported",
+        ),
+        ("a: 1\n---\nb: 2\n", "scene.yaml:2:1: a second document begins here; only one is allowed"),
+        ("? [a]\n: 1\n", "scene.yaml:1:3: ?: a key must be plain text"),
+        (
+            "a: [1,\n",
+            "scene.yaml:2:1: not YAML: while parsing a flow node, expected the node content, but found '<stream end>'",
+        ),
+        (
+            "a: 1\n\tb: 2\n",
+            "scene.yaml:2:1: not YAML: while scanning for the next token, found character '\\t' that cannot start any token",
+        ),
+        ("a: 1\nb: \x01\n", "scene.yaml:2:4: not YAML: the character 1 is not allowed"),
+        ("", "scene.yaml:1:1: is empty"),
+        ("# nothing\n---\n", "scene.yaml:3:1: is empty"),
+        ("[1, 2]", "scene.yaml:1:1: expected a mapping, found a list of 2"),
+        ("hello", "scene.yaml:1:1: expected a mapping, found 'hello'"),
+    ],
+)
+def test_what_is_not_strict_yaml_is_refused_in_one_line(refusal: Refusal, text: str, line: str):
+    assert refusal(text) == [line]
+
+
+def test_deep_nesting_is_refused_not_a_crash(refusal: Refusal):
+    (line,) = refusal("[" * 20_000)
+    assert "nested more than 32 deep" in line
+
+
+def test_repeated_keys_are_found_at_every_level(refusal: Refusal):
+    lines = refusal("volume: {g: 0, g: 1}\nlights: []\nlights: []\n")
+    assert lines[0] == "scene.yaml:1:16: volume.g: repeated key; it is already at scene.yaml:1:10"
+    assert lines[1] == "scene.yaml:3:1: lights: repeated key; it is already at scene.yaml:2:1"
+
+
+def test_absent_large_and_binary_files_are_refused(tmp_path: Path):
+    def problem(path: Path) -> str:
+        with pytest.raises(SceneError) as caught:
+            read_scene(path)
+        return str(caught.value)
+
+    assert problem(tmp_path / "a.yaml").endswith(
+        "a.yaml: cannot be read: No such file or directory"
+    )
+    assert "cannot be read" in problem(tmp_path)
+    (tmp_path / "b.yaml").write_bytes(b"a: b\n" + b"\n" * MAX_BYTES)
+    start = time.perf_counter()
+    assert "larger than 1 MiB" in problem(tmp_path / "b.yaml") and time.perf_counter() - start < 1
+    (tmp_path / "c.yaml").write_bytes(b"a: 1\nb: \xff\n")
+    assert problem(tmp_path / "c.yaml").endswith("c.yaml:2:4: is not UTF-8 text")

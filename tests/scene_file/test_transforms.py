@@ -1,0 +1,362 @@
+"""Camera files of NeRF, instant-ngp and nerfstudio: read as they are, written so that they come
+back, and refused by key.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from example_scene import SCENE, changed
+
+from ddrecon.cameras import cast_rays
+from ddrecon.errors import FormatError, SceneError
+from ddrecon.scene_file.build import build_scene, load_scene
+from ddrecon.scene_file.dump import dump_scene
+from ddrecon.scene_file.export_transforms import export_transforms
+from ddrecon.scene_file.load import SceneFile, read_scene
+from ddrecon.scene_file.schema import PerspectiveSection, ViewSection
+
+Read = Callable[..., SceneFile]
+Refusal = Callable[..., list[str]]
+POSE = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, 0.6, 1.8], [0.0, -0.6, 0.8, 2.4], [0.0, 0.0, 0.0, 1.0]]
+"""Looks at the origin, nearly: from behind it along z and from above along y."""
+NERFSTUDIO = {
+    "w": 8,
+    "h": 6,
+    "fl_x": 20.0,
+    "fl_y": 19.0,
+    "cx": 4.3,
+    "cy": 2.9,
+    "k1": 0,
+    "k2": 0.0,
+    "camera_model": "OPENCV",
+    "aabb_scale": 16,
+    "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]],
+    "ply_file_path": "sparse.ply",
+}
+
+
+def frame(name: str | None = "images/frame_00001.npy", **others: Any) -> dict[str, Any]:
+    return (
+        ({"file_path": name} if name else {})
+        | {"transform_matrix": POSE, "sharpness": 37.5}
+        | others
+    )
+
+
+def transforms(path: Path, *frames: dict[str, Any], **shared: Any) -> str:
+    """A scene whose views are in a file at `path`, which is written."""
+    path.write_text(json.dumps(shared | {"frames": frames}))
+    return changed(views={"transforms": path.name})
+
+
+def views(scene_file: SceneFile) -> tuple[ViewSection, ...]:
+    return scene_file.tree.views
+
+
+def camera_of(view: ViewSection) -> PerspectiveSection:
+    assert isinstance(view.camera, PerspectiveSection)
+    return view.camera
+
+
+def test_rays_are_those_of_the_calibration(read: Read, tmp_path: Path) -> None:
+    """Pixel centers, +y up and looking along -z; what maps the world into other programs' boxes
+    changes nothing.
+    """
+    read(transforms(tmp_path / "transforms.json", frame(None), **NERFSTUDIO))
+    (view,) = load_scene(tmp_path / "scene.yaml", dtype=torch.float64).views
+    bundle, pose = cast_rays(view.camera), torch.tensor(POSE, dtype=torch.float64)
+    assert view.camera.size == (6, 8)
+    for row in range(6):
+        for column in range(8):
+            toward = pose[:3, :3] @ pose.new_tensor(
+                [(column + 0.5 - 4.3) / 20, -(row + 0.5 - 2.9) / 19, -1]
+            )
+            torch.testing.assert_close(
+                bundle.direction[8 * row + column].flip(0),
+                toward / toward.norm(),
+                rtol=0,
+                atol=1e-14,
+            )
+    torch.testing.assert_close(bundle.eye.flip(0), pose[:3, 3], rtol=0, atol=0)
+
+
+def test_nerf_synthetic_data(read: Read, tmp_path: Path) -> None:
+    """An angle alone, images without a suffix whose size is that of the image, and a file for each
+    split.
+    """
+    for split in ("train", "val"):
+        transforms(
+            tmp_path / f"transforms_{split}.json", frame(f"./{split}/r_0"), camera_angle_x=0.6
+        )
+    train, val = views(
+        read(changed(views={"transforms": ["transforms_train.json", "transforms_val.json"]}))
+    )
+    assert train.image == tmp_path / "train/r_0.png" and val.image == tmp_path / "val/r_0.png"
+    assert (train.split, val.split) == ("train", "test") and (train.name, val.name) == (
+        "train_r_0",
+        "val_r_0",
+    )
+    assert (
+        camera_of(train).fov == pytest.approx(math.degrees(0.6))
+        and camera_of(train).resolution is None
+    )
+
+
+def test_a_frame_takes_precedence_over_its_file(read: Read, tmp_path: Path) -> None:
+    special = frame("b.png", w=16.0, h=12, fl_x=40, fl_y=40, cx=8, cy=6, mask_path="masks/b.png")
+    first, second = views(
+        read(transforms(tmp_path / "transforms.json", frame("a.png"), special, **NERFSTUDIO))
+    )
+    assert camera_of(first).resolution == (8, 6) and first.mask is None
+    expected = PerspectiveSection(
+        matrix=camera_of(second).matrix, fov=2 * math.degrees(math.atan(0.2)), resolution=(16, 12)
+    )
+    assert second.camera == expected and second.mask == tmp_path / "masks/b.png"
+
+
+def test_angles_and_focal_lengths_say_the_same(read: Read, tmp_path: Path) -> None:
+    angles = {
+        "camera_angle_x": 2 * math.atan(8 / 2 / 20),
+        "camera_angle_y": 2 * math.atan(6 / 2 / 19),
+        "w": 8,
+        "h": 6,
+    }
+    (one,) = views(read(transforms(tmp_path / "a.json", frame(), **angles)))
+    (other,) = views(
+        read(transforms(tmp_path / "a.json", frame(), **(NERFSTUDIO | {"cx": 4, "cy": 3})))
+    )
+    assert camera_of(one).fov == pytest.approx(camera_of(other).fov, rel=1e-14)
+    assert camera_of(one).pixel_aspect == pytest.approx(20 / 19, rel=1e-14)
+    assert camera_of(one).principal_point == camera_of(other).principal_point == (0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "test_every", "expected"),
+    [
+        ("transforms.json", {}, None, []),
+        ("transforms.json", {}, 2, [0, 2, 4]),
+        ("transforms_test.json", {}, 2, [0, 1, 2, 3, 4]),
+        ("transforms_train.json", {}, 2, []),
+        ("contest.json", {}, None, []),
+        (
+            "transforms.json",
+            {"train_filenames": ["0.png"], "val_filenames": ["3.png"], "test_filenames": ["4.png"]},
+            2,
+            [3, 4],
+        ),
+        ("transforms.json", {"test_filenames": ["1.png"]}, None, [1]),
+    ],
+)
+def test_which_views_are_held_out(
+    read: Read, tmp_path: Path, name: str, more: Any, test_every: int | None, expected: list[int]
+) -> None:
+    transforms(
+        tmp_path / name, *(frame(f"{index}.png") for index in range(5)), **(NERFSTUDIO | more)
+    )
+    source = {"transforms": name} | ({"test_every": test_every} if test_every else {})
+    assert [
+        index
+        for index, view in enumerate(views(read(changed(views=source))))
+        if view.split == "test"
+    ] == expected
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (["a/0.png", "b/1.png"], ["0", "1"]),
+        (["a/0.png", "b c/0.png"], ["a_0", "b_c_0"]),
+        (["x/a/0.png", "y/a/0.png"], ["000_0", "001_0"]),
+        (["a.single.png", None], ["a_single", "view_01"]),
+    ],
+)
+def test_names_are_legal_and_differ(
+    read: Read, tmp_path: Path, files: list[str | None], names: list[str]
+) -> None:
+    assert [
+        view.name
+        for view in views(read(transforms(tmp_path / "t.json", *map(frame, files), **NERFSTUDIO)))
+    ] == names
+
+
+def test_a_dumped_scene_is_the_same(read: Read, tmp_path: Path) -> None:
+    scene_file = read(
+        transforms(
+            tmp_path / "transforms.json",
+            frame("a.png", mask_path="m.png"),
+            frame("b.png"),
+            **NERFSTUDIO,
+        )
+    )
+    dump_scene(scene_file, tmp_path / "dump.yaml")
+    assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"k1": 0.01}, "k1: 0.01 is a lens distortion, which is not modeled; undistort"),
+        (
+            {"distortion_params": [0, 0, 0, 0, 1e-3, 0]},
+            "distortion_params.4: 0.001 is a lens distortion",
+        ),
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model: OPENCV_FISHEYE is no pinhole camera"),
+        ({"is_fisheye": True}, "is_fisheye: a fisheye is no pinhole camera"),
+        ({"fl_x": 0}, "fl_x: must be above 0"),
+        ({"w": 8.5}, "w: expected a whole number, found 8.5"),
+        ({"w": None}, "w: expected a number, found nothing"),
+        ({"w": 10**400}, "w: expected a finite number"),
+        ({"cx": float("nan")}, "cx: expected a finite number"),
+    ],
+)
+def test_what_is_no_pinhole_is_refused_by_key(
+    refusal: Refusal, tmp_path: Path, change: dict[str, Any], problem: str
+) -> None:
+    (line,) = refusal(transforms(tmp_path / "transforms.json", frame(), **(NERFSTUDIO | change)))
+    assert line.startswith("transforms.json: ") and problem in line
+
+
+@pytest.mark.parametrize(
+    ("frames", "problem"),
+    [
+        ([], "frames: expected a list with at least one entry, found a list of 0"),
+        (
+            [frame(transform_matrix=POSE[:3])],
+            "frames.0.transform_matrix: expected a list of 4 rows",
+        ),
+        (
+            [frame(transform_matrix=[[2 * x for x in row] for row in POSE[:3]] + POSE[3:])],
+            "frames.0.transform_matrix: must be rigid",
+        ),
+        ([{"file_path": "a.png"}], "frames.0: missing key 'transform_matrix'"),
+        ([frame(), 3], "frames.1: expected a mapping, found 3"),
+        ([frame(7)], "frames.0.file_path: expected text, found 7"),
+    ],
+)
+def test_what_is_wrong_with_a_frame_is_told_by_key(
+    refusal: Refusal, tmp_path: Path, frames: list[Any], problem: str
+) -> None:
+    (line,) = refusal(transforms(tmp_path / "transforms.json", *frames, **NERFSTUDIO))
+    assert line.startswith(f"transforms.json: {problem}")
+
+
+def test_intrinsics_that_say_too_little(refusal: Refusal, tmp_path: Path) -> None:
+    for shared, problem in (
+        ({"w": 8, "h": 6}, "frames.0: has neither fl_x nor camera_angle_x"),
+        ({"fl_x": 20}, "fl_x: is in pixels, but w and h do not say how many there are"),
+        ({"camera_angle_x": 0.5, "cx": 3}, "cx: is in pixels"),
+    ):
+        (line,) = refusal(transforms(tmp_path / "t.json", frame(), **shared))
+        assert problem in line
+    (line,) = refusal(transforms(tmp_path / "t.json", frame(None), camera_angle_x=0.5))
+    assert "frames.0: has neither file_path nor w and h" in line
+
+
+def test_files_that_are_none(read: Read, refusal: Refusal, tmp_path: Path) -> None:
+    (line,) = refusal(changed(views={"transforms": "none.json"}))
+    assert (
+        line.startswith("scene.yaml:")
+        and "views.transforms: " in line
+        and "none.json does not exist" in line
+    )
+    for text, problem in (("{", "not JSON"), ("[" * 10**5, "not JSON")):
+        (tmp_path / "bad.json").write_text(text)
+        with pytest.raises(FormatError, match=problem):
+            read(changed(views={"transforms": "bad.json"}))
+    (tmp_path / "bad.json").write_text("[1]")
+    assert "has no 'frames'" in refusal(changed(views={"transforms": "bad.json"}))[0]
+
+
+@pytest.mark.parametrize(
+    ("source", "problem"),
+    [
+        ({"images": "*.png"}, "views.images: is for a ring"),
+        ({"test_every": 1}, "views.test_every: must be at least 2"),
+        (
+            {"ring": {"count": 2, "radius": 1, "fov": 30, "resolution": [2, 2]}},
+            "views: give only one of ring or transforms",
+        ),
+    ],
+)
+def test_keys_that_do_not_go_with_transforms(
+    refusal: Refusal, tmp_path: Path, source: dict[str, Any], problem: str
+) -> None:
+    transforms(tmp_path / "t.json", frame(), **NERFSTUDIO)
+    (line,) = refusal(changed(views={"transforms": "t.json"} | source))
+    assert problem in line
+
+
+def test_poses_in_other_axes_are_named_with_the_cause(read: Read, tmp_path: Path) -> None:
+    """As OpenCV has them, y down and z forward, every camera looks away from the volume."""
+    flipped = (np.array(POSE) * [1, -1, -1, 1]).tolist()
+    scene_file = read(
+        transforms(
+            tmp_path / "t.json", frame(None), frame(None, transform_matrix=flipped), **NERFSTUDIO
+        )
+    )
+    with pytest.raises(SceneError) as caught:
+        build_scene(scene_file)
+    (line,) = caught.value.problems
+    assert (
+        "scene.yaml:" in line
+        and "no pixel of view 'view_01' looks through the volume" in line
+        and "OpenCV's axes" in line
+    )
+
+
+def test_what_is_exported_comes_back(read: Read, tmp_path: Path) -> None:
+    """Cameras, images, masks and splits, also from a folder of its own."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "out").mkdir()
+    for name in ("a", "b"):
+        np.save(tmp_path / f"images/{name}.npy", np.ones((6, 8, 3), np.float32))
+    camera = {
+        "type": "perspective",
+        "matrix": POSE,
+        "fov": 30,
+        "principal_point": [0.4, 0.55],
+        "pixel_aspect": 1.05,
+        "resolution": [8, 6],
+    }
+    front = {"name": "a", "image": "images/a.npy", "mask": "images/b.npy", "camera": camera}
+    side = {"name": "b", "image": "images/b.npy", "split": "test", "camera": camera | {"fov": 40}}
+    scene_file = read(json.dumps(yaml.safe_load(SCENE) | {"views": [front, side]}))
+    before = build_scene(scene_file, dtype=torch.float64)
+    assert export_transforms(
+        before, scene_file, tmp_path / "out/transforms.json", may_exist=False
+    ) == [tmp_path / "out/transforms.json"]
+    again = read(changed(views={"transforms": "out/transforms.json"}))
+    for one, other in zip(scene_file.tree.views, again.tree.views, strict=True):
+        assert other.image is not None and (one.name, one.split) == (other.name, other.split)
+        assert (
+            other.image.resolve() == one.image and (other.mask and other.mask.resolve()) == one.mask
+        )
+    for one, other in zip(before.views, build_scene(again, dtype=torch.float64).views, strict=True):
+        torch.testing.assert_close(
+            cast_rays(one.camera).direction, cast_rays(other.camera).direction, rtol=0, atol=1e-14
+        )
+        assert (
+            torch.equal(one.camera.pose, other.camera.pose) and one.camera.size == other.camera.size
+        )
+
+
+def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:
+    scene_file = read(SCENE.replace("perspective", "orthographic").replace("fov: 28", "width: 2"))
+    scene = build_scene(scene_file)
+    with pytest.raises(SceneError, match="orthographic camera has no place"):
+        export_transforms(scene, scene_file, tmp_path / "t.json", may_exist=False)
+    (tmp_path / "t.json").write_text("mine")
+    with pytest.raises(SceneError, match="already there"):
+        export_transforms(scene, scene_file, tmp_path / "t.json", may_exist=False)
+    with pytest.raises(SceneError, match="there is no folder"):
+        export_transforms(scene, scene_file, tmp_path / "none/t.json", may_exist=False)
+    assert (tmp_path / "t.json").read_text() == "mine"

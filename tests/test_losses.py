@@ -1,0 +1,106 @@
+"""Losses: closed forms, masks, and invariances of total variation."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+
+from ddrecon.grid import Grid
+from ddrecon.losses import HUBER, LOSSES, image_loss, psnr, total_variation
+from ddrecon.settings import OptimizeSettings
+
+
+def box(cells: int, side: float = 1.0) -> Grid:
+    return Grid((cells,) * 3, (0.0,) * 3, (side,) * 3)
+
+
+def test_l2_is_the_mean_square() -> None:
+    image, target = torch.rand(3, 4, 5), torch.rand(3, 4, 5)
+    assert image_loss("l2", image, target, None) == pytest.approx(
+        float(((image - target) ** 2).sum()) / 60
+    )
+
+
+def test_a_scene_may_ask_for_every_loss_there_is() -> None:
+    (choice,) = (field for field in fields(OptimizeSettings) if field.name == "loss")
+    assert set(choice.metadata["choices"]) == set(LOSSES)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_loss_is_least_at_the_target_and_grows_with_the_square_of_all_brightness(
+    loss: str,
+) -> None:
+    image, target = (
+        torch.rand(3, 4, 5, dtype=torch.float64),
+        torch.rand(3, 4, 5, dtype=torch.float64),
+    )
+    assert image_loss(loss, target, target, None) == 0
+    values = [
+        float(image_loss(loss, target + part * (image - target), target, None))
+        for part in (0.1, 0.5, 1.0)
+    ]
+    assert 0 < values[0] < values[1] < values[2]
+    assert float(image_loss(loss, 7 * image, 7 * target, None)) == pytest.approx(
+        49 * values[2], rel=1e-12
+    )
+
+
+def test_huber_is_the_square_of_small_errors_and_grows_linearly_with_large_ones() -> None:
+    target = torch.ones(3, 4, 5, dtype=torch.float64)
+    small, large, larger = (
+        float(image_loss("huber", target + error, target, None)) for error in (0.01, 10.0, 20.0)
+    )
+    assert small == pytest.approx(1e-4, rel=1e-9) and larger - large == pytest.approx(
+        2 * HUBER * 10, rel=1e-9
+    )
+
+
+def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:
+    target = torch.tensor([1.0, 100.0], dtype=torch.float64).expand(3, 1, 2)
+    dark, bright = (
+        1.1 * target - 0.1 * target * torch.tensor(keep) for keep in ([0.0, 1.0], [1.0, 0.0])
+    )
+    losses = [float(image_loss("relative_l2", image, target, None)) for image in (dark, bright)]
+    plain = [float(image_loss("l2", image, target, None)) for image in (dark, bright)]
+    assert losses[1] / losses[0] < 0.01 * plain[1] / plain[0]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_masked_pixels_do_not_count(loss: str) -> None:
+    image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
+    spoiled = torch.where(mask > 0, target, target + 100)
+    assert image_loss(loss, image, spoiled, mask) == image_loss(loss, image, target, mask)
+
+
+def test_what_counts_is_averaged() -> None:
+    image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
+    kept = mask.bool()
+    assert float(image_loss("l2", image, target, mask)) == pytest.approx(
+        float(((image - target)[:, kept] ** 2).mean()), rel=1e-6
+    )
+
+
+def test_psnr_of_a_known_error() -> None:
+    target = torch.ones(3, 8, 8)
+    assert psnr(target + 0.01, target, None) == pytest.approx(40, abs=1e-3)
+
+
+@pytest.mark.parametrize("cells", [8, 16, 32])
+def test_total_variation_of_a_ramp_is_its_slope_at_any_resolution(cells: int) -> None:
+    grid = box(cells)
+    ramp = 2 * grid.centers(torch.zeros(1, dtype=torch.float64))[2].expand(*grid.shape)
+    inner = (cells - 1) / cells
+    assert float(total_variation(ramp, grid)) == pytest.approx(2 * inner, rel=0.01)
+
+
+def test_total_variation_does_not_depend_on_world_scale() -> None:
+    field = torch.rand(6, 6, 6, dtype=torch.float64)
+    assert float(total_variation(field, box(6))) == pytest.approx(
+        float(total_variation(field, box(6, 7.0))), rel=1e-12
+    )
+
+
+def test_total_variation_has_a_finite_derivative_where_flat() -> None:
+    field = torch.zeros(4, 4, 4, requires_grad=True)
+    total_variation(field, box(4)).backward()
+    assert torch.isfinite(field.grad).all()

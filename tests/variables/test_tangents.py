@@ -1,0 +1,88 @@
+"""Derivative images: equal to central differences of the image, component by component, and to what
+closed forms say.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from media import make_scene, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.scene import Scene
+from ddrecon.variables.tangents import render_tangent, variation
+from ddrecon.variables.values import value_of, with_values
+
+STEP = 1e-5
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return make_scene(random_values(4, 3, 5), g=0.3, ambient=(0.2, 0.3, 0.4))
+
+
+def images_of(scene: Scene) -> dict[str, Tensor]:
+    parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
+    return {
+        "image": render(scene)[0],
+        "reduced": parts.reduced,
+        "single": parts.single,
+        "multiple": parts.multiple,
+    }
+
+
+NAMES = [
+    "density",
+    "sigma_a",
+    "sigma_s.g",
+    "sigma_t",
+    "albedo.b",
+    "g",
+    "lights.0.irradiance",
+    "lights.0.direction.x",
+    "lights.1.radiance.r",
+]
+NAMES += ["views.view.camera.rotation_y", "views.view.camera.z"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_derivative_image_is_the_central_difference_of_the_image(scene: Scene, name: str) -> None:
+    variable, change = variation(scene, name)
+    found = render_tangent(scene, name, images_of)
+    high, low = (
+        images_of(with_values(scene, {variable: value_of(scene, variable) + way * STEP * change}))
+        for way in (1, -1)
+    )
+    for key, (image, derivative) in found.items():
+        difference = (high[key] - low[key]) / (2 * STEP)
+        assert (derivative - difference).abs().max() <= 1e-6 * max(
+            1e-2, float(difference.abs().max())
+        ), key
+        torch.testing.assert_close(image, images_of(scene)[key], rtol=1e-11, atol=0)
+
+
+def test_components_of_a_derivative_sum_to_it(scene: Scene) -> None:
+    found = render_tangent(scene, "density", images_of)
+    total = sum(found[key][1] for key in ("reduced", "single", "multiple"))
+    torch.testing.assert_close(total, found["image"][1], rtol=1e-9, atol=1e-12)
+
+
+def test_a_color_of_light_shows_in_its_own_channel_alone(scene: Scene) -> None:
+    (_, derivative) = render_tangent(scene, "lights.1.radiance.g", images_of)["image"]
+    assert bool((derivative[1] > 0).all()) and bool((derivative[[0, 2]] == 0).all())
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("depth", "no number depth"),
+        ("lights.0.direction", "lights.0.direction.x"),
+        ("views.view.camera", "rotation_x"),
+        ("sigma_s.x", "no number"),
+    ],
+)
+def test_what_cannot_vary_is_refused_with_what_can(scene: Scene, name: str, hint: str) -> None:
+    with pytest.raises(KeyError, match=hint):
+        variation(scene, name)

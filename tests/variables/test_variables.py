@@ -1,0 +1,126 @@
+"""Variables by name: read out, put back, and nothing else touched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from media import make_scene, random_values
+
+from ddrecon.renderer import render
+from ddrecon.scene import Scene
+from ddrecon.variables.values import component_names, value_of, variable_names, with_values
+
+SHAPE = (4, 3, 5)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,))
+
+
+def test_every_name_has_a_value_and_putting_it_back_changes_nothing(scene: Scene) -> None:
+    image = render(scene)
+    for name in variable_names(scene):
+        torch.testing.assert_close(
+            render(with_values(scene, {name: value_of(scene, name)})), image, rtol=1e-12, atol=1e-15
+        )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "density",
+        "sigma_a",
+        "sigma_s",
+        "g",
+        "lights.0.irradiance",
+        "lights.0.direction",
+        "lights.1.radiance",
+    ],
+)
+def test_a_value_that_is_put_in_comes_out_and_the_scene_keeps_its_own(
+    scene: Scene, name: str
+) -> None:
+    before = value_of(scene, name).clone()
+    changed = with_values(scene, {name: before + 0.1})
+    assert torch.equal(value_of(changed, name), before + 0.1) and torch.equal(
+        value_of(scene, name), before
+    )
+    follows = {"sigma_t", "albedo"} if name.startswith("sigma") else set()
+    moved = {
+        other
+        for other in variable_names(scene)
+        if not torch.equal(value_of(changed, other), value_of(scene, other))
+    }
+    assert moved == {name} | follows
+
+
+@pytest.mark.parametrize("is_field", [True, False])
+def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(
+    scene: Scene, is_field: bool
+) -> None:
+    shape = (3, *SHAPE) if is_field else (3,)
+    changed = with_values(
+        scene, {"sigma_a": random_values(*shape), "sigma_s": 5 * random_values(*shape, seed=1)}
+    )
+    values = {name: value_of(changed, name) for name in ("sigma_t", "albedo")}
+    again = with_values(scene, values)
+    for name in ("sigma_a", "sigma_s"):
+        torch.testing.assert_close(
+            value_of(again, name), value_of(changed, name), rtol=1e-13, atol=1e-15
+        )
+
+
+def test_a_field_and_a_constant_mix(scene: Scene) -> None:
+    albedo, sigma_t = random_values(3, *SHAPE), torch.tensor([4.0, 5.0, 6.0], dtype=torch.float64)
+    changed = with_values(scene, {"albedo": albedo, "sigma_t": sigma_t})
+    torch.testing.assert_close(changed.volume.sigma_s, albedo * sigma_t.view(3, 1, 1, 1))
+    assert torch.isfinite(render(changed)).all()
+
+
+def test_the_albedo_of_nothing_is_nothing(scene: Scene) -> None:
+    nothing = torch.zeros(3, dtype=torch.float64)
+    assert torch.equal(
+        value_of(with_values(scene, {"sigma_a": nothing, "sigma_s": nothing}), "albedo"), nothing
+    )
+
+
+def test_one_density_fills_the_grid(scene: Scene) -> None:
+    changed = with_values(scene, {"density": torch.tensor(0.5, dtype=torch.float64)})
+    assert changed.volume.density.shape == SHAPE and bool((changed.volume.density == 0.5).all())
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "depth",
+        "lights.2.radiance",
+        "lights.0.radiance",
+        "lights.x.radiance",
+        "views.none.camera",
+        "views.view",
+    ],
+)
+def test_what_a_scene_does_not_have_is_refused(scene: Scene, name: str) -> None:
+    with pytest.raises(KeyError):
+        value_of(scene, name)
+    with pytest.raises(KeyError):
+        with_values(scene, {name: torch.zeros(3)})
+
+
+def test_components_follow_the_order_of_entries(scene: Scene) -> None:
+    for name in variable_names(scene):
+        value = value_of(scene, name)
+        names = component_names(name, value)
+        assert len(names) in (0, value.shape[0] if value.ndim else 0)
+        assert len(set(names)) == len(names)
+    assert component_names("density", torch.zeros(3, 4, 5)) == ()
+
+
+def test_a_twist_belongs_to_its_view_alone(scene: Scene) -> None:
+    two = replace(scene, views=[scene.views[0], replace(scene.views[0], name="other")])
+    changed = with_values(two, {"views.other.camera": torch.full((6,), 0.1, dtype=torch.float64)})
+    assert changed.views[0] is two.views[0]
+    assert not torch.allclose(changed.views[1].camera.pose, two.views[1].camera.pose)
