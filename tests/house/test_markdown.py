@@ -31,12 +31,20 @@ CLOSED = re.compile(r"[.:!?][)\]\"'*_]*$")
 
 
 def blocks(text: str) -> Iterator[list[str]]:
-    """Paragraphs, headings and list items of a page, a list of lines each; code, tables, comments and pictures are left out."""
+    """Paragraphs, headings and list items of a page, a list of lines each.
+
+    Code, tables, comments and pictures are left out.
+    """
     paragraph: list[str] = []
     is_code = False
     for line in [*text.splitlines(), ""]:
         is_fence = line.lstrip().startswith("```")
-        is_other = is_code or is_fence or not line.strip() or line.startswith(("    ", "|", "<", "![", "#"))
+        is_other = (
+            is_code
+            or is_fence
+            or not line.strip()
+            or line.startswith(("    ", "|", "<", "![", "#"))
+        )
         if paragraph and (is_other or MARKER.match(line)):
             yield paragraph
             paragraph = []
@@ -48,7 +56,7 @@ def blocks(text: str) -> Iterator[list[str]]:
 
 
 def plain(line: str) -> str:
-    """`line` without its marker of a list or a heading, its label, code and the targets of links."""
+    """`line` without its marker of a list or a heading, its label, code and targets of links."""
     for start in (MARKER, LABEL):
         match = start.match(line)
         line = line[match.end() :] if match else line
@@ -62,10 +70,15 @@ def ends_early(line: str) -> bool:
 
 
 def anchors(page: Path) -> set[str]:
-    """What a link to a heading of `page` may say after the #, both where GitHub shows the page and on the site that MkDocs builds."""
-    headings = [lines[0] for lines in blocks(page.read_text(encoding="utf-8")) if lines[0].startswith("#")]
+    """What a link to a heading of `page` may hold after the #, on GitHub and on MkDocs' site alike."""
+    headings = [
+        lines[0] for lines in blocks(page.read_text(encoding="utf-8")) if lines[0].startswith("#")
+    ]
     words = [re.sub(r"[^\w\s-]", "", heading.lstrip("# ")).lower() for heading in headings]
-    hosted, built = [{word.replace(" ", "-") for word in words}, {re.sub(r"[-\s]+", "-", word.strip()) for word in words}]
+    hosted, built = [
+        {word.replace(" ", "-") for word in words},
+        {re.sub(r"[-\s]+", "-", word.strip()) for word in words},
+    ]
     return hosted & built
 
 
@@ -94,7 +107,9 @@ def test_the_end_of_a_sentence_is_known(line: str, expected: bool) -> None:
 def test_a_line_holds_one_sentence(page: Path) -> None:
     paragraphs = list(blocks(page.read_text(encoding="utf-8")))
     assert [line for lines in paragraphs for line in lines if ends_early(line)] == []
-    assert [line for lines in paragraphs for line in lines[:-1] if not CLOSED.search(line)] == [], "broken sentences"
+    assert [line for lines in paragraphs for line in lines[:-1] if not CLOSED.search(line)] == [], (
+        "broken sentences"
+    )
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
@@ -105,11 +120,15 @@ def test_sentences_are_not_too_long(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_links_lead_somewhere(page: Path) -> None:
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(
+        r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
+    )
     for target in LINK.findall(text):
         if "://" in target or target.startswith("mailto:"):
             continue
         path, _, anchor = target.partition("#")
         there = (page.parent / path).resolve() if path else page
         assert there.exists(), f"{target}: there is no {there}"
-        assert not anchor or anchor in anchors(there), f"{target}: no such heading; there are {sorted(anchors(there))}"
+        assert not anchor or anchor in anchors(there), (
+            f"{target}: no such heading; there are {sorted(anchors(there))}"
+        )
