@@ -70,7 +70,7 @@ def ends_early(line: str) -> bool:
 
 
 def anchors(page: Path) -> set[str]:
-    """What a link to a heading of `page` may hold after the #, on GitHub and on MkDocs' site alike."""
+    """What a link to a heading of `page` may hold after the #, on GitHub and the built site."""
     headings = [
         lines[0] for lines in blocks(page.read_text(encoding="utf-8")) if lines[0].startswith("#")
     ]
