@@ -18,7 +18,7 @@ LATER = {ROOT / "CONTRIBUTING.md"}
 """Pages whose sentences are not held to a line each yet; their links are."""
 ABBREVIATIONS = ("e.g", "i.e", "et al", "Fig", "Figs", "Eq", "Eqs", "cf", "vs", "resp", "approx")
 """What a full stop may follow within a sentence."""
-LONGEST = 60
+LONGEST = 40
 """No sentence has more words."""
 
 CODE_SPAN = re.compile(r"`[^`]*`")
@@ -27,10 +27,11 @@ MARKER = re.compile(r"\s*(?:[-*+]|\d+\.)\s+|#+\s+(?:\d+\.\s+)?|>\s*")
 LABEL = re.compile(r"\*\*[^*]+[.:?]\*\*\s+")
 """What a paragraph may begin with: its subject in bold."""
 END = re.compile(r"(?<!\.)[.!?][)\]\"'*_]*\s+\S")
+FILE = re.compile(r"`(?:python )?((?:ddrecon|tests|benchmarks|docs|configs|data|\.ci)/[\w./-]*)")
 CLOSED = re.compile(r"[.:!?][)\]\"'*_]*$")
 
 
-def blocks(text: str) -> Iterator[list[str]]:
+def split_into_blocks(text: str) -> Iterator[list[str]]:
     """Paragraphs, headings and list items of a page, a list of lines each.
 
     Code, tables, comments and pictures are left out.
@@ -55,7 +56,7 @@ def blocks(text: str) -> Iterator[list[str]]:
         is_code ^= is_fence
 
 
-def plain(line: str) -> str:
+def strip_markup(line: str) -> str:
     """`line` without its marker of a list or a heading, its label, code and targets of links."""
     for start in (MARKER, LABEL):
         match = start.match(line)
@@ -65,14 +66,16 @@ def plain(line: str) -> str:
 
 def ends_early(line: str) -> bool:
     """Whether a sentence ends before the end of `line`."""
-    text = plain(line)
+    text = strip_markup(line)
     return any(not text[: match.start()].endswith(ABBREVIATIONS) for match in END.finditer(text))
 
 
-def anchors(page: Path) -> set[str]:
+def find_anchors(page: Path) -> set[str]:
     """What a link to a heading of `page` may hold after the #, on GitHub and the built site."""
     headings = [
-        lines[0] for lines in blocks(page.read_text(encoding="utf-8")) if lines[0].startswith("#")
+        lines[0]
+        for lines in split_into_blocks(page.read_text(encoding="utf-8"))
+        if lines[0].startswith("#")
     ]
     words = [re.sub(r"[^\w\s-]", "", heading.lstrip("# ")).lower() for heading in headings]
     hosted, built = [
@@ -105,7 +108,7 @@ def test_the_end_of_a_sentence_is_known(line: str, expected: bool) -> None:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
 def test_a_line_holds_one_sentence(page: Path) -> None:
-    paragraphs = list(blocks(page.read_text(encoding="utf-8")))
+    paragraphs = list(split_into_blocks(page.read_text(encoding="utf-8")))
     assert [line for lines in paragraphs for line in lines if ends_early(line)] == []
     assert [line for lines in paragraphs for line in lines[:-1] if not CLOSED.search(line)] == [], (
         "broken sentences"
@@ -114,8 +117,10 @@ def test_a_line_holds_one_sentence(page: Path) -> None:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
 def test_sentences_are_not_too_long(page: Path) -> None:
-    lines = [line for lines in blocks(page.read_text(encoding="utf-8")) for line in lines]
-    assert [line for line in lines if len(plain(line).split()) > LONGEST] == []
+    lines = [
+        line for lines in split_into_blocks(page.read_text(encoding="utf-8")) for line in lines
+    ]
+    assert [line for line in lines if len(strip_markup(line).split()) > LONGEST] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
@@ -129,6 +134,12 @@ def test_links_lead_somewhere(page: Path) -> None:
         path, _, anchor = target.partition("#")
         there = (page.parent / path).resolve() if path else page
         assert there.exists(), f"{target}: there is no {there}"
-        assert not anchor or anchor in anchors(there), (
-            f"{target}: no such heading; there are {sorted(anchors(there))}"
+        assert not anchor or anchor in find_anchors(there), (
+            f"{target}: no such heading; there are {sorted(find_anchors(there))}"
         )
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in LATER], ids=named)
+def test_files_that_a_page_names_exist(page: Path) -> None:
+    files = FILE.findall(page.read_text(encoding="utf-8"))
+    assert [file for file in files if not (ROOT / file).exists()] == []
