@@ -58,7 +58,7 @@ def scene_of(
         "resolution": [cells] * 3,
         "albedo": case.get("albedo", 0.9),
         "g": case.get("g", 0.0),
-    }  # type: ignore[dict-item]
+    }
     views = [
         {"name": "view", "camera": {**CAMERA, "origin": [0, 0.3, 3.2], "resolution": [pixels] * 2}}
     ]
@@ -88,7 +88,7 @@ def peak(command: list[str]) -> int:
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     _, status, usage = os.wait4(process.pid, 0)
     if status:
-        raise RuntimeError(process.stderr.read().decode())  # type: ignore[union-attr]
+        raise RuntimeError(process.stderr.read().decode())
     return usage.ru_maxrss * 1024
 
 

@@ -83,9 +83,9 @@ def by_path_replay(scene: Scene, iterations: int, headroom: float = 1.0) -> Foun
     """
     import drjit
 
-    settings = scene.optimize.parameters["density"]  # type: ignore[union-attr]
+    settings = scene.optimize.parameters["density"]
     parameter = Parameter("density", settings, RATE, scene.starts["density"], scene.volume.grid)
-    target = scene.views[0].image.movedim(0, -1)  # type: ignore[union-attr]
+    target = scene.views[0].image.movedim(0, -1)
     replay, found, power = (
         Replay.of(scene, headroom),
         Found([], [], {}),
@@ -245,7 +245,7 @@ def run(
             f"density_{iteration}": density for iteration, density in found.densities.items()
         }
         judged = {f"errors_{iteration}": values for iteration, values in errors.items()}
-        np.savez_compressed(path, seconds=found.seconds, losses=found.losses, **densities, **judged)  # type: ignore[arg-type]
+        np.savez_compressed(path, seconds=found.seconds, losses=found.losses, **densities, **judged)
     kept = np.load(path)
     at = [int(key.removeprefix("density_")) for key in kept if key.startswith("density_")]
     found = Found(

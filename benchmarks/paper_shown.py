@@ -70,7 +70,7 @@ def first(runs: Runs) -> Run:
 def shape(name: str, like: Array, field: str = "density") -> Array:
     """A field of the true volume `name`, in cells as small as those of `like` [z, y, x, ...]."""
     values = read_field(SHAPES / f"{name}.npz", field)
-    grid = Grid(like.shape[:3], *(tuple(corner[::-1]) for corner in values.bounds))  # type: ignore[arg-type]
+    grid = Grid(like.shape[:3], *(tuple(corner[::-1]) for corner in values.bounds))
     found = torch.from_numpy(values.values)
     moved = found if found.ndim == 3 else found.movedim(-1, 0)
     carried = resample(moved, grid)

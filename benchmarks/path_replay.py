@@ -57,7 +57,8 @@ class Replay:
 
     def name(self, ending: str) -> str:
         """The parameter whose name ends so."""
-        (name,) = (key for key in self.parameters.keys() if key.endswith(ending))  # noqa: SIM118 - Mitsuba's own mapping
+        # Mitsuba's own mapping cannot be iterated over itself.
+        (name,) = (key for key in self.parameters.keys() if key.endswith(ending))  # noqa: SIM118
         return str(name)
 
     def set_density(self, density: Tensor) -> None:
@@ -110,7 +111,7 @@ def _roomy_scene(scene: Scene, headroom: float) -> Scene:
     grid, volume = scene.volume.grid, scene.volume
     lower = tuple(low - RING * step for low, step in zip(grid.lower, grid.spacing, strict=True))
     upper = tuple(high + RING * step for high, step in zip(grid.upper, grid.spacing, strict=True))
-    wide = Grid(tuple(count + 2 * RING for count in grid.shape), lower, upper)  # type: ignore[arg-type]
+    wide = Grid(tuple(count + 2 * RING for count in grid.shape), lower, upper)
     return replace(
         scene, volume=replace(volume, grid=wide, density=roomy(volume.density, headroom))
     )

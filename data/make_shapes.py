@@ -42,11 +42,11 @@ def centers(bounds: Array, cells: tuple[int, int, int]) -> Array:
 def bunny_mesh(package: Path) -> Array:
     """Triangles [n, 3, 3] of the bunny: corners (x, y, z) [u], centered, 0.88 u wide."""
     with tarfile.open(package) as archive:
-        source = archive.extractfile("package/index.js").read().decode()  # type: ignore[union-attr]
+        source = archive.extractfile("package/index.js").read().decode()
     positions, cells = (
         np.array(json.loads(re.search(rf"exports\.{name}=(\[\[.*?\]\])", source)[1]))
         for name in ("positions", "cells")
-    )  # type: ignore[index]
+    )
     low, high = positions.min(0), positions.max(0)
     triangles: Array = (positions - (low + high) / 2)[cells] * (0.88 / (high - low)[0])
     return triangles
@@ -170,7 +170,7 @@ def write(path: Path, bounds: Array, **fields: Array) -> None:
         name: (np.round(values * LEVELS) / LEVELS).astype(np.float16)
         for name, values in fields.items()
     }
-    np.savez_compressed(path, bounds=bounds, **rounded)  # type: ignore[arg-type]
+    np.savez_compressed(path, bounds=bounds, **rounded)
 
 
 def main() -> None:
