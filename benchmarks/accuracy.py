@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from traced import Traced, traced
+from traced import Traced, trace
 
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
@@ -237,8 +237,8 @@ def measure_cases(references: Path, only: str, pictures: Path | None, directions
     for case in CASES:
         if only not in case.name:
             continue
-        whole = traced(case.scene(), references, noise=case.noise)
-        once = traced(case.scene(), references, depth=2, noise=0.02)
+        whole = trace(case.scene(), references, noise=case.noise)
+        once = trace(case.scene(), references, depth=2, noise=0.02)
         found = {
             n: image(case.scene(transport_rounds=n, transport_directions=directions))
             for n in ROUNDS
@@ -267,7 +267,7 @@ def measure_convergence(references: Path) -> None:
     row(["case", "noise", "cells", "directions", *(f"n = {n}" for n in rounds)])
     row(["---"] * (4 + len(rounds)))
     for case in CONVERGING:
-        whole = traced(case.scene(96), references, noise=case.noise, passes=96)
+        whole = trace(case.scene(96), references, noise=case.noise, passes=96)
         for cells, counts in {24: (26, 50, 86), 48: (26, 50, 86), 96: (50,)}.items():
             diffusion = image(case.scene(cells))
             for directions in counts:

@@ -81,10 +81,10 @@ def sample(pid: int, made: int, out: Path) -> Sample:
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     numbers = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     seconds = (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
-    return Sample(made, pages * os.sysconf("SC_PAGE_SIZE"), seconds, written(out))
+    return Sample(made, pages * os.sysconf("SC_PAGE_SIZE"), seconds, count_bytes(out))
 
 
-def written(folder: Path) -> int:
+def count_bytes(folder: Path) -> int:
     """Bytes of all files below `folder` but the log, and but temporary ones."""
     names = [
         path

@@ -92,7 +92,7 @@ def peak(command: list[str]) -> int:
     return usage.ru_maxrss * 1024
 
 
-def measured(
+def measure(
     folder: Path, verb: str, cells: int, pixels: int, case: dict[str, object]
 ) -> tuple[int, int]:
     """The peak of `verb` and what `ddrecon check` says of the scene [bytes]."""
@@ -128,14 +128,14 @@ def main() -> None:
         print(f"|{'---|' * 6}")
         for title, case in ((title, CASES[title]) for title in arguments.scene):
             bases = {
-                verb: measured(folder, verb, SMALL, 16, case)[0]
+                verb: measure(folder, verb, SMALL, 16, case)[0]
                 for verb in ("solve", "render", "optimize")
             }
             for cells in arguments.cells:
-                solve = measured(folder, "solve", cells, 16, case)[0] - bases["solve"]
+                solve = measure(folder, "solve", cells, 16, case)[0] - bases["solve"]
                 each = solve / (cells**3 - SMALL**3) / (3 if "albedo" in case else 1)
                 for verb in ("render", "optimize"):
-                    found, predicted = measured(folder, verb, cells, arguments.pixels, case)
+                    found, predicted = measure(folder, verb, cells, arguments.pixels, case)
                     used = found - bases[verb]
                     print(
                         f"| {title} | {cells}^3 | {each:.0f} | {verb} | {used / 2**20:.0f} | "

@@ -55,7 +55,7 @@ def pace(log: Log) -> NDArray[np.float64]:
     return np.diff(log["seconds"], prepend=0.0)
 
 
-def projected(field: Array, axis: int, side: float) -> Array:
+def project(field: Array, axis: int, side: float) -> Array:
     """The integral of `field` [z, y, x] along `axis` (0 or 2) across a box of that `side` [u], y
     upwards.
     """
@@ -90,12 +90,12 @@ def draw_derivatives(path: Path, images: Sequence[tuple[str, Array]]) -> None:
     )
     for axis, (title, image) in zip(axes, images, strict=True):
         full = float(np.quantile(np.abs(image), 0.999))
-        signed(axis, image, full, title)
+        show_signed(axis, image, full, title)
         axis.set_xlabel(f"to {full:.2g}", fontsize=7)
     save(figure, path)
 
 
-def signed(axis: Any, values: Array, full: float, title: str) -> None:
+def show_signed(axis: Any, values: Array, full: float, title: str) -> None:
     """Draws a signed map on `axis`: white is 0, red is `full`, blue minus that."""
     axis.imshow(values, cmap="RdBu_r", vmin=-full, vmax=full)
     axis.set(xticks=[], yticks=[])

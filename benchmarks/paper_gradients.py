@@ -20,7 +20,7 @@ import matplotlib
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from paper_figures import Array, save, show, signed
+from paper_figures import Array, save, show, show_signed
 from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, rewrite_table
 from path_replay import ALBEDO, Replay, why_not
 
@@ -82,7 +82,7 @@ def changes(folder: Path) -> list[Change]:
     ]
 
 
-def traced(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
+def trace_derivative(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
     """The derivative image [h, w] from path tracing, and the standard error of its pixels (root
     mean square).
     """
@@ -100,7 +100,7 @@ def traced(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
     return (pictures[1] - pictures[0]) / change.amount, variance**0.5 / change.amount
 
 
-def replayed(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
+def replay_derivative(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
     """The derivative image [h, w] by path replay, in larger pixels, and the standard error of its
     pixels (root mean square).
 
@@ -109,12 +109,12 @@ def replayed(change: Change, folder: Path, paths: int) -> tuple[Array, float]:
     """
     path = folder / f"{change.parameter}_replay.npy"
     if not path.exists():
-        np.save(path, [_replayed_once(change, paths, seed) for seed in range(2)])
+        np.save(path, [_replay_once(change, paths, seed) for seed in range(2)])
     both = np.load(path)
     return both.mean(0), float(np.sqrt(((both[0] - both[1]) ** 2).mean()) / 2)
 
 
-def _replayed_once(change: Change, paths: int, seed: int) -> Array:
+def _replay_once(change: Change, paths: int, seed: int) -> Array:
     import drjit
 
     scene = load_scene(CONFIG, overrides=[change.between])
@@ -145,7 +145,7 @@ def _replayed_once(change: Change, paths: int, seed: int) -> Array:
     return image
 
 
-def ours(change: Change, folder: Path, model: str) -> dict[str, Array]:
+def differentiate(change: Change, folder: Path, model: str) -> dict[str, Array]:
     """By one of `MODELS`: the `image` [h, w] and its `derivative`, and of each the part of light
     scattered more than once, as `many`.
     """
@@ -188,12 +188,12 @@ def regions(folder: Path) -> dict[str, NDArray[np.bool_]]:
     }
 
 
-def relative(image: Array, truth: Array) -> float:
+def relative_error(image: Array, truth: Array) -> float:
     """The root mean square error of `image` relative to `truth`, whose noise it includes."""
     return float(np.sqrt(((image - truth) ** 2).mean() / (truth**2).mean()))
 
 
-def coarser(image: Array) -> Array:
+def coarsen(image: Array) -> Array:
     """`image` [h, w] in pixels `LARGER` times as large."""
     height, width = (side // LARGER for side in image.shape)
     mean: Array = image.reshape(height, LARGER, width, LARGER).mean((1, 3))
@@ -207,33 +207,33 @@ def remake(folder: Path, paths: int = PATHS, replay_paths: int = REPLAY_PATHS) -
     seen, lines, parts = regions(folder), [], []
     figure, axes = plt.subplots(2, 9, figsize=(15, 4), layout="constrained")
     for row, change in zip(axes, changes(folder), strict=True):
-        truth, noise = traced(change, folder, paths)
+        truth, noise = trace_derivative(change, folder, paths)
         full = float(np.quantile(np.abs(truth), 0.99))
         row[0].set_ylabel(f"by {change.parameter}")
-        signed(row[0], truth, full, "differences of\npath tracing")
-        images = {name: ours(change, folder, name) for name in MODELS}
+        show_signed(row[0], truth, full, "differences of\npath tracing")
+        images = {name: differentiate(change, folder, name) for name in MODELS}
         for (name, found), axis, error_axis in zip(images.items(), row[2:5], row[6:], strict=True):
             lines.append(line(change, name, found["derivative"], truth, noise, seen))
-            _compared(axis, error_axis, found["derivative"], truth, full, f"ours, {name}")
+            _draw_comparison(axis, error_axis, found["derivative"], truth, full, f"ours, {name}")
         parts += shares(change, images, folder, truth, seen["thick"])
         for axis in (row[1], row[5]):
             axis.axis("off")
         if why_not() is None:
-            image, scatter = replayed(change, folder, replay_paths)
+            image, scatter = replay_derivative(change, folder, replay_paths)
             regions_there = {
-                name: coarser(region.astype(np.float32)) > 0.5 for name, region in seen.items()
+                name: coarsen(region.astype(np.float32)) > 0.5 for name, region in seen.items()
             }
             lines.append(
                 line(
                     change,
                     "path replay, larger pixels",
                     image,
-                    coarser(truth),
+                    coarsen(truth),
                     scatter,
                     regions_there,
                 )
             )
-            _compared(row[1], row[5], image, coarser(truth), full, "path replay")
+            _draw_comparison(row[1], row[5], image, coarsen(truth), full, "path replay")
     save(figure, PICTURE)
     for name, top, text in ((SCRIPT, TOP, lines), (f"{SCRIPT} (parts)", TOP_PARTS, parts)):
         print(top + "".join(text), end="")
@@ -250,11 +250,13 @@ def line(
 ) -> str:
     """A line of the table: errors of `image`, and the `noise` there is in truth, or in it."""
     told = ", ".join(
-        f"{region} {relative(image[where], truth[where]):.3f}" for region, where in seen.items()
+        f"{region} {relative_error(image[where], truth[where]):.3f}"
+        for region, where in seen.items()
     )
     size, alike = np.sqrt((truth**2).mean()), np.corrcoef(image.ravel(), truth.ravel())[0, 1]
     return (
-        f"| {change.parameter} | {name} | {noise / size:.3f} | {relative(image, truth):.3f} | "
+        f"| {change.parameter} | {name} | {noise / size:.3f} | {relative_error(image, truth):.3f} "
+        "| "
         f"{told} | {alike:.3f} |\n"
     )
 
@@ -297,15 +299,15 @@ def main() -> None:
     remake(given.output, given.paths, given.replay_paths)
 
 
-def _compared(
+def _draw_comparison(
     axis: Any, error_axis: Any, image: Array, truth: Array, full: float, title: str
 ) -> None:
     for each in (axis, error_axis):
         each.axis("on")
-    signed(axis, image, full, title)
+    show_signed(axis, image, full, title)
     show(error_axis, np.abs(image - truth), full / ENLARGED, "inferno")
     error_axis.set_title(
-        f"{ENLARGED} x |error|,\n{title}: {relative(image, truth):.2f}", fontsize=8
+        f"{ENLARGED} x |error|,\n{title}: {relative_error(image, truth):.2f}", fontsize=8
     )
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
-from paper_figures import Array, projected, save, show
+from paper_figures import Array, project, save, show
 from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, rewrite_table
 from path_replay import HEADROOM, Replay, why_not
 
@@ -137,7 +137,7 @@ competes.
 """
 
 
-def larger(picture: Array, times: int) -> Array:
+def enlarge(picture: Array, times: int) -> Array:
     """`picture` [h, w, 3] in pixels `times` times as large."""
     height, width = (size // times for size in picture.shape[:2])
     mean: Array = (
@@ -180,7 +180,7 @@ class Judge:
         if not path.exists():
             np.save(
                 path,
-                _traced(scene, scene.volume.density.numpy(), CONVERGED, 1000, len(scene.views)),
+                _trace(scene, scene.volume.density.numpy(), CONVERGED, 1000, len(scene.views)),
             )
         return Judge(scene, np.load(path))
 
@@ -188,15 +188,15 @@ class Judge:
         """The mean squared error of each of the first `views`, in pixels `times` times as large,
         without noise.
         """
-        pictures = _traced(self.scene, density, JUDGING, 0, views)
+        pictures = _trace(self.scene, density, JUDGING, 0, views)
         pairs = [
-            [larger(a - b, times) for a, b in zip(*both, strict=True)]
+            [enlarge(a - b, times) for a, b in zip(*both, strict=True)]
             for both in zip(pictures, self.targets, strict=False)
         ]
         return [float((first * second).mean()) for first, second in pairs]
 
 
-def _traced(scene: Scene, density: Array, paths: int, seed: int, views: int) -> list[list[Array]]:
+def _trace(scene: Scene, density: Array, paths: int, seed: int, views: int) -> list[list[Array]]:
     """Two pictures of each of the first `views`, each `seed` and those after it with paths of its
     own.
     """
@@ -234,7 +234,7 @@ def run(
     path = folder / f"{'_'.join(map(str, words))}.npz"
     if not (is_kept and path.exists()):
         contender, overrides = CONTENDERS[name]
-        picture = larger(np.load(TARGET / "front.npy").astype(np.float32), times)
+        picture = enlarge(np.load(TARGET / "front.npy").astype(np.float32), times)
         print(f"{len(picture)} pixels, total variation {tv}, {name}", flush=True)
         found = contender(scene_of(picture, folder, overrides, tv), iterations)
         errors = {
@@ -283,8 +283,7 @@ def paces(folder: Path, is_kept: bool) -> dict[str, float]:
 def flat_error(density: Array, truth: Array) -> float:
     """The relative L1 error of the density's sum along z."""
     return float(
-        np.abs(projected(density, 0, 1) - projected(truth, 0, 1)).sum()
-        / projected(truth, 0, 1).sum()
+        np.abs(project(density, 0, 1) - project(truth, 0, 1)).sum() / project(truth, 0, 1).sum()
     )
 
 
@@ -332,20 +331,20 @@ def draw(entries: list[Entry], truth: Array, path: Path) -> None:
         layout="constrained",
         width_ratios=(1.5, 1.5, 1, 1, 1, 1),
     )
-    full = float(projected(truth, 0, 1).max())
+    full = float(project(truth, 0, 1).max())
     for row, case in zip(axes, cases, strict=True):
         for axis in row[2:]:
             axis.axis("off")
         some = [entry for entry in entries if entry.case == case]
         for index, entry in enumerate(some):
             _curves(row[:2], entry, f"C{list(CONTENDERS).index(entry.name)}")
-            show(row[3 + index], projected(entry.found.densities[max(entry.errors)], 0, 1), full)
+            show(row[3 + index], project(entry.found.densities[max(entry.errors)], 0, 1), full)
         for axis, title in zip(
             row[2:], ["truth", *(entry.name.replace(", ", ",\n") for entry in some)], strict=False
         ):
             axis.axis("on")
             axis.set_title(title, fontsize=8)
-        show(row[2], projected(truth, 0, 1), full)
+        show(row[2], project(truth, 0, 1), full)
         row[0].set_ylabel(
             f"{96 // case[0]} x {96 // case[0]} pixels,\n{'no' if case[1] == 0 else 'with'} total "
             "variation",

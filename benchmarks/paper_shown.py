@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from paper_figures import Array, Pair, draw, draw_derivatives, projected, read_log
+from paper_figures import Array, Pair, draw, draw_derivatives, project, read_log
 from paper_page import CONFIGS, PICTURES, SHAPES, as_options, ddrecon, rewrite_table
 
 from ddrecon.grid import Grid
@@ -77,7 +77,7 @@ def shape(name: str, like: Array, field: str = "density") -> Array:
     return (carried if found.ndim == 3 else carried.movedim(0, -1)).numpy()
 
 
-def apart(ours: Array, truth: Array) -> float:
+def relative_l1(ours: Array, truth: Array) -> float:
     """The relative L1 error."""
     return float(np.abs(ours - truth).sum() / truth.sum())
 
@@ -86,7 +86,7 @@ def densities(run: Run, truth: Array) -> list[Pair]:
     """Density seen from the front and from the side, and its middle slice, beside `truth`."""
     ours = run.field("density")
     pairs = [
-        Pair(f"density along {name}", projected(truth, axis, 1), projected(ours, axis, 1))
+        Pair(f"density along {name}", project(truth, axis, 1), project(ours, axis, 1))
         for axis, name in ((0, "z"), (2, "x"))
     ]
     middle = truth.shape[0] // 2
@@ -106,7 +106,10 @@ def show_density(truth: str, front: str) -> Shown:
             run.view("novel", "novel view"),
             *densities(run, density),
         ]
-        return pairs, f"relative L1 error of the density {apart(run.field('density'), density):.2f}"
+        return (
+            pairs,
+            f"relative L1 error of the density {relative_l1(run.field('density'), density):.2f}",
+        )
 
     return shown
 
@@ -120,14 +123,15 @@ def draw_rounds(runs: Runs) -> None:
         pairs.append(
             Pair(
                 f"{NAMES_13[name]}:\ndensity along x",
-                projected(true, 2, 1),
-                projected(density, 2, 1),
+                project(true, 2, 1),
+                project(density, 2, 1),
             )
         )
         low = slice(0, len(density[0]) // 3)
         quality = f"{log['psnr'][-1]:.1f} dB, {log['test_psnr'][-1]:.1f} dB"
         parts = (
-            f"{apart(density, true):.3f} | {apart(density[:, low], true[:, low]):.2f} | "
+            f"{relative_l1(density, true):.3f} | {relative_l1(density[:, low], true[:, low]):.2f} "
+            "| "
             f"{density[:, low].sum() / true[:, low].sum():.2f}"
         )
         lines.append(
@@ -152,7 +156,7 @@ def draw_parts(runs: Runs) -> None:
     )
     for name in parts:
         run, places = runs[name], {"start": ["volume.density={file: ../../data/shapes/bunny.npz}"]}
-        for place, overrides in (places | {"end": found(run)}).items():
+        for place, overrides in (places | {"end": result_overrides(run)}).items():
             folder, scene = run.folder / f"derivative_{place}", CONFIGS / "fig09.yaml"
             ddrecon(
                 "render",
@@ -178,7 +182,9 @@ def draw_parts(runs: Runs) -> None:
 def show_light(runs: Runs) -> tuple[list[Pair], str]:
     """The bunny, and the color of its light."""
     run = first(runs)
-    words = f"irradiance {rounded(run.number('lights.0.irradiance'))}, in truth [3.2, 2.1, 1.2]"
+    words = (
+        f"irradiance {round_values(run.number('lights.0.irradiance'))}, in truth [3.2, 2.1, 1.2]"
+    )
     return [run.view("front", "the view it was shown"), run.view("novel", "novel view")], words
 
 
@@ -213,7 +219,7 @@ def show_optics(runs: Runs) -> tuple[list[Pair], str]:
             Pair(f"{title}, middle slices", *(middle(field[..., color]) for field in (truth, ours)))
         )
     errors = ", ".join(
-        f"{apart(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
+        f"{relative_l1(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
     )
     alone = f", alone {runs['g_alone'].number('g'):.3f}" if "g_alone" in runs else ""
     return (
@@ -237,11 +243,11 @@ def show_smoke(runs: Runs) -> tuple[list[Pair], str]:
         pairs.append(
             Pair(
                 f"{title}, along z",
-                *(projected(field[..., color], 0, 1) for field in (truth, ours)),
+                *(project(field[..., color], 0, 1) for field in (truth, ours)),
             )
         )
     errors = ", ".join(
-        f"{apart(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
+        f"{relative_l1(ours, truth):.2f}" for ours, truth in zip(found, truths, strict=True)
     )
     return pairs, f"relative L1 error of absorption and scattering {errors}"
 
@@ -274,7 +280,7 @@ def show_photograph(runs: Runs) -> tuple[list[Pair], str]:
     """The cloud, and what was found of its light."""
     run = first(runs)
     names = ("lights.0.irradiance", "lights.0.direction", "lights.1.radiance", "sigma_a", "sigma_s")
-    words = "; ".join(f"{name} {rounded(run.number(name))}" for name in names)
+    words = "; ".join(f"{name} {round_values(run.number(name))}" for name in names)
     return [run.view("front", "the photograph"), run.view("novel", "novel view")], words
 
 
@@ -285,7 +291,7 @@ def middle(field: Array) -> Array:
     return mean
 
 
-def rounded(values: float | list[float]) -> str:
+def round_values(values: float | list[float]) -> str:
     """Numbers to three digits."""
     return (
         f"{values:.3g}"
@@ -294,7 +300,7 @@ def rounded(values: float | list[float]) -> str:
     )
 
 
-def found(run: Run) -> list[str]:
+def result_overrides(run: Run) -> list[str]:
     """Overrides that put what `run` found into its scene."""
     fields = [
         f"volume.{path.stem}={{file: {path.resolve()}}}"

@@ -47,7 +47,7 @@ class Replay:
         """That of `scene`, on as many threads as torch has; `headroom` 1: as Mitsuba comes."""
         module = load_mitsuba(torch.get_num_threads())
         described = mitsuba_scene(scene, scene.views[:1]) | {
-            MEDIUM: mitsuba_scene(_roomy_scene(scene, headroom), [])[MEDIUM]
+            MEDIUM: mitsuba_scene(_pad_scene(scene, headroom), [])[MEDIUM]
         }
         loaded = module.load_dict(make_mitsuba_objects(module, described))
         integrator = module.load_dict(
@@ -64,7 +64,7 @@ class Replay:
     def set_density(self, density: Tensor) -> None:
         """Puts `density` [z, y, x] into the scene."""
         self.parameters[self.name(DENSITY)] = self.module.TensorXf(
-            roomy(density, self.headroom).numpy()[..., None]
+            pad_density(density, self.headroom).numpy()[..., None]
         )
         self.parameters.update()
 
@@ -92,12 +92,12 @@ class Replay:
     def by_density(self, gradient: np.ndarray, density: Tensor) -> Tensor:
         """The derivative by the cells of `density` [z, y, x] from that by Mitsuba's grid."""
         leaf = density.detach().requires_grad_()
-        padded = roomy(leaf, self.headroom)
+        padded = pad_density(leaf, self.headroom)
         (own,) = torch.autograd.grad(padded, leaf, torch.from_numpy(gradient).view_as(padded))
         return own
 
 
-def roomy(density: Tensor, headroom: float) -> Tensor:
+def pad_density(density: Tensor, headroom: float) -> Tensor:
     """`density` [z, y, x] with RING more cells on all sides, like their neighbors but for one in a
     corner, `headroom` times the densest.
     """
@@ -107,13 +107,13 @@ def roomy(density: Tensor, headroom: float) -> Tensor:
     return torch.where(is_corner, headroom * density.detach().max(), padded)
 
 
-def _roomy_scene(scene: Scene, headroom: float) -> Scene:
+def _pad_scene(scene: Scene, headroom: float) -> Scene:
     grid, volume = scene.volume.grid, scene.volume
     lower = tuple(low - RING * step for low, step in zip(grid.lower, grid.spacing, strict=True))
     upper = tuple(high + RING * step for high, step in zip(grid.upper, grid.spacing, strict=True))
     wide = Grid(tuple(count + 2 * RING for count in grid.shape), lower, upper)
     return replace(
-        scene, volume=replace(volume, grid=wide, density=roomy(volume.density, headroom))
+        scene, volume=replace(volume, grid=wide, density=pad_density(volume.density, headroom))
     )
 
 

@@ -66,7 +66,7 @@ def with_colors(scene: Scene, count: int) -> Scene:
     return replace(scene, volume=replace(scene.volume, sigma_s=scene.volume.sigma_s * colors))
 
 
-def started(scene: Scene) -> Reconstruction:
+def start_run(scene: Scene) -> Reconstruction:
     """A reconstruction of `scene` from half its density."""
     with torch.no_grad():
         images = render_each(scene, scene.views, SolveMemory())
@@ -86,7 +86,7 @@ def started(scene: Scene) -> Reconstruction:
 
 def seconds(scene: Scene, repeat: int) -> float:
     """The median of some iterations, after one that is not counted."""
-    run, taken = started(scene), []
+    run, taken = start_run(scene), []
     for _ in range(repeat + 1):
         start = now(scene)
         run.step()

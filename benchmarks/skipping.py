@@ -46,7 +46,7 @@ def seconds(scene: Scene, is_varied: bool) -> float:
     return least
 
 
-def behind(density: Tensor, sigma_t: float) -> tuple[float, float]:
+def dark_parts(density: Tensor, sigma_t: float) -> tuple[float, float]:
     """The part of all samples along z that less than `DARK` of the light reaches: ray by ray, and
     where whole tiles of rays could stop.
     """
@@ -74,7 +74,7 @@ def main() -> None:
     for name, cases in OPAQUE.items():
         for file, sigma_t in cases:
             density = torch.from_numpy(read_field(ROOT / "data" / f"{file}.npz", "density").values)
-            rays, tiles = behind(density, sigma_t)
+            rays, tiles = dark_parts(density, sigma_t)
             print(f"| {name} | {sigma_t:g} | {rays:.3f} | {tiles:.3f} |")
 
 

@@ -67,7 +67,7 @@ def system(density: Tensor, sigma_t: float, device: str) -> tuple[Operator, Tens
         return problem.system
 
 
-def resampled(density: Tensor, shape: tuple[int, int, int]) -> Tensor:
+def resample(density: Tensor, shape: tuple[int, int, int]) -> Tensor:
     """`density` [z, y, x] on `shape` cells."""
     return interpolate(density[None, None], size=shape, mode="trilinear")[0, 0]
 
@@ -125,7 +125,7 @@ def main() -> None:
     }
     shapes = [(n, n, n) for n in arguments.cells] + [(64, 96, 64)]
     for shape in shapes:
-        fields = {name: (resampled(values, shape), 40.0) for name, values in media.items()} | {
+        fields = {name: (resample(values, shape), 40.0) for name, values in media.items()} | {
             "nearly empty": (torch.full(shape, 1e-3), 12.0)
         }
         for name, (density, sigma_t) in fields.items():

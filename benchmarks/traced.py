@@ -20,7 +20,7 @@ SAMPLES, LEAST = 128, 4
 """Paths a pixel in each pass, and the fewest passes."""
 
 
-def traced(
+def trace(
     scene: Scene, folder: Path, depth: int = -1, noise: float = 0.03, passes: int = 32
 ) -> Traced:
     """The image [h, w] of the first view of `scene` by paths of at most `depth` segments (2:
@@ -49,11 +49,13 @@ def _fingerprint(scene: Scene, depth: int) -> str:
     camera = scene.views[0].camera
     records: list[Any] = [scene.volume, camera, *scene.lights]
     values = [(type(record).__name__, *vars(record).values()) for record in records]
-    text = repr([[_written(value) for value in record] for record in [*values, (depth, SAMPLES)]])
+    text = repr(
+        [[_as_plain_values(value) for value in record] for record in [*values, (depth, SAMPLES)]]
+    )
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _written(value: object) -> object:
+def _as_plain_values(value: object) -> object:
     return (
         (tuple(value.shape), hashlib.sha256(value.numpy().tobytes()).hexdigest())
         if isinstance(value, Tensor)

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from make_shapes import centers, smoothly, swirled, write
+from make_shapes import centers, smooth_step, swirl, write
 from make_targets import keep
 
 from ddrecon.io.images.table import read_image
@@ -50,15 +50,15 @@ def field() -> None:
     """
     points = centers(BOX, CELLS)
     height = points[..., 2] - 0.56
-    folded = swirled(points * 2.5, 5, 0.22) / 2.5
+    folded = swirl(points * 2.5, 5, 0.22) / 2.5
     density = np.zeros(points.shape[:-1])
     for x, y, radius, top in CLOUDS:
         middle = np.array([x, y, 0.56 + 0.35 * top])
         scaled = (folded - middle) / (radius, radius, 0.62 * top)
-        inside = smoothly(np.linalg.norm(scaled, axis=-1) - 1, 0.05)
+        inside = smooth_step(np.linalg.norm(scaled, axis=-1) - 1, 0.05)
         density = np.maximum(density, inside * np.clip(height / 0.4, 0.15, 1) ** (2 / 3))
     FIELD.mkdir(exist_ok=True)
-    write(FIELD / "density.npz", BOX, density=density * smoothly(-height, 0.008))
+    write(FIELD / "density.npz", BOX, density=density * smooth_step(-height, 0.008))
 
 
 def sky(source: Path) -> None:

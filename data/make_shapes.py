@@ -52,7 +52,7 @@ def bunny_mesh(package: Path) -> Array:
     return triangles
 
 
-def inside(triangles: Array, points: Array) -> NDArray[np.bool_]:
+def is_inside(triangles: Array, points: Array) -> NDArray[np.bool_]:
     """Whether each of the lattice `points` [z, y, x, 3] is within the closed surface of
     `triangles`.
 
@@ -94,7 +94,7 @@ def _between(line: Array, values: list[float]) -> slice:
 def bunny(package: Path, cells: tuple[int, int, int]) -> Array:
     """Density [z, y, x]: the part of each cell that is within the bunny."""
     x, y, z = cells
-    fine = inside(bunny_mesh(package), centers(TALL, (x * SAMPLES, y * SAMPLES, z * SAMPLES)))
+    fine = is_inside(bunny_mesh(package), centers(TALL, (x * SAMPLES, y * SAMPLES, z * SAMPLES)))
     part: Array = fine.reshape(z, SAMPLES, y, SAMPLES, x, SAMPLES).mean((1, 3, 5))
     return part
 
@@ -112,7 +112,7 @@ def knot(points: Array) -> Array:
     return 1 / (1 + np.exp((np.sqrt(square) - 0.09) / 0.008))
 
 
-def swirled(points: Array, seed: int, strength: float) -> Array:
+def swirl(points: Array, seed: int, strength: float) -> Array:
     """Where the `points` [..., 3] came from, carried backward by a curl noise for the time
     `strength`.
 
@@ -128,19 +128,19 @@ def swirled(points: Array, seed: int, strength: float) -> Array:
     return points
 
 
-def smoothly(distance: Array, width: float) -> Array:
+def smooth_step(distance: Array, width: float) -> Array:
     """1 where `distance` is well below 0, 0 where it is well above, changing over `width`."""
     return 1 / (1 + np.exp(np.clip(distance / width, -50, 50)))
 
 
 def cloud(points: Array) -> Array:
     """Density at `points` of the cube: three merged balls, folded by curl noise."""
-    places = swirled(points, 3, 0.12)
+    places = swirl(points, 3, 0.12)
     balls = [((-0.13, -0.08, 0.0), 0.23), ((0.15, -0.05, 0.05), 0.21), ((0.0, 0.13, -0.03), 0.2)]
     distance = np.min(
         [np.linalg.norm(places - center, axis=-1) - radius for center, radius in balls], 0
     )
-    return smoothly(distance, 0.02)
+    return smooth_step(distance, 0.02)
 
 
 def black_optics(points: Array) -> tuple[Array, Array]:
@@ -156,9 +156,11 @@ def smoke(points: Array) -> tuple[Array, Array]:
     """Density and albedo [..., 3] at `points` of the cube: a column of red, green and blue smoke,
     folded by curl noise.
     """
-    places = swirled(points, 11, 0.15)
+    places = swirl(points, 11, 0.15)
     x, y, z = np.moveaxis(places, -1, 0)
-    density = smoothly(np.hypot(x, z) - 0.13 - 0.12 * y, 0.02) * smoothly(np.abs(y) - 0.33, 0.02)
+    density = smooth_step(np.hypot(x, z) - 0.13 - 0.12 * y, 0.02) * smooth_step(
+        np.abs(y) - 0.33, 0.02
+    )
     angle = np.arctan2(z, x) + 5 * y
     hue = np.stack([np.cos(angle - shift) for shift in (0, 2 * np.pi / 3, 4 * np.pi / 3)], -1)
     return density, 0.72 + 0.25 * hue
