@@ -29,7 +29,7 @@ def octahedron(radius: float) -> np.ndarray:
 def test_a_closed_surface_is_filled() -> None:
     radius, cells = 0.4, 60
     points = shapes.centers(shapes.CUBE, (cells,) * 3)
-    filled = shapes.inside(octahedron(radius), points)
+    filled = shapes.is_inside(octahedron(radius), points)
     assert filled.mean() == pytest.approx(4 / 3 * radius**3, rel=0.02)
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     assert (filled == (np.abs(points @ turn).sum(-1) < radius)).all()
@@ -39,15 +39,15 @@ def test_a_hole_in_a_shape_stays_empty() -> None:
     points = shapes.centers(shapes.CUBE, (40,) * 3)
     both = np.concatenate([octahedron(0.4), octahedron(0.2)[:, ::-1]])
     assert (
-        shapes.inside(both, points)
-        == shapes.inside(octahedron(0.4), points) & ~shapes.inside(octahedron(0.2), points)
+        shapes.is_inside(both, points)
+        == shapes.is_inside(octahedron(0.4), points) & ~shapes.is_inside(octahedron(0.2), points)
     ).all()
 
 
 def test_curl_noise_has_no_divergence() -> None:
     points, step = np.random.default_rng(1).uniform(-0.5, 0.5, (50, 3)), 1e-5
     sides = [
-        [shapes.swirled(points + sign * step * axis, 3, 1e-3) for sign in (1, -1)]
+        [shapes.swirl(points + sign * step * axis, 3, 1e-3) for sign in (1, -1)]
         for axis in np.eye(3)
     ]
     jacobian = np.stack([(ahead - behind) / (2 * step) for ahead, behind in sides], -1)
