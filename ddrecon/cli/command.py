@@ -118,12 +118,6 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-def require_folder_of(report: Path | None) -> None:
-    """Raises click.UsageError where `report` is to be written into a folder that does not exist."""
-    if report is not None and not report.absolute().parent.is_dir():
-        raise click.UsageError(f"--json {report}: there is no folder {report.absolute().parent}")
-
-
 @contextmanager
 def show_warnings() -> Iterator[None]:
     """Warnings about data become lines on stderr; those of libraries are for developers and stay
