@@ -23,9 +23,10 @@ from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import Color
 from ddrecon.settings import FieldFile, ParameterSettings
+from ddrecon.variables.kinds import KINDS, VOLUME
 from ddrecon.variables.values import cross_sections
 
-QUANTITIES = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo")
+QUANTITIES = tuple(name for name in VOLUME if KINDS[name].is_cellwise)
 Fields = Mapping[str, Field]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import reduce
+from itertools import product
 from operator import or_
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -26,7 +27,13 @@ from ddrecon.scene_file.ring import ring_views
 from ddrecon.scene_file.schema import Constant, Density, Quantity, ViewSection, ViewSource
 from ddrecon.scene_file.transforms import read_transforms
 from ddrecon.settings import FieldFile, ParameterSettings, Start
-from ddrecon.variables.kinds import KINDS, Kind, pattern_of
+from ddrecon.variables.kinds import (
+    CROSS_SECTIONS,
+    EXTINCTION_AND_ALBEDO,
+    KINDS,
+    Kind,
+    pattern_of,
+)
 
 R = TypeVar("R")
 
@@ -157,12 +164,7 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
     problems.raise_any()
     if not parameters:
         raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
-    for name, other in (
-        ("sigma_t", "sigma_a"),
-        ("sigma_t", "sigma_s"),
-        ("albedo", "sigma_a"),
-        ("albedo", "sigma_s"),
-    ):
+    for name, other in product(EXTINCTION_AND_ALBEDO, CROSS_SECTIONS):
         if name in parameters and other in parameters:
             raise _mapping(node)[name].key_refused(
                 f"cannot be optimized beside {other}: take sigma_a and sigma_s, or sigma_t and albedo"

@@ -27,6 +27,7 @@ from ddrecon.settings import (
     one_of,
     optional,
 )
+from ddrecon.variables.kinds import PAIRS
 
 Count = tuple[int, int, int]
 Size = tuple[int, int]
@@ -74,7 +75,7 @@ class Bounds:
 class VolumeSection:
     """`bounds` and `resolution` may be left out where a field's file has them."""
 
-    ALTERNATIVES: ClassVar = (("sigma_a", "sigma_s"), ("sigma_t", "albedo"))
+    ALTERNATIVES: ClassVar = PAIRS
 
     density: Density = limited(minimum=0)
     bounds: Bounds | None = None

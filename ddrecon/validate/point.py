@@ -20,21 +20,13 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import image_loss
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
-from ddrecon.variables.kinds import pattern_of
+from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import component_names, value_of, with_values
 
 TOLERANCE = 1e-13
 """Relative residual of the solves."""
-STEPS = (1e-2, 1e-3, 1e-4)
-"""Changes by which finite differences are taken, as parts of the parameter's largest value."""
-SHORT_STEPS = (1e-4, 1e-5, 1e-6)
-"""The same for what moves rays or beams, since interpolation has a kink at every cell center and a
-short step crosses few, and for g, whose delta-Eddington scaling has a second derivative that jumps
-at 0.
-"""
 NUDGE = 1e-2
 """The most that a component of a light's direction is changed by, as a part of the largest."""
-SHORT = {"g", "lights.N.direction", "lights.N.position", "lights.N.rotation", "views.NAME.camera"}
 
 
 def starting_point(
@@ -55,7 +47,7 @@ def starting_point(
             density for density in candidates if bool((density != density.flatten()[0]).any())
         )
     for name, value in point.items():
-        if pattern_of(name) == "lights.N.direction":
+        if kind_of(name).is_direction:
             point[name] = value + NUDGE * value.abs().max() * (
                 2 * random_like(value, generator) - 1
             )
@@ -95,8 +87,9 @@ def loss_at(
 def steps_of(name: str, value: Tensor) -> tuple[float, ...]:
     """The steps of finite differences for the parameter `name` at `value`."""
     largest = float(value.abs().max())
-    steps = SHORT_STEPS if pattern_of(name) in SHORT else STEPS
-    return tuple(step * (largest if largest > 0 else 1.0) for step in steps)
+    return tuple(
+        step * (largest if largest > 0 else 1.0) for step in kind_of(name).difference_steps
+    )
 
 
 def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:

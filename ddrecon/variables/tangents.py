@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.scene import Scene
+from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
 
 
@@ -28,10 +29,9 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
     """
     if name in variable_names(scene):
         value = value_of(scene, name)
-        if name.rpartition(".")[2] in ("direction", "position", "camera"):
-            raise KeyError(
-                f"{name} changes by component: {', '.join(f'{name}.{part}' for part in component_names(name, value))}"
-            )
+        if components := kind_of(name).components:
+            parts = ", ".join(f"{name}.{component}" for component in components)
+            raise KeyError(f"{name} changes by component: {parts}")
         return name, torch.ones_like(value)
     owner, _, component = name.rpartition(".")
     if owner in variable_names(scene):

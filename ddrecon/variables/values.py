@@ -18,11 +18,7 @@ from ddrecon.cameras import twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
-
-VOLUME = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo", "g")
-"""The volume's variables; either sigma_a and sigma_s or sigma_t and albedo are varied, the other
-pair follows.
-"""
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, VOLUME, kind_of
 
 
 def variable_names(scene: Scene) -> list[str]:
@@ -91,19 +87,12 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
 
 
 def component_names(name: str, value: Tensor) -> tuple[str, ...]:
-    """What the entries of a variable that is a vector, a color or a twist are called; none for a
-    number, a field or a map.
+    """The names along the first axis of `value`: a vector's entries or three colors; else none.
+
+    Raises KeyError for a name of no variable.
     """
-    attribute = name.rpartition(".")[2]
-    if attribute == "camera":
-        return "rotation_x", "rotation_y", "rotation_z", "x", "y", "z"
-    if attribute in ("direction", "position"):
-        return "x", "y", "z"
-    return (
-        ("r", "g", "b")
-        if value.ndim in (1, 3, 4) and value.shape[0] == 3 and attribute != "density"
-        else ()
-    )
+    kind = kind_of(name)
+    return ("r", "g", "b") if kind.is_color and value.shape[:1] == (3,) else kind.components
 
 
 def cross_sections(sigma_t: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,32 +113,28 @@ def _tensors(light: Light) -> list[str]:
 
 
 def _volume_value(volume: Volume, name: str) -> Tensor:
-    if name not in ("sigma_t", "albedo"):
+    if name not in EXTINCTION_AND_ALBEDO:
         value: Tensor = getattr(volume, name)
         return value
-    one, other = _same_axes(volume.sigma_a, volume.sigma_s)
-    sigma_t = one + other
-    return (
-        sigma_t if name == "sigma_t" else other / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
-    )
+    sigma_a, sigma_s = _same_axes(volume.sigma_a, volume.sigma_s)
+    sigma_t = sigma_a + sigma_s
+    if name == "sigma_t":
+        return sigma_t
+    return sigma_s / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
 
 
 def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
-    density, g = values.get("density", volume.density), values.get("g", volume.g)
-    sigma_a, sigma_s = values.get("sigma_a", volume.sigma_a), values.get("sigma_s", volume.sigma_s)
-    if "sigma_t" in values or "albedo" in values:
+    held = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
+    if len(held) < len(values):
         sigma_t, albedo = (
             values[name] if name in values else _volume_value(volume, name)
-            for name in ("sigma_t", "albedo")
+            for name in EXTINCTION_AND_ALBEDO
         )
-        sigma_a, sigma_s = cross_sections(sigma_t, albedo)
-    return Volume(
-        volume.grid,
-        density.expand(volume.grid.shape) if density.ndim == 0 else density,
-        sigma_a,
-        sigma_s,
-        g,
-    )
+        held["sigma_a"], held["sigma_s"] = cross_sections(sigma_t, albedo)
+    if "density" in held and held["density"].ndim == 0:
+        held["density"] = held["density"].expand(volume.grid.shape)
+    changed: Volume = replace(volume, **held)  # type: ignore[arg-type]
+    return changed
 
 
 def _replace_light(light: Light, values: Mapping[str, Tensor]) -> Light:
