@@ -1,8 +1,9 @@
-"""What a renderer can be told: the `render` and `diffusion` sections of a scene, with their
-defaults and legal values.
+"""Settings of rendering and of optimizing: the sections `render`, `diffusion` and `optimize` of a
+scene, with their defaults and legal values.
 
-Each field's metadata is what the scene loader checks: `minimum`, `above`, `maximum`, or `choices`,
-a table of implementations.
+What the scene loader checks stands with each field: the limits `minimum`, `above`, `maximum` and
+`below` of its numbers, or its `choices`, which are the names of a table of implementations.
+`problems` yields what is wrong with several values together.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.losses import LOSSES
 from ddrecon.numerics.quadrature import DEGREES
 
 DERIVATIVES = ("all", "single", "diffusion")
@@ -24,21 +26,36 @@ diffusion (the paper's Fig. 9).
 """
 
 
-def bounded(
-    default: Any,
-    *,
-    minimum: float | None = None,
-    above: float | None = None,
-    maximum: float | None = None,
-) -> Any:
-    """A number field whose value is at least `minimum`, greater than `above` and at most `maximum`,
-    where given.
-    """
-    return field(default=default, metadata={"minimum": minimum, "above": above, "maximum": maximum})
+Problem = tuple[str, str]
+"""The key of a record that breaks a rule, and what is wrong with its value."""
+
+
+class Limits(TypedDict, total=False):
+    """What each number of a field must be: `minimum` and `maximum` are legal, the others not."""
+
+    minimum: float
+    above: float
+    maximum: float
+    below: float
+
+
+def bounded(default: Any, **limits: Unpack[Limits]) -> Any:
+    """A number, or numbers, within `limits`, `default` where the scene gives none."""
+    return field(default=default, metadata=dict(limits))
+
+
+def limited(**limits: Unpack[Limits]) -> Any:
+    """A number, or numbers, within `limits`, that the scene must give."""
+    return field(metadata=dict(limits))
+
+
+def optional(**limits: Unpack[Limits]) -> Any:
+    """A number, or numbers, within `limits`, that may be left out."""
+    return bounded(None, **limits)
 
 
 def one_of(default: Any, choices: Collection[Any]) -> Any:
-    """A field whose value is one of `choices`."""
+    """One of `choices`, `default` where the scene gives none."""
     return field(default=default, metadata={"choices": tuple(choices)})
 
 
@@ -81,8 +98,8 @@ class DiffusionSettings:
     transport_rounds: int = bounded(0, minimum=0, maximum=16)
     transport_directions: int = one_of(26, DEGREES)
 
-    def problems(self) -> Iterator[tuple[str, str]]:
-        """Settings that exclude each other, as key and what is wrong with it."""
+    def problems(self) -> Iterator[Problem]:
+        """Settings that exclude each other."""
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
         if self.transport_rounds > 0 and (self.model, self.scheme) != ("p1", "conservative"):
@@ -90,14 +107,6 @@ class DiffusionSettings:
                 "transport_rounds",
                 "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",
             )
-
-
-Problem = tuple[str, str]
-
-
-def optional(**limits: float) -> Any:
-    """A number, or numbers, within `limits`, that may be left out."""
-    return field(default=None, metadata=limits)
 
 
 @dataclass(frozen=True)
@@ -109,6 +118,7 @@ class FieldFile:
 
 
 Start = float | tuple[float, ...] | FieldFile
+"""Where a parameter starts: the same number everywhere, a vector or color, or a file's values."""
 
 
 @dataclass(frozen=True)
@@ -130,10 +140,8 @@ class ParameterSettings:
     field: bool | None = None
 
     def problems(self) -> Iterator[Problem]:
-        low, high = (
-            -math.inf if self.min is None else self.min,
-            math.inf if self.max is None else self.max,
-        )
+        low = -math.inf if self.min is None else self.min
+        high = math.inf if self.max is None else self.max
         entries = self.init if isinstance(self.init, tuple) else (self.init,)
         if high <= low:
             yield "max", f"{high:g} is not above min, {low:g}"
@@ -153,11 +161,10 @@ class OptimizeSettings:
 
     parameters: Mapping[str, ParameterSettings]
     iterations: int = bounded(300, minimum=1)
-    loss: str = one_of("l2", ("l2", "l1", "huber", "relative_l2"))
-    optimizer: str = one_of("adam", ("adam",))
+    loss: str = one_of("l2", LOSSES)
     views_per_iteration: int = bounded(3, minimum=0)
     derivatives: str = one_of("all", DERIVATIVES)
-    refine_at: tuple[float, ...] = field(default=(0.4, 0.8), metadata={"above": 0, "below": 1})
+    refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)
 
     def problems(self) -> Iterator[Problem]:
         if any(

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from ddrecon.settings import (
     Problem,
     RenderSettings,
     bounded,
+    limited,
     one_of,
     optional,
 )
@@ -40,11 +41,6 @@ Matrix = tuple[Row, Row, Row, Row]
 MAX_CELLS = 2**30
 TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
 """Endings of the names of output files, which a view's name must not have."""
-
-
-def limited(**limits: float) -> Any:
-    """A required number, or numbers, within `limits`."""
-    return field(metadata=limits)
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,7 @@ class VolumeSection:
     sigma_s: Quantity | None = optional(minimum=0)
     sigma_t: Quantity | None = optional(minimum=0)
     albedo: Quantity | None = optional(minimum=0, maximum=1)
-    g: float = field(default=0.0, metadata={"above": -1, "below": 1})
+    g: float = bounded(0.0, above=-1, below=1)
 
     def problems(self) -> Iterator[Problem]:
         x, y, z = self.resolution or (1, 1, 1)

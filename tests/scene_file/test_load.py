@@ -55,7 +55,6 @@ diffusion:
 optimize:
   iterations: 300
   loss: l2                 # l2 | l1 | huber | relative_l2
-  optimizer: adam          # or lbfgs
   refine_at: [0.3, 0.6]    # coarse-to-fine, fractions of the run
   parameters:
     density: {init: 0.0, lr: 0.05, min: 0, tv: 1e-4}
@@ -104,7 +103,7 @@ def test_defaults(read: Read):
     )
     settings = read(SCENE + "optimize: {parameters: {density: {}}}\n").tree.optimize
     assert settings == OptimizeSettings(
-        {"density": ParameterSettings()}, 300, "l2", "adam", 3, "all", (0.4, 0.8)
+        {"density": ParameterSettings()}, 300, "l2", 3, "all", (0.4, 0.8)
     )
     assert read(changed(volume={"density": 1, "sigma_a": 0, "sigma_s": 1})).tree.volume.g == 0
 
@@ -251,6 +250,10 @@ ONE_FAULT = [
     ),
     ("diffusion.tolerance=0.6", "diffusion.tolerance: must be at most 0.5"),
     ("difusion.model=p1", "difusion: unknown key; did you mean 'diffusion'?"),
+    (
+        "optimize={parameters: {density: {}}, optimizer: adam}",
+        "optimize.optimizer: unknown key; known: parameters, iterations, loss,",
+    ),
     ("optimize.iterations=10", "optimize: missing key 'parameters'"),
     ("optimize.parameters={}", "optimize.parameters: names no parameter; known: density"),
     (
