@@ -1,5 +1,4 @@
-"""Settings of rendering and of optimizing: the sections `render`, `diffusion` and `optimize` of a
-scene, with their defaults and legal values.
+"""The sections `render`, `diffusion` and `optimize` of a scene: defaults and legal values.
 
 What the scene loader checks stands with each field: the limits `minimum`, `above`, `maximum` and
 `below` of its numbers, or its `choices`, which are the names of a table of implementations.
@@ -123,8 +122,10 @@ Start = float | tuple[float, ...] | FieldFile
 
 @dataclass(frozen=True)
 class ParameterSettings:
-    """How one parameter is optimized: from `init` (None: what the scene says), within [`min`,
-    `max`], by learning rate `lr`.
+    """How one parameter is optimized.
+
+    It starts from `init` (None: what the scene says), stays within [`min`, `max`] and has the
+    learning rate `lr` (None: that of its kind).
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
     always does). `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as

@@ -39,6 +39,7 @@ def _build_light(
         return torch.tensor(value, dtype=dtype, device=device)
 
     def color(value: Color) -> Tensor:
+        """[1] or [3]"""
         return tensor(value).view(-1)
 
     if isinstance(section, DirectionalSection):
@@ -64,11 +65,12 @@ def _read_map(path: Path) -> np.ndarray:
         raise FormatError(
             path, f"an environment map has at least 3 x 2 pixels, and this is {width} x {height}"
         )
-    negative = np.count_nonzero(pixels.min(axis=2) < 0)
-    if negative:
-        row, column = np.argwhere(pixels.min(axis=2) < 0)[0]
+    is_negative = pixels.min(axis=2) < 0
+    if negative := np.count_nonzero(is_negative):
+        row, column = np.argwhere(is_negative)[0]
         warnings.warn(
-            f"{path}: {negative} pixels with negative radiance are taken as 0, the first at row {row}, column {column}",
+            f"{path}: {negative} pixels with negative radiance are taken as 0,"
+            f" the first at row {row}, column {column}",
             DataWarning,
             4,
         )

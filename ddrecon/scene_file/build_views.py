@@ -48,9 +48,9 @@ def _build_view(
                 read_referenced(scene_file, f"{key}.mask", section.mask, read_mask)
             ).to(device, dtype)
     size = _size(section.camera, image)
-    for name, pixels_of in (("image", image), ("mask", mask)):
-        if pixels_of is not None and size is not None and tuple(pixels_of.shape[-2:]) != size:
-            height, width = pixels_of.shape[-2:]
+    for name, picture in (("image", image), ("mask", mask)):
+        if picture is not None and size is not None and tuple(picture.shape[-2:]) != size:
+            height, width = picture.shape[-2:]
             problems.note(
                 scene_file.refused(
                     f"{key}.{name}",
@@ -63,7 +63,8 @@ def _build_view(
             if grid is not None and not sees_box(camera, grid):
                 raise scene_file.refused(
                     f"{key}.camera",
-                    f"no pixel of view {section.name!r} looks through the volume; {explain_blindness(camera, grid)}",
+                    f"no pixel of view {section.name!r} looks through the volume;"
+                    f" {explain_blindness(camera, grid)}",
                 )
     problems.raise_any()
     camera = replace(camera, pose=camera.pose.to(device, dtype))

@@ -124,7 +124,8 @@ def _read_quantity(path: Path, name: str, called: str) -> Field:
     if name == "density" and field.values.ndim != 3:
         raise FormatError(
             path,
-            f"density has shape {list(field.values.shape)}; expected [z, y, x]: colors belong to the cross sections",
+            f"density has shape {list(field.values.shape)}; expected [z, y, x]:"
+            " colors belong to the cross sections",
         )
     if name == "albedo" and (highest := field.values.max()) > 1:
         z, y, x = np.argwhere(field.values > 1)[0, :3]

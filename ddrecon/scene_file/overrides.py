@@ -46,11 +46,13 @@ def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
     elif isinstance(parent.value, list):
         if not (parts[0].isascii() and parts[0].isdigit() and int(parts[0]) < len(parent.value)):
             raise SceneError(
-                f"{where}: {parent.child_key(parts[0])}: no such entry: {parent.key} is {describe_found(parent)}, counted from 0"
+                f"{where}: {parent.child_key(parts[0])}: no such entry:"
+                f" {parent.key} is {describe_found(parent)}, counted from 0"
             )
     else:
         raise SceneError(
-            f"{where}: {parent.child_key(parts[0])}: {parent.key or 'the scene'} is {describe_found(parent)}, not a mapping or list"
+            f"{where}: {parent.child_key(parts[0])}: {parent.key or 'the scene'} is"
+            f" {describe_found(parent)}, not a mapping or list"
         )
     return parts[0], ".".join(parts[1:])
 

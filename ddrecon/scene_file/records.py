@@ -139,7 +139,8 @@ def _read_density(node: Node, rule: Rule) -> float | FieldFile:
         return read_record(node, Constant, rule.folder).constant
     if node.value is None or isinstance(node.value, str | list | dict):
         raise node.refused(
-            f"expected a number, {{constant: number}} or {{file: path}}, found {describe_found(node)}"
+            "expected a number, {constant: number} or {file: path},"
+            f" found {describe_found(node)}"
         )
     return read_number(node, rule)
 
@@ -167,7 +168,8 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
     for name, other in product(EXTINCTION_AND_ALBEDO, CROSS_SECTIONS):
         if name in parameters and other in parameters:
             raise _mapping(node)[name].key_refused(
-                f"cannot be optimized beside {other}: take sigma_a and sigma_s, or sigma_t and albedo"
+                f"cannot be optimized beside {other}:"
+                " take sigma_a and sigma_s, or sigma_t and albedo"
             )
     return parameters
 

@@ -160,15 +160,16 @@ class PoseSection:
 
 
 def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
-    turn = matrix[:3, :3]
+    """Why `matrix` [4, 4] is no rotation and shift, where it is not."""
+    rotation = matrix[:3, :3]
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-4:
         yield "matrix", "its last row must be [0, 0, 0, 1]"
-    elif np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
+    elif np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
         yield (
             "matrix",
             "must be rigid, but its first three columns are not of unit length and perpendicular",
         )
-    elif np.linalg.det(turn) < 0:
+    elif np.linalg.det(rotation) < 0:
         yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
 
@@ -216,12 +217,14 @@ class ViewSection:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
             yield (
                 "name",
-                f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.', the last not at its start",
+                f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.',"
+                " the last not at its start",
             )
         if self.name.endswith(TAKEN):
             yield (
                 "name",
-                f"{self.name!r} ends as files of other views do; do not end it with {', '.join(TAKEN)}",
+                f"{self.name!r} ends as files of other views do;"
+                f" do not end it with {', '.join(TAKEN)}",
             )
         if self.image is None and self.camera.resolution is None:
             yield "camera", "missing key 'resolution'; only a view with an image can go without"

@@ -25,9 +25,7 @@ RELATIVE_STEP = 0.1
 
 
 def density_rate(volume: Volume, start: Tensor) -> float:
-    """`DENSITY_STEP`, or the density of `THICKEST_STEP` optical depths across the box's shortest
-    side where that is less.
-    """
+    """`DENSITY_STEP`, or less in a box that would become thicker than `THICKEST_STEP`."""
     depth = float(volume.sigma_a.mean() + volume.sigma_s.mean()) * _side(volume)
     return min(DENSITY_STEP, THICKEST_STEP / depth) if depth > 0 else DENSITY_STEP
 

@@ -1,5 +1,4 @@
-"""The table of variables: all that the program knows of each kind of number in a scene that can be
-differentiated and optimized.
+"""The table of variables: all that is known of each kind of number that can be optimized.
 
 A kind is named by a pattern: N is a light's place in the list, counted from 0, and NAME a view's
 name. `ddrecon.variables.values` reads and replaces the values themselves.

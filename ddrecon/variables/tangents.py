@@ -1,5 +1,6 @@
-"""Derivative images: how every pixel changes with one number of the scene, by the differential
-diffusion equation (docs/theory.md E8).
+"""Derivative images: how every pixel changes with one number of the scene.
+
+They solve the differential diffusion equation (docs/theory.md E8).
 
 One forward-mode pass renders image and derivative together; a field changes uniformly, by one unit
 in every cell.
@@ -20,8 +21,9 @@ from ddrecon.variables.values import component_names, value_of, variable_names, 
 
 
 def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
-    """The variable that `name` belongs to, and its change [same shape] by one unit of what is
-    named.
+    """The variable that `name` belongs to, and its change by one unit of what `name` names.
+
+    The change has the shape of the variable's value.
 
     `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
     or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
@@ -50,8 +52,9 @@ Key = TypeVar("Key")
 def render_tangent(
     scene: Scene, name: str, images_of: Callable[[Scene], dict[Key, Tensor]]
 ) -> dict[Key, tuple[Tensor, Tensor]]:
-    """What `images_of` makes of `scene`, each image with its derivative with respect to `name` (see
-    `variation`).
+    """The images that `images_of` renders of `scene`, each with its derivative by `name`.
+
+    `name` is as for `variation`. Raises KeyError.
     """
     variable, change = variation(scene, name)
     with forward_ad.dual_level():

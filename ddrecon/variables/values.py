@@ -1,5 +1,4 @@
-"""The numbers of a scene by name: what can be differentiated and optimized, read out of a scene and
-put back into it.
+"""The numbers of a scene by name, read out of a scene and put back into it.
 
 `density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo` and `g` are the volume's; `lights.0.irradiance`
 is any number of the first light; `views.front.camera` is the twist of a camera. Vectors are (x, y,
@@ -36,28 +35,24 @@ def value_of(scene: Scene, name: str) -> Tensor:
 
     `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
     that light holds them; a camera's twist is the change of its pose, [6] and zero: see
-    `ddrecon.cameras.twisted`.
+    `ddrecon.cameras.twist`.
     """
-    kind, _, rest = name.partition(".")
-    if kind in VOLUME and not rest:
-        return _volume_value(scene.volume, kind)
-    if kind == "lights":
-        index, _, attribute = rest.partition(".")
-        if (
-            index.isdecimal()
-            and int(index) < len(scene.lights)
-            and attribute in _tensors(scene.lights[int(index)])
-        ):
-            value: Tensor = getattr(scene.lights[int(index)], attribute)
-            return value
-    elif kind == "views" and rest.endswith(".camera"):
-        return scene.view(rest.removesuffix(".camera")).camera.pose.new_zeros(6)
-    raise KeyError(name)
+    if name not in variable_names(scene):
+        raise KeyError(name)
+    if name in VOLUME:
+        return _volume_value(scene.volume, name)
+    section, _, path = name.partition(".")
+    if section == "views":
+        return scene.view(path.removesuffix(".camera")).camera.pose.new_zeros(6)
+    index, _, attribute = path.partition(".")
+    value: Tensor = getattr(scene.lights[int(index)], attribute)
+    return value
 
 
 def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
-    """`scene` with its variables replaced by `values`; a density of one number fills the grid.
-    `scene` itself stays as it is.
+    """`scene` with its variables replaced by `values`; `scene` itself stays as it is.
+
+    A density of one number fills the grid.
 
     Raises KeyError for a name that is none, ValueError for a density of another shape than the
     grid's.
@@ -67,15 +62,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     if unknown:
         raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(known)}")
     lights = [
-        _replace_light(
-            light,
-            {
-                name: values[key]
-                for name in _tensors(light)
-                if (key := f"lights.{index}.{name}") in values
-            },
-        )
-        for index, light in enumerate(scene.lights)
+        _replace_light(light, f"lights.{index}", values) for index, light in enumerate(scene.lights)
     ]
     views = [
         _replace_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views
@@ -124,21 +111,22 @@ def _volume_value(volume: Volume, name: str) -> Tensor:
 
 
 def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
-    held = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
-    if len(held) < len(values):
+    stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
+    if len(stored) < len(values):
         sigma_t, albedo = (
             values[name] if name in values else _volume_value(volume, name)
             for name in EXTINCTION_AND_ALBEDO
         )
-        held["sigma_a"], held["sigma_s"] = cross_sections(sigma_t, albedo)
-    if "density" in held and held["density"].ndim == 0:
-        held["density"] = held["density"].expand(volume.grid.shape)
-    changed: Volume = replace(volume, **held)  # type: ignore[arg-type]
+        stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)
+    if "density" in stored and stored["density"].ndim == 0:
+        stored["density"] = stored["density"].expand(volume.grid.shape)
+    changed: Volume = replace(volume, **stored)  # type: ignore[arg-type]
     return changed
 
 
-def _replace_light(light: Light, values: Mapping[str, Tensor]) -> Light:
-    changed: Light = replace(light, **values)  # type: ignore[arg-type]
+def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Light:
+    own = {key: values[f"{name}.{key}"] for key in _tensors(light) if f"{name}.{key}" in values}
+    changed: Light = replace(light, **own)  # type: ignore[arg-type]
     return changed
 
 
