@@ -19,8 +19,9 @@ from ddrecon.scene_file.schema import AmbientSection, Color, DirectionalSection,
 
 
 def build_lights(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> list[Light]:
-    """The scene's lights in `dtype` on `device`; raises SceneError or FormatError with the problems
-    of all.
+    """The scene's lights in `dtype` on `device`.
+
+    Raises SceneError or FormatError with the problems of all.
     """
     problems, lights = Problems(), list[Light]()
     for index in range(len(scene_file.tree.lights)):
@@ -56,8 +57,9 @@ def _build_light(
 
 
 def _read_map(path: Path) -> np.ndarray:
-    """The radiance of an environment map, float32 [h, w, 3]; what is negative, as around a sun in
-    lossy files, becomes 0 with a warning.
+    """The radiance of an environment map, float32 [h, w, 3].
+
+    What is negative, as around a sun in lossy files, becomes 0 with a warning.
     """
     pixels = read_image(path).pixels
     height, width = pixels.shape[:2]

@@ -1,5 +1,6 @@
-"""Where each optimized parameter starts: what the scene says of it, unless `init` or `field` ask
-for something else.
+"""The value each optimized parameter starts from.
+
+It is what the scene says of the parameter, unless `init` or `field` ask for something else.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ def require_start_files(scene_file: SceneFile, problems: Problems) -> None:
 
 
 def build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
-    """The value each optimized parameter of `scene` starts from; raises SceneError with all
-    problems, or FormatError.
+    """The value each optimized parameter of `scene` starts from, by name.
+
+    Raises SceneError with all problems, or FormatError.
     """
     problems, starts = Problems(), {}
     for name, settings in scene.optimize.parameters.items() if scene.optimize else ():

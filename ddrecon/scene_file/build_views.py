@@ -22,8 +22,9 @@ from ddrecon.scene_file.sight import explain_blindness, sees_box
 def build_views(
     scene_file: SceneFile, grid: Grid | None, dtype: torch.dtype, device: torch.device
 ) -> list[View]:
-    """The scene's views in `dtype` on `device`; where `grid` is known, cameras must see it. Raises
-    SceneError or FormatError.
+    """The scene's views in `dtype` on `device`.
+
+    Where `grid` is known, cameras must see it. Raises SceneError or FormatError.
     """
     problems, views = Problems(), []
     for index in range(len(scene_file.tree.views)):
@@ -72,9 +73,7 @@ def _build_view(
 
 
 def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None:
-    """(height, width): what the scene says, else the image's, else unknown because the image could
-    not be read.
-    """
+    """(height, width): what the scene says, else the image's; None if that could not be read."""
     if camera.resolution is not None:
         return camera.resolution[1], camera.resolution[0]
     return None if image is None else (image.shape[1], image.shape[2])

@@ -1,5 +1,6 @@
-"""The volume section as tensors: its grid, agreed on by the scene and every field file, its density
-and its cross sections.
+"""The volume section as tensors: its grid, its density and its cross sections.
+
+The scene and every field file must agree on the grid.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ Fields = Mapping[str, Field]
 
 
 def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> Volume:
-    """The volume of the scene in `dtype` on `device`; raises SceneError with all its problems, or
-    FormatError.
+    """The volume of the scene in `dtype` on `device`.
+
+    Raises SceneError with all its problems, or FormatError.
     """
     section = scene_file.tree.volume
     fields = _read_fields(scene_file)
@@ -63,8 +65,9 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
 
 
 def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype) -> Needs:
-    """What the scene's memory depends on; views that are as large as their images count as nothing,
-    since those are not read yet.
+    """What the scene's memory depends on.
+
+    Views that are as large as their images count as nothing, since those are not read yet.
     """
     tree, section = scene_file.tree, scene_file.tree.volume
     given = [
@@ -183,8 +186,9 @@ def _corners(bounds: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def _same_box(one: tuple[Triple, Triple], other: tuple[Triple, Triple]) -> bool:
-    """Whether the corners agree to a hundred-thousandth of the box's sides: files may hold them in
-    single precision.
+    """Whether the corners agree to a hundred-thousandth of the box's sides.
+
+    Files may hold them in single precision.
     """
     tolerance = 1e-5 * (np.array(other[1]) - np.array(other[0]))
     return bool((np.abs(np.array(one) - np.array(other)) <= tolerance).all())

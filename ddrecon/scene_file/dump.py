@@ -1,5 +1,6 @@
-"""Scenes written back: every default filled in and every path absolute, so that reading the result
-gives the same tree.
+"""Scenes written back, with every default filled in and every path absolute.
+
+Reading the result gives the same tree.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Reading the leaves of a scene: numbers, text, paths, vectors and colors, each within the limits
-its record declares.
+"""Reading the leaves of a scene: numbers, text, paths, vectors and colors.
+
+Each must be within the limits that its record declares.
 """
 
 from __future__ import annotations

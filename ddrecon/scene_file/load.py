@@ -1,4 +1,4 @@
-"""Scene files as records: strict YAML, with everything that is wrong told in one go."""
+"""Scene files as records: strict YAML, with everything that is wrong reported at once."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ MAX_BYTES = 2**20
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene file that was read: its `tree`, its `path`, and for each key path in it the
-    `file:line:column` of its value.
+    """A scene file that was read.
+
+    `tree` is its content, `path` where it lies, and `marks` are the `file:line:column` of each
+    value by key path.
     """
 
     tree: SceneTree
@@ -30,8 +32,9 @@ class SceneFile:
     marks: Mapping[str, str]
 
     def refused(self, key: str, what: str) -> SceneError:
-        """The error that says `what` is wrong with the value at `key`, or with the nearest one
-        above it that was written.
+        """The error that says `what` is wrong with the value at `key`.
+
+        It points to the nearest value above it where it was not written itself.
         """
         written = key
         while written and written not in self.marks:
@@ -40,8 +43,9 @@ class SceneFile:
 
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
-    """The scene file at `path` with `overrides` (`key.path=value`) put in; raises SceneError with
-    one line per problem.
+    """The scene file at `path` with `overrides` (`key.path=value`) put in.
+
+    Raises SceneError with one line per problem.
     """
     path = Path(path)
     problems = Problems()

@@ -84,8 +84,9 @@ def show_value(value: Scalar) -> str:
 
 
 def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
-    """The tree of the YAML (or JSON) document `text`, whose root is at `key`; repeated keys go to
-    `problems`.
+    """The tree of the YAML (or JSON) document `text`, whose root is at `key`.
+
+    Repeated keys go to `problems`.
 
     Raises SceneError where the text has no such tree: broken syntax, several documents, aliases,
     tags.

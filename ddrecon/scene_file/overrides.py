@@ -1,6 +1,4 @@
-"""`-D key.path=value`: values from the command line, put into the tree of a scene file before it is
-validated.
-"""
+"""`-D key.path=value`: values from the command line, put into a scene before it is validated."""
 
 from __future__ import annotations
 
@@ -14,8 +12,9 @@ PARAMETERS = "optimize.parameters"
 
 
 def override(root: Node, text: str, problems: Problems) -> None:
-    """Puts the value of `text` (`key.path=value`, the value in YAML) into the tree under `root`,
-    making mappings as needed.
+    """Puts the value of `text` (`key.path=value`, in YAML) into the tree under `root`.
+
+    Mappings are made as needed.
 
     A list is entered by index. Where keys themselves have dots, as those of parameters do, the
     longest one present or legal is taken. Raises SceneError.

@@ -1,5 +1,6 @@
-"""Reading records: any frozen dataclass of the schema from a mapping, by its fields' types. One
-function per shape of type.
+"""Reading records: any frozen dataclass of the schema from a mapping, by its fields' types.
+
+There is one function per shape of type; `Node`s are those of the YAML.
 """
 
 from __future__ import annotations
@@ -39,8 +40,9 @@ R = TypeVar("R")
 
 
 def read_record(node: Node, kind: type[R], folder: Path) -> R:
-    """The record of type `kind` that the mapping `node` describes; raises SceneError with
-    everything wrong in it.
+    """The record of type `kind` that the mapping `node` describes.
+
+    Raises SceneError with everything wrong in it.
     """
     entries = _mapping(node)
     declared: dict[str, Field[Any]] = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
@@ -61,8 +63,9 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
 
 
 def read_value(node: Node, rule: Rule) -> Any:
-    """The value of `node` by `rule`: a leaf, a record, a list of records, or one of several records
-    told apart by `type`.
+    """The value of `node` by `rule`.
+
+    It is a leaf, a record, a list of records, or one of several records told apart by `type`.
     """
     if read := READERS.get(rule.hint):
         return read(node, rule)
@@ -88,8 +91,9 @@ def _mapping(node: Node) -> dict[str, Node]:
 def _absences(
     kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]
 ) -> list[str]:
-    """What is wrong with the set of keys given: required ones missing or, of alternatives, empty,
-    or not exactly one group of those.
+    """What is wrong with the set of keys given.
+
+    Required keys must be there, and exactly one group of alternatives.
     """
     required = [
         name

@@ -113,8 +113,9 @@ class AmbientSection:
 
 @dataclass(frozen=True)
 class EnvironmentSection:
-    """A latitude-longitude map, +y up, its pixels times `scale`, turned by `rotation` [degrees]
-    about +y.
+    """A latitude-longitude map, +y up.
+
+    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about +y.
 
     `directions`: how many directions its light on the volume is gathered into.
     """
@@ -142,8 +143,9 @@ LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointS
 
 @dataclass(frozen=True, kw_only=True)
 class PoseSection:
-    """Where a camera stands: `origin`, `target` and `up` [u], or `matrix`, camera to world with
-    OpenGL axes; its pixels (w, h).
+    """Where a camera stands, and its `resolution` (width, height) in pixels.
+
+    The pose is `origin`, `target` and `up` [u], or `matrix`, camera to world with OpenGL axes.
     """
 
     ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
@@ -202,8 +204,9 @@ CameraSection = PerspectiveSection | OrthographicSection
 
 @dataclass(frozen=True)
 class ViewSection:
-    """One view; `resolution` of its camera may be left out where there is an image. `weight`: how
-    much it counts in the loss.
+    """One view; its camera's `resolution` may be left out where there is an image.
+
+    `weight`: how much it counts in the loss.
     """
 
     name: str
@@ -232,8 +235,9 @@ class ViewSection:
 
 @dataclass(frozen=True)
 class RingSection:
-    """Cameras around `target`, in the horizontal plane `height` above it, the first towards +z and
-    the next towards +x.
+    """Cameras around `target`, the first towards +z of it and the next towards +x.
+
+    The circle is horizontal, `height` above `target`.
     """
 
     count: int = limited(minimum=1, maximum=10000)
@@ -247,8 +251,9 @@ class RingSection:
 
 @dataclass(frozen=True)
 class ViewSource:
-    """Views that are not listed one by one: from a ring, or from transforms.json files of NeRF,
-    instant-ngp or nerfstudio.
+    """Views that are not listed one by one: those of a ring, or of transforms.json files.
+
+    Such files are written by NeRF, instant-ngp or nerfstudio.
 
     `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every
     `test_every` views of files that say nothing of it, the first is a test view.
@@ -275,8 +280,9 @@ class ViewSource:
 
 @dataclass(frozen=True)
 class SceneTree:
-    """A whole scene file; a ring of views is already the views it stands for, and paths are
-    absolute.
+    """A whole scene file.
+
+    A ring of views is already the views it stands for, and paths are absolute.
     """
 
     volume: VolumeSection
