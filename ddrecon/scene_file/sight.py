@@ -15,9 +15,8 @@ MOST_PIXELS = 2**18
 
 
 def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
-    """Which rays pass through the box of `grid` in front of their origin: bool [R].
-
-    This is the slab test (Kay and Kajiya 1986).
+    """Which rays pass through the box of `grid` in front of their origin: bool [R], by the slab
+    test (Kay and Kajiya 1986).
     """
     direction = torch.where(
         view_rays.direction == 0,
@@ -32,9 +31,8 @@ def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
 
 
 def sees_box(camera: Camera, grid: Grid) -> bool:
-    """Whether any pixel of `camera` looks through the box of `grid`.
-
-    A coarser image is tried first, because it is quick.
+    """Whether any pixel of `camera` looks through the box of `grid`; a coarser image is tried
+    first, because it is quick.
     """
     finer = max(1, math.ceil(math.sqrt(camera.size[0] * camera.size[1] / MOST_PIXELS)))
     return any(
