@@ -118,6 +118,14 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
+def require_folder_of(report: Path | None) -> None:
+    """Raises UsageError where `report` is to be written into a folder that does not exist."""
+    from ddrecon.io.files import folders
+
+    if report is not None:
+        folders.require_folder_of(report)
+
+
 @contextmanager
 def show_warnings() -> Iterator[None]:
     """Warnings about data become lines on stderr; those of libraries are for developers and stay

@@ -20,6 +20,7 @@ from ddrecon.cli.command import (
     REPORT,
     SCENE,
     in_session,
+    require_folder_of,
     show_version,
 )
 
@@ -193,12 +194,10 @@ def gradcheck(
     session: Session, scene: Path, names: tuple[str, ...], samples: int, report: Path | None
 ) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
-    from ddrecon.io.files.folders import require_folder_of
     from ddrecon.io.files.json_file import write_json
     from ddrecon.validate.gradcheck import check_parameters, describe
 
-    if report is not None:
-        require_folder_of(report)
+    require_folder_of(report)
     checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
     click.echo("\n".join(line for check in checks for line in check.lines()))
     if report is not None:
@@ -241,11 +240,10 @@ def bench(
         raise click.UsageError("-D changes a scene file; name one")
     if is_hard and (scene is not None or is_quick):
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
+    require_folder_of(report)
     from ddrecon.bench.run import bench_hard, bench_speed
-    from ddrecon.io.files.folders import claim_folder, require_folder_of
+    from ddrecon.io.files.folders import claim_folder
 
-    if report is not None:
-        require_folder_of(report)
     with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
         has_passed = (
             bench_hard(session, output, report)
