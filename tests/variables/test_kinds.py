@@ -1,6 +1,4 @@
-"""The table of variables: every kind of it can be set, differentiated and optimized, and is what its
-row says.
-"""
+"""The table of variables: every kind can be set, differentiated and optimized as its row says."""
 
 from __future__ import annotations
 
