@@ -60,11 +60,12 @@ def one_of(default: Any, choices: Collection[Any]) -> Any:
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How view rays are sampled. `background`: ambient light is also seen directly.
+    """How view rays are sampled.
 
-    `tolerance`: pixels closer together than half a voxel are interpolated between rays that far
-    apart, but for those which that may change by more than this part of the image's root mean
-    square; 0: every pixel has its own rays.
+    `tolerance`: pixels closer together than half a voxel are interpolated between rays that are
+    half a voxel apart. A pixel that this may change by more than this part of the image's root mean
+    square has rays of its own; with 0 every pixel has. `background`: ambient light and environment
+    maps are also seen directly.
     """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
@@ -75,10 +76,10 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class DiffusionSettings:
-    """How multiply scattered light is found.
+    """How multiply scattered light is computed.
 
-    `tolerance` is the relative residual of each linear solve; a reconstruction solves no closer
-    than its gradient needs.
+    `tolerance` is the relative residual of each linear solve. A reconstruction solves less closely
+    where its gradient needs no more.
 
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
@@ -110,7 +111,7 @@ class DiffusionSettings:
 
 @dataclass(frozen=True)
 class FieldFile:
-    """Values per cell, from a volume file, where they are called `name` (None: as in the scene)."""
+    """Values per cell from a volume file, which calls them `name` (None: as the scene does)."""
 
     file: Path
     name: str | None = None
@@ -153,8 +154,9 @@ class ParameterSettings:
 
 @dataclass(frozen=True)
 class OptimizeSettings:
-    """`refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
+    """What is optimized, and how.
 
+    `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
     `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
     all. `derivatives`: which radiance passes derivatives on: all of it, that scattered once, or
     that scattered more often.

@@ -36,10 +36,10 @@ class SceneFile:
 
         It points to the nearest value above it where it was not written itself.
         """
-        written = key
-        while written and written not in self.marks:
-            written = written.rpartition(".")[0]
-        return SceneError(f"{self.marks[written]}: {key}: {what}")
+        nearest = key
+        while nearest and nearest not in self.marks:
+            nearest = nearest.rpartition(".")[0]
+        return SceneError(f"{self.marks[nearest]}: {key}: {what}")
 
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
@@ -58,7 +58,8 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     for text in overrides:
         with problems.collecting():
             override(root, text, problems)
-    return SceneFile(_tree(root, path.absolute().parent, problems), path, _marks(root))
+    tree = _tree(root, path.absolute().parent, problems)
+    return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
 
 def _tree(root: Node, folder: Path, problems: Problems) -> SceneTree:
@@ -68,10 +69,6 @@ def _tree(root: Node, folder: Path, problems: Problems) -> SceneTree:
         raise SceneError([*problems.lines, *error.problems]) from None
     problems.raise_any()
     return tree
-
-
-def _marks(root: Node) -> dict[str, str]:
-    return {node.key: node.where for node in root.walk()}
 
 
 def _text(path: Path) -> str:

@@ -25,10 +25,10 @@ def override(root: Node, text: str, problems: Problems) -> None:
         raise SceneError(f"{where}: expected key.path=value")
     if key.count(".") > MAX_DEPTH:
         raise SceneError(f"{where}: nested more than {MAX_DEPTH} deep")
-    parent, rest = root, key
+    parent, path = root, key
     while True:
-        name, rest = _step(parent, rest, where)
-        if not rest:
+        name, path = _step(parent, path, where)
+        if not path:
             _put(parent, name, _value(value, parent.child_key(name), where, problems))
             return
         parent = _enter(parent, name, where)
@@ -57,6 +57,7 @@ def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
 
 
 def _enter(parent: Node, name: str, where: str) -> Node:
+    """The child `name` of `parent`, a mapping that is added where there is none."""
     if isinstance(parent.value, list):
         return parent.value[int(name)]
     if not isinstance(parent.value, dict):

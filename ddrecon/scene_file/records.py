@@ -59,7 +59,7 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
         if problems.are_many:
             break
     problems.raise_any()
-    return _check(node, kind(**values))
+    return _require_rules(node, kind(**values))
 
 
 def read_value(node: Node, rule: Rule) -> Any:
@@ -71,10 +71,10 @@ def read_value(node: Node, rule: Rule) -> Any:
         return read(node, rule)
     arguments = get_args(rule.hint)
     if type(None) in arguments:
-        rest = reduce(or_, (argument for argument in arguments if argument is not type(None)))
-        return (
-            None if node.value is None else read_value(node, Rule(rest, rule.limits, rule.folder))
-        )
+        if node.value is None:
+            return None
+        hint = reduce(or_, (argument for argument in arguments if argument is not type(None)))
+        return read_value(node, Rule(hint, rule.limits, rule.folder))
     if is_dataclass(rule.hint):
         return read_record(node, rule.hint, rule.folder)  # type: ignore[arg-type]
     if get_origin(rule.hint) is tuple:
@@ -83,6 +83,7 @@ def read_value(node: Node, rule: Rule) -> Any:
 
 
 def _mapping(node: Node) -> dict[str, Node]:
+    """The entries of `node`; raises SceneError where it is no mapping."""
     if not isinstance(node.value, dict):
         raise node.refused(f"expected a mapping, found {describe_found(node)}")
     return node.value
@@ -119,7 +120,7 @@ def _absences(
     return wrong
 
 
-def _check(node: Node, record: R) -> R:
+def _require_rules(node: Node, record: R) -> R:
     """`record`, unless it breaks a rule about several of its values."""
     problems = Problems()
     for name, what in getattr(record, "problems", tuple)():
@@ -129,6 +130,7 @@ def _check(node: Node, record: R) -> R:
 
 
 def _read_tagged(node: Node, kinds: Mapping[str, type], folder: Path) -> Any:
+    """A record of the one of `kinds` that the entry `type` names."""
     entries = _mapping(node)
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(kinds)}")
@@ -137,6 +139,7 @@ def _read_tagged(node: Node, kinds: Mapping[str, type], folder: Path) -> Any:
 
 
 def _read_density(node: Node, rule: Rule) -> float | FieldFile:
+    """A number, `{constant: number}` or `{file: path}`."""
     if isinstance(node.value, dict) and "file" in node.value:
         return read_record(node, FieldFile, rule.folder)
     if isinstance(node.value, dict) and "constant" in node.value:
@@ -150,6 +153,7 @@ def _read_density(node: Node, rule: Rule) -> float | FieldFile:
 
 
 def _read_quantity(node: Node, rule: Rule) -> Any:
+    """A number, a color or `{file: path}`."""
     return (
         read_record(node, FieldFile, rule.folder)
         if isinstance(node.value, dict)
@@ -158,12 +162,13 @@ def _read_quantity(node: Node, rule: Rule) -> Any:
 
 
 def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
+    """Settings by name of a variable, of one pair of cross sections at most."""
     problems, parameters = Problems(), {}
     for name, child in _mapping(node).items():
         with problems.collecting():
             if (kind := KINDS.get(pattern_of(name))) is None:
                 raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
-            parameters[name] = _legal(
+            parameters[name] = _require_legal(
                 child, read_record(child, ParameterSettings, rule.folder), kind
             )
     problems.raise_any()
@@ -178,7 +183,7 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
     return parameters
 
 
-def _legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSettings:
+def _require_legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSettings:
     """`settings`, unless they leave what is legal for a parameter of `kind`."""
     problems = Problems()
     numbers = {"min": settings.min, "max": settings.max} | {
@@ -208,6 +213,7 @@ def _legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSett
 
 
 def _read_start(node: Node, rule: Rule) -> Any:
+    """A number, a list of numbers or `{file: path}`."""
     return (
         read_each(read_list(node), rule, read_number)
         if isinstance(node.value, list)
@@ -216,6 +222,7 @@ def _read_start(node: Node, rule: Rule) -> Any:
 
 
 def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
+    """A list of views with names of their own, or the views of a ring or of transforms."""
     if isinstance(node.value, dict):
         source = read_record(node, ViewSource, rule.folder)
         if source.ring is not None:
@@ -228,11 +235,11 @@ def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
                 "name", Node(entry.child_key("name"), entry.where, entry.where, f"view_{index:02d}")
             )
     views = read_each(entries, Rule(ViewSection, {}, rule.folder), read_value)
-    _check_unique(entries, [view.name for view in views])
+    _require_unique(entries, [view.name for view in views])
     return views
 
 
-def _check_unique(entries: list[Node], names: list[str]) -> None:
+def _require_unique(entries: list[Node], names: list[str]) -> None:
     problems, first = Problems(), dict[str, int]()
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
         if first.setdefault(name, index) != index:

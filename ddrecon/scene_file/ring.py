@@ -36,7 +36,7 @@ def ring_views(
     cameras = ring_cameras(ring)
     images: list[Path] | list[None] = [None] * len(cameras)
     if pattern is not None:
-        images = matches(pattern, folder)
+        images = match_files(pattern, folder)
         if len(images) != len(cameras):
             entry = node.value["images"] if isinstance(node.value, dict) else node
             raise entry.refused(
@@ -48,7 +48,7 @@ def ring_views(
     )
 
 
-def matches(pattern: str, folder: Path) -> list[Path]:
+def match_files(pattern: str, folder: Path) -> list[Path]:
     """The files that match the glob `pattern`, as sorted absolute paths.
 
     It is relative to `folder`; wildcards stand in its last two parts.

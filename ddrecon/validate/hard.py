@@ -70,7 +70,7 @@ class HardResult:
 
     def failures(self) -> list[str]:
         """The bounds that are not kept (a NaN keeps none)."""
-        kept = {
+        bounds = {
             "finite": self.is_finite,
             "residual": self.residual <= TOLERANCE[torch.float32] + ROUNDINGS * self.attainable,
             "image": self.image_error <= SINGLE_FROM_DOUBLE,
@@ -79,7 +79,7 @@ class HardResult:
             "energy": self.energy <= ENERGY[torch.float32]
             and self.energy_double <= ENERGY[torch.float64],
         }
-        return [name for name, is_kept in kept.items() if not is_kept]
+        return [name for name, is_kept in bounds.items() if not is_kept]
 
     def row(self) -> str:
         """The case as a line of the table."""

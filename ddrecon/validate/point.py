@@ -36,10 +36,9 @@ def starting_point(
     Density is the scene's own; where that is the same everywhere, what it starts from; where that
     is, too, random numbers of which half are empty.
     """
-    wanted = dict.fromkeys([*scene.starts, *names, "density"])
     point = {
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
-        for name in wanted
+        for name in dict.fromkeys([*scene.starts, *names, "density"])
     }
     if point["density"].ndim == 3:
         of_scene = scene.volume.density

@@ -96,6 +96,7 @@ def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tensors(light: Light) -> list[str]:
+    """The names of the numbers of `light` that can be varied."""
     return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
 
 
@@ -125,8 +126,8 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
 
 
 def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Light:
-    own = {key: values[f"{name}.{key}"] for key in _tensors(light) if f"{name}.{key}" in values}
-    changed: Light = replace(light, **own)  # type: ignore[arg-type]
+    tensors = {key: values[f"{name}.{key}"] for key in _tensors(light) if f"{name}.{key}" in values}
+    changed: Light = replace(light, **tensors)  # type: ignore[arg-type]
     return changed
 
 
