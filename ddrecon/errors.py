@@ -13,14 +13,11 @@ LONGEST = 1000
 
 
 def one_line(text: str) -> str:
-    """`text` as a line that can be printed: what cannot be is escaped, and what is too long
-    shortened.
+    """`text` as one line that can be printed, other characters escaped and its middle left out.
+
+    The middle is left out where there are more than `LONGEST` characters.
     """
-    line = (
-        text
-        if text.isprintable()
-        else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    )
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
 
 
@@ -31,7 +28,7 @@ class DdreconError(Exception):
 
 
 class _ProblemsError(DdreconError):
-    """One line for each of `problems`."""
+    """An error with one line for each of its `problems`."""
 
     def __init__(self, problems: str | Sequence[str]):
         each = [problems] if isinstance(problems, str) else problems
@@ -40,18 +37,24 @@ class _ProblemsError(DdreconError):
 
 
 class SceneError(_ProblemsError):
-    """A scene that cannot be used; a problem reads `file:line:column: key.path: what is wrong`."""
+    """What the scene says cannot be used; the user mends the scene file, or a `-D` that changed it.
+
+    A problem reads `file:line:column: key.path: what is wrong`, or `-D key.path=value: ...`.
+    """
 
 
 class UsageError(_ProblemsError):
-    """A command that cannot be carried out as it was given: an output that is there already, a
-    locked folder, a device or a checkpoint that is missing.
+    """What the command line asks for cannot be done; the user changes the command, not the scene.
+
+    Such are an output that is there already, a folder that another process writes to, a device or
+    a checkpoint that is missing, and the name of a view or variable that the scene does not have.
     """
 
 
 class FormatError(DdreconError):
-    """A data file that exists but cannot be used, or several: the first, and the lines that tell of
-    the `others`.
+    """A data file that exists but cannot be used.
+
+    Of several, `path` and `reason` are of the first, and `others` are the lines of the others.
     """
 
     exit_code = 3
@@ -69,7 +72,10 @@ class MissingExtraError(DdreconError):
 
 
 class SolveError(DdreconError):
-    """A linear solve or an optimization that did not converge; the last good state is kept."""
+    """A linear solve or an optimization that did not converge.
+
+    `what` failed after `iterations` with the relative `residual`; `advice` says what may help.
+    """
 
     exit_code = 4
 
@@ -81,8 +87,9 @@ class SolveError(DdreconError):
 
 
 class DivergenceError(SolveError):
-    """An optimization that cannot go on: `iteration`, counted from 1, failed by what `what` says;
-    `residual` is that of its solve.
+    """An optimization that cannot go on; the last good state is kept.
+
+    `iteration`, counted from 1, failed as `what` says; `residual` is that of its solve.
     """
 
     def __init__(self, iteration: int, what: str, residual: float, advice: str):
@@ -90,7 +97,7 @@ class DivergenceError(SolveError):
         DdreconError.__init__(self, f"iteration {iteration}: {what}; {advice}")
 
     def with_advice(self, more: str) -> DivergenceError:
-        """The same with `more` to know."""
+        """The same error, its advice followed by `more`."""
         return DivergenceError(self.iterations, self.what, self.residual, f"{self.advice}; {more}")
 
 

@@ -23,22 +23,19 @@ RELATIVE = 0.05
 
 
 def l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """The square of `error`, entry by entry; `scale`, the root mean square of the target, plays no
-    part.
-    """
+    """The square of each entry of `error`; `scale` plays no part."""
     return error**2
 
 
 def l1(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """The magnitude of `error` times `scale`, so that it is in units of radiance squared, as all
-    losses are.
-    """
+    """The magnitude of `error` times `scale`: a radiance squared, as all losses are."""
     return error.abs() * scale
 
 
 def huber(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """The square of `error` up to `HUBER` `scale`, and a straight line beyond (Huber 1964,
-    doi:10.1214/aoms/1177703732).
+    """The square of `error` up to `HUBER` times `scale`, and a straight line beyond.
+
+    Huber 1964, doi:10.1214/aoms/1177703732.
     """
     return (
         2
@@ -50,8 +47,9 @@ def huber(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
 
 
 def relative_l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """The square of `error` over the target, times `scale`: dark pixels count as much as bright
-    ones.
+    """The square of `error` over the target, so that dark pixels count as much as bright ones.
+
+    The quotient is multiplied by `scale`, and the target raised by `RELATIVE` of it.
     """
     return (error / (target.abs() + RELATIVE * scale)) ** 2 * scale**2
 
@@ -65,8 +63,9 @@ LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
 
 
 def image_loss(loss: str, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """The mean of `loss` over the pixels and colors of `image` [3, h, w]; pixels where `mask` [h,
-    w] is 0 do not count.
+    """The mean of `loss` over the pixels and colors of `image` [3, h, w] against `target`.
+
+    Pixels where `mask` [h, w] is 0 do not count; None counts all.
     """
     seen = torch.ones_like(image[0]) if mask is None else mask
     count = (3 * seen.sum()).clamp(min=1)
@@ -79,8 +78,9 @@ def image_loss(loss: str, image: Tensor, target: Tensor, mask: Tensor | None) ->
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
-    """Peak signal-to-noise ratio [dB] of `image` against `target`, both [3, h, w]; the peak is the
-    target's largest value.
+    """The peak signal-to-noise ratio [dB] of `image` against `target`, both [3, h, w].
+
+    The peak is the largest value of the target. Pixels where `mask` [h, w] is 0 do not count.
     """
     error = image_loss("l2", image.detach(), target, mask)
     tiny = torch.finfo(target.dtype).tiny
@@ -88,8 +88,9 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
 
 
 def total_variation(field: Tensor, grid: Grid) -> Tensor:
-    """Mean over the cells of `grid` of the length of the gradient of `field` [..., z, y, x], times
-    the box's shortest side.
+    """The mean length of the gradient of `field` [..., z, y, x] over the cells of `grid`.
+
+    The gradient is by position in units of the box's shortest side.
 
     Isotropic total variation (Rudin, Osher, Fatemi 1992, doi:10.1016/0167-2789(92)90242-F), the
     same at every resolution and world scale, and rounded off at zero so that its derivative is

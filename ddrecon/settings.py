@@ -1,8 +1,8 @@
-"""What a renderer can be told: the `render` and `diffusion` sections of a scene, with their
-defaults and legal values.
+"""The sections `render`, `diffusion` and `optimize` of a scene: defaults and legal values.
 
-Each field's metadata is what the scene loader checks: `minimum`, `above`, `maximum`, or `choices`,
-a table of implementations.
+What the scene loader checks stands with each field: the limits `minimum`, `above`, `maximum` and
+`below` of its numbers, or its `choices`, which are the names of a table of implementations.
+`problems` yields what is wrong with several values together.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.losses import LOSSES
 from ddrecon.numerics.quadrature import DEGREES
 
 DERIVATIVES = ("all", "single", "diffusion")
@@ -24,31 +25,47 @@ diffusion (the paper's Fig. 9).
 """
 
 
-def bounded(
-    default: Any,
-    *,
-    minimum: float | None = None,
-    above: float | None = None,
-    maximum: float | None = None,
-) -> Any:
-    """A number field whose value is at least `minimum`, greater than `above` and at most `maximum`,
-    where given.
-    """
-    return field(default=default, metadata={"minimum": minimum, "above": above, "maximum": maximum})
+Problem = tuple[str, str]
+"""The key of a record that breaks a rule, and what is wrong with its value."""
+
+
+class Limits(TypedDict, total=False):
+    """What each number of a field must be: `minimum` and `maximum` are legal, the others not."""
+
+    minimum: float
+    above: float
+    maximum: float
+    below: float
+
+
+def bounded(default: Any, **limits: Unpack[Limits]) -> Any:
+    """A number, or numbers, within `limits`, `default` where the scene gives none."""
+    return field(default=default, metadata=dict(limits))
+
+
+def limited(**limits: Unpack[Limits]) -> Any:
+    """A number, or numbers, within `limits`, that the scene must give."""
+    return field(metadata=dict(limits))
+
+
+def optional(**limits: Unpack[Limits]) -> Any:
+    """A number, or numbers, within `limits`, that may be left out."""
+    return bounded(None, **limits)
 
 
 def one_of(default: Any, choices: Collection[Any]) -> Any:
-    """A field whose value is one of `choices`."""
+    """One of `choices`, `default` where the scene gives none."""
     return field(default=default, metadata={"choices": tuple(choices)})
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How view rays are sampled. `background`: ambient light is also seen directly.
+    """How view rays are sampled.
 
-    `tolerance`: pixels closer together than half a voxel are interpolated between rays that far
-    apart, but for those which that may change by more than this part of the image's root mean
-    square; 0: every pixel has its own rays.
+    `tolerance`: pixels closer together than half a voxel are interpolated between rays that are
+    half a voxel apart. A pixel that this may change by more than this part of the image's root mean
+    square has rays of its own; with 0 every pixel has. `background`: ambient light and environment
+    maps are also seen directly.
     """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
@@ -59,10 +76,10 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class DiffusionSettings:
-    """How multiply scattered light is found.
+    """How multiply scattered light is computed.
 
-    `tolerance` is the relative residual of each linear solve; a reconstruction solves no closer
-    than its gradient needs.
+    `tolerance` is the relative residual of each linear solve. A reconstruction solves less closely
+    where its gradient needs no more.
 
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
@@ -81,8 +98,8 @@ class DiffusionSettings:
     transport_rounds: int = bounded(0, minimum=0, maximum=16)
     transport_directions: int = one_of(26, DEGREES)
 
-    def problems(self) -> Iterator[tuple[str, str]]:
-        """Settings that exclude each other, as key and what is wrong with it."""
+    def problems(self) -> Iterator[Problem]:
+        """Settings that exclude each other."""
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
         if self.transport_rounds > 0 and (self.model, self.scheme) != ("p1", "conservative"):
@@ -92,29 +109,24 @@ class DiffusionSettings:
             )
 
 
-Problem = tuple[str, str]
-
-
-def optional(**limits: float) -> Any:
-    """A number, or numbers, within `limits`, that may be left out."""
-    return field(default=None, metadata=limits)
-
-
 @dataclass(frozen=True)
 class FieldFile:
-    """Values per cell, from a volume file, where they are called `name` (None: as in the scene)."""
+    """Values per cell from a volume file, which calls them `name` (None: as the scene does)."""
 
     file: Path
     name: str | None = None
 
 
 Start = float | tuple[float, ...] | FieldFile
+"""Where a parameter starts: the same number everywhere, a vector or color, or a file's values."""
 
 
 @dataclass(frozen=True)
 class ParameterSettings:
-    """How one parameter is optimized: from `init` (None: what the scene says), within [`min`,
-    `max`], by learning rate `lr`.
+    """How one parameter is optimized.
+
+    It starts from `init` (None: what the scene says), stays within [`min`, `max`] and has the
+    learning rate `lr` (None: that of its kind).
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
     always does). `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as
@@ -130,10 +142,8 @@ class ParameterSettings:
     field: bool | None = None
 
     def problems(self) -> Iterator[Problem]:
-        low, high = (
-            -math.inf if self.min is None else self.min,
-            math.inf if self.max is None else self.max,
-        )
+        low = -math.inf if self.min is None else self.min
+        high = math.inf if self.max is None else self.max
         entries = self.init if isinstance(self.init, tuple) else (self.init,)
         if high <= low:
             yield "max", f"{high:g} is not above min, {low:g}"
@@ -144,8 +154,9 @@ class ParameterSettings:
 
 @dataclass(frozen=True)
 class OptimizeSettings:
-    """`refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
+    """What is optimized, and how.
 
+    `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
     `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
     all. `derivatives`: which radiance passes derivatives on: all of it, that scattered once, or
     that scattered more often.
@@ -153,11 +164,10 @@ class OptimizeSettings:
 
     parameters: Mapping[str, ParameterSettings]
     iterations: int = bounded(300, minimum=1)
-    loss: str = one_of("l2", ("l2", "l1", "huber", "relative_l2"))
-    optimizer: str = one_of("adam", ("adam",))
+    loss: str = one_of("l2", LOSSES)
     views_per_iteration: int = bounded(3, minimum=0)
     derivatives: str = one_of("all", DERIVATIVES)
-    refine_at: tuple[float, ...] = field(default=(0.4, 0.8), metadata={"above": 0, "below": 1})
+    refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)
 
     def problems(self) -> Iterator[Problem]:
         if any(

@@ -249,7 +249,6 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "parameters": "What to find: names, as in the last table, with their settings.",
             "iterations": "In all.",
             "loss": "What is made small, as a mean over pixels.",
-            "optimizer": "How.",
             "views_per_iteration": "Training views drawn at random for each iteration; 0 for all.",
             "derivatives": (
                 "Which light passes derivatives on: all, only light scattered once, or only the "

@@ -119,9 +119,11 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def require_folder_of(report: Path | None) -> None:
-    """Raises click.UsageError where `report` is to be written into a folder that does not exist."""
-    if report is not None and not report.absolute().parent.is_dir():
-        raise click.UsageError(f"--json {report}: there is no folder {report.absolute().parent}")
+    """Raises UsageError where `report` is to be written into a folder that does not exist."""
+    from ddrecon.io.files import folders
+
+    if report is not None:
+        folders.require_folder_of(report)
 
 
 @contextmanager

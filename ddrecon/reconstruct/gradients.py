@@ -17,7 +17,8 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import solve_light, view_image
 from ddrecon.scene import Scene, View
-from ddrecon.variables.values import VOLUME, with_values
+from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.values import with_values
 
 
 @dataclass(frozen=True)

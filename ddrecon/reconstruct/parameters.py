@@ -14,7 +14,7 @@ from ddrecon.grid import Grid
 from ddrecon.losses import total_variation
 from ddrecon.reconstruct.levels import resample
 from ddrecon.settings import ParameterSettings
-from ddrecon.variables.kinds import KINDS, pattern_of
+from ddrecon.variables.kinds import kind_of
 
 BETAS = (0.9, 0.99)
 """Decay of Adam's first and second moments; the second forgets sooner than customary, since runs
@@ -37,10 +37,11 @@ class Parameter:
     def __init__(
         self, name: str, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid
     ):
-        kind = KINDS[pattern_of(name)]
+        kind = kind_of(name)
         self.name, self.rate, self.grid = name, rate, grid
         self.low = kind.low if settings.min is None else settings.min
         self.high = kind.high if settings.max is None else settings.max
+        self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
         self.tv = (kind.tv if settings.tv is None else settings.tv) if self.is_field else 0.0
         self.l1 = settings.l1
@@ -80,7 +81,7 @@ class Parameter:
                 maximize=False,
             )
             self.value.clamp_(self.low, self.high)
-            if self.name.endswith(".direction"):
+            if self.is_direction:
                 self.value.mul_(length / self.value.norm())
 
     def refine(self, grid: Grid) -> None:

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ddrecon.errors import SceneError
 from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.images.exr import write_exr
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
@@ -46,22 +46,16 @@ Arrays = dict[Path, np.ndarray]
 def export_scene(scene: Scene, path: Path, *, may_exist: bool) -> list[Path]:
     """Writes `scene` to `path` (.xml) and files named like it beside it; returns their paths.
 
-    Raises SceneError where one exists and `may_exist` is False, the folder does not exist, or for
-    what Mitsuba cannot show.
+    Raises UsageError where one exists and `may_exist` is False or the folder does not exist,
+    SceneError for what Mitsuba cannot show.
     """
     arrays: Arrays = {}
     root = ElementTree.Element("scene", version="3.0.0")
     for key, value in mitsuba_scene(scene, scene.views).items():
         if key != "type":
             root.append(_element(key, value, "id", path, arrays))
-    if not path.absolute().parent.is_dir():
-        raise SceneError(f"{path}: there is no folder {path.absolute().parent}")
     written = [path, *arrays]
-    taken = [str(file) for file in written if file.exists()]
-    if taken and not may_exist:
-        raise SceneError(
-            f"{', '.join(taken)}: already there; choose another name, or say --overwrite"
-        )
+    require_free_files(written, may_exist=may_exist)
     bounds = np.array(scene.volume.grid.bounds_xyz)
     for file, array in arrays.items():
         if array.ndim == 4:

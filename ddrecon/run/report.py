@@ -30,7 +30,8 @@ from ddrecon.report.pictures import comparison, find_white, pixels, projections,
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
-from ddrecon.variables.values import VOLUME, value_of
+from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.values import value_of
 
 SHOWN = 12
 """Views whose pictures are in the report; all are in the folder."""

@@ -8,11 +8,10 @@ from typing import Any
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.values import VOLUME
+from ddrecon.variables.kinds import PAIRS, VOLUME
 
 RESULT = "result.yaml"
 """What the file is called in a run's folder."""
-PAIRS = (("sigma_a", "sigma_s"), ("sigma_t", "albedo"))
 
 
 def found_names(parameters: list[str]) -> list[str]:

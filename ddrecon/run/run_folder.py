@@ -30,7 +30,8 @@ from ddrecon.run.result import RESULT, describe_result, found_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.values import VOLUME, value_of, variable_names
+from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.values import value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
 """Where a run folder keeps its checkpoints."""

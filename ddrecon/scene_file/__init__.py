@@ -1,3 +1,1 @@
-"""Scene files: what they may say (`schema`), how they are read (`load`) and how they become tensors
-(`build`).
-"""
+"""Scene files: their schema, how they are read (`load`) and become tensors (`build`)."""

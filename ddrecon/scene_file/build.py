@@ -25,8 +25,9 @@ def load_scene(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Scene:
-    """The scene in the file at `path`, with `overrides` (`key.path=value`), as tensors of `dtype`
-    on `device`.
+    """The scene in the file at `path`, as tensors of `dtype` on `device`.
+
+    `overrides` (`key.path=value`) are put in first.
 
     Raises SceneError with one line per problem of the scene, or FormatError for a file it names
     that cannot be used.
@@ -37,9 +38,7 @@ def load_scene(
 def build_scene(
     scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Scene:
-    """The scene of a file that was read, as tensors of `dtype` on `device`; raises as `load_scene`
-    does.
-    """
+    """The scene of a file that was read, as tensors; `load_scene` says what is raised."""
     place, tree, problems = torch.device(device), scene_file.tree, Problems()
     volume, grid = None, None
     with problems.collecting():

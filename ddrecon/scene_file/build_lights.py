@@ -19,8 +19,9 @@ from ddrecon.scene_file.schema import AmbientSection, Color, DirectionalSection,
 
 
 def build_lights(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> list[Light]:
-    """The scene's lights in `dtype` on `device`; raises SceneError or FormatError with the problems
-    of all.
+    """The scene's lights in `dtype` on `device`.
+
+    Raises SceneError or FormatError with the problems of all.
     """
     problems, lights = Problems(), list[Light]()
     for index in range(len(scene_file.tree.lights)):
@@ -39,6 +40,7 @@ def _build_light(
         return torch.tensor(value, dtype=dtype, device=device)
 
     def color(value: Color) -> Tensor:
+        """[1] or [3]"""
         return tensor(value).view(-1)
 
     if isinstance(section, DirectionalSection):
@@ -55,8 +57,9 @@ def _build_light(
 
 
 def _read_map(path: Path) -> np.ndarray:
-    """The radiance of an environment map, float32 [h, w, 3]; what is negative, as around a sun in
-    lossy files, becomes 0 with a warning.
+    """The radiance of an environment map, float32 [h, w, 3].
+
+    What is negative, as around a sun in lossy files, becomes 0 with a warning.
     """
     pixels = read_image(path).pixels
     height, width = pixels.shape[:2]
@@ -64,11 +67,12 @@ def _read_map(path: Path) -> np.ndarray:
         raise FormatError(
             path, f"an environment map has at least 3 x 2 pixels, and this is {width} x {height}"
         )
-    negative = np.count_nonzero(pixels.min(axis=2) < 0)
-    if negative:
-        row, column = np.argwhere(pixels.min(axis=2) < 0)[0]
+    is_negative = pixels.min(axis=2) < 0
+    if negative := np.count_nonzero(is_negative):
+        row, column = np.argwhere(is_negative)[0]
         warnings.warn(
-            f"{path}: {negative} pixels with negative radiance are taken as 0, the first at row {row}, column {column}",
+            f"{path}: {negative} pixels with negative radiance are taken as 0,"
+            f" the first at row {row}, column {column}",
             DataWarning,
             4,
         )

@@ -1,5 +1,6 @@
-"""Where each optimized parameter starts: what the scene says of it, unless `init` or `field` ask
-for something else.
+"""The value each optimized parameter starts from.
+
+It is what the scene says of the parameter, unless `init` or `field` ask for something else.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from ddrecon.scene_file.files import read_referenced, require
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import KINDS, Kind, pattern_of
+from ddrecon.variables.kinds import Kind, kind_of
 from ddrecon.variables.values import value_of, variable_names
 
 
@@ -30,8 +31,9 @@ def require_start_files(scene_file: SceneFile, problems: Problems) -> None:
 
 
 def build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
-    """The value each optimized parameter of `scene` starts from; raises SceneError with all
-    problems, or FormatError.
+    """The value each optimized parameter of `scene` starts from, by name.
+
+    Raises SceneError with all problems, or FormatError.
     """
     problems, starts = Problems(), {}
     for name, settings in scene.optimize.parameters.items() if scene.optimize else ():
@@ -49,13 +51,14 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
         raise scene_file.refused(
             key, f"the scene has no such number{suggestion(name, variable_names(scene))}"
         ) from None
-    kind = KINDS[pattern_of(name)]
+    kind = kind_of(name)
     if isinstance(settings.init, FieldFile):
-        value = _from_file(scene_file, f"{key}.init.file", name, settings.init, value)
+        read = _read_cells if kind.is_cellwise else _read_pixels
+        value = read(scene_file, f"{key}.init.file", name, settings.init, value)
     elif settings.init is not None:
         value = _fill(scene_file, f"{key}.init", kind, settings.init, value)
     if kind.is_cellwise:
-        value = _spread(scene_file, key, name, settings, value, scene.volume.grid.shape)
+        value = _spread(scene_file, key, kind, settings, value, scene.volume.grid.shape)
     if not bool(((value >= kind.low) & (value <= kind.high)).all()):
         raise scene_file.refused(
             f"{key}.init", f"must be at least {kind.low:g} and at most {kind.high:g} everywhere"
@@ -63,35 +66,31 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     return value
 
 
-def _from_file(
+def _read_cells(
     scene_file: SceneFile, key: str, name: str, init: FieldFile, value: Tensor
 ) -> Tensor:
-    """Values per cell, or per pixel of an environment map, from the file that `init` names."""
-    if KINDS[pattern_of(name)].is_cellwise:
-        array = torch.from_numpy(
-            read_referenced(
-                scene_file, key, init.file, partial(read_field, name=init.name or name)
-            ).values
+    """The file's values per cell, [C, z, y, x] or, where there are no colors, [z, y, x]."""
+    read = partial(read_field, name=init.name or name)
+    field = torch.from_numpy(read_referenced(scene_file, key, init.file, read).values).to(value)
+    has_colors = field.ndim == 4
+    if kind_of(name).is_color:
+        return field.permute(3, 0, 1, 2) if has_colors else field[None]
+    if has_colors:
+        raise scene_file.refused(
+            key,
+            f"{name} has no colors, but the file has {list(field.shape)} values [z, y, x, color]",
         )
-        if name == "density" and array.ndim == 4:
-            raise scene_file.refused(
-                key,
-                f"density has no colors, but the file has {list(array.shape)} values [z, y, x, color]",
-            )
-        return (
-            array.permute(3, 0, 1, 2).to(value)
-            if array.ndim == 4
-            else array.to(value)
-            if name == "density"
-            else array[None].to(value)
-        )
+    return field
+
+
+def _read_pixels(
+    scene_file: SceneFile, key: str, name: str, init: FieldFile, value: Tensor
+) -> Tensor:
+    """The file's radiance per pixel of an environment map, [3, h, w]."""
     if value.ndim != 3:
         raise scene_file.refused(key, f"{name} is not a field or map: give its numbers")
-    pixels = (
-        torch.from_numpy(read_referenced(scene_file, key, init.file, read_image).pixels)
-        .permute(2, 0, 1)
-        .to(value)
-    )
+    image = read_referenced(scene_file, key, init.file, read_image)
+    pixels = torch.from_numpy(image.pixels).permute(2, 0, 1).to(value)
     if pixels.shape[1:] != value.shape[1:]:
         raise scene_file.refused(
             key, f"is {_size(pixels)} pixels, but the scene's map is {_size(value)}"
@@ -106,50 +105,48 @@ def _size(pixels: Tensor) -> str:
 def _fill(
     scene_file: SceneFile, key: str, kind: Kind, init: float | tuple[float, ...], value: Tensor
 ) -> Tensor:
-    """`value` with every entry `init`, or every color its own."""
-    if isinstance(init, float):
-        if value.ndim == 1 and not kind.is_color:
-            raise scene_file.refused(key, f"expected a list of {len(value)} numbers")
+    """`value` with every entry `init`, or every color or component its own."""
+    count = len(kind.components)
+    if isinstance(init, float) and not count:
         return torch.full_like(value, init)
-    entries = value.new_tensor(init)
-    if kind.is_color and len(init) == 3:
-        return entries.view(-1, *[1] * (value.ndim - 1)).expand(3, *value.shape[1:]).clone()
-    if value.ndim == 1 and not kind.is_color and len(init) == len(value):
-        return entries
-    wanted = (
-        "one number or [r, g, b]"
-        if kind.is_color
-        else f"a list of {len(value)} numbers"
-        if value.ndim == 1
-        else "one number"
-    )
-    raise scene_file.refused(key, f"expected {wanted}, found a list of {len(init)}")
+    if isinstance(init, tuple) and kind.is_color and len(init) == 3:
+        colors = value.new_tensor(init).view(-1, *[1] * (value.ndim - 1))
+        return colors.expand(3, *value.shape[1:]).clone()
+    if isinstance(init, tuple) and count and len(init) == count:
+        return value.new_tensor(init)
+    expected = f"a list of {count} numbers" if count else "one number"
+    if kind.is_color:
+        expected += " or [r, g, b]"
+    given = f", found a list of {len(init)}" if isinstance(init, tuple) else ""
+    raise scene_file.refused(key, f"expected {expected}{given}")
 
 
 def _spread(
     scene_file: SceneFile,
     key: str,
-    name: str,
+    kind: Kind,
     settings: ParameterSettings,
     value: Tensor,
     shape: tuple[int, int, int],
 ) -> Tensor:
-    """`value` as a field or as one number (a color), as the scene asks for."""
-    own = 0 if name == "density" else 1
-    is_field = value.ndim == own + 3
+    """`value` as a field of `shape`, or as one number (a color), as the scene asks for."""
+    leading = 1 if kind.is_color else 0
+    is_field = value.ndim == leading + 3
     if settings.field is None or settings.field == is_field:
-        if is_field and tuple(value.shape[own:]) != shape:
+        if is_field and tuple(value.shape[leading:]) != shape:
             raise scene_file.refused(
                 f"{key}.init.file",
-                f"has {list(value.shape[own:])} cells [z, y, x], but the volume has {list(shape)}",
+                f"has {list(value.shape[leading:])} cells [z, y, x],"
+                f" but the volume has {list(shape)}",
             )
         return value
     if settings.field:
         return value.view(*value.shape, 1, 1, 1).expand(*value.shape, *shape).clone()
-    single = value.flatten(own).amin(-1)
-    if not torch.equal(single, value.flatten(own).amax(-1)):
+    single = value.flatten(leading).amin(-1)
+    if not torch.equal(single, value.flatten(leading).amax(-1)):
         raise scene_file.refused(
             key,
-            "differs from cell to cell where it starts; give init: number, or leave field: false out",
+            "differs from cell to cell where it starts;"
+            " give init: number, or leave field: false out",
         )
     return single

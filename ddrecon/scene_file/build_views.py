@@ -22,8 +22,9 @@ from ddrecon.scene_file.sight import explain_blindness, sees_box
 def build_views(
     scene_file: SceneFile, grid: Grid | None, dtype: torch.dtype, device: torch.device
 ) -> list[View]:
-    """The scene's views in `dtype` on `device`; where `grid` is known, cameras must see it. Raises
-    SceneError or FormatError.
+    """The scene's views in `dtype` on `device`.
+
+    Where `grid` is known, cameras must see it. Raises SceneError or FormatError.
     """
     problems, views = Problems(), []
     for index in range(len(scene_file.tree.views)):
@@ -48,9 +49,9 @@ def _build_view(
                 read_referenced(scene_file, f"{key}.mask", section.mask, read_mask)
             ).to(device, dtype)
     size = _size(section.camera, image)
-    for name, pixels_of in (("image", image), ("mask", mask)):
-        if pixels_of is not None and size is not None and tuple(pixels_of.shape[-2:]) != size:
-            height, width = pixels_of.shape[-2:]
+    for name, picture in (("image", image), ("mask", mask)):
+        if picture is not None and size is not None and tuple(picture.shape[-2:]) != size:
+            height, width = picture.shape[-2:]
             problems.note(
                 scene_file.refused(
                     f"{key}.{name}",
@@ -63,7 +64,8 @@ def _build_view(
             if grid is not None and not sees_box(camera, grid):
                 raise scene_file.refused(
                     f"{key}.camera",
-                    f"no pixel of view {section.name!r} looks through the volume; {explain_blindness(camera, grid)}",
+                    f"no pixel of view {section.name!r} looks through the volume;"
+                    f" {explain_blindness(camera, grid)}",
                 )
     problems.raise_any()
     camera = replace(camera, pose=camera.pose.to(device, dtype))
@@ -71,9 +73,7 @@ def _build_view(
 
 
 def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None:
-    """(height, width): what the scene says, else the image's, else unknown because the image could
-    not be read.
-    """
+    """(height, width): what the scene says, else the image's; None if that could not be read."""
     if camera.resolution is not None:
         return camera.resolution[1], camera.resolution[0]
     return None if image is None else (image.shape[1], image.shape[2])

@@ -1,5 +1,6 @@
-"""The volume section as tensors: its grid, agreed on by the scene and every field file, its density
-and its cross sections.
+"""The volume section as tensors: its grid, its density and its cross sections.
+
+The scene and every field file must agree on the grid.
 """
 
 from __future__ import annotations
@@ -23,15 +24,17 @@ from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import Color
 from ddrecon.settings import FieldFile, ParameterSettings
+from ddrecon.variables.kinds import KINDS, VOLUME
 from ddrecon.variables.values import cross_sections
 
-QUANTITIES = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo")
+QUANTITIES = tuple(name for name in VOLUME if KINDS[name].is_cellwise)
 Fields = Mapping[str, Field]
 
 
 def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> Volume:
-    """The volume of the scene in `dtype` on `device`; raises SceneError with all its problems, or
-    FormatError.
+    """The volume of the scene in `dtype` on `device`.
+
+    Raises SceneError with all its problems, or FormatError.
     """
     section = scene_file.tree.volume
     fields = _read_fields(scene_file)
@@ -62,8 +65,9 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
 
 
 def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype) -> Needs:
-    """What the scene's memory depends on; views that are as large as their images count as nothing,
-    since those are not read yet.
+    """What the scene's memory depends on.
+
+    Views that are as large as their images count as nothing, since those are not read yet.
     """
     tree, section = scene_file.tree, scene_file.tree.volume
     given = [
@@ -123,7 +127,8 @@ def _read_quantity(path: Path, name: str, called: str) -> Field:
     if name == "density" and field.values.ndim != 3:
         raise FormatError(
             path,
-            f"density has shape {list(field.values.shape)}; expected [z, y, x]: colors belong to the cross sections",
+            f"density has shape {list(field.values.shape)}; expected [z, y, x]:"
+            " colors belong to the cross sections",
         )
     if name == "albedo" and (highest := field.values.max()) > 1:
         z, y, x = np.argwhere(field.values > 1)[0, :3]
@@ -181,8 +186,9 @@ def _corners(bounds: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def _same_box(one: tuple[Triple, Triple], other: tuple[Triple, Triple]) -> bool:
-    """Whether the corners agree to a hundred-thousandth of the box's sides: files may hold them in
-    single precision.
+    """Whether the corners agree to a hundred-thousandth of the box's sides.
+
+    Files may hold them in single precision.
     """
     tolerance = 1e-5 * (np.array(other[1]) - np.array(other[0]))
     return bool((np.abs(np.array(one) - np.array(other)) <= tolerance).all())

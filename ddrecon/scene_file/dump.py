@@ -1,5 +1,6 @@
-"""Scenes written back: every default filled in and every path absolute, so that reading the result
-gives the same tree.
+"""Scenes written back, with every default filled in and every path absolute.
+
+Reading the result gives the same tree.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def _left_out(record: Any) -> set[str]:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what would be read as something else: PyYAML decides by YAML 1.1, where 1e5 is text."""
+    """Quotes text that would be read as something else; PyYAML itself goes by YAML 1.1."""
 
 
 def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:

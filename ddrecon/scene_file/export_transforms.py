@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.errors import SceneError
+from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.json_file import write_json
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.load import SceneFile
@@ -18,12 +19,10 @@ def export_transforms(
     """Writes the views of `scene`, read from `scene_file`, to `path`, and returns what was written.
 
     Images and masks are named relative to it; a view without an image has no `file_path`. Raises
-    SceneError where `path` exists and may not, and for views in parallel projection.
+    UsageError where `path` exists and may not or its folder is missing, SceneError for views in
+    parallel projection.
     """
-    if path.exists() and not may_exist:
-        raise SceneError(f"{path}: already there; choose another name, or say --overwrite")
-    if not path.absolute().parent.is_dir():
-        raise SceneError(f"{path}: there is no folder {path.absolute().parent}")
+    require_free_files([path], may_exist=may_exist)
     frames = []
     for view, section in zip(scene.views, scene_file.tree.views, strict=True):
         files = {"file_path": section.image, "mask_path": section.mask}

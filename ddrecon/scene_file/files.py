@@ -13,8 +13,9 @@ T = TypeVar("T")
 
 
 def read_referenced(scene_file: SceneFile, key: str, path: Path, read: Callable[[Path], T]) -> T:
-    """What `read` makes of the file `path` named at `key`; raises SceneError if there is none,
-    FormatError if it is unusable.
+    """The content of the file `path` named at `key`, as `read` returns it.
+
+    Raises SceneError if there is no such file, FormatError if it is unusable.
     """
     require(scene_file, key, path)
     return read(path)

@@ -1,5 +1,6 @@
-"""Reading the leaves of a scene: numbers, text, paths, vectors and colors, each within the limits
-its record declares.
+"""Reading the leaves of a scene: numbers, text, paths, vectors and colors.
+
+Each must be within the limits that its record declares.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
 
 @dataclass(frozen=True)
 class Rule:
-    """What a value must be: of the type `hint`, within `limits`; relative paths start at `folder`."""
+    """What a value must be: a `hint`, within `limits`; relative paths start at `folder`."""
 
     hint: Any
     limits: Mapping[str, Any]
@@ -111,7 +112,8 @@ def read_text(node: Node, rule: Rule) -> str:
     if choices is not None and node.value not in choices:
         near = suggestion(node.value, choices) if len(choices) > 1 else ""
         raise node.refused(
-            f"expected one of {', '.join(choices)}, found {show_value(node.value)}{near if 'did you' in near else ''}"
+            f"expected one of {', '.join(choices)}, found {show_value(node.value)}"
+            f"{near if 'did you' in near else ''}"
         )
     return node.value
 

@@ -1,4 +1,4 @@
-"""Scene files as records: strict YAML, with everything that is wrong told in one go."""
+"""Scene files as records: strict YAML, with everything that is wrong reported at once."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ MAX_BYTES = 2**20
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene file that was read: its `tree`, its `path`, and for each key path in it the
-    `file:line:column` of its value.
+    """A scene file that was read.
+
+    `tree` is its content, `path` where it lies, and `marks` are the `file:line:column` of each
+    value by key path.
     """
 
     tree: SceneTree
@@ -30,18 +32,20 @@ class SceneFile:
     marks: Mapping[str, str]
 
     def refused(self, key: str, what: str) -> SceneError:
-        """The error that says `what` is wrong with the value at `key`, or with the nearest one
-        above it that was written.
+        """The error that says `what` is wrong with the value at `key`.
+
+        It points to the nearest value above it where it was not written itself.
         """
-        written = key
-        while written and written not in self.marks:
-            written = written.rpartition(".")[0]
-        return SceneError(f"{self.marks[written]}: {key}: {what}")
+        nearest = key
+        while nearest and nearest not in self.marks:
+            nearest = nearest.rpartition(".")[0]
+        return SceneError(f"{self.marks[nearest]}: {key}: {what}")
 
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> SceneFile:
-    """The scene file at `path` with `overrides` (`key.path=value`) put in; raises SceneError with
-    one line per problem.
+    """The scene file at `path` with `overrides` (`key.path=value`) put in.
+
+    Raises SceneError with one line per problem.
     """
     path = Path(path)
     problems = Problems()
@@ -54,7 +58,8 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
     for text in overrides:
         with problems.collecting():
             override(root, text, problems)
-    return SceneFile(_tree(root, path.absolute().parent, problems), path, _marks(root))
+    tree = _tree(root, path.absolute().parent, problems)
+    return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
 
 def _tree(root: Node, folder: Path, problems: Problems) -> SceneTree:
@@ -64,10 +69,6 @@ def _tree(root: Node, folder: Path, problems: Problems) -> SceneTree:
         raise SceneError([*problems.lines, *error.problems]) from None
     problems.raise_any()
     return tree
-
-
-def _marks(root: Node) -> dict[str, str]:
-    return {node.key: node.where for node in root.walk()}
 
 
 def _text(path: Path) -> str:

@@ -84,8 +84,9 @@ def show_value(value: Scalar) -> str:
 
 
 def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
-    """The tree of the YAML (or JSON) document `text`, whose root is at `key`; repeated keys go to
-    `problems`.
+    """The tree of the YAML (or JSON) document `text`, whose root is at `key`.
+
+    Repeated keys go to `problems`.
 
     Raises SceneError where the text has no such tree: broken syntax, several documents, aliases,
     tags.
@@ -109,19 +110,20 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
 
 
 def _parse(text: str, locate: Locate, problems: Problems, key: str) -> Node:
-    found_now = Problems()
+    """The tree as the parser in C sees it, or the other one where that refuses a short text."""
+    repeated = Problems()
     try:
-        root = _Composer(text, locate, found_now, FAST).document(key)
+        root = _Composer(text, locate, repeated, FAST).document(key)
     except (yaml.YAMLError, UnicodeEncodeError):
         if len(text) > SHORT:
             raise
         return _Composer(text, locate, problems, yaml.BaseLoader).document(key)
-    problems.lines.extend(found_now.lines)
+    problems.lines.extend(repeated.lines)
     return root
 
 
 class _Composer:
-    """Builds nodes from the parser's events, so that aliases are seen before anything follows them."""
+    """Builds nodes from the parser's events: aliases are seen before anything follows them."""
 
     def __init__(self, text: str, locate: Locate, problems: Problems, loader: Any):
         self.events = yaml.parse(text, Loader=loader)

@@ -1,6 +1,4 @@
-"""`-D key.path=value`: values from the command line, put into the tree of a scene file before it is
-validated.
-"""
+"""`-D key.path=value`: values from the command line, put into a scene before it is validated."""
 
 from __future__ import annotations
 
@@ -14,8 +12,9 @@ PARAMETERS = "optimize.parameters"
 
 
 def override(root: Node, text: str, problems: Problems) -> None:
-    """Puts the value of `text` (`key.path=value`, the value in YAML) into the tree under `root`,
-    making mappings as needed.
+    """Puts the value of `text` (`key.path=value`, in YAML) into the tree under `root`.
+
+    Mappings are made as needed.
 
     A list is entered by index. Where keys themselves have dots, as those of parameters do, the
     longest one present or legal is taken. Raises SceneError.
@@ -26,10 +25,10 @@ def override(root: Node, text: str, problems: Problems) -> None:
         raise SceneError(f"{where}: expected key.path=value")
     if key.count(".") > MAX_DEPTH:
         raise SceneError(f"{where}: nested more than {MAX_DEPTH} deep")
-    parent, rest = root, key
+    parent, path = root, key
     while True:
-        name, rest = _step(parent, rest, where)
-        if not rest:
+        name, path = _step(parent, path, where)
+        if not path:
             _put(parent, name, _value(value, parent.child_key(name), where, problems))
             return
         parent = _enter(parent, name, where)
@@ -46,16 +45,19 @@ def _step(parent: Node, path: str, where: str) -> tuple[str, str]:
     elif isinstance(parent.value, list):
         if not (parts[0].isascii() and parts[0].isdigit() and int(parts[0]) < len(parent.value)):
             raise SceneError(
-                f"{where}: {parent.child_key(parts[0])}: no such entry: {parent.key} is {describe_found(parent)}, counted from 0"
+                f"{where}: {parent.child_key(parts[0])}: no such entry:"
+                f" {parent.key} is {describe_found(parent)}, counted from 0"
             )
     else:
         raise SceneError(
-            f"{where}: {parent.child_key(parts[0])}: {parent.key or 'the scene'} is {describe_found(parent)}, not a mapping or list"
+            f"{where}: {parent.child_key(parts[0])}: {parent.key or 'the scene'} is"
+            f" {describe_found(parent)}, not a mapping or list"
         )
     return parts[0], ".".join(parts[1:])
 
 
 def _enter(parent: Node, name: str, where: str) -> Node:
+    """The child `name` of `parent`, a mapping that is added where there is none."""
     if isinstance(parent.value, list):
         return parent.value[int(name)]
     if not isinstance(parent.value, dict):

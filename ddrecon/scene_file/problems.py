@@ -1,4 +1,4 @@
-"""Collecting what is wrong with a scene, so that a user is told all of it at once."""
+"""Collecting what is wrong with a scene, so that a user sees all of it at once."""
 
 from __future__ import annotations
 
@@ -35,17 +35,16 @@ class Problems:
 
     @contextmanager
     def collecting(self) -> Iterator[None]:
-        """Notes the problems of an error raised inside the block, which ends there, and goes on
-        after it.
-        """
+        """Notes the problems of an error raised inside the block, which ends there."""
         try:
             yield
         except (SceneError, FormatError) as error:
             self.note(error)
 
     def raise_any(self) -> None:
-        """Raises an error with every problem noted, each once, if there is one: FormatError where
-        only files are to blame.
+        """Raises an error with every problem noted, each once, if there is one.
+
+        It is a FormatError where only files are to blame, else a SceneError.
         """
         files = list(dict.fromkeys(line for error in self.unusable for line in error.lines))
         if self.lines:
@@ -59,8 +58,6 @@ class Problems:
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
-    """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them where none
-    is near.
-    """
+    """`; did you mean 'x'?` with the nearest of the `known` names, or the list of them."""
     near = difflib.get_close_matches(name.lower(), known, n=1) if len(name) <= LONGEST else []
     return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"

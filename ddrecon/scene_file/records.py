@@ -1,5 +1,6 @@
-"""Reading records: any frozen dataclass of the schema from a mapping, by its fields' types. One
-function per shape of type.
+"""Reading records: any frozen dataclass of the schema from a mapping, by its fields' types.
+
+There is one function per shape of type; `Node`s are those of the YAML.
 """
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import reduce
+from itertools import product
 from operator import or_
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -26,14 +28,21 @@ from ddrecon.scene_file.ring import ring_views
 from ddrecon.scene_file.schema import Constant, Density, Quantity, ViewSection, ViewSource
 from ddrecon.scene_file.transforms import read_transforms
 from ddrecon.settings import FieldFile, ParameterSettings, Start
-from ddrecon.variables.kinds import KINDS, Kind, pattern_of
+from ddrecon.variables.kinds import (
+    CROSS_SECTIONS,
+    EXTINCTION_AND_ALBEDO,
+    KINDS,
+    Kind,
+    pattern_of,
+)
 
 R = TypeVar("R")
 
 
 def read_record(node: Node, kind: type[R], folder: Path) -> R:
-    """The record of type `kind` that the mapping `node` describes; raises SceneError with
-    everything wrong in it.
+    """The record of type `kind` that the mapping `node` describes.
+
+    Raises SceneError with everything wrong in it.
     """
     entries = _mapping(node)
     declared: dict[str, Field[Any]] = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
@@ -50,21 +59,22 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
         if problems.are_many:
             break
     problems.raise_any()
-    return _check(node, kind(**values))
+    return _require_rules(node, kind(**values))
 
 
 def read_value(node: Node, rule: Rule) -> Any:
-    """The value of `node` by `rule`: a leaf, a record, a list of records, or one of several records
-    told apart by `type`.
+    """The value of `node` by `rule`.
+
+    It is a leaf, a record, a list of records, or one of several records told apart by `type`.
     """
     if read := READERS.get(rule.hint):
         return read(node, rule)
     arguments = get_args(rule.hint)
     if type(None) in arguments:
-        rest = reduce(or_, (argument for argument in arguments if argument is not type(None)))
-        return (
-            None if node.value is None else read_value(node, Rule(rest, rule.limits, rule.folder))
-        )
+        if node.value is None:
+            return None
+        hint = reduce(or_, (argument for argument in arguments if argument is not type(None)))
+        return read_value(node, Rule(hint, rule.limits, rule.folder))
     if is_dataclass(rule.hint):
         return read_record(node, rule.hint, rule.folder)  # type: ignore[arg-type]
     if get_origin(rule.hint) is tuple:
@@ -73,6 +83,7 @@ def read_value(node: Node, rule: Rule) -> Any:
 
 
 def _mapping(node: Node) -> dict[str, Node]:
+    """The entries of `node`; raises SceneError where it is no mapping."""
     if not isinstance(node.value, dict):
         raise node.refused(f"expected a mapping, found {describe_found(node)}")
     return node.value
@@ -81,8 +92,9 @@ def _mapping(node: Node) -> dict[str, Node]:
 def _absences(
     kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]
 ) -> list[str]:
-    """What is wrong with the set of keys given: required ones missing or, of alternatives, empty,
-    or not exactly one group of those.
+    """What is wrong with the set of keys given.
+
+    Required keys must be there, and exactly one group of alternatives.
     """
     required = [
         name
@@ -108,7 +120,7 @@ def _absences(
     return wrong
 
 
-def _check(node: Node, record: R) -> R:
+def _require_rules(node: Node, record: R) -> R:
     """`record`, unless it breaks a rule about several of its values."""
     problems = Problems()
     for name, what in getattr(record, "problems", tuple)():
@@ -118,6 +130,7 @@ def _check(node: Node, record: R) -> R:
 
 
 def _read_tagged(node: Node, kinds: Mapping[str, type], folder: Path) -> Any:
+    """A record of the one of `kinds` that the entry `type` names."""
     entries = _mapping(node)
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(kinds)}")
@@ -126,18 +139,21 @@ def _read_tagged(node: Node, kinds: Mapping[str, type], folder: Path) -> Any:
 
 
 def _read_density(node: Node, rule: Rule) -> float | FieldFile:
+    """A number, `{constant: number}` or `{file: path}`."""
     if isinstance(node.value, dict) and "file" in node.value:
         return read_record(node, FieldFile, rule.folder)
     if isinstance(node.value, dict) and "constant" in node.value:
         return read_record(node, Constant, rule.folder).constant
     if node.value is None or isinstance(node.value, str | list | dict):
         raise node.refused(
-            f"expected a number, {{constant: number}} or {{file: path}}, found {describe_found(node)}"
+            "expected a number, {constant: number} or {file: path},"
+            f" found {describe_found(node)}"
         )
     return read_number(node, rule)
 
 
 def _read_quantity(node: Node, rule: Rule) -> Any:
+    """A number, a color or `{file: path}`."""
     return (
         read_record(node, FieldFile, rule.folder)
         if isinstance(node.value, dict)
@@ -146,31 +162,28 @@ def _read_quantity(node: Node, rule: Rule) -> Any:
 
 
 def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
+    """Settings by name of a variable, of one pair of cross sections at most."""
     problems, parameters = Problems(), {}
     for name, child in _mapping(node).items():
         with problems.collecting():
             if (kind := KINDS.get(pattern_of(name))) is None:
                 raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
-            parameters[name] = _legal(
+            parameters[name] = _require_legal(
                 child, read_record(child, ParameterSettings, rule.folder), kind
             )
     problems.raise_any()
     if not parameters:
         raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
-    for name, other in (
-        ("sigma_t", "sigma_a"),
-        ("sigma_t", "sigma_s"),
-        ("albedo", "sigma_a"),
-        ("albedo", "sigma_s"),
-    ):
+    for name, other in product(EXTINCTION_AND_ALBEDO, CROSS_SECTIONS):
         if name in parameters and other in parameters:
             raise _mapping(node)[name].key_refused(
-                f"cannot be optimized beside {other}: take sigma_a and sigma_s, or sigma_t and albedo"
+                f"cannot be optimized beside {other}:"
+                " take sigma_a and sigma_s, or sigma_t and albedo"
             )
     return parameters
 
 
-def _legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSettings:
+def _require_legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSettings:
     """`settings`, unless they leave what is legal for a parameter of `kind`."""
     problems = Problems()
     numbers = {"min": settings.min, "max": settings.max} | {
@@ -200,6 +213,7 @@ def _legal(node: Node, settings: ParameterSettings, kind: Kind) -> ParameterSett
 
 
 def _read_start(node: Node, rule: Rule) -> Any:
+    """A number, a list of numbers or `{file: path}`."""
     return (
         read_each(read_list(node), rule, read_number)
         if isinstance(node.value, list)
@@ -208,6 +222,7 @@ def _read_start(node: Node, rule: Rule) -> Any:
 
 
 def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
+    """A list of views with names of their own, or the views of a ring or of transforms."""
     if isinstance(node.value, dict):
         source = read_record(node, ViewSource, rule.folder)
         if source.ring is not None:
@@ -220,11 +235,11 @@ def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
                 "name", Node(entry.child_key("name"), entry.where, entry.where, f"view_{index:02d}")
             )
     views = read_each(entries, Rule(ViewSection, {}, rule.folder), read_value)
-    _check_unique(entries, [view.name for view in views])
+    _require_unique(entries, [view.name for view in views])
     return views
 
 
-def _check_unique(entries: list[Node], names: list[str]) -> None:
+def _require_unique(entries: list[Node], names: list[str]) -> None:
     problems, first = Problems(), dict[str, int]()
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
         if first.setdefault(name, index) != index:

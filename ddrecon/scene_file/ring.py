@@ -29,13 +29,14 @@ def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:
 def ring_views(
     node: Node, ring: RingSection, pattern: str | None, folder: Path
 ) -> tuple[ViewSection, ...]:
-    """The views of the section `node`, named ring_00, ...; raises SceneError unless `pattern`
-    matches as many images as cameras.
+    """The views of the section `node`, named ring_00, ...
+
+    Raises SceneError unless `pattern` matches as many images as there are cameras.
     """
     cameras = ring_cameras(ring)
     images: list[Path] | list[None] = [None] * len(cameras)
     if pattern is not None:
-        images = matches(pattern, folder)
+        images = match_files(pattern, folder)
         if len(images) != len(cameras):
             entry = node.value["images"] if isinstance(node.value, dict) else node
             raise entry.refused(
@@ -47,9 +48,10 @@ def ring_views(
     )
 
 
-def matches(pattern: str, folder: Path) -> list[Path]:
-    """The files that match the glob `pattern`, relative to `folder`, as sorted absolute paths;
-    wildcards stand in its last two parts.
+def match_files(pattern: str, folder: Path) -> list[Path]:
+    """The files that match the glob `pattern`, as sorted absolute paths.
+
+    It is relative to `folder`; wildcards stand in its last two parts.
     """
     if glob.has_magic(str(Path(pattern).parent.parent)):
         return []

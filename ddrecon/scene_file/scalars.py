@@ -1,5 +1,6 @@
-"""What a plain YAML scalar means, by the core schema of YAML 1.2 (section 10.3.2): `1e-3` is a
-number, `yes` is text.
+"""What a plain YAML scalar means: `1e-3` is a number, `yes` is text.
+
+That is the core schema of YAML 1.2 (section 10.3.2).
 """
 
 from __future__ import annotations

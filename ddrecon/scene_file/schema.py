@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,9 +24,11 @@ from ddrecon.settings import (
     Problem,
     RenderSettings,
     bounded,
+    limited,
     one_of,
     optional,
 )
+from ddrecon.variables.kinds import PAIRS
 
 Count = tuple[int, int, int]
 Size = tuple[int, int]
@@ -39,11 +41,6 @@ Matrix = tuple[Row, Row, Row, Row]
 MAX_CELLS = 2**30
 TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
 """Endings of the names of output files, which a view's name must not have."""
-
-
-def limited(**limits: float) -> Any:
-    """A required number, or numbers, within `limits`."""
-    return field(metadata=limits)
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,7 @@ class Bounds:
 class VolumeSection:
     """`bounds` and `resolution` may be left out where a field's file has them."""
 
-    ALTERNATIVES: ClassVar = (("sigma_a", "sigma_s"), ("sigma_t", "albedo"))
+    ALTERNATIVES: ClassVar = PAIRS
 
     density: Density = limited(minimum=0)
     bounds: Bounds | None = None
@@ -83,7 +80,7 @@ class VolumeSection:
     sigma_s: Quantity | None = optional(minimum=0)
     sigma_t: Quantity | None = optional(minimum=0)
     albedo: Quantity | None = optional(minimum=0, maximum=1)
-    g: float = field(default=0.0, metadata={"above": -1, "below": 1})
+    g: float = bounded(0.0, above=-1, below=1)
 
     def problems(self) -> Iterator[Problem]:
         x, y, z = self.resolution or (1, 1, 1)
@@ -116,8 +113,9 @@ class AmbientSection:
 
 @dataclass(frozen=True)
 class EnvironmentSection:
-    """A latitude-longitude map, +y up, its pixels times `scale`, turned by `rotation` [degrees]
-    about +y.
+    """A latitude-longitude map, +y up.
+
+    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about +y.
 
     `directions`: how many directions its light on the volume is gathered into.
     """
@@ -145,8 +143,9 @@ LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointS
 
 @dataclass(frozen=True, kw_only=True)
 class PoseSection:
-    """Where a camera stands: `origin`, `target` and `up` [u], or `matrix`, camera to world with
-    OpenGL axes; its pixels (w, h).
+    """Where a camera stands, and its `resolution` (width, height) in pixels.
+
+    The pose is `origin`, `target` and `up` [u], or `matrix`, camera to world with OpenGL axes.
     """
 
     ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
@@ -163,15 +162,16 @@ class PoseSection:
 
 
 def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
-    turn = matrix[:3, :3]
+    """Why `matrix` [4, 4] is no rotation and shift, where it is not."""
+    rotation = matrix[:3, :3]
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-4:
         yield "matrix", "its last row must be [0, 0, 0, 1]"
-    elif np.abs(turn.T @ turn - np.eye(3)).max() > 1e-4:
+    elif np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
         yield (
             "matrix",
             "must be rigid, but its first three columns are not of unit length and perpendicular",
         )
-    elif np.linalg.det(turn) < 0:
+    elif np.linalg.det(rotation) < 0:
         yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
 
@@ -204,8 +204,9 @@ CameraSection = PerspectiveSection | OrthographicSection
 
 @dataclass(frozen=True)
 class ViewSection:
-    """One view; `resolution` of its camera may be left out where there is an image. `weight`: how
-    much it counts in the loss.
+    """One view; its camera's `resolution` may be left out where there is an image.
+
+    `weight`: how much it counts in the loss.
     """
 
     name: str
@@ -219,12 +220,14 @@ class ViewSection:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
             yield (
                 "name",
-                f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.', the last not at its start",
+                f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.',"
+                " the last not at its start",
             )
         if self.name.endswith(TAKEN):
             yield (
                 "name",
-                f"{self.name!r} ends as files of other views do; do not end it with {', '.join(TAKEN)}",
+                f"{self.name!r} ends as files of other views do;"
+                f" do not end it with {', '.join(TAKEN)}",
             )
         if self.image is None and self.camera.resolution is None:
             yield "camera", "missing key 'resolution'; only a view with an image can go without"
@@ -232,8 +235,9 @@ class ViewSection:
 
 @dataclass(frozen=True)
 class RingSection:
-    """Cameras around `target`, in the horizontal plane `height` above it, the first towards +z and
-    the next towards +x.
+    """Cameras around `target`, the first towards +z of it and the next towards +x.
+
+    The circle is horizontal, `height` above `target`.
     """
 
     count: int = limited(minimum=1, maximum=10000)
@@ -247,8 +251,9 @@ class RingSection:
 
 @dataclass(frozen=True)
 class ViewSource:
-    """Views that are not listed one by one: from a ring, or from transforms.json files of NeRF,
-    instant-ngp or nerfstudio.
+    """Views that are not listed one by one: those of a ring, or of transforms.json files.
+
+    Such files are written by NeRF, instant-ngp or nerfstudio.
 
     `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every
     `test_every` views of files that say nothing of it, the first is a test view.
@@ -275,8 +280,9 @@ class ViewSource:
 
 @dataclass(frozen=True)
 class SceneTree:
-    """A whole scene file; a ring of views is already the views it stands for, and paths are
-    absolute.
+    """A whole scene file.
+
+    A ring of views is already the views it stands for, and paths are absolute.
     """
 
     volume: VolumeSection

@@ -109,8 +109,9 @@ def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSect
 def _tests(
     entries: Entries, path: Path, frames: list[Node], rule: Rule, test_every: int | None
 ) -> list[bool]:
-    """Which frames are test views: as lists of the file say, or its name (`transforms_test.json`),
-    or one in `test_every`.
+    """Which frames are test views.
+
+    Lists of the file say so, or its name (`transforms_test.json`), or it is one in `test_every`.
     """
     listed = [
         name for name in ("train_filenames", "test_filenames", "val_filenames") if name in entries

@@ -1,5 +1,6 @@
-"""The camera of one frame of a `transforms.json`: a pinhole, whose intrinsics are in pixels, or an
-angle of view.
+"""The camera of one frame of a `transforms.json`: a pinhole.
+
+Its intrinsics are in pixels, or it has an angle of view.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ Entries = Mapping[str, Node]
 
 
 def read_camera(frame: Node, entries: Entries, rule: Rule) -> PerspectiveSection:
-    """The camera that `entries` describe, those of `frame` and of its file; raises SceneError for
-    what is wrong or distorted.
+    """The camera that `entries` describe, those of `frame` and of its file.
+
+    Raises SceneError for what is wrong or distorted.
     """
     _require_pinhole(entries, rule)
     if "transform_matrix" not in entries:
@@ -36,8 +38,9 @@ def read_camera(frame: Node, entries: Entries, rule: Rule) -> PerspectiveSection
 
 
 def _intrinsics(frame: Node, entries: Entries, rule: Rule) -> dict[str, Any]:
-    """`fov`, and where the size of the image is known, `resolution`, `principal_point` and
-    `pixel_aspect`.
+    """`fov`, and where the image's size is known, the rest that a camera needs.
+
+    That is `resolution`, `principal_point` and `pixel_aspect`.
     """
     angle_x, angle_y = (
         _number(entries, f"camera_angle_{axis}", rule, above=0, below=math.pi) for axis in "xy"

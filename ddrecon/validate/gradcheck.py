@@ -1,5 +1,4 @@
-"""Derivatives checked against each other: tangent against adjoint, and the adjoint against finite
-differences of the program.
+"""Checks of derivatives: tangent against adjoint, and adjoint against finite differences.
 
 Everything runs in float64 with solves to nearly its precision, for every parameter alone and for
 all of them at once.
@@ -7,6 +6,7 @@ all of them at once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -15,7 +15,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import UsageError
 from ddrecon.scene import Scene
 from ddrecon.scene_file.problems import suggestion
 from ddrecon.validate.point import (
@@ -32,9 +32,10 @@ AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6
 NEGLIGIBLE = 1e-6
 """Errors are relative to the derivative they are of, or to this part of the parameter's largest
-where that is more; those that the last digits of the loss could make pass.
+where that is more. What the last digits of the loss can make is no error.
 """
 TOGETHER = "all at once"
+"""What the check of all parameters together is called."""
 
 Loss = Callable[[Mapping[str, Tensor]], Tensor]
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -42,11 +43,11 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 @dataclass(frozen=True)
 class EntryCheck:
-    """One entry of a parameter, or a random direction in it: derivative by the adjoint, by central
-    differences, relative error.
+    """The derivative by one entry of a parameter, or along a random direction in it.
 
-    `differences` are those of all `steps`; `difference`, taken with `step`, is the one that agrees
-    best: larger steps suffer from truncation, smaller ones from rounding.
+    `adjoint` is the derivative by reverse mode, `difference` that by central differences with
+    `step`, and `error` their relative difference. Of the `differences` with all `steps` it is the
+    one that agrees best: larger steps suffer from truncation, smaller ones from rounding.
     """
 
     entry: str
@@ -58,11 +59,21 @@ class EntryCheck:
     steps: tuple[float, ...]
     differences: tuple[float, ...]
 
+    def row(self) -> str:
+        """The check as a line of the table."""
+        value = "" if self.value is None else f"{self.value:.4g}"
+        return (
+            f"{self.entry:>24}  {value:>10}  {self.adjoint:14.7e}  {self.difference:14.7e}"
+            f"  {self.step:8.1e}  {self.error:14.1e}"
+        )
+
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """The check of one parameter: relative difference of tangent and adjoint along a random
-    direction, and the entries looked at.
+    """The check of one parameter, or of all at once.
+
+    `tangent` is the derivative by forward mode along the random direction that is the first of
+    `entries`, and `modes_error` its relative difference from the adjoint's.
     """
 
     parameter: str
@@ -74,8 +85,7 @@ class GradientCheck:
     def worst(self) -> EntryCheck:
         """The entry with the largest error; NaN counts as largest."""
         return max(
-            self.entries,
-            key=lambda entry: entry.error if entry.error == entry.error else float("inf"),
+            self.entries, key=lambda entry: math.inf if math.isnan(entry.error) else entry.error
         )
 
     @property
@@ -87,54 +97,45 @@ class GradientCheck:
 
     def lines(self) -> list[str]:
         """The check as a table."""
-        header = f"{self.parameter:>24}  {'value':>10}  {'adjoint':>14}  {'difference':>14}  {'step':>8}  {'relative error':>14}"
-        rows = [_row(entry) for entry in self.entries]
-        verdict = "pass" if self.has_passed else "FAIL"
-        worst = f"central differences {self.worst.error:.1e} at worst, {self.worst.entry} (allowed {AGREE_DIFFERENCES:.0e})"
-        modes = f"tangent against adjoint {self.modes_error:.1e} (allowed {AGREE_MODES:.0e})"
-        return [header, *rows, f"{self.parameter}: {verdict}; {modes}; {worst}"]
-
-
-def _row(e: EntryCheck) -> str:
-    value = "" if e.value is None else f"{e.value:.4g}"
-    return f"{e.entry:>24}  {value:>10}  {e.adjoint:14.7e}  {e.difference:14.7e}  {e.step:8.1e}  {e.error:14.1e}"
+        header = (
+            f"{self.parameter:>24}  {'value':>10}  {'adjoint':>14}  {'difference':>14}"
+            f"  {'step':>8}  {'relative error':>14}"
+        )
+        verdict = (
+            f"{self.parameter}: {'pass' if self.has_passed else 'FAIL'}"
+            f"; tangent against adjoint {self.modes_error:.1e} (allowed {AGREE_MODES:.0e})"
+            f"; central differences {self.worst.error:.1e} at worst, {self.worst.entry}"
+            f" (allowed {AGREE_DIFFERENCES:.0e})"
+        )
+        return [header, *(entry.row() for entry in self.entries), verdict]
 
 
 def check_parameters(
     scene: Scene, names: tuple[str, ...], samples: int, seed: int, progress: Progress
 ) -> list[GradientCheck]:
-    """Checks the parameters called `names`, or all that `scene` (float64) optimizes (density where
-    that is none), and all at once.
+    """The checks of the parameters `names` of `scene` (float64), and of all of them at once.
 
-    `samples` entries of each are looked at one by one. Raises SceneError for a name the scene does
-    not have.
+    Without names it is what the scene optimizes, or density where that is nothing. `samples`
+    entries of each are looked at one by one. Raises UsageError for a name the scene does not have.
     """
-    known = variable_names(scene)
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise SceneError(
-            [
-                f"--parameter {name}: the scene has no such number{suggestion(name, known)}"
-                for name in unknown
-            ]
-        )
-    chosen = tuple(dict.fromkeys(names)) or tuple(
+    names = _require_known(scene, names) or tuple(
         scene.optimize.parameters if scene.optimize else ("density",)
     )
     generator = torch.Generator().manual_seed(seed)
-    point = starting_point(scene, chosen, generator)
+    point = starting_point(scene, names, generator)
     loss = loss_at(scene, point, generator)
-    values = {name: point[name] for name in chosen}
+    values = {name: point[name] for name in names}
     gradients = _gradients(loss, values)
-    checks = [
-        _check(loss, {name: values[name]}, gradients, samples if name else 0, generator, name)
-        for name in progress(chosen, "gradcheck")
-    ]
-    return (
-        checks
-        if len(chosen) == 1
-        else [*checks, _check(loss, values, gradients, 0, generator, TOGETHER)]
-    )
+    checks = []
+    for name in progress(names, "gradcheck"):
+        value = {name: values[name]}
+        along = _random_way(value, gradients, generator)
+        entries = _entry_ways(name, values[name], gradients[name], samples, generator)
+        checks.append(_check(loss, value, name, [along, *entries]))
+    if len(names) > 1:
+        along = _random_way(values, gradients, generator)
+        checks.append(_check(loss, values, TOGETHER, [along]))
+    return checks
 
 
 def describe(checks: list[GradientCheck]) -> dict[str, Any]:
@@ -146,6 +147,7 @@ def describe(checks: list[GradientCheck]) -> dict[str, Any]:
 
 
 def _gradients(loss: Loss, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The derivatives of `loss` by each of `values`, in reverse mode."""
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     bars = torch.autograd.grad(loss(leaves), list(leaves.values()), allow_unused=True)
     return {
@@ -154,49 +156,80 @@ def _gradients(loss: Loss, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _check(
-    loss: Loss,
-    values: Mapping[str, Tensor],
-    gradients: Mapping[str, Tensor],
-    samples: int,
-    generator: torch.Generator,
-    label: str,
-) -> GradientCheck:
-    """The check of `values`: along a random direction in all of them, and at `samples` entries
-    where it is one parameter.
+def _require_known(scene: Scene, names: tuple[str, ...]) -> tuple[str, ...]:
+    """`names`, each once; raises UsageError for those that are no variables of `scene`."""
+    known = variable_names(scene)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise UsageError(
+            [
+                f"--parameter {name}: the scene has no such number{suggestion(name, known)}"
+                for name in unknown
+            ]
+        )
+    return tuple(dict.fromkeys(names))
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A way to move parameters along: `direction` for each that moves, and what is known of it.
+
+    `adjoint` is the derivative along it; differences are taken with `steps`. Errors are relative to
+    at least `floor`. `value` is that of the entry that moves, where it is one.
     """
+
+    label: str
+    direction: Mapping[str, Tensor]
+    adjoint: float
+    steps: tuple[float, ...]
+    value: float | None = None
+    floor: float = 0.0
+
+
+def _random_way(
+    values: Mapping[str, Tensor], gradients: Mapping[str, Tensor], generator: torch.Generator
+) -> _Way:
+    """A random direction in all of `values`, each moving by its longest step at most."""
     steps = {name: steps_of(name, value) for name, value in values.items()}
     direction = {
         name: 2 * (random_like(value, generator) - 0.5) * steps[name][0]
         for name, value in values.items()
     }
     along = float(sum((gradients[name] * direction[name]).sum() for name in values))
-    tangent = _tangent(loss, values, direction)
-    fractions = tuple(step / first[0] for first in [next(iter(steps.values()))] for step in first)
-    ways: list[tuple[str, float | None, float, Mapping[str, Tensor], tuple[float, ...], float]]
-    ways = [("a random direction", None, along, direction, fractions, 0.0)]
-    for name, value in values.items() if samples else ():
-        floor = NEGLIGIBLE * float(gradients[name].abs().max())
-        for index in pick_entries(name, value, samples, generator):
-            unit = torch.zeros_like(value)
-            unit.view(-1)[index] = 1
-            derivative = float(gradients[name].flatten()[index])
-            ways.append(
-                (
-                    entry_name(name, value, index),
-                    float(value.flatten()[index]),
-                    derivative,
-                    {name: unit},
-                    steps[name],
-                    floor,
-                )
-            )
-    entries = tuple(_check_way(loss, values, *way) for way in ways)
-    modes_error = abs(tangent - along) / max(abs(along), torch.finfo(torch.float64).tiny)
+    # a direction is as long as the longest steps: those along it are parts of 1
+    first = next(iter(steps.values()))
+    return _Way("a random direction", direction, along, tuple(step / first[0] for step in first))
+
+
+def _entry_ways(
+    name: str, value: Tensor, gradient: Tensor, samples: int, generator: torch.Generator
+) -> list[_Way]:
+    """The ways along `samples` single entries of the parameter `name`."""
+    steps, floor = steps_of(name, value), NEGLIGIBLE * float(gradient.abs().max())
+    ways = []
+    for index in pick_entries(name, value, samples, generator):
+        unit = torch.zeros_like(value)
+        unit.view(-1)[index] = 1
+        adjoint, entry = float(gradient.flatten()[index]), float(value.flatten()[index])
+        label = entry_name(name, value, index)
+        ways.append(_Way(label, {name: unit}, adjoint, steps, entry, floor))
+    return ways
+
+
+def _check(
+    loss: Loss, values: Mapping[str, Tensor], label: str, ways: Sequence[_Way]
+) -> GradientCheck:
+    """The check of `values` along `ways`, of which the first is a direction in all of them."""
+    along = ways[0]
+    tangent = _tangent(loss, values, along.direction)
+    tiny = torch.finfo(torch.float64).tiny
+    modes_error = abs(tangent - along.adjoint) / max(abs(along.adjoint), tiny)
+    entries = tuple(_check_way(loss, values, way) for way in ways)
     return GradientCheck(label, tangent, modes_error, entries)
 
 
 def _tangent(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, Tensor]) -> float:
+    """The derivative of `loss` along `direction`, in forward mode."""
     with forward_ad.dual_level():
         duals = {
             name: forward_ad.make_dual(value, direction[name]) for name, value in values.items()
@@ -205,49 +238,43 @@ def _tangent(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, T
     return 0.0 if tangent is None else float(tangent)
 
 
-def _check_way(
-    loss: Loss,
-    values: Mapping[str, Tensor],
-    entry: str,
-    value: float | None,
-    adjoint: float,
-    direction: Mapping[str, Tensor],
-    steps: tuple[float, ...],
-    floor: float,
-) -> EntryCheck:
+def _check_way(loss: Loss, values: Mapping[str, Tensor], way: _Way) -> EntryCheck:
+    """The check along `way`, with the step whose difference agrees best."""
     differences, roundings = zip(
-        *(_difference(loss, values, direction, step) for step in steps), strict=True
+        *(_difference(loss, values, way.direction, step) for step in way.steps), strict=True
     )
     tiny = torch.finfo(torch.float64).tiny
     errors = [
-        abs(difference - adjoint)
-        / max(abs(difference), abs(adjoint), floor, rounding / AGREE_DIFFERENCES, tiny)
+        abs(difference - way.adjoint)
+        / max(abs(difference), abs(way.adjoint), way.floor, rounding / AGREE_DIFFERENCES, tiny)
         for difference, rounding in zip(differences, roundings, strict=True)
     ]
-    best = min(range(len(steps)), key=lambda i: errors[i])
+    best = min(range(len(errors)), key=lambda i: errors[i])
     return EntryCheck(
-        entry, value, adjoint, differences[best], steps[best], errors[best], steps, differences
+        way.label,
+        way.value,
+        way.adjoint,
+        differences[best],
+        way.steps[best],
+        errors[best],
+        way.steps,
+        differences,
     )
 
 
 def _difference(
     loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, Tensor], step: float
 ) -> tuple[float, float]:
-    """The central difference of fourth order along `direction`, and what the last digits of the
-    loss make of it.
+    """The central difference of fourth order along `direction`, and the error of its rounding.
+
+    f' = (8 (f(h) - f(-h)) - (f(2h) - f(-2h))) / 12h; each of the 18 values that this adds, counted
+    by weight, may be off by one unit in the last place.
     """
 
     def shifted(steps: int) -> float:
+        moved = {name: value + steps * step * direction[name] for name, value in values.items()}
         with torch.no_grad():
-            return float(
-                loss(
-                    {
-                        name: value + steps * step * direction[name]
-                        for name, value in values.items()
-                        if name in direction
-                    }
-                )
-            )
+            return float(loss(moved))
 
     near, far = (shifted(1), shifted(-1)), (shifted(2), shifted(-2))
     rounding = 18 * torch.finfo(torch.float64).eps * max(map(abs, (*near, *far)))

@@ -1,5 +1,7 @@
-"""The hard cases run: finite, single precision close to double, solved as far as rounding allows,
-no light lost, none below zero.
+"""The hard cases of `hard_cases`, run and judged.
+
+Results must be finite, the same in single and double precision, solved as far as rounding allows,
+lose no light and have no radiance below zero.
 """
 
 from __future__ import annotations
@@ -30,8 +32,10 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 @dataclass(frozen=True)
 class Rendered:
-    """One case in one precision: `image` [3, h, w], `gradient` of its mean by density [z, y, x],
-    iterations and balance of the solve.
+    """One case in one precision.
+
+    `image` is [3, h, w], `gradient` that of its mean by density [z, y, x]; `iterations` and
+    `balance` are of the solve.
     """
 
     image: Tensor
@@ -47,8 +51,10 @@ class Rendered:
 
 @dataclass(frozen=True)
 class HardResult:
-    """What a case came to. `iterations` to `energy` are of float32; errors are relative RMS;
-    `lowest` is over the brightest pixel.
+    """The result of a case.
+
+    `iterations` to `energy` are of float32; errors are relative RMS; `lowest` is a part of the
+    brightest pixel.
     """
 
     case: str
@@ -64,7 +70,7 @@ class HardResult:
 
     def failures(self) -> list[str]:
         """The bounds that are not kept (a NaN keeps none)."""
-        kept = {
+        bounds = {
             "finite": self.is_finite,
             "residual": self.residual <= TOLERANCE[torch.float32] + ROUNDINGS * self.attainable,
             "image": self.image_error <= SINGLE_FROM_DOUBLE,
@@ -73,7 +79,7 @@ class HardResult:
             "energy": self.energy <= ENERGY[torch.float32]
             and self.energy_double <= ENERGY[torch.float64],
         }
-        return [name for name, is_kept in kept.items() if not is_kept]
+        return [name for name, is_kept in bounds.items() if not is_kept]
 
     def row(self) -> str:
         """The case as a line of the table."""

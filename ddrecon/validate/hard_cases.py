@@ -1,5 +1,6 @@
-"""Small scenes at the edges of what is allowed, each in any precision: `CASES` is the table that
-`ddrecon bench --hard` and the tests run.
+"""Small scenes at the edges of what is allowed, each in any precision.
+
+`CASES` is the table that `ddrecon bench --hard` and the tests run.
 
 Everything is written here in double precision and rounded once, as the scene loader does it. Shapes
 and sides are in array order (z, y, x).
@@ -55,8 +56,9 @@ def layer(shape: Shape) -> Tensor:
 
 @dataclass(frozen=True)
 class HardCase:
-    """A scene in words: a medium of `shape` cells in a box of `sides` [u] about the origin, a beam
-    and a camera of 16 x 16 pixels.
+    """A scene in words: a medium in a box about the origin, a beam, and a camera of 16 x 16 pixels.
+
+    The box has `shape` cells and `sides` [u].
 
     `depth`: optical depth of a cell of density 1 along its shortest side. `travel`, `eye` and
     `target` are (x, y, z).

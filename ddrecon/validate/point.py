@@ -1,5 +1,4 @@
-"""Where derivatives are checked: the values all parameters have there, the loss as a function of
-them, and the entries looked at.
+"""The point where derivatives are checked: the values of parameters, and the loss there.
 
 Where the scene's density is the same everywhere, and above all where it is empty, the check is made
 at a random density, half of whose cells are empty: an empty volume would hide all but density from
@@ -20,42 +19,37 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import image_loss
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
-from ddrecon.variables.kinds import pattern_of
+from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import component_names, value_of, with_values
 
 TOLERANCE = 1e-13
 """Relative residual of the solves."""
-STEPS = (1e-2, 1e-3, 1e-4)
-"""Changes by which finite differences are taken, as parts of the parameter's largest value."""
-SHORT_STEPS = (1e-4, 1e-5, 1e-6)
-"""The same for what moves rays or beams, since interpolation has a kink at every cell center and a
-short step crosses few, and for g, whose delta-Eddington scaling has a second derivative that jumps
-at 0.
-"""
 NUDGE = 1e-2
 """The most that a component of a light's direction is changed by, as a part of the largest."""
-SHORT = {"g", "lights.N.direction", "lights.N.position", "lights.N.rotation", "views.NAME.camera"}
 
 
 def starting_point(
     scene: Scene, names: tuple[str, ...], generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """The value of density (the scene's own before that it starts from), of each optimized
-    parameter and of each of `names`.
+    """The value of each optimized parameter, of each of `names`, and of density.
+
+    Density is the scene's own; where that is the same everywhere, what it starts from; where that
+    is, too, random numbers of which half are empty.
     """
-    wanted = dict.fromkeys([*scene.starts, *names, "density"])
     point = {
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
-        for name in wanted
+        for name in dict.fromkeys([*scene.starts, *names, "density"])
     }
-    own = scene.volume.density
     if point["density"].ndim == 3:
-        candidates = [own, point["density"], (2 * random_like(own, generator) - 1).clamp(min=0)]
+        of_scene = scene.volume.density
+        random = (2 * random_like(of_scene, generator) - 1).clamp(min=0)
         point["density"] = next(
-            density for density in candidates if bool((density != density.flatten()[0]).any())
+            density
+            for density in (of_scene, point["density"], random)
+            if bool((density != density.flatten()[0]).any())
         )
     for name, value in point.items():
-        if pattern_of(name) == "lights.N.direction":
+        if kind_of(name).is_direction:
             point[name] = value + NUDGE * value.abs().max() * (
                 2 * random_like(value, generator) - 1
             )
@@ -65,10 +59,10 @@ def starting_point(
 def loss_at(
     scene: Scene, point: Mapping[str, Tensor], generator: torch.Generator
 ) -> Callable[[Mapping[str, Tensor]], Tensor]:
-    """The image loss of `scene` (float64) as a function of some parameters, the others being as in
-    `point`.
+    """The image loss of `scene` (float64) as a function of some parameters.
 
-    Targets are the views' images where they have them, else random ones.
+    The others are as in `point`. Targets are the images of the views that have them, else random
+    ones.
     """
     exact = replace(scene, diffusion=replace(scene.diffusion, tolerance=TOLERANCE))
     views = [view for view in scene.views if view.image is not None] or scene.views
@@ -81,13 +75,13 @@ def loss_at(
     memory = SolveMemory(is_warm=False)
 
     def loss(values: Mapping[str, Tensor]) -> Tensor:
-        world = with_values(exact, {**point, **values})
-        seen = [world.view(view.name) for view in views]
-        images = render_each(world, seen, memory)
-        compared = zip(images, targets, seen, strict=True)
-        return torch.stack(
-            [image_loss("l2", image, target, view.mask) for image, target, view in compared]
-        ).mean()
+        changed = with_values(exact, {**point, **values})
+        images = render_each(changed, [changed.view(view.name) for view in views], memory)
+        losses = [
+            image_loss("l2", image, target, view.mask)
+            for image, target, view in zip(images, targets, views, strict=True)
+        ]
+        return torch.stack(losses).mean()
 
     return loss
 
@@ -95,8 +89,9 @@ def loss_at(
 def steps_of(name: str, value: Tensor) -> tuple[float, ...]:
     """The steps of finite differences for the parameter `name` at `value`."""
     largest = float(value.abs().max())
-    steps = SHORT_STEPS if pattern_of(name) in SHORT else STEPS
-    return tuple(step * (largest if largest > 0 else 1.0) for step in steps)
+    return tuple(
+        step * (largest if largest > 0 else 1.0) for step in kind_of(name).difference_steps
+    )
 
 
 def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Generator) -> list[int]:
@@ -104,18 +99,17 @@ def pick_entries(name: str, value: Tensor, samples: int, generator: torch.Genera
     order = torch.randperm(value.numel(), generator=generator)
     if name != "density":
         return sorted(order[:samples].tolist())
-    is_empty = (value.flatten().cpu()[order] == 0).tolist()
-    empty = [i for i, e in zip(order.tolist(), is_empty, strict=True) if e][: samples // 2]
-    filled = [i for i, e in zip(order.tolist(), is_empty, strict=True) if not e][
-        : samples - len(empty)
-    ]
-    return filled + empty
+    is_empty = value.flatten().cpu()[order] == 0
+    empty = order[is_empty].tolist()[: samples // 2]
+    return order[~is_empty].tolist()[: samples - len(empty)] + empty
 
 
 def entry_name(name: str, value: Tensor, index: int) -> str:
-    """What a user calls the entry at flat `index`: a component, a cell (x, y, z) or a pixel (x, y),
-    with its color.
+    """What a user calls the entry at flat `index`, with its color.
+
+    It is a component, a cell (x, y, z) or a pixel (x, y).
     """
+    # the last axis of a tensor is x, and its first, if there is such, is that of colors
     place = []
     for size in reversed(value.shape):
         place.append(index % size)

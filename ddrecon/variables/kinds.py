@@ -1,5 +1,7 @@
-"""What can be optimized: for each kind of variable its legal values, and what a run assumes of it
-unless the scene says otherwise.
+"""The table of variables: all that is known of each kind of number that can be optimized.
+
+A kind is named by a pattern: N is a light's place in the list, counted from 0, and NAME a view's
+name. `ddrecon.variables.values` reads and replaces the values themselves.
 """
 
 from __future__ import annotations
@@ -9,46 +11,90 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ddrecon.variables.default_rates import (
+    Rate,
+    brightness_rate,
+    cross_section_rate,
+    density_rate,
+    direction_rate,
+    fixed_rate,
+    position_rate,
+)
+
+LONG_STEPS = (1e-2, 1e-3, 1e-4)
+"""Changes by which finite differences are taken, as parts of the variable's largest value."""
+SHORT_STEPS = (1e-4, 1e-5, 1e-6)
+"""The same for what moves rays or beams, since interpolation has a kink at every cell center and a
+short step crosses few, and for g, whose delta-Eddington scaling has a second derivative that jumps
+at 0.
+"""
+STEEPEST_G = 0.99
+"""Beyond this mean cosine of scattering the phase function is all peak."""
+XYZ = ("x", "y", "z")
+
 
 @dataclass(frozen=True)
 class Kind:
-    """Values are kept within [`low`, `high`]; `is_color` if they may differ by color, `is_cellwise`
-    if from cell to cell.
+    """One kind of variable.
 
-    `tv` is the weight of total variation where a scene gives none.
+    `rate` is the default learning rate; values are kept within [`low`, `high`]. `is_color`: they
+    may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components` are
+    the names of a vector's entries, which change one at a time. `is_direction`: only the way a
+    vector points matters, and a step keeps its length. `tv` is the default weight of total
+    variation, and `difference_steps` are those of finite differences.
     """
 
+    rate: Rate
     low: float = -math.inf
     high: float = math.inf
     is_color: bool = False
     is_cellwise: bool = False
+    components: tuple[str, ...] = ()
+    is_direction: bool = False
     tv: float = 0.0
+    difference_steps: tuple[float, ...] = LONG_STEPS
 
 
-STEEPEST_G = 0.99
-"""Beyond this mean cosine of scattering the phase function is all peak."""
-
-_CROSS_SECTION = Kind(low=0, is_color=True, is_cellwise=True)
-_BRIGHTNESS = Kind(low=0, is_color=True)
-_FREE = Kind()
+_CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
+_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True)
 
 KINDS: Mapping[str, Kind] = {
-    "density": Kind(low=0, is_cellwise=True, tv=3e-3),
+    "density": Kind(density_rate, low=0, is_cellwise=True, tv=3e-3),
     "sigma_a": _CROSS_SECTION,
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
-    "albedo": Kind(low=0, high=1, is_color=True, is_cellwise=True),
-    "g": Kind(low=-STEEPEST_G, high=STEEPEST_G),
+    "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
+    "g": Kind(fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS),
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
-    "lights.N.scale": Kind(low=0),
-    "lights.N.rotation": _FREE,
-    "lights.N.direction": _FREE,
-    "lights.N.position": _FREE,
-    "views.NAME.camera": _FREE,
+    "lights.N.scale": Kind(brightness_rate, low=0),
+    # in degrees
+    "lights.N.rotation": Kind(fixed_rate(1.0), difference_steps=SHORT_STEPS),
+    "lights.N.direction": Kind(
+        direction_rate, components=XYZ, is_direction=True, difference_steps=SHORT_STEPS
+    ),
+    "lights.N.position": Kind(position_rate, components=XYZ, difference_steps=SHORT_STEPS),
+    # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
+    "views.NAME.camera": Kind(
+        fixed_rate(0.01),
+        components=("rotation_x", "rotation_y", "rotation_z", *XYZ),
+        difference_steps=SHORT_STEPS,
+    ),
 }
-"""By pattern of name: N is a light's place in the list, counted from 0, NAME a view's name."""
+"""Every kind of variable, by its pattern."""
+
+VOLUME = tuple(pattern for pattern in KINDS if "." not in pattern)
+"""The variables of the volume."""
+CROSS_SECTIONS = ("sigma_a", "sigma_s")
+EXTINCTION_AND_ALBEDO = ("sigma_t", "albedo")
+PAIRS = (CROSS_SECTIONS, EXTINCTION_AND_ALBEDO)
+"""Two ways to say the same: a scene gives and varies one pair, and the other follows."""
+
+
+def kind_of(name: str) -> Kind:
+    """The kind of the variable `name`; raises KeyError for a name of none."""
+    return KINDS[pattern_of(name)]
 
 
 def pattern_of(name: str) -> str:

@@ -1,5 +1,6 @@
-"""Derivative images: how every pixel changes with one number of the scene, by the differential
-diffusion equation (docs/theory.md E8).
+"""Derivative images: how every pixel changes with one number of the scene.
+
+They solve the differential diffusion equation (docs/theory.md E8).
 
 One forward-mode pass renders image and derivative together; a field changes uniformly, by one unit
 in every cell.
@@ -15,12 +16,14 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.scene import Scene
+from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
 
 
 def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
-    """The variable that `name` belongs to, and its change [same shape] by one unit of what is
-    named.
+    """The variable that `name` belongs to, and its change by one unit of what `name` names.
+
+    The change has the shape of the variable's value.
 
     `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
     or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
@@ -28,10 +31,9 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
     """
     if name in variable_names(scene):
         value = value_of(scene, name)
-        if name.rpartition(".")[2] in ("direction", "position", "camera"):
-            raise KeyError(
-                f"{name} changes by component: {', '.join(f'{name}.{part}' for part in component_names(name, value))}"
-            )
+        if components := kind_of(name).components:
+            parts = ", ".join(f"{name}.{component}" for component in components)
+            raise KeyError(f"{name} changes by component: {parts}")
         return name, torch.ones_like(value)
     owner, _, component = name.rpartition(".")
     if owner in variable_names(scene):
@@ -50,8 +52,9 @@ Key = TypeVar("Key")
 def render_tangent(
     scene: Scene, name: str, images_of: Callable[[Scene], dict[Key, Tensor]]
 ) -> dict[Key, tuple[Tensor, Tensor]]:
-    """What `images_of` makes of `scene`, each image with its derivative with respect to `name` (see
-    `variation`).
+    """The images that `images_of` renders of `scene`, each with its derivative by `name`.
+
+    `name` is as for `variation`. Raises KeyError.
     """
     variable, change = variation(scene, name)
     with forward_ad.dual_level():

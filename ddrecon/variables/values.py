@@ -1,5 +1,4 @@
-"""The numbers of a scene by name: what can be differentiated and optimized, read out of a scene and
-put back into it.
+"""The numbers of a scene by name, read out of a scene and put back into it.
 
 `density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo` and `g` are the volume's; `lights.0.irradiance`
 is any number of the first light; `views.front.camera` is the twist of a camera. Vectors are (x, y,
@@ -18,11 +17,7 @@ from ddrecon.cameras import twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
-
-VOLUME = ("density", "sigma_a", "sigma_s", "sigma_t", "albedo", "g")
-"""The volume's variables; either sigma_a and sigma_s or sigma_t and albedo are varied, the other
-pair follows.
-"""
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, VOLUME, kind_of
 
 
 def variable_names(scene: Scene) -> list[str]:
@@ -40,28 +35,24 @@ def value_of(scene: Scene, name: str) -> Tensor:
 
     `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
     that light holds them; a camera's twist is the change of its pose, [6] and zero: see
-    `ddrecon.cameras.twisted`.
+    `ddrecon.cameras.twist`.
     """
-    kind, _, rest = name.partition(".")
-    if kind in VOLUME and not rest:
-        return _volume_value(scene.volume, kind)
-    if kind == "lights":
-        index, _, attribute = rest.partition(".")
-        if (
-            index.isdecimal()
-            and int(index) < len(scene.lights)
-            and attribute in _tensors(scene.lights[int(index)])
-        ):
-            value: Tensor = getattr(scene.lights[int(index)], attribute)
-            return value
-    elif kind == "views" and rest.endswith(".camera"):
-        return scene.view(rest.removesuffix(".camera")).camera.pose.new_zeros(6)
-    raise KeyError(name)
+    if name not in variable_names(scene):
+        raise KeyError(name)
+    if name in VOLUME:
+        return _volume_value(scene.volume, name)
+    section, _, path = name.partition(".")
+    if section == "views":
+        return scene.view(path.removesuffix(".camera")).camera.pose.new_zeros(6)
+    index, _, attribute = path.partition(".")
+    value: Tensor = getattr(scene.lights[int(index)], attribute)
+    return value
 
 
 def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
-    """`scene` with its variables replaced by `values`; a density of one number fills the grid.
-    `scene` itself stays as it is.
+    """`scene` with its variables replaced by `values`; `scene` itself stays as it is.
+
+    A density of one number fills the grid.
 
     Raises KeyError for a name that is none, ValueError for a density of another shape than the
     grid's.
@@ -71,15 +62,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     if unknown:
         raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(known)}")
     lights = [
-        _replace_light(
-            light,
-            {
-                name: values[key]
-                for name in _tensors(light)
-                if (key := f"lights.{index}.{name}") in values
-            },
-        )
-        for index, light in enumerate(scene.lights)
+        _replace_light(light, f"lights.{index}", values) for index, light in enumerate(scene.lights)
     ]
     views = [
         _replace_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views
@@ -91,19 +74,12 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
 
 
 def component_names(name: str, value: Tensor) -> tuple[str, ...]:
-    """What the entries of a variable that is a vector, a color or a twist are called; none for a
-    number, a field or a map.
+    """The names along the first axis of `value`: a vector's entries or three colors; else none.
+
+    Raises KeyError for a name of no variable.
     """
-    attribute = name.rpartition(".")[2]
-    if attribute == "camera":
-        return "rotation_x", "rotation_y", "rotation_z", "x", "y", "z"
-    if attribute in ("direction", "position"):
-        return "x", "y", "z"
-    return (
-        ("r", "g", "b")
-        if value.ndim in (1, 3, 4) and value.shape[0] == 3 and attribute != "density"
-        else ()
-    )
+    kind = kind_of(name)
+    return ("r", "g", "b") if kind.is_color and value.shape[:1] == (3,) else kind.components
 
 
 def cross_sections(sigma_t: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,40 +96,38 @@ def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tensors(light: Light) -> list[str]:
+    """The names of the numbers of `light` that can be varied."""
     return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
 
 
 def _volume_value(volume: Volume, name: str) -> Tensor:
-    if name not in ("sigma_t", "albedo"):
+    if name not in EXTINCTION_AND_ALBEDO:
         value: Tensor = getattr(volume, name)
         return value
-    one, other = _same_axes(volume.sigma_a, volume.sigma_s)
-    sigma_t = one + other
-    return (
-        sigma_t if name == "sigma_t" else other / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
-    )
+    sigma_a, sigma_s = _same_axes(volume.sigma_a, volume.sigma_s)
+    sigma_t = sigma_a + sigma_s
+    if name == "sigma_t":
+        return sigma_t
+    return sigma_s / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
 
 
 def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
-    density, g = values.get("density", volume.density), values.get("g", volume.g)
-    sigma_a, sigma_s = values.get("sigma_a", volume.sigma_a), values.get("sigma_s", volume.sigma_s)
-    if "sigma_t" in values or "albedo" in values:
+    stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
+    if len(stored) < len(values):
         sigma_t, albedo = (
             values[name] if name in values else _volume_value(volume, name)
-            for name in ("sigma_t", "albedo")
+            for name in EXTINCTION_AND_ALBEDO
         )
-        sigma_a, sigma_s = cross_sections(sigma_t, albedo)
-    return Volume(
-        volume.grid,
-        density.expand(volume.grid.shape) if density.ndim == 0 else density,
-        sigma_a,
-        sigma_s,
-        g,
-    )
+        stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)
+    if "density" in stored and stored["density"].ndim == 0:
+        stored["density"] = stored["density"].expand(volume.grid.shape)
+    changed: Volume = replace(volume, **stored)  # type: ignore[arg-type]
+    return changed
 
 
-def _replace_light(light: Light, values: Mapping[str, Tensor]) -> Light:
-    changed: Light = replace(light, **values)  # type: ignore[arg-type]
+def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Light:
+    tensors = {key: values[f"{name}.{key}"] for key in _tensors(light) if f"{name}.{key}" in values}
+    changed: Light = replace(light, **tensors)  # type: ignore[arg-type]
     return changed
 
 

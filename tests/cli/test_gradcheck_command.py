@@ -1,4 +1,4 @@
-"""`ddrecon gradcheck` passes for the program, and fails for a program whose derivatives are wrong."""
+"""`ddrecon gradcheck` passes for the program, and fails where a derivative is wrong."""
 
 from __future__ import annotations
 

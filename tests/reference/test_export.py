@@ -15,7 +15,7 @@ import pytest
 import torch
 from media import make_camera, make_scene, random_values
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import UsageError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.reference.export import export_scene
@@ -128,7 +128,7 @@ def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(tmp_path: Path) ->
 def test_what_is_there_stays(tmp_path: Path) -> None:
     scene, path = make_scene(random_values(3, 4, 5)), tmp_path / "scene.xml"
     (tmp_path / "scene.sigma_t.vol").write_text("mine")
-    with pytest.raises(SceneError, match=r"scene.sigma_t.vol: already there"):
+    with pytest.raises(UsageError, match=r"scene.sigma_t.vol: already there"):
         export_scene(scene, path, may_exist=False)
     assert (tmp_path / "scene.sigma_t.vol").read_text() == "mine" and not path.exists()
     export_scene(scene, path, may_exist=True)
@@ -136,7 +136,7 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
 
 
 def test_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match="there is no folder"):
+    with pytest.raises(UsageError, match="there is no folder"):
         export_scene(
             make_scene(random_values(3, 4, 5)), tmp_path / "none" / "scene.xml", may_exist=False
         )

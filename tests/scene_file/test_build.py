@@ -182,7 +182,8 @@ def test_resolutions_must_agree(write: Write, tmp_path: Path):
     lines = problems(write(text))
     assert (
         len(lines) == 2
-        and "volume.density.file: has 3 x 4 x 5 cells in x, y, z, but volume.resolution has 2 x 3 x 4"
+        and "volume.density.file: has 3 x 4 x 5 cells in x, y, z, but volume.resolution"
+        " has 2 x 3 x 4"
         in lines[0]
     )
     assert "volume.sigma_a.file: has 2 x 4 x 5 cells" in lines[1]
@@ -199,8 +200,8 @@ def test_bounds_must_agree_to_single_precision(write: Write, tmp_path: Path):
     load_scene(write(text))
     save_field(tmp_path, "density", 4, 3, 2, bounds=2 * BOUNDS)
     assert (
-        "volume.density.file: its bounds are (-1, -1.5, -1) to (1, 1.5, 1), but volume.bounds says (-0.5,"
-        in problem(write(text))
+        "volume.density.file: its bounds are (-1, -1.5, -1) to (1, 1.5, 1), but"
+        " volume.bounds says (-0.5," in problem(write(text))
     )
 
 

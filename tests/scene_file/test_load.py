@@ -29,20 +29,24 @@ Refusal = Callable[..., list[str]]
 CONTRACT = """\
 volume:
   bounds: {min: [-0.5, -0.75, -0.5], max: [0.5, 0.75, 0.5]}
-  resolution: [64, 96, 64]                 # cells in x, y, z; may be left out where a field's file gives it
+  resolution: [64, 96, 64]    # cells in x, y, z; may be left out where a field's file gives it
   density: {file: plume.npz}               # or {constant: 0.1}; fields and constants mix freely
-  sigma_a: 0.6                             # either sigma_a + sigma_s, or sigma_t + albedo; number, [r,g,b] or {file: ...}
+  # either sigma_a + sigma_s, or sigma_t + albedo; number, [r,g,b] or {file: ...}
+  sigma_a: 0.6
   sigma_s: [11.4, 10.8, 9.6]
   g: 0.3
 lights:
-  - {type: directional, direction: [-2, -2, -1], irradiance: 3.14159}     # direction = the way the light travels
-  - {type: ambient, radiance: [0.2, 0.3, 0.5]}                            # the same from everywhere
+  # direction = the way the light travels
+  - {type: directional, direction: [-2, -2, -1], irradiance: 3.14159}
+  - {type: ambient, radiance: [0.2, 0.3, 0.5]}    # the same from everywhere
 views:
   - name: front
     image: targets/front.exr
     mask: targets/front_mask.png           # black = ignore these pixels
     split: train                           # or test: never optimised on, always reported
-    camera: {type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], up: [0, 1, 0], fov: 28, resolution: [128, 128]}
+    camera:
+      {type: perspective, origin: [0, 0.3, 3.2], target: [0, 0, 0], up: [0, 1, 0], fov: 28,
+       resolution: [128, 128]}
 render: {samples_per_pixel: 1, steps_per_voxel: 1, background: true}
 diffusion:
   model: p1                # none | p1 | flux_limited
@@ -55,7 +59,6 @@ diffusion:
 optimize:
   iterations: 300
   loss: l2                 # l2 | l1 | huber | relative_l2
-  optimizer: adam          # or lbfgs
   refine_at: [0.3, 0.6]    # coarse-to-fine, fractions of the run
   parameters:
     density: {init: 0.0, lr: 0.05, min: 0, tv: 1e-4}
@@ -104,7 +107,7 @@ def test_defaults(read: Read):
     )
     settings = read(SCENE + "optimize: {parameters: {density: {}}}\n").tree.optimize
     assert settings == OptimizeSettings(
-        {"density": ParameterSettings()}, 300, "l2", "adam", 3, "all", (0.4, 0.8)
+        {"density": ParameterSettings()}, 300, "l2", 3, "all", (0.4, 0.8)
     )
     assert read(changed(volume={"density": 1, "sigma_a": 0, "sigma_s": 1})).tree.volume.g == 0
 
@@ -127,7 +130,8 @@ lights:
   - {type: directonal, direction: [0, 0, 0], irradiance: 3}
   - {type: ambient, radiance: [0.2, -0.3, 0.5]}
 views:
-  - {name: a/b, camera: {type: perspective, origin: [0, 0, 3], target: [0, 0, 0], fov: 30, resolution: [4, 4]}}
+  - {name: a/b,
+     camera: {type: perspective, origin: [0, 0, 3], target: [0, 0, 0], fov: 30, resolution: [4, 4]}}
 diffusion: {tolerance: 0}
 """
     assert set(refusal(text, "render.steps_per_voxel=1.5", "lights.5.radiance=1")) == {
@@ -136,13 +140,16 @@ diffusion: {tolerance: 0}
         "scene.yaml:2:3: volume: missing key 'density'",
         "scene.yaml:4:3: volume.densty: unknown key; did you mean 'density'?",
         "scene.yaml:5:12: volume.sigma_a: expected a number, found true",
-        "scene.yaml:6:19: volume.sigma_s.1: expected a finite number of single precision, found inf",
+        "scene.yaml:6:19: volume.sigma_s.1: expected a finite number of single"
+        " precision, found inf",
         "scene.yaml:7:6: volume.g: must be below 1, found 1",
-        "scene.yaml:9:12: lights.0.type: expected one of directional, ambient, environment, point, found 'directonal'; "
+        "scene.yaml:9:12: lights.0.type: expected one of directional, ambient, environment,"
+        " point, found 'directonal'; "
         "did you mean 'directional'?",
         "scene.yaml:10:37: lights.1.radiance.1: must be at least 0, found -0.3",
-        "scene.yaml:12:12: views.0.name: 'a/b' is not a file name; use letters, digits, '_', '-' and '.', the last not at its start",
-        "scene.yaml:13:24: diffusion.tolerance: must be above 0, found 0",
+        "scene.yaml:12:12: views.0.name: 'a/b' is not a file name; use letters, digits, '_', '-'"
+        " and '.', the last not at its start",
+        "scene.yaml:14:24: diffusion.tolerance: must be above 0, found 0",
         "-D render.steps_per_voxel=1.5: render.steps_per_voxel: expected a whole number, found 1.5",
         "-D lights.5.radiance=1: lights.5: no such entry: lights is a list of 2, counted from 0",
     }
@@ -201,11 +208,13 @@ ONE_FAULT = [
     ),
     ("views.0.camera.width=1", "views.0.camera.width: unknown key"),
     (
-        "views.0.camera={type: orthographic, origin: [0, 0, 1], target: [0, 0, 0], resolution: [1, 1]}",
+        "views.0.camera={type: orthographic, origin: [0, 0, 1], target: [0, 0, 0],"
+        " resolution: [1, 1]}",
         "views.0.camera: missing key 'width'",
     ),
     (
-        "views.0.camera={type: orthographic, width: 0, origin: [0, 0, 1], target: [0, 0, 0], resolution: [1, 1]}",
+        "views.0.camera={type: orthographic, width: 0, origin: [0, 0, 1], target: [0, 0, 0],"
+        " resolution: [1, 1]}",
         "width: must be above 0",
     ),
     (
@@ -251,6 +260,10 @@ ONE_FAULT = [
     ),
     ("diffusion.tolerance=0.6", "diffusion.tolerance: must be at most 0.5"),
     ("difusion.model=p1", "difusion: unknown key; did you mean 'diffusion'?"),
+    (
+        "optimize={parameters: {density: {}}, optimizer: adam}",
+        "optimize.optimizer: unknown key; known: parameters, iterations, loss,",
+    ),
     ("optimize.iterations=10", "optimize: missing key 'parameters'"),
     ("optimize.parameters={}", "optimize.parameters: names no parameter; known: density"),
     (
@@ -417,7 +430,8 @@ def test_overrides_prefer_the_longest_key_there_is(read: Read):
         ),
         (
             "volume.g=[1",
-            "-D volume.g=[1: not YAML: while parsing a flow sequence, expected ',' or ']', but got '<stream end>'",
+            "-D volume.g=[1: not YAML: while parsing a flow sequence, expected ',' or ']', but"
+            " got '<stream end>'",
         ),
         (
             "volume.g=*x",

@@ -98,17 +98,20 @@ def test_quoted_scalars_are_text():
         ),
         (
             "a: !!python/name:os.system x\n",
-            "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:python/name:os.system' are not supported",
+            "scene.yaml:1:4: a: tags such as 'tag:yaml.org,2002:python/name:os.system' are"
+            " not supported",
         ),
         ("a: 1\n---\nb: 2\n", "scene.yaml:2:1: a second document begins here; only one is allowed"),
         ("? [a]\n: 1\n", "scene.yaml:1:3: ?: a key must be plain text"),
         (
             "a: [1,\n",
-            "scene.yaml:2:1: not YAML: while parsing a flow node, expected the node content, but found '<stream end>'",
+            "scene.yaml:2:1: not YAML: while parsing a flow node, expected the node content, but"
+            " found '<stream end>'",
         ),
         (
             "a: 1\n\tb: 2\n",
-            "scene.yaml:2:1: not YAML: while scanning for the next token, found character '\\t' that cannot start any token",
+            "scene.yaml:2:1: not YAML: while scanning for the next token, found character '\\t'"
+            " that cannot start any token",
         ),
         ("a: 1\nb: \x01\n", "scene.yaml:2:4: not YAML: the character 1 is not allowed"),
         ("", "scene.yaml:1:1: is empty"),

@@ -98,7 +98,8 @@ def test_a_start_from_a_file(
         ("{densty: {}}", "optimize.parameters.densty: unknown parameter; did you mean 'density'?"),
         (
             "{lights.7.irradiance: {}}",
-            "optimize.parameters.lights.7.irradiance: the scene has no such number; did you mean 'lights.0.irradiance'?",
+            "optimize.parameters.lights.7.irradiance: the scene has no such number; did you mean"
+            " 'lights.0.irradiance'?",
         ),
         (
             "{lights.0.radiance: {}}",
@@ -106,7 +107,8 @@ def test_a_start_from_a_file(
         ),
         (
             "{views.back.camera: {}}",
-            "optimize.parameters.views.back.camera: the scene has no such number; did you mean 'views.front.camera'?",
+            "optimize.parameters.views.back.camera: the scene has no such number; did you mean"
+            " 'views.front.camera'?",
         ),
         (
             "{albedo: {init: 1.5}}",
@@ -152,8 +154,8 @@ def test_a_file_of_another_size_is_refused(
     write_field(tmp_path / "start.npz", "sigma_a", np.ones((2, 2, 2)), BOUNDS)
     (line,) = refused("{sigma_a: {init: {file: start.npz}}}")
     assert (
-        "optimize.parameters.sigma_a.init.file: has [2, 2, 2] cells [z, y, x], but the volume has [4, 3, 2]"
-        in line
+        "optimize.parameters.sigma_a.init.file: has [2, 2, 2] cells [z, y, x], but the volume"
+        " has [4, 3, 2]" in line
     )
 
 

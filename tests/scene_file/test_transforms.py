@@ -17,7 +17,7 @@ import yaml
 from example_scene import SCENE, changed
 
 from ddrecon.cameras import cast_rays
-from ddrecon.errors import FormatError, SceneError
+from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.export_transforms import export_transforms
@@ -355,8 +355,8 @@ def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="orthographic camera has no place"):
         export_transforms(scene, scene_file, tmp_path / "t.json", may_exist=False)
     (tmp_path / "t.json").write_text("mine")
-    with pytest.raises(SceneError, match="already there"):
+    with pytest.raises(UsageError, match="already there"):
         export_transforms(scene, scene_file, tmp_path / "t.json", may_exist=False)
-    with pytest.raises(SceneError, match="there is no folder"):
+    with pytest.raises(UsageError, match="there is no folder"):
         export_transforms(scene, scene_file, tmp_path / "none/t.json", may_exist=False)
     assert (tmp_path / "t.json").read_text() == "mine"

@@ -9,7 +9,7 @@ import torch
 from torch.autograd import Function
 
 from ddrecon.diffusion import implicit
-from ddrecon.errors import SceneError
+from ddrecon.errors import UsageError
 from ddrecon.numerics import decay
 from ddrecon.numerics import interpolation as sampling
 from ddrecon.scene_file.build import load_scene
@@ -65,7 +65,7 @@ def test_forward_peaks_and_backward_scattering_pass() -> None:
 
 
 def test_an_unknown_parameter_is_refused() -> None:
-    with pytest.raises(SceneError, match=r"no such number; did you mean 'density'"):
+    with pytest.raises(UsageError, match=r"no such number; did you mean 'density'"):
         check("densty")
 
 

@@ -4,7 +4,7 @@ process writes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,3 +29,23 @@ def claim_folder(path: Path, *, may_exist: bool) -> Iterator[None]:
         if not may_exist and any(entry.name != LOCK for entry in path.iterdir()):
             raise UsageError(f"{path}: the folder is not empty; choose another, or say --overwrite")
         yield
+
+
+def require_free_files(paths: Sequence[Path], *, may_exist: bool) -> None:
+    """Raises UsageError unless `paths` can be written: their folders exist, and they do not.
+
+    With `may_exist` only the folders must.
+    """
+    for path in paths:
+        require_folder_of(path)
+    if not may_exist and (taken := [str(path) for path in paths if path.exists()]):
+        raise UsageError(
+            f"{', '.join(taken)}: already there; choose another name, or say --overwrite"
+        )
+
+
+def require_folder_of(path: Path) -> None:
+    """Raises UsageError unless the folder that `path` lies in exists."""
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise UsageError(f"{path}: there is no folder {folder}")

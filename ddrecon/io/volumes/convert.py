@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ddrecon.errors import FormatError, SceneError
+from ddrecon.errors import FormatError
+from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.volumes.field import BOX, Field
 from ddrecon.io.volumes.table import field_names, read_field, require_format, write_fields
 
@@ -15,12 +16,12 @@ from ddrecon.io.volumes.table import field_names, read_field, require_format, wr
 def convert(sources: Sequence[Path], output: Path, *, may_exist: bool) -> list[Path]:
     """Writes all fields of the volumes `sources` to `output`, in the format of its suffix.
 
-    Returns what was written. Raises SceneError where `output` is there and may not be, FormatError
+    Returns what was written. Raises UsageError where `output` is there and may not be or its folder
+    is missing, FormatError
     for volumes of different cells or boxes, and for none at all.
     """
     require_format(output)
-    if output.exists() and not may_exist:
-        raise SceneError(f"{output}: already there; choose another name, or say --overwrite")
+    require_free_files([output], may_exist=may_exist)
     fields: dict[str, Field] = {}
     for path in sources:
         for name in field_names(path):

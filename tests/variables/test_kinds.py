@@ -1,0 +1,102 @@
+"""The table of variables: every kind can be set, differentiated and optimized as its row says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.renderer import render
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
+from ddrecon.settings import ParameterSettings
+from ddrecon.variables.kinds import KINDS, PAIRS, VOLUME, kind_of, pattern_of
+from ddrecon.variables.values import component_names, value_of, variable_names, with_values
+
+CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
+SMALL = [
+    "volume.resolution=[5, 4, 3]",
+    "volume.density=0.7",
+    "volume.sigma_a=[0.3, 0.4, 0.5]",
+    "lights.0.irradiance=[3, 2, 1]",
+    *(f"views.{index}.camera.resolution=[7, 6]" for index in (0, 1)),
+]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A scene with every kind of light, in which all kinds of variables occur."""
+    return load_scene(CONFIG, overrides=SMALL, dtype=torch.float64)
+
+
+def name_of(pattern: str, scene: Scene) -> str:
+    """The last variable of `scene` that follows `pattern`: of lights, the one with colors."""
+    return [name for name in variable_names(scene) if pattern_of(name) == pattern][-1]
+
+
+def test_the_table_has_every_variable_of_a_scene_and_no_other(scene: Scene) -> None:
+    assert {pattern_of(name) for name in variable_names(scene)} == set(KINDS)
+
+
+@pytest.mark.parametrize("pattern", KINDS)
+def test_a_kind_is_settable(scene: Scene, pattern: str) -> None:
+    name = name_of(pattern, scene)
+    value = 0.9 * value_of(scene, name) + 0.01
+    changed = with_values(scene, {name: value})
+    assert not torch.allclose(render(changed), render(scene))
+    # a camera that was moved is as far from itself as before: not at all
+    expected = torch.zeros_like(value) if pattern == "views.NAME.camera" else value
+    torch.testing.assert_close(value_of(changed, name), expected, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("pattern", KINDS)
+def test_a_kind_is_differentiable(scene: Scene, pattern: str) -> None:
+    name = name_of(pattern, scene)
+    value = value_of(scene, name).clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(render(with_values(scene, {name: value})).sum(), value)
+    assert gradient.isfinite().all() and gradient.any()
+
+
+@pytest.mark.parametrize("pattern", KINDS)
+def test_values_are_within_bounds_and_stay_there_in_a_step(scene: Scene, pattern: str) -> None:
+    kind, name = KINDS[pattern], name_of(pattern, scene)
+    value = value_of(scene, name)
+    assert kind.low < kind.high and bool((value >= kind.low).all() and (value <= kind.high).all())
+    rate = kind.rate(scene.volume, value)
+    assert rate > 0
+    for sign in (1, -1):
+        parameter = Parameter(name, ParameterSettings(), rate, value, scene.volume.grid)
+        for _ in range(20):
+            parameter.step(torch.full_like(value, sign), 1.0)
+        moved = parameter.value.detach()
+        assert bool((moved >= kind.low).all() and (moved <= kind.high).all())
+        assert not torch.equal(moved, value) or kind.is_direction
+        if kind.is_direction:
+            torch.testing.assert_close(moved.norm(), value.norm())
+
+
+@pytest.mark.parametrize("pattern", KINDS)
+def test_the_axes_of_a_value_are_those_of_its_kind(scene: Scene, pattern: str) -> None:
+    kind, name = KINDS[pattern], name_of(pattern, scene)
+    value, cells = value_of(scene, name), scene.volume.grid.shape
+    components = component_names(name, value)
+    assert len(components) == (value.shape[0] if kind.is_color or kind.components else 0)
+    assert len(set(components)) == len(components)
+    if kind.is_cellwise:
+        field = torch.full((*([3] if kind.is_color else []), *cells), 0.5, dtype=torch.float64)
+        changed = with_values(scene, {name: field})
+        torch.testing.assert_close(value_of(changed, name), field, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("pattern", KINDS)
+def test_differences_are_taken_by_ever_shorter_steps(pattern: str) -> None:
+    steps = KINDS[pattern].difference_steps
+    assert list(steps) == sorted(steps, reverse=True) and 0 < steps[-1] < steps[0] < 1
+
+
+def test_pairs_are_of_the_volume_and_of_the_same_axes() -> None:
+    for pair in PAIRS:
+        assert set(pair) <= set(VOLUME)
+        assert len({(kind_of(name).is_color, kind_of(name).is_cellwise) for name in pair}) == 1
