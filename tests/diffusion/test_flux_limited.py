@@ -13,7 +13,7 @@ from torch.autograd import forward_ad
 
 from ddrecon.diffusion import flux_limited
 from ddrecon.diffusion.flux_limited import Balance, steepness_square
-from ddrecon.diffusion.implicit import Solve, SolveMemory
+from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
@@ -41,8 +41,8 @@ def make(make_scene, half_empty):
     return scene
 
 
-def make_solve(tolerance: float, memory: SolveMemory | None = None) -> Solve:
-    return Solve(SOLVERS["conjugate_gradient"], tolerance, memory or SolveMemory())
+def make_solve(tolerance: float, memory: SolveMemory | None = None) -> SolverWithMemory:
+    return SolverWithMemory(SOLVERS["conjugate_gradient"], tolerance, memory or SolveMemory())
 
 
 def test_steepness_of_exponential_light_is_its_rate():
@@ -70,7 +70,7 @@ def test_the_light_found_balances(limiter: str, make, box, random):
     balance = Balance(box(SHAPE), LIMITERS[limiter])
     fields = [5 * random(2, *SHAPE, seed=seed) for seed in range(3)]
     outside = torch.tensor([0.5, 1.0], dtype=torch.float64).view(2, 1, 1, 1)
-    u = flux_limited._Solve.apply(make_solve(1e-13), balance, *fields, outside)
+    u = flux_limited.ImplicitFixedPoint.apply(make_solve(1e-13), balance, *fields, outside)
     assert float(balance.residual(u, *fields, outside).abs().max()) < 1e-11 * float(u.abs().max())
 
 
@@ -120,7 +120,7 @@ def test_both_derivatives_agree_with_differences(limiter: str, random, box):
     balance = Balance(box(shape), LIMITERS[limiter])
 
     def solved(*coefficients: Tensor) -> Tensor:
-        return flux_limited._Solve.apply(
+        return flux_limited.ImplicitFixedPoint.apply(
             make_solve(1e-14, SolveMemory(is_warm=False)), balance, *coefficients
         )
 

@@ -17,15 +17,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
-from ddrecon.diffusion.implicit import Solve, SolveMemory
-from ddrecon.diffusion.paper import printed
-from ddrecon.diffusion.paper.printed import (
-    Ghosts,
-    PrintedOperator,
-    diffuse_light,
-    jacobi,
-    solve_printed,
-)
+from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
+from ddrecon.diffusion.paper import iteration
+from ddrecon.diffusion.paper.iteration import iterate_jacobi
+from ddrecon.diffusion.paper.operator import PrintedOperator
+from ddrecon.diffusion.paper.printed import Ghosts, solve_printed, solve_printed_system
 from ddrecon.diffusion.paper.stencils import Stencils, convolve, extend
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
@@ -45,8 +41,10 @@ TO_ROUNDING: dict[str, Any] = {
 }
 
 
-def solving(tolerance: float = 1e-14, memory: SolveMemory | None = None) -> Solve[PrintedOperator]:
-    return Solve(jacobi, tolerance, memory or SolveMemory())
+def solving(
+    tolerance: float = 1e-14, memory: SolveMemory | None = None
+) -> SolverWithMemory[PrintedOperator]:
+    return SolverWithMemory(iterate_jacobi, tolerance, memory or SolveMemory())
 
 
 @pytest.fixture
@@ -196,7 +194,7 @@ def errors_on(cells: int) -> tuple[float, float]:
     ]
     u, diffusion, absorption, mean, *vectors = manufactured(position)
     scattered = Moments(mean, (vectors[0], vectors[1], vectors[2]))
-    light = diffuse_light(
+    light = solve_printed(
         absorbing(grid, absorption), diffusion, scattered, DARK, solving(1e-9), True
     )
     assert light.flux is not None
@@ -323,7 +321,7 @@ def test_both_derivatives_of_a_solve_agree_with_differences(
     arguments = [argument.clone().requires_grad_() for argument in arguments]
 
     def solution(source: Tensor, *parts: Tensor) -> Tensor:
-        return solve_printed(solving(), PrintedOperator(stencils, *parts), source)
+        return solve_printed_system(solving(), PrintedOperator(stencils, *parts), source)
 
     assert torch.autograd.gradcheck(solution, arguments, **TO_ROUNDING)
 
@@ -333,7 +331,7 @@ def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
     directions = [torch.randn_like(tensor) for tensor in arguments]
 
     def solution(source: Tensor, *parts: Tensor) -> Tensor:
-        return solve_printed(solving(), PrintedOperator(stencils, *parts), source)
+        return solve_printed_system(solving(), PrintedOperator(stencils, *parts), source)
 
     u, pull = torch.func.vjp(solution, *arguments)
     u_bar = torch.randn_like(u)
@@ -397,7 +395,7 @@ def test_the_tolerance_is_a_relative_residual(
 ):
     operator = replace(make_printed(box((4, 5, 3))), is_transposed=is_transposed)
     source = random(2, 4, 5, 3, seed=3) - 0.5
-    solution = jacobi(operator, source, None, tolerance)
+    solution = iterate_jacobi(operator, source, None, tolerance)
     residual = (source - operator.apply(solution.value)) / operator.diagonal
     assert 0 < solution.residual <= tolerance
     assert float(residual.norm() / (source / operator.diagonal).norm()) < 2 * tolerance
@@ -408,7 +406,7 @@ def test_the_tolerance_is_a_relative_residual(
 
 def test_a_tolerance_below_rounding_ends_all_the_same(box, make_printed, random):
     operator, source = make_printed(box((4, 5, 3))), random(2, 4, 5, 3, seed=3)
-    solution = jacobi(operator, source, None, 1e-30)
+    solution = iterate_jacobi(operator, source, None, 1e-30)
     torch.testing.assert_close(solution.value, exact(operator, source), rtol=1e-12, atol=0)
 
 
@@ -416,7 +414,7 @@ def test_a_tolerance_below_rounding_ends_all_the_same(box, make_printed, random)
 def test_a_color_without_source_stays_dark(has_guess: bool, box, make_printed, random):
     operator, source = make_printed(box((4, 5, 3))), random(2, 4, 5, 3, seed=3)
     source[0] = 0
-    value = jacobi(operator, source, random(2, 4, 5, 3) if has_guess else None, 1e-8).value
+    value = iterate_jacobi(operator, source, random(2, 4, 5, 3) if has_guess else None, 1e-8).value
     assert not value[0].any() and bool(value[1].any())
 
 
@@ -520,13 +518,15 @@ def test_divergence_that_the_criterion_does_not_explain_is_not_blamed_on_it(
 ):
     operator = make_printed(box((4, 5, 3)))
     with pytest.raises(SolveError, match=r"diverged, although kappa changes by a factor [0-3]\."):
-        jacobi(replace(operator, diagonal=operator.diagonal / 3), random(2, 4, 5, 3), None, 1e-8)
+        iterate_jacobi(
+            replace(operator, diagonal=operator.diagonal / 3), random(2, 4, 5, 3), None, 1e-8
+        )
 
 
 def test_slow_convergence_ends_with_an_error(box, make_printed, random, monkeypatch):
-    monkeypatch.setattr(printed, "MAX_ITERATIONS", 4)
+    monkeypatch.setattr(iteration, "MAX_ITERATIONS", 4)
     with pytest.raises(SolveError, match="did not reach its tolerance after 4 iterations"):
-        jacobi(make_printed(box((4, 5, 3))), random(2, 4, 5, 3), None, 1e-8)
+        iterate_jacobi(make_printed(box((4, 5, 3))), random(2, 4, 5, 3), None, 1e-8)
 
 
 @pytest.mark.parametrize("where", ["source", "diagonal", "coefficients"])
@@ -536,4 +536,4 @@ def test_a_system_that_is_not_finite_is_an_error(where: str, box, make_printed, 
         0, 0, 0, 0
     ] = float("nan")
     with pytest.raises(SolveError, match="not finite"):
-        jacobi(operator, source, None, 1e-8)
+        iterate_jacobi(operator, source, None, 1e-8)
