@@ -216,7 +216,7 @@ def face_fluxes(
     # What drives F: through the box's first face, the interior faces, and the box's last face.
     low = inside = high = diffusion.new_zeros(())
     if radiance is not None:
-        # inside -grad L0; on the box L0 of the cell itself, which flows outwards: down at the low end
+        # inside -grad L0; on the box the cell's own L0, which flows outwards (down at the low end)
         low, high = -_first(radiance, axis), _last(radiance, axis)
         inside = difference(radiance, axis) / -step
     if source_flux is not None:

@@ -1,7 +1,9 @@
 """The paper's own scheme, for the record: central differences (Eq. 22-25) and Algorithm 3.
 
 With kappa = 3 D and the corrections of docs/theory.md, section 4, the balance E4 reads
-grad kappa . grad L0 + kappa lap L0 - 3 kappa_a L0 + S = 0, S = 3 kappa_s Q0 - div(kappa kappa_s Q1).
+grad kappa . grad L0 + kappa lap L0 - 3 kappa_a L0 + S = 0 with
+S = 3 kappa_s Q0 - div(kappa kappa_s Q1).
+
 The paper names no boundary condition; here ghost cells around the box hold what Marshak's E6 asks
 for. The scheme neither conserves energy nor has a symmetric matrix, and its iteration may diverge
 where kappa changes abruptly: every surface against empty space.
