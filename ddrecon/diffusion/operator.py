@@ -217,8 +217,9 @@ def face_fluxes(
     low = inside = high = diffusion.new_zeros(())
     if radiance is not None:
         # inside -grad L0; on the box the cell's own L0, which flows outwards (down at the low end)
-        low, high = -_first(radiance, axis), _last(radiance, axis)
+        low = -_first(radiance, axis)
         inside = difference(radiance, axis) / -step
+        high = _last(radiance, axis)
     if source_flux is not None:
         # inside the mean kappa_s Q1 of both cells; on the box (h/2) kappa_s Q1 of E6's numerator
         low, high = (

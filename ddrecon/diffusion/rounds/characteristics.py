@@ -99,9 +99,9 @@ def radiance_along(
         else _step_integral(medium.scattering, course)
     )
     depth = mass * _scale(medium.extinction)
-    scattering_scale = (1 - medium.forward_fraction) * _scale(medium.scattering)
     # what scatters along the step and reaches its end, and the part of I that is lost on it
     line, lost = decayed_line(scatters, course.before(scatters, is_repeated=True), depth)
+    scattering_scale = (1 - medium.forward_fraction) * _scale(medium.scattering)
     source = line * (scattering_mass * scattering_scale)
     if inflow is None:
         return course.lift(follow(1 - lost, source, course))
