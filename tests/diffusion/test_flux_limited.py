@@ -4,6 +4,7 @@ not get there.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -58,6 +59,18 @@ def test_steepness_of_exponential_light_is_its_rate():
     )
 
 
+def test_steepness_is_that_of_central_differences_cell_by_cell():
+    grid, u = box_grid((3, 4, 2)), 1 + random_values(1, 3, 4, 2)
+    expected = torch.zeros_like(u[0])
+    for cell in itertools.product(*map(range, grid.shape)):
+        for axis, h in enumerate(grid.spacing):
+            # a neighbor beyond the box is replaced by the cell itself, and the step is shorter
+            ends = [min(max(cell[axis] + side, 0), grid.shape[axis] - 1) for side in (-1, 1)]
+            low, high = (u[0][(*cell[:axis], end, *cell[axis + 1 :])] for end in ends)
+            expected[cell] += ((high - low) / (h * (ends[1] - ends[0])) / u[0][cell]) ** 2
+    torch.testing.assert_close(steepness_square(u, grid)[0], expected, rtol=1e-9, atol=0)
+
+
 def test_even_light_and_no_light_have_no_steepness():
     for value in (0.0, 2.0):
         u = torch.full((2, 3, 4, 2), value, dtype=torch.float64, requires_grad=True)
@@ -77,7 +90,7 @@ def test_the_light_found_balances(limiter: str, make):
 
 @each_limiter
 def test_dense_media_diffuse_as_without_a_limit(limiter: str, make):
-    """Uniform and 4000 optical depths thick: R is small, and what is added to the medium as well."""
+    """Uniform and 4000 optical depths thick: R is small, and so is what is added to the medium."""
     dense = torch.full(SHAPE, 500.0, dtype=torch.float64)
     ways = {"limiter": limiter}, {"model": "p1"}
     ours, theirs = (

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from media import random_values
+from media import dense_matrix, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -91,6 +91,18 @@ def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
     assert float(((u_bar * tangent).sum() - along).abs()) < 1e-10 * float(
         (u_bar * tangent).abs().sum()
     )
+
+
+@pytest.mark.parametrize("colors", [1, 2])
+def test_cotangents_are_those_of_a_dense_solve_by_autograd(colors: int, inputs):
+    leaves = [tensor.requires_grad_() for tensor in inputs((3, 2, 3), colors)]
+    source, loss, *conductances = leaves
+    matrix = dense_matrix(Operator(tuple(conductances), loss))
+    dense = torch.linalg.solve(matrix, source.flatten(1).unsqueeze(-1)).view_as(source)
+    u_bar = torch.randn_like(source)
+    found, expected = (torch.autograd.grad(u, leaves, u_bar) for u in (solving()(*leaves), dense))
+    for bar, known in zip(found, expected, strict=True):
+        torch.testing.assert_close(bar, known, rtol=1e-10, atol=1e-12)
 
 
 def test_the_adjoint_takes_what_the_forward_solve_prepared_of_the_operator(

@@ -164,7 +164,7 @@ def test_memory_does_not_grow_with_directions():
 
 
 class ArrayCount(TorchDispatchMode):
-    """The most arrays of at least `size` entries, made by operations, that have been alive at once."""
+    """The most arrays of at least `size` entries that have been alive at once."""
 
     def __init__(self, size: int):
         super().__init__()
