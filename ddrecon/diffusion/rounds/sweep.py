@@ -116,15 +116,15 @@ class _Sweep(torch.autograd.Function):
                 [weight * bar for weight, bar in zip(weights, moment_bars, strict=True)]
             ).sum(0)
             # E11 transposed, by autograd: what each part receives from this direction
-            shares = torch.autograd.grad(radiance, varied, radiance_bar, allow_unused=True)
-            for total, share in zip(totals, shares, strict=True):
-                if share is not None:
-                    total += share
+            bars = torch.autograd.grad(radiance, varied, radiance_bar, allow_unused=True)
+            for total, bar in zip(totals, bars, strict=True):
+                if bar is not None:
+                    total += bar
         remaining = iter(totals)
-        bars = (
+        part_bars = (
             None if leaf is None or not leaf.requires_grad else next(remaining) for leaf in leaves
         )
-        return None, None, *bars
+        return None, None, *part_bars
 
 
 def _sum_over_directions(medium: Medium, directions: int, parts: Parts) -> tuple[Tensor, ...]:

@@ -67,11 +67,11 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
 
 
 def _transport_share(medium: Medium, directions: int) -> Tensor:
-    """The share theta of a sweep's change that counts, the rest being diffusion's: 1 / (1 + rho^2).
+    """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E14).
 
-    See docs/theory.md, transport rounds. With d the depth of a step,
-    rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic whose source is linear over the
-    step diffuses too much. Returns theta in (0, 1], `[C, z, y, x]`.
+    The rest is diffusion's. rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic diffuses
+    too much if its source is linear over steps of optical depth d; here d is that of the mean step.
+    Returns `[C, z, y, x]` in (0, 1].
     """
     # the length of a step along each direction of the quadrature; along an axis of one cell nothing
     # varies, so such steps do not count
