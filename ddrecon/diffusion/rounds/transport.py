@@ -73,8 +73,8 @@ def _transport_share(medium: Medium, directions: int) -> Tensor:
     too much if its source is linear over steps of optical depth d; here d is that of the mean step.
     Returns `[C, z, y, x]` in (0, 1].
     """
-    # the length of a step along each direction of the quadrature; along an axis of one cell nothing
-    # varies, so such steps do not count
+    # the length of a step along each direction; along an axis of one cell nothing varies, so such
+    # steps do not count
     points, weights = sphere_quadrature(
         medium.extinction.scale.new_zeros((), dtype=torch.float64), directions
     )
@@ -85,7 +85,8 @@ def _transport_share(medium: Medium, directions: int) -> Tensor:
     # their mean over directions; a grid of one cell has none, and then theta is 1
     weight_of_steps = weights[step_lengths > 0].sum().clamp(min=1e-9)
     mean_length = float(weights @ step_lengths / weight_of_steps)
-    # d / 2. At 0 x coth(x) is 0 / 0; x = 1e-3 stands for all below, where rho < 1e-6, theta = 1
+    # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
+    # 1e-6, theta is 1 already
     half_depth = (0.5 * mean_length * medium.extinction.value).clamp(min=1e-3)
     rho = half_depth / torch.tanh(half_depth) - 1
     return 1 / (1 + rho**2)
