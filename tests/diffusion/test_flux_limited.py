@@ -1,6 +1,4 @@
-"""Flux-limited diffusion: its fixed point, the derivatives of that, and what it says when it does
-not get there.
-"""
+"""Flux-limited diffusion: its fixed point, the derivatives of that, and failures."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Derivatives of a solve: tangent and adjoint agree with differences and with each other, and
-solves are remembered.
-"""
+"""Derivatives of a solve agree with differences and with each other; solves are remembered."""
 
 from __future__ import annotations
 

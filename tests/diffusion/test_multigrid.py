@@ -1,6 +1,4 @@
-"""Multigrid's preconditioner is symmetric positive definite, and takes as few iterations on many
-cells as on few, whatever the medium.
-"""
+"""Multigrid's preconditioner is symmetric positive definite, and as fast on many cells."""
 
 from __future__ import annotations
 

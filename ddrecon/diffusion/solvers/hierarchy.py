@@ -96,8 +96,9 @@ class Level:
         )
 
     def cycle(self, source: Tensor) -> Tensor:
-        """Roughly y with S A S y = `source` [C, z, y, x]: linear in `source`, symmetric and
-        positive definite.
+        """Roughly y with S A S y = `source` [C, z, y, x].
+
+        Linear in `source`, symmetric and positive definite.
         """
         y = STEPS[0] * source
         for step in STEPS[1:]:

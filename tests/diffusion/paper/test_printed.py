@@ -1,6 +1,4 @@
-"""The paper's own scheme: second order where media are smooth, exact derivatives of itself, and a
-plain word where it diverges.
-"""
+"""The paper's own scheme: second order in smooth media, exact derivatives of itself."""
 
 from __future__ import annotations
 

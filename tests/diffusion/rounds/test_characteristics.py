@@ -1,6 +1,4 @@
-"""Radiance along one direction: closed forms, a slow twin, symmetry under reversal, and derivatives
-in both modes.
-"""
+"""Radiance along one direction: closed forms, a slow twin, reversal, derivatives."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Transport rounds: where they lead, how fast, that thick cells do not upset them, and what their
-derivatives cost.
-"""
+"""Transport rounds: where they lead, how fast, in thick cells, and what derivatives cost."""
 
 from __future__ import annotations
 
