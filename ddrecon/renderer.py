@@ -15,11 +15,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
-from ddrecon.diffusion import conservative, flux_limited
 from ddrecon.diffusion.closures import CLOSURES, smooth
-from ddrecon.diffusion.implicit import Solve, SolveMemory
+from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
+from ddrecon.diffusion.flux_limited import solve_flux_limited
+from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.limiters import LIMITERS
-from ddrecon.diffusion.paper import printed
+from ddrecon.diffusion.paper.iteration import iterate_jacobi
+from ddrecon.diffusion.paper.printed import solve_printed
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.light.beam import Beam
@@ -148,20 +150,18 @@ def solve_diffuse(
         return CLOSURES[settings.closure](transport_extinction, medium.grid, settings.floor)
 
     if settings.scheme == "printed":
-        by_jacobi = Solve(printed.jacobi, settings.tolerance, memory)
+        by_jacobi = SolverWithMemory(iterate_jacobi, settings.tolerance, memory)
         diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
-        return printed.diffuse_light(
-            medium, diffusion, scattered, outside, by_jacobi, has_flux(medium)
-        )
-    solve = Solve(SOLVERS[settings.solver], settings.tolerance, memory)
+        return solve_printed(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
+    solve = SolverWithMemory(SOLVERS[settings.solver], settings.tolerance, memory)
     if settings.model == "flux_limited":
-        return flux_limited.diffuse_light(
+        return solve_flux_limited(
             medium, LIMITERS[settings.limiter], source, outside, solve, has_flux(medium)
         )
-    problem = conservative.DiffusionProblem(medium, closure, source, outside, has_flux(medium))
-    light = conservative.diffuse_light(problem, solve)
+    problem = DiffusionProblem(medium, closure, source, outside, has_flux(medium))
+    light = solve_conservative(problem, solve)
     return run_rounds(
         problem, light, solve, settings.transport_rounds, settings.transport_directions
     )

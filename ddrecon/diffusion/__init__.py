@@ -1,3 +1,1 @@
-"""Multiply scattered light by the diffusion approximation: the operator, its solvers and the
-derivatives of a solve.
-"""
+"""Light scattered many times, by diffusion: the operator, its solvers, derivatives of a solve."""

@@ -1,5 +1,4 @@
-"""Closures: what the diffusion coefficient becomes where the medium thins out and 1 / (3 kappa_tr)
-grows without bound.
+"""Closures: what D becomes where the medium thins out and 1 / (3 kappa_tr) grows without bound.
 
 A closure turns the transport extinction [C, z, y, x] into the diffusion coefficient D [u] of the
 same shape, finite and with finite derivatives at zero density. `CLOSURES` is the table the scene
@@ -18,16 +17,19 @@ from torch.nn.functional import adaptive_avg_pool3d, interpolate
 from ddrecon.grid import Grid
 
 FLOOR = 3.3
-"""Optical thickness, across the box's shortest side, of the medium that the smooth closure gives
-empty space (docs/theory.md section 5).
+"""Optical thickness across the box's shortest side that `smooth` gives empty space.
+
+See docs/theory.md, section 5.
 """
 BACKGROUND = 0.01
-"""Optical thickness, across a side of the box, of a haze that gives an empty box distances too;
-accuracy is flat from 0.001 to 0.1.
+"""Optical thickness, across a side of the box, of a haze that gives an empty box distances too.
+
+Accuracy is flat from 0.001 to 0.1.
 """
 COARSE_CELLS = 32
-"""Cells, at most, along the longest side in which distances, which are smooth, are found; 16, 32
-and 64 render alike.
+"""Distances, which are smooth, are computed on at most so many cells along the longest side.
+
+16, 32 and 64 render alike.
 """
 
 
@@ -38,24 +40,24 @@ def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Te
 
 
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
-    """D = 1 / (3 kappa_tr + 4 / distance): collisions and the spreading of light, two resistances
-    in series (docs/theory.md section 5).
+    """D = 1 / (3 kappa_tr + 4 / distance): collisions and spreading, two resistances in series.
 
-    `distance` is that to the medium. `floor` is not used: nothing here depends on the size of the
-    box. Below zero, where only finite differences go, D is continued to second order and stays
-    positive.
+    See docs/theory.md, section 5. `distance` is that to the medium. `floor` is not used: nothing
+    here depends on the size of the box. Below zero, where only finite differences go, D is
+    continued to second order and stays positive.
     """
+    # D = 1 / (spreading (1 + ratio)), with spreading = 4 / distance
     spreading = 4 * inverse_distance(transport_extinction, grid)
     ratio = 3 * transport_extinction / spreading
-    share = torch.where(ratio < 0, 1 - ratio + ratio**2, 1 / (1 + ratio.clamp(min=0)))
-    return share / spreading
+    inverse = torch.where(ratio < 0, 1 - ratio + ratio**2, 1 / (1 + ratio.clamp(min=0)))
+    return inverse / spreading
 
 
 def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
-    """The mean of 1 / distance [1/u] from each cell to all `weight` [C, z, y, x] >= 0, found on a
-    coarse grid.
+    """The mean of 1 / distance [1/u] from each cell to all `weight` [C, z, y, x] >= 0.
 
-    Outside a sphere this is 1 / (distance to its center), exactly: Newton's shell theorem.
+    It is computed on a coarse grid and interpolated. Outside a sphere this is
+    1 / (distance to its center), exactly: Newton's shell theorem.
     """
     coarse = grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
     mass = adaptive_avg_pool3d(weight, coarse.shape) + 3 * BACKGROUND / sum(grid.extent)
@@ -64,8 +66,9 @@ def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
 
 
 def _potential(mass: Tensor, grid: Grid) -> Tensor:
-    """The sum over cells of `mass` / distance [1/u], by Fourier transform in a box twice as wide,
-    one color at a time for memory.
+    """The sum over cells of `mass` / distance [1/u], by Fourier transform.
+
+    The box is twice as wide, so that periods do not overlap; colors come one at a time, for memory.
     """
     wide = [2 * cells for cells in grid.shape]
     axes = [
@@ -73,6 +76,7 @@ def _potential(mass: Tensor, grid: Grid) -> Tensor:
         for n, step in zip(wide, grid.spacing, strict=True)
     ]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
+    # 1 / distance; within a cell, its mean over the sphere of the cell's volume, 3 / (2 radius)
     radius = (3 * math.prod(grid.spacing) / (4 * math.pi)) ** (1 / 3)
     square = z * z + y * y + x * x
     within = square == 0

@@ -1,5 +1,4 @@
-"""Diffuse light by the conservative scheme: the P1 balance E4 with the Marshak boundary E6 on the
-operator of E7, and the flux E5.
+"""Light by the conservative scheme: balance E4 with boundary E6 on the operator of E7, and flux E5.
 
 D is kept for the backward pass, which makes conductances and right sides from it anew, one axis at
 a time: memory is what limits the size of a volume.
@@ -13,7 +12,7 @@ from functools import cached_property
 
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import Solve, solve_diffusion
+from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import (
     AXES,
     Operator,
@@ -31,11 +30,12 @@ Closure = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class DiffusionProblem:
-    """What diffuse light is asked for: E4 to E6 in `medium`.
+    """E4 to E6 in `medium`, as a linear system for L0, and L1 of its solution.
 
-    `closure` turns transport extinction into D; `source`: Q0 and Q1 of beams; `outside` [C, 1, 1,
-    1]: radiance that enters through the box's faces. L0 and L1 hold all of that, scattered or not,
-    which keeps a white furnace exact (docs/theory.md, section 5).
+    `closure` turns transport extinction into D; `source`: Q0 and Q1 of beams; `outside`
+    [C, 1, 1, 1]: radiance that enters through the box's faces. L0 and L1 hold all of that,
+    scattered or not, which keeps a white furnace exact (docs/theory.md, section 5). `has_flux`:
+    whether light's direction matters, so that L1 is asked for.
     """
 
     medium: Medium
@@ -77,7 +77,7 @@ class DiffusionProblem:
         return dict(zip(AXES, self.source.flux or (None, None, None), strict=True))
 
 
-def diffuse_light(problem: DiffusionProblem, solve: Solve[Operator]) -> Moments:
+def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operator]) -> Moments:
     """L0 and, where `problem` has flux, L1."""
     mean = solve_diffusion(solve, *problem.system)
     return Moments(mean, problem.flux(mean))
@@ -90,21 +90,20 @@ def _diffusion(medium: Medium, closure: Closure) -> Tensor:
 def _loss_and_source(
     medium: Medium, diffusion: Tensor, source_mean: Tensor, outside: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What cells lose to absorption and through the box's faces, and what they gain from Q0 and
-    from outside.
+    """What cells lose, and what they gain but for Q1 (E4, E6, E7).
+
+    kappa_a + escape, and kappa_s Q0 + escape L, where escape is the part through the box's faces
+    and L the radiance `outside`.
     """
     escape = boundary_loss(diffusion, medium.grid)
-    return (
-        medium.absorption.value + escape,
-        medium.remaining_scattering * source_mean + escape * outside,
-    )
+    loss = medium.absorption.value + escape
+    return loss, medium.remaining_scattering * source_mean + escape * outside
 
 
 def _divergence(medium: Medium, diffusion: Tensor, source_flux: Tensor, axis: int) -> Tensor:
-    """The part along `axis` of div (D kappa_s Q1)."""
-    faces = face_fluxes(
-        None, medium.remaining_scattering * source_flux, diffusion, medium.grid, axis
-    )
+    """The part along `axis` of div(D kappa_s Q1)."""
+    scattered = medium.remaining_scattering * source_flux
+    faces = face_fluxes(None, scattered, diffusion, medium.grid, axis)
     return faces.diff(dim=axis) / medium.grid.spacing[axis - 1]
 
 
@@ -116,6 +115,6 @@ def axis_flux(
     mean: Tensor,
     axis: int,
 ) -> Tensor:
-    """L1 along `axis`, averaged over each cell's two faces."""
+    """L1 = 3 F along `axis` (E5), averaged over each cell's two faces."""
     source = None if source_flux is None else medium.remaining_scattering * source_flux
     return 3 * cell_average(face_fluxes(mean, source, diffusion, medium.grid, axis, outside), axis)

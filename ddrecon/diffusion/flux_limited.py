@@ -1,12 +1,15 @@
-"""Flux-limited diffusion (Koerner et al. 2014): D depends on the light it diffuses, so that the
-balance E4 is solved by Picard iteration.
+"""Flux-limited diffusion: D depends on the light it diffuses, so E4 is solved by Picard iteration.
 
 With r(u) = A(D(u)) u - S(D(u)), an iteration is u <- u - `DAMPING` A(D(u))^-1 r(u), A being that of
 E7 with the D of the last light. Derivatives are those of the fixed point r(u, theta) = 0, by the
-implicit function theorem: with J = dr/du, which is not symmetric, J du = -(dr/dtheta) dtheta (E8)
-and J^T lambda = u_bar, theta_bar = -(dr/dtheta)^T lambda (E9), by the same damped iteration with
-the same A: linearized at the fixed point it is the Picard iteration, so one converges where the
-other does.
+implicit function theorem, with J = dr/du, which is not symmetric:
+
+- E8: J du = -(dr/dtheta) dtheta;
+- E9: J^T lambda = u_bar, then theta_bar = -(dr/dtheta)^T lambda.
+
+Both are solved by the same damped iteration with the same A. Linearized at the fixed point it is
+the Picard iteration, so one converges where the other does. Source: Koerner et al. 2014,
+arXiv:1403.8105.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.conservative import axis_flux
-from ddrecon.diffusion.implicit import Solve, SolveRecord
+from ddrecon.diffusion.implicit import SolverWithMemory
 from ddrecon.diffusion.limiters import Limiter
 from ddrecon.diffusion.operator import (
     AXES,
@@ -31,7 +34,7 @@ from ddrecon.diffusion.operator import (
     difference,
     face_fluxes,
 )
-from ddrecon.diffusion.solvers.scaled import norm
+from ddrecon.diffusion.solvers.scaled import Solution, norm
 from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
@@ -43,22 +46,17 @@ MAX_ITERATIONS = 1000
 INNER_TOLERANCE = 0.05
 """How closely each iteration's linear system is solved; the fixed point does not depend on it."""
 VACUUM = 0.1
-"""Optical thickness, across the shortest side, of the least medium there is: D stays finite where
-light is even and space empty.
-"""
+"""Optical thickness across the shortest side that empty space is given, so that D stays finite."""
 DARKNESS = 1e-6
-"""Light below this part of its mean is taken as even, so that steepness is finite where there is
-none.
-"""
+"""Light below this part of its mean counts as even, so that steepness is finite without light."""
 
 
 @dataclass(frozen=True)
 class Balance:
-    """r(u) = 0, the balance of flux-limited diffusion on `grid`, with [C, z, y, x] tensors of
-    `coefficients` in this order:
+    """r(u) = 0, the balance of flux-limited diffusion on `grid`.
 
-    kappa_tr, kappa_a [1/u], kappa_s Q0, the radiance outside [C, 1, 1, 1] and, where g is not 0,
-    kappa_s Q1 along z, y, x.
+    `coefficients` are tensors [C, z, y, x] in this order: kappa_tr, kappa_a [1/u], kappa_s Q0, the
+    radiance outside [C, 1, 1, 1] and, where g is not 0, kappa_s Q1 along z, y, x.
     """
 
     grid: Grid
@@ -67,16 +65,17 @@ class Balance:
     def diffusion(self, u: Tensor, transport_extinction: Tensor) -> Tensor:
         """D [u] in the light `u`."""
         least = VACUUM / min(self.grid.extent)
-        return self.limiter(
-            torch.sqrt(transport_extinction**2 + least**2), steepness_square(u, self.grid)
-        )
+        extinction = torch.sqrt(transport_extinction**2 + least**2)
+        return self.limiter(extinction, steepness_square(u, self.grid))
 
     def system(self, u: Tensor, *coefficients: Tensor) -> tuple[Operator, Tensor]:
         """A and S with the D of the light `u`."""
         transport_extinction, absorption, gain, outside, *flux = coefficients
         diffusion = self.diffusion(u, transport_extinction)
+        # E6: what goes out through the faces of the box, and what comes in
         escape = boundary_loss(diffusion, self.grid)
         right = gain + escape * outside
+        # -div(D kappa_s Q1) of E4
         for axis, component in zip(AXES, flux, strict=bool(flux)):
             faces = face_fluxes(None, component, diffusion, self.grid, axis)
             right = right - faces.diff(dim=axis) / self.grid.spacing[axis - 1]
@@ -90,8 +89,9 @@ class Balance:
 
 
 def steepness_square(u: Tensor, grid: Grid) -> Tensor:
-    """q^2 = |grad u|^2 / u^2 [1/u^2] by central differences, one-sided at the box; `u` [C, z, y,
-    x].
+    """q^2 = |grad u|^2 / u^2 [1/u^2] of `u` [C, z, y, x].
+
+    By central differences, one-sided at the faces of the box.
     """
     total = torch.zeros_like(u)
     for axis, step in zip(AXES, grid.spacing, strict=True):
@@ -103,17 +103,17 @@ def steepness_square(u: Tensor, grid: Grid) -> Tensor:
     return total / (u**2 + dark**2 + torch.finfo(u.dtype).tiny)
 
 
-def diffuse_light(
+def solve_flux_limited(
     medium: Medium,
     limiter: Limiter,
     source: Moments,
     outside: Tensor,
-    solve: Solve[Operator],
+    solve: SolverWithMemory[Operator],
     has_flux: bool,
 ) -> Moments:
-    """L0 and, where `has_flux`, L1 in `medium`; arguments as in the conservative scheme, with a
-    `limiter` in place of a closure.
+    """L0 and, where `has_flux`, L1 in `medium`.
 
+    Arguments are those of `conservative.DiffusionProblem`, with a `limiter` in place of a closure.
     Raises SolveError where the iteration does not converge to `solve.tolerance`.
     """
     balance = Balance(medium.grid, limiter)
@@ -127,7 +127,9 @@ def diffuse_light(
     transport_extinction, absorption, gain, *flux = (
         field.expand_as(scattered.mean + outside) for field in fields
     )
-    mean = _Solve.apply(solve, balance, transport_extinction, absorption, gain, outside, *flux)
+    mean = ImplicitFixedPoint.apply(
+        solve, balance, transport_extinction, absorption, gain, outside, *flux
+    )
     if not has_flux:
         return Moments(mean)
     diffusion = balance.diffusion(mean, transport_extinction)
@@ -139,12 +141,16 @@ def diffuse_light(
     return Moments(mean, (z, y, x))
 
 
-class _Solve(torch.autograd.Function):
+class ImplicitFixedPoint(torch.autograd.Function):
+    """u with r(u, `coefficients`) = 0, in both modes."""
+
     @staticmethod
-    def forward(solve: Solve[Operator], balance: Balance, *coefficients: Tensor) -> Tensor:
+    def forward(
+        solve: SolverWithMemory[Operator], balance: Balance, *coefficients: Tensor
+    ) -> Tensor:
         def correction(u: Tensor) -> Tensor:
             operator, right = balance.system(u, *coefficients)
-            return solve.solver(operator, right - operator.apply(u), None, INNER_TOLERANCE).value
+            return _solve_loosely(solve, operator, right - operator.apply(u))
 
         return iterate_picard(solve, "forward", torch.zeros_like(coefficients[0]), correction)
 
@@ -157,11 +163,13 @@ class _Solve(torch.autograd.Function):
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, *coefficients = ctx.saved_tensors
         operator, _ = ctx.balance.system(u, *coefficients)
+        # pull(lambda) = (J^T lambda, (dr/dtheta)^T lambda)
         _, pull, *_ = torch.func.vjp(ctx.balance.residual, u, *coefficients)
 
         def correction(adjoint: Tensor) -> Tensor:
-            return ctx.solve.solver(operator, u_bar - pull(adjoint)[0], None, INNER_TOLERANCE).value
+            return _solve_loosely(ctx.solve, operator, u_bar - pull(adjoint)[0])
 
+        # E9: J^T lambda = u_bar, then theta_bar = -(dr/dtheta)^T lambda
         adjoint = iterate_picard(ctx.solve, "adjoint", torch.zeros_like(u), correction)
         return None, None, *pull(-adjoint)[1:]
 
@@ -169,31 +177,39 @@ class _Solve(torch.autograd.Function):
     def jvp(ctx: Any, _solve: None, _balance: None, *d_coefficients: Tensor | None) -> Tensor:
         u, *coefficients = ctx.saved_tensors
         operator, _ = ctx.balance.system(u, *coefficients)
+        # torch refuses forward mode inside a jvp. But pull(v) = (dr)^T v is linear in v, so its
+        # own vjp is dr: push((du, dtheta)) = J du + (dr/dtheta) dtheta, by reverse mode twice.
         _, pull, *_ = torch.func.vjp(ctx.balance.residual, u, *coefficients)
         _, push, *_ = torch.func.vjp(pull, torch.zeros_like(u))
-        still = [torch.zeros_like(c) for c in coefficients]
-        moved = [zero if d is None else d for zero, d in zip(still, d_coefficients, strict=True)]
-        (right,) = push((torch.zeros_like(u), *moved))
+        zeros = [torch.zeros_like(c) for c in coefficients]
+        changes = [zero if d is None else d for zero, d in zip(zeros, d_coefficients, strict=True)]
+        (right,) = push((torch.zeros_like(u), *changes))
 
         def correction(d_u: Tensor) -> Tensor:
-            return ctx.solve.solver(
-                operator, -right - push((d_u, *still))[0], None, INNER_TOLERANCE
-            ).value
+            return _solve_loosely(ctx.solve, operator, -right - push((d_u, *zeros))[0])
 
+        # E8: J du = -(dr/dtheta) dtheta
         return iterate_picard(ctx.solve, "tangent", torch.zeros_like(u), correction)
 
 
-def iterate_picard(
-    solve: Solve[Operator], kind: str, start: Tensor, correction: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """The u [C, z, y, x] whose `correction` vanishes, by damped steps from the last solution of
-    this `kind`, or from `start`.
+def _solve_loosely(solve: SolverWithMemory[Operator], operator: Operator, source: Tensor) -> Tensor:
+    return solve.solver(operator, source, None, INNER_TOLERANCE).value
 
-    Stops when a step's norm is below the tolerance of `solve` times that of u, for every color, and
-    records the steps and the last such change.
+
+def iterate_picard(
+    solve: SolverWithMemory[Operator],
+    kind: str,
+    start: Tensor,
+    correction: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """The u [C, z, y, x] whose `correction` vanishes, by damped steps.
+
+    From the last solution of this `kind`, or from `start`. Stops when a step's norm is below the
+    tolerance of `solve` times that of u, for every color, and records the steps and the last such
+    change. Raises SolveError where that is not reached.
     """
-    began, memory, tolerance = perf_counter(), solve.memory, solve.tolerance_of(kind)
-    guess = memory.last.get((kind, solve.turn)) if memory.is_warm and kind != "tangent" else None
+    began, tolerance = perf_counter(), solve.tolerance_of(kind)
+    guess = solve.last_solution(kind)
     u = start if guess is None or guess.shape != start.shape else guess
     iteration, change = 0, float("inf")
     while change > tolerance and iteration < MAX_ITERATIONS:
@@ -201,14 +217,12 @@ def iterate_picard(
         u, iteration = u + step, iteration + 1
         change = float((norm(step) / norm(u).clamp(min=torch.finfo(u.dtype).tiny)).max())
     if not change <= tolerance:
-        advice = "raise diffusion.tolerance, use --dtype float64, diffusion.limiter=marshak or diffusion.model=p1"
         raise SolveError(
             f"flux-limited diffusion ({kind}) did not reach its tolerance",
             iteration,
             change,
-            advice,
+            "raise diffusion.tolerance, use --dtype float64, diffusion.limiter=marshak or "
+            "diffusion.model=p1",
         )
-    memory.records.append(SolveRecord(kind, iteration, change, perf_counter() - began))
-    if memory.is_warm:
-        memory.last[kind, solve.turn] = u
+    solve.remember(kind, Solution(u, iteration, change), began)
     return u.clone()

@@ -1,35 +1,51 @@
-"""Derivatives of a diffusion solve: the tangent (docs/theory.md E8) and the adjoint (E9) of the
-discrete system, both by hand.
+"""Derivatives of a linear solve, by hand: the tangent (docs/theory.md E8) and the adjoint (E9).
 
-With A u = S and A symmetric, differentiating gives A du = dS - dA u for a tangent; for a cotangent
-u_bar one solve A lambda = u_bar serves all parameters: S_bar = lambda and A_bar = -lambda u^T, of
-which only the entries A depends on are needed. A nested forward-mode call inside a custom
-function's own jvp fails in torch, hence no help from autograd here.
+A u = S, where the matrix A is made of some tensors p. Differentiating both sides gives
+A du = dS - dA u: one more solve for each direction in which S and p change. For a cotangent u_bar
+of the solution, one solve A^T lambda = u_bar serves all of them: S_bar = lambda, and p_bar follows
+from A_bar = -lambda u^T, of which only the entries that p appears in are needed.
+
+An operator knows its transpose and these products with dA; `ImplicitSolve` does the rest, for every
+scheme. Autograd could not help here: torch refuses a nested forward-mode call inside a custom
+function's own jvp.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
+from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.numerics.autodiff import keep
 
-Made = dict[Callable[[Operator], Any], Any]
-System = TypeVar("System")
-"""What a solver solves: an operator."""
+
+class DifferentiableOperator(Protocol):
+    """A matrix A made of tensors p, as `ImplicitSolve` needs to know it; lists follow p's order."""
+
+    def transposed(self) -> Self:
+        """A^T."""
+
+    def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+        """p_bar for A_bar = -lambda u^T (E9), lambda being the `adjoint` light."""
+
+    def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterable[Tensor]:
+        """The terms of dA u for the tangents of p (E8); None is a tangent of zero."""
+
+
+AnyOperator = TypeVar("AnyOperator", bound=DifferentiableOperator)
 
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """One solve: `kind` is forward, adjoint or tangent; iterations used, relative residual reached,
-    seconds taken.
+    """One solve: `kind` is forward, adjoint or tangent.
+
+    `iterations` used, relative `residual` reached, `seconds` taken.
     """
 
     kind: str
@@ -40,115 +56,121 @@ class SolveRecord:
 
 @dataclass
 class SolveMemory:
-    """What solves remember between renders: the last solution of each kind and turn, to start from,
-    and a record of every solve.
+    """What solves remember between renders: last solutions, to start from, and a record of each.
 
-    With `is_warm` False every solve starts from zero. `enough`: by kind, the tolerance up to which
-    a solve is of use; it is solved no more exactly than that, whatever it is asked for.
+    `last`: by kind and transport round. With `is_warm` False every solve starts from zero.
+    `tolerance_floor`: by kind, the tolerance below which nothing is gained; no solve goes below it,
+    whatever it is asked for.
     """
 
     is_warm: bool = True
     last: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     records: list[SolveRecord] = field(default_factory=list)
-    enough: dict[str, float] = field(default_factory=dict)
+    tolerance_floor: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Solve(Generic[System]):
-    """How to solve: the solver, its tolerance, and the memory that its solves share.
+class SolverWithMemory(Generic[AnyOperator]):
+    """A solver, its tolerance, and the memory that its solves share.
 
-    A render's solves are told apart by `turn`; forward solves that remember nothing begin at
-    `start`, or at zero.
+    `round_index` tells the solves of one render apart: 0 is diffusion's own, transport rounds count
+    from 1. Forward solves that remember nothing begin at `start`, or at zero.
     """
 
-    solver: Callable[[System, Tensor, Tensor | None, float], Solution]
+    solver: Callable[[AnyOperator, Tensor, Tensor | None, float], Solution]
     tolerance: float
     memory: SolveMemory
-    turn: int = 0
+    round_index: int = 0
     start: Tensor | None = None
 
-    def __call__(self, kind: str, operator: System, source: Tensor) -> Tensor:
+    def __call__(self, kind: str, operator: AnyOperator, source: Tensor) -> Tensor:
         """u with `operator` u = `source` [C, z, y, x]."""
-        start = perf_counter()
-        guess = self.start if kind == "forward" else None
-        if self.memory.is_warm and kind != "tangent":
-            guess = self.memory.last.get((kind, self.turn), guess)
+        began = perf_counter()
+        guess = self.last_solution(kind)
+        if guess is None and kind == "forward":
+            guess = self.start
         solution = self.solver(operator, source, guess, self.tolerance_of(kind))
-        self.memory.records.append(
-            SolveRecord(kind, solution.iterations, solution.residual, perf_counter() - start)
-        )
-        if self.memory.is_warm:
-            self.memory.last[kind, self.turn] = solution.value
+        self.remember(kind, solution, began)
         return solution.value
 
     def tolerance_of(self, kind: str) -> float:
         """How exactly to solve."""
-        return max(self.tolerance, self.memory.enough.get(kind, 0.0))
+        return max(self.tolerance, self.memory.tolerance_floor.get(kind, 0.0))
+
+    def last_solution(self, kind: str) -> Tensor | None:
+        """Where to start from; None for tangents, whose directions have nothing in common."""
+        if not self.memory.is_warm or kind == "tangent":
+            return None
+        return self.memory.last.get((kind, self.round_index))
+
+    def remember(self, kind: str, solution: Solution, began: float) -> None:
+        """Keeps `solution` and the record of the solve that `began` at that time."""
+        seconds = perf_counter() - began
+        record = SolveRecord(kind, solution.iterations, solution.residual, seconds)
+        self.memory.records.append(record)
+        if self.memory.is_warm:
+            self.memory.last[kind, self.round_index] = solution.value
 
 
-class _Solve(torch.autograd.Function):
+class ImplicitSolve(torch.autograd.Function):
+    """u with A u = `source`, where A is `assemble(prepared, *tensors)`, in both modes.
+
+    `prepared` is what solvers keep about A from one solve to the next.
+    """
+
     @staticmethod
     def forward(
-        solve: Solve[Operator],
-        made: Made,
+        solve: SolverWithMemory[AnyOperator],
+        assemble: Callable[..., AnyOperator],
+        prepared: dict[Any, Any],
         source: Tensor,
-        loss: Tensor,
-        c_z: Tensor,
-        c_y: Tensor,
-        c_x: Tensor,
+        *tensors: Tensor,
     ) -> Tensor:
-        return solve("forward", Operator((c_z, c_y, c_x), loss, made), source).clone()
+        return solve("forward", assemble(prepared, *tensors), source).clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.solve, ctx.made, _, *coefficients = inputs
-        keep(ctx, output, *coefficients)
+        ctx.solve, ctx.assemble, ctx.prepared, _, *tensors = inputs
+        keep(ctx, output, *tensors)
 
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
-        u, loss, *conductances = ctx.saved_tensors
-        made, ctx.made = (
-            ctx.made,
-            {},
-        )  # after the last of the solves that share it the memory is wanted for what follows
-        adjoint = ctx.solve("adjoint", Operator(tuple(conductances), loss, made), u_bar)
-        del made
-        conductance_bars = [
-            (-difference(adjoint, axis) * difference(u, axis)).sum_to_size(conductance.shape)
-            for axis, conductance in zip(AXES, conductances, strict=True)
-        ]
-        return (
-            None,
-            None,
-            adjoint.clone(),
-            (-adjoint * u).sum_to_size(loss.shape),
-            *conductance_bars,
-        )
+        u, *tensors = ctx.saved_tensors
+        # E9: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:
+        # several solves may share it, and with the last of them its memory is free again.
+        prepared, ctx.prepared = ctx.prepared, {}
+        adjoint = ctx.solve("adjoint", ctx.assemble(prepared, *tensors).transposed(), u_bar)
+        del prepared
+        # E9: p_bar, the entries of A_bar = -lambda u^T that depend on p.
+        tensor_bars = ctx.assemble({}, *tensors).cotangents(adjoint, u)
+        return None, None, None, adjoint.clone(), *tensor_bars
 
     @staticmethod
     def jvp(
         ctx: Any,
         _solve: None,
-        _made: None,
+        _assemble: None,
+        _prepared: None,
         d_source: Tensor | None,
-        d_loss: Tensor | None,
-        *d_conductances: Tensor | None,
+        *d_tensors: Tensor | None,
     ) -> Tensor:
-        u, loss, *conductances = ctx.saved_tensors
+        u, *tensors = ctx.saved_tensors
+        operator = ctx.assemble(ctx.prepared, *tensors)
+        # E8: A du = dS - dA u.
         right = torch.zeros_like(u) if d_source is None else d_source.clone()
-        if d_loss is not None:
-            right -= d_loss * u
-        for axis, d_conductance in zip(AXES, d_conductances, strict=True):
-            if d_conductance is not None:
-                right -= accumulate(d_conductance * difference(u, axis), axis)
-        return ctx.solve("tangent", Operator(tuple(conductances), loss, ctx.made), right).clone()
+        for term in operator.change_terms(d_tensors, u):
+            right -= term
+        return ctx.solve("tangent", operator, right).clone()
 
 
-def solve_diffusion(solve: Solve[Operator], operator: Operator, source: Tensor) -> Tensor:
-    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes with respect to
-    `source` and the operator.
+def solve_diffusion(
+    solve: SolverWithMemory[Operator], operator: Operator, source: Tensor
+) -> Tensor:
+    """u with `operator` u = `source` [C, z, y, x], differentiable in both modes (E8, E9).
 
-    An operator of one color serves a source of several. What solvers make of the operator, in plain
-    numbers, serves all its solves.
+    By `source` and by the operator. An operator of one color serves a source of several. What
+    solvers prepare about the operator serves all its solves.
     """
-    return _Solve.apply(solve, operator.made, source, operator.loss, *operator.conductances)
+    return ImplicitSolve.apply(
+        solve, Operator.of, operator.prepared, source, operator.loss, *operator.conductances
+    )

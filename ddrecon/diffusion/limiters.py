@@ -1,5 +1,4 @@
-"""Flux limiters: D as a function of how fast light falls off, so that no more flows than radiance
-allows.
+"""Flux limiters: D falls where light falls off fast, so that no more flows than radiance allows.
 
 A limiter is lambda(R) in D = lambda(R) / kappa with R = |grad L0| / (kappa L0), written in the
 steepness q = |grad L0| / L0 [1/u] so that it is finite where either vanishes: `limiter(kappa, q^2)
@@ -20,8 +19,9 @@ SERIES_BELOW = 0.04
 
 
 def levermore_pomraning(extinction: Tensor, steepness_square: Tensor) -> Tensor:
-    """lambda = (coth R - 1/R) / R: 1/3 in dense media, 1/R in empty space (doi:10.1086/159157, in
-    the form of scattering albedo 1).
+    """lambda = (coth R - 1/R) / R: 1/3 in dense media, 1/R in empty space.
+
+    Source: Levermore and Pomraning 1981, doi:10.1086/159157, in the form of scattering albedo 1.
     """
     square = steepness_square / extinction**2
     is_small = square < SERIES_BELOW
@@ -31,8 +31,9 @@ def levermore_pomraning(extinction: Tensor, steepness_square: Tensor) -> Tensor:
 
 
 def marshak(extinction: Tensor, steepness_square: Tensor) -> Tensor:
-    """lambda = 1 / sqrt(9 + 4 R^2): as Larsen's with n = 2, but no more than F = L0 / 2 flows, what
-    E6 lets out of a surface.
+    """lambda = 1 / sqrt(9 + 4 R^2): as Larsen's with n = 2, but no more than F = L0 / 2 flows.
+
+    That is what E6 lets out of a surface.
     """
     return 1 / torch.sqrt(9 * extinction**2 + 4 * steepness_square)
 

@@ -1,16 +1,17 @@
-"""The conservative diffusion operator A = G^T c G + loss (docs/theory.md E7) on cell-centered
-arrays `[C, z, y, x]`.
+"""The conservative diffusion operator A = G^T c G + loss (docs/theory.md E7).
 
-G is the difference of neighboring cells across each interior face, c the conductance of that face;
-`loss` is what a cell gives up to absorption and through the faces of the box. Every flux that
-leaves a cell enters its neighbor, so energy is kept to rounding. Neighbors are combined by slicing:
-conv3d with fixed difference kernels gives the same result 30 to 50 times slower on a CPU
-(`benchmarks/stencil.py` measures both).
+All arrays hold cell centers, `[C, z, y, x]`, or the faces between cells along one axis. G is the
+difference of neighboring cells across each interior face, c the conductance of that face; `loss` is
+what a cell gives up to absorption and through the faces of the box. Every flux that leaves a cell
+enters its neighbor, so energy is kept to rounding.
+
+Neighbors are combined by slicing: conv3d with fixed difference kernels gives the same result 30 to
+50 times slower on a CPU (`benchmarks/stencil.py` measures both).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
@@ -21,7 +22,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import keep
 
-Made = TypeVar("Made")
+Prepared = TypeVar("Prepared")
 AXES = (1, 2, 3)
 """Array axes of z, y, x in a `[C, z, y, x]` tensor."""
 
@@ -32,15 +33,23 @@ class Operator:
 
     `conductances`: c [1/u] on the interior faces along z, y, x, each one entry shorter than a cell
     array along its axis; `loss` [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0. Conductances that
-    all colors share may be given once. `made`: what solvers have made of these numbers; to be
-    handed on with them only.
+    all colors share may be given once. `prepared`: what solvers have computed from these numbers;
+    to be handed on with them only.
     """
 
     conductances: tuple[Tensor, Tensor, Tensor]
     loss: Tensor
-    made: dict[Callable[[Operator], Any], Any] = field(
+    prepared: dict[Callable[[Operator], Any], Any] = field(
         default_factory=dict, repr=False, compare=False
     )
+
+    @staticmethod
+    def of(
+        prepared: dict[Callable[[Operator], Any], Any], loss: Tensor, *conductances: Tensor
+    ) -> Operator:
+        """The operator of `loss` and three conductances, in the order of its derivatives."""
+        z, y, x = conductances
+        return Operator((z, y, x), loss, prepared)
 
     @cached_property
     def diagonal(self) -> Tensor:
@@ -55,35 +64,55 @@ class Operator:
         """A u, `[C, z, y, x]`."""
         return subtract_neighbors(self.diagonal * u, u, self.conductances)
 
-    def once(self, make: Callable[[Operator], Made]) -> Made:
-        """What `make` makes of this operator, made when first asked for and kept: forward and
-        adjoint solves share it.
-        """
-        if make not in self.made:
-            self.made[make] = make(self)
-        return self.made[make]
+    def once(self, prepare: Callable[[Operator], Prepared]) -> Prepared:
+        """`prepare(self)`, computed when first asked for and kept for all solves."""
+        if prepare not in self.prepared:
+            self.prepared[prepare] = prepare(self)
+        return self.prepared[prepare]
+
+    def transposed(self) -> Operator:
+        """A^T, which is A."""
+        return self
+
+    def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+        """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E9)."""
+        conductance_bars = (
+            (-difference(adjoint, axis) * difference(u, axis)).sum_to_size(conductance.shape)
+            for axis, conductance in zip(AXES, self.conductances, strict=True)
+        )
+        return (-adjoint * u).sum_to_size(self.loss.shape), *conductance_bars
+
+    def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
+        """dA u = dloss u + G^T (dc G u), term by term (E8)."""
+        d_loss, *d_conductances = d_tensors
+        if d_loss is not None:
+            yield d_loss * u
+        for axis, d_conductance in zip(AXES, d_conductances, strict=True):
+            if d_conductance is not None:
+                yield accumulate(d_conductance * difference(u, axis), axis)
 
 
 def lower_cells(u: Tensor, axis: int) -> Tensor:
-    """The cells on the low side of every interior face along `axis` (a view)."""
+    """The cells below every interior face along `axis`: all but the last (a view)."""
     return u.narrow(axis, 0, u.shape[axis] - 1)
 
 
 def upper_cells(u: Tensor, axis: int) -> Tensor:
-    """The cells on the high side of every interior face along `axis` (a view)."""
+    """The cells above every interior face along `axis`: all but the first (a view)."""
     return u.narrow(axis, 1, u.shape[axis] - 1)
 
 
 def difference(u: Tensor, axis: int) -> Tensor:
-    """G u along `axis`: high side minus low side of every interior face."""
+    """G u along `axis`: the cell above minus the cell below every interior face."""
     return upper_cells(u, axis) - lower_cells(u, axis)
 
 
 def subtract_neighbors(
     result: Tensor, u: Tensor, conductances: tuple[Tensor, ...], times: float = 1.0
 ) -> Tensor:
-    """`result` minus `times` conductance times neighbor, over all interior faces; `result` is
-    changed in place and returned.
+    """`result` minus `times` conductance times neighbor, over all interior faces.
+
+    `result` is changed in place and returned.
     """
     for axis, conductance in zip(AXES, conductances, strict=True):
         lower_cells(result, axis).addcmul_(conductance, upper_cells(u, axis), value=-times)
@@ -92,31 +121,33 @@ def subtract_neighbors(
 
 
 def accumulate(faces: Tensor, axis: int) -> Tensor:
-    """G^T f along `axis`: each cell gets what its low face brings minus what its high face brings."""
-    nothing = faces.new_zeros(_with(faces.shape, axis, 1))
-    return torch.cat([nothing, faces], axis) - torch.cat([faces, nothing], axis)
+    """G^T f along `axis`: what each cell's lower face holds minus what its upper face does."""
+    wall = faces.new_zeros([1 if other == axis else n for other, n in enumerate(faces.shape)])
+    return torch.cat([wall, faces], axis) - torch.cat([faces, wall], axis)
 
 
 def conductance(diffusion: Tensor, grid: Grid, axis: int) -> Tensor:
-    """c = harmonic mean of D on the interior faces along `axis` / h^2 [1/u] (E7); `diffusion`: D
-    [u], `[C, z, y, x]`, > 0.
+    """c = (harmonic mean of D) / h^2 [1/u] on the interior faces along `axis` (E7).
+
+    `diffusion`: D [u], `[C, z, y, x]`, > 0.
     """
     return harmonic_mean(diffusion, axis) / grid.spacing[axis - 1] ** 2
 
 
 def harmonic_mean(u: Tensor, axis: int) -> Tensor:
-    """The harmonic mean (E7) of the cells on both sides of every interior face along `axis`, in the
-    units of `u`: `[C, z, y, x]`, > 0.
+    """2 / (1/a + 1/b) of the two cells beside every interior face along `axis` (E7).
 
-    One entry shorter than `u` along `axis`.
+    `u`: `[C, z, y, x]`, > 0, in any unit; the result has that unit, and one entry less along
+    `axis`.
     """
     mean: Tensor = _HarmonicMean.apply(u, axis)
     return mean
 
 
 class _HarmonicMean(torch.autograd.Function):
-    """Differentiated by hand, d mean = mean^2 / 2 (da / a^2 + db / b^2): keeps one array beside
-    `u`, autograd five.
+    """d mean = mean^2 / 2 (da / a^2 + db / b^2), by hand.
+
+    This keeps one array beside `u`; autograd would keep five.
     """
 
     @staticmethod
@@ -137,10 +168,11 @@ class _HarmonicMean(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, mean_bar: Tensor) -> tuple[Tensor, None]:
         u, mean = ctx.saved_tensors
-        half = 0.5 * mean_bar * mean * mean
+        # mean_bar mean^2 / 2, which goes to a over a^2 and to b over b^2
+        flow = 0.5 * mean_bar * mean * mean
         u_bar = torch.zeros_like(u)
         for side in (lower_cells, upper_cells):
-            side(u_bar, ctx.axis).addcdiv_(half, side(u, ctx.axis) ** 2)
+            side(u_bar, ctx.axis).addcdiv_(flow, side(u, ctx.axis) ** 2)
         return u_bar, None
 
     @staticmethod
@@ -153,8 +185,9 @@ class _HarmonicMean(torch.autograd.Function):
 
 
 def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
-    """What a cell loses through the faces of the box per unit L0 [1/u]: 1 / (h (2 + h / (2 D))) for
-    each such face (Marshak, E6).
+    """What a cell loses through the faces of the box, per unit L0 [1/u] (Marshak, E6).
+
+    1 / (h (2 + h / (2 D))) for each such face; `diffusion`: D [u], `[C, z, y, x]`.
     """
     loss = torch.zeros_like(diffusion)
     for axis, step in zip(AXES, grid.spacing, strict=True):
@@ -171,42 +204,43 @@ def face_fluxes(
     axis: int,
     outside: Tensor | None = None,
 ) -> Tensor:
-    """Flux F = D (-grad L0 + kappa_s Q1) along `axis` on all faces, those of the box included (E5
-    without its 3, and E6).
+    """F = D (-grad L0 + kappa_s Q1) along `axis` on all faces (E5 without its 3, and E6).
 
-    `radiance`: L0 [C, z, y, x]; `source_flux`: the component of kappa_s Q1 along `axis`, same
-    shape; `outside`: the radiance [C, 1, 1, 1] that enters from outside the box, the same from
-    everywhere; None for zero. Returns an array one entry longer than the cells along `axis`,
-    positive towards higher indices.
+    F is linear in three terms; one that is None is zero. `radiance`: L0 [C, z, y, x];
+    `source_flux`: the component of kappa_s Q1 along `axis`, same shape; `outside`: the radiance
+    [C, 1, 1, 1] that enters from outside the box, the same from everywhere. `diffusion`: D [u].
+    Returns an array one entry longer than the cells along `axis`: the faces of the box come first
+    and last, and fluxes are positive towards higher indices.
     """
     step = grid.spacing[axis - 1]
+    # What drives F: through the box's first face, the interior faces, and the box's last face.
     low = inside = high = diffusion.new_zeros(())
     if radiance is not None:
-        low, inside, high = (
-            -_first(radiance, axis),
-            difference(radiance, axis) / -step,
-            _last(radiance, axis),
-        )
+        # inside -grad L0; on the box the cell's own L0, which flows outwards (down at the low end)
+        low = -_first(radiance, axis)
+        inside = difference(radiance, axis) / -step
+        high = _last(radiance, axis)
     if source_flux is not None:
+        # inside the mean kappa_s Q1 of both cells; on the box (h/2) kappa_s Q1 of E6's numerator
         low, high = (
             side + step / 2 * end(source_flux, axis) for side, end in ((low, _first), (high, _last))
         )
         inside = inside + 0.5 * (lower_cells(source_flux, axis) + upper_cells(source_flux, axis))
     if outside is not None:
+        # E6 for L0 - outside in place of L0
         low, high = low + outside, high - outside
+    # E6 divides by 2 + h / (2 D); inside, the drive is multiplied by the harmonic mean of D (E7)
     into, out = (_escape(end(diffusion, axis), step) for end in (_first, _last))
     return torch.cat([into * low, harmonic_mean(diffusion, axis) * inside, out * high], axis)
 
 
 def cell_average(faces: Tensor, axis: int) -> Tensor:
-    """Half the sum of a cell's two faces along `axis`; `faces` is one entry longer there than the
-    cells.
-    """
+    """The mean of each cell's two faces along `axis`, where `faces` has one entry more."""
     return 0.5 * (lower_cells(faces, axis) + upper_cells(faces, axis))
 
 
 def _escape(diffusion: Tensor, step: float) -> Tensor:
-    """What leaves a cell through a face on the box per unit L0 (Marshak, E6): 1 / (2 + h / (2 D))."""
+    """The flux out of a cell at the box, per unit L0: 1 / (2 + h / (2 D)) (Marshak, E6)."""
     return 1 / (2 + step / (2 * diffusion))
 
 
@@ -216,7 +250,3 @@ def _first(u: Tensor, axis: int) -> Tensor:
 
 def _last(u: Tensor, axis: int) -> Tensor:
     return u.narrow(axis, u.shape[axis] - 1, 1)
-
-
-def _with(shape: list[int] | torch.Size, axis: int, size: int) -> list[int]:
-    return [size if other == axis else old for other, old in enumerate(shape)]

@@ -292,7 +292,7 @@ class Reconstruction:
             return _mean_psnr(render_each(level, level.views, self.memory), level.views)
 
     def _differentiated(self, seen: list[View]) -> Differentiated:
-        self.memory.enough = solve_tolerances(self.misfit)
+        self.memory.tolerance_floor = solve_tolerances(self.misfit)
         try:
             return differentiate(
                 self.train_level,
@@ -302,7 +302,7 @@ class Reconstruction:
                 self.memory,
             )
         finally:
-            self.memory.enough = {}
+            self.memory.tolerance_floor = {}
 
     def _require_finite(self, gradients: dict[str, Tensor]) -> None:
         for parameter in self.parameters:

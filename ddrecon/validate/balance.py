@@ -1,5 +1,4 @@
-"""How well a solution of the diffusion equation satisfies it, by a system put together here face by
-face (docs/theory.md E4, E6, E7).
+"""How well a solution of the diffusion equation satisfies it (docs/theory.md E4, E6, E7).
 
 Iterations update their residual rather than compute it, so that rounding hides from them; here it
 is b - A u itself.
@@ -13,7 +12,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.closures import CLOSURES
-from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance, face_fluxes
+from ddrecon.diffusion.conservative import DiffusionProblem
+from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, face_fluxes
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import has_flux, scale_medium
@@ -22,11 +22,11 @@ from ddrecon.scene import Scene
 
 @dataclass(frozen=True)
 class Balance:
-    """`residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by;
-    `attainable`: what rounding u makes of it.
+    """How far a solution is from balance; all are 0 where there is no source.
 
-    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces. All
-    are 0 where there is no source.
+    `residual`: |b - A u| / |b| in the scaling to a unit diagonal that solvers stop by;
+    `attainable`: what rounding u makes of it;
+    `energy`: (injected - absorbed - leaked) / injected, each summed over all cells or faces.
     """
 
     residual: float
@@ -35,47 +35,42 @@ class Balance:
 
 
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
-    """The balance of `solution`, L0 [C, z, y, x], in `scene`, whose lights are beams and ambient
-    light.
-    """
-    medium, grid, lights = (
-        scale_medium(scene.volume),
-        scene.volume.grid,
-        decompose_lights(scene.lights),
+    """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
+    medium, grid, settings = scale_medium(scene.volume), scene.volume.grid, scene.diffusion
+    lights, is_directed = decompose_lights(scene.lights), has_flux(medium)
+    problem = DiffusionProblem(
+        medium,
+        lambda extinction: CLOSURES[settings.closure](extinction, grid, settings.floor),
+        reduced_light(medium, lights, is_directed).source,
+        ambient_radiance(lights, solution),
+        is_directed,
     )
-    source = reduced_light(medium, lights, has_flux(medium)).source
-    diffusion = CLOSURES[scene.diffusion.closure](
-        medium.transport_extinction, grid, scene.diffusion.floor
-    )
-    escape = boundary_loss(diffusion, grid)
-    z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
-    operator = Operator((z, y, x), medium.absorption.value + escape)
-    injected = medium.remaining_scattering * source.mean + escape * ambient_radiance(
-        lights, solution
-    )
-    right, leaked = injected, torch.zeros((), dtype=torch.float64, device=solution.device)
-    for axis, flux in zip(AXES, source.flux or (None,) * 3, strict=True):
-        scattered, step = (
-            None if flux is None else medium.remaining_scattering * flux,
-            grid.spacing[axis - 1],
-        )
-        if scattered is not None:
-            right = (
-                right - face_fluxes(None, scattered, diffusion, grid, axis).diff(dim=axis) / step
-            )
-        faces = face_fluxes(solution, scattered, diffusion, grid, axis).double()
-        leaked = leaked + (faces.select(axis, -1) - faces.select(axis, 0)).sum() / step
+    operator, right = problem.system
     if not right.any():
         return Balance(0.0, 0.0, 0.0)
-    spent = (medium.absorption.value.double() * solution.double()).sum() + leaked
+    # What Q1 takes out of one cell it brings to the next, so it is no part of what is injected.
+    escape = boundary_loss(problem.diffusion, grid)
+    injected = medium.remaining_scattering * problem.source.mean + escape * problem.outside
     total = injected.double().sum()
-    return Balance(*_residual(operator, right, solution), float((total - spent).abs() / total))
+    absorbed = (medium.absorption.value.double() * solution.double()).sum()
+    energy = float((total - (absorbed + _leak(problem, solution))).abs() / total)
+    return Balance(*_residual(operator, right, solution), energy)
+
+
+def _leak(problem: DiffusionProblem, solution: Tensor) -> Tensor:
+    """What flows out through the faces of the box (E6), as for dark surroundings."""
+    grid, scattering = problem.medium.grid, problem.medium.remaining_scattering
+    leaked = torch.zeros((), dtype=torch.float64, device=solution.device)
+    for axis, flux in zip(AXES, problem.source.flux or (None,) * 3, strict=True):
+        scattered = None if flux is None else scattering * flux
+        faces = face_fluxes(solution, scattered, problem.diffusion, grid, axis).double()
+        outflow = (faces.select(axis, -1) - faces.select(axis, 0)).sum()
+        leaked = leaked + outflow / grid.spacing[axis - 1]
+    return leaked
 
 
 def _residual(operator: Operator, right: Tensor, u: Tensor) -> tuple[float, float]:
-    """The relative residual, and what a rounding of the size of one unit in the last place of every
-    entry of `u` adds to it.
-    """
+    """The relative residual, and what rounding every entry of `u` by one unit in the last adds."""
     scale = operator.diagonal.rsqrt()
     size = (scale * right).norm()
     rounding = torch.finfo(u.dtype).eps * (scale * operator.diagonal * u).norm()

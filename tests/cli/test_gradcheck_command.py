@@ -63,9 +63,9 @@ def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_wrong_tangent_alone_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    right = implicit._Solve.jvp
+    right = implicit.ImplicitSolve.jvp
     monkeypatch.setattr(
-        implicit._Solve, "jvp", staticmethod(lambda *arguments: 0.99 * right(*arguments))
+        implicit.ImplicitSolve, "jvp", staticmethod(lambda *arguments: 0.99 * right(*arguments))
     )
     result = run(*GRADCHECK, *SMALL, "--json", "report.json")
     assert result.exit_code == 1

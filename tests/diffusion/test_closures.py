@@ -1,6 +1,4 @@
-"""Closures: the diffusion coefficient of dense media, and what replaces its infinity in empty
-space.
-"""
+"""Closures: D of dense media, and what replaces its infinity in empty space."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""Flux-limited diffusion: its fixed point, the derivatives of that, and what it says when it does
-not get there.
-"""
+"""Flux-limited diffusion: its fixed point, the derivatives of that, and failures."""
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -14,7 +13,7 @@ from torch.autograd import forward_ad
 
 from ddrecon.diffusion import flux_limited
 from ddrecon.diffusion.flux_limited import Balance, steepness_square
-from ddrecon.diffusion.implicit import Solve, SolveMemory
+from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.errors import SolveError
@@ -42,8 +41,8 @@ def make():
     return scene
 
 
-def make_solve(tolerance: float, memory: SolveMemory | None = None) -> Solve:
-    return Solve(SOLVERS["conjugate_gradient"], tolerance, memory or SolveMemory())
+def make_solve(tolerance: float, memory: SolveMemory | None = None) -> SolverWithMemory:
+    return SolverWithMemory(SOLVERS["conjugate_gradient"], tolerance, memory or SolveMemory())
 
 
 def test_steepness_of_exponential_light_is_its_rate():
@@ -56,6 +55,18 @@ def test_steepness_of_exponential_light_is_its_rate():
     torch.testing.assert_close(
         inside.sqrt(), torch.full_like(inside, math.sinh(2 * step) / step), rtol=1e-9, atol=0
     )
+
+
+def test_steepness_is_that_of_central_differences_cell_by_cell():
+    grid, u = box_grid((3, 4, 2)), 1 + random_values(1, 3, 4, 2)
+    expected = torch.zeros_like(u[0])
+    for cell in itertools.product(*map(range, grid.shape)):
+        for axis, h in enumerate(grid.spacing):
+            # a neighbor beyond the box is replaced by the cell itself, and the step is shorter
+            ends = [min(max(cell[axis] + side, 0), grid.shape[axis] - 1) for side in (-1, 1)]
+            low, high = (u[0][(*cell[:axis], end, *cell[axis + 1 :])] for end in ends)
+            expected[cell] += ((high - low) / (h * (ends[1] - ends[0])) / u[0][cell]) ** 2
+    torch.testing.assert_close(steepness_square(u, grid)[0], expected, rtol=1e-9, atol=0)
 
 
 def test_even_light_and_no_light_have_no_steepness():
@@ -71,13 +82,13 @@ def test_the_light_found_balances(limiter: str, make):
     balance = Balance(box_grid(SHAPE), LIMITERS[limiter])
     fields = [5 * random_values(2, *SHAPE, seed=seed) for seed in range(3)]
     outside = torch.tensor([0.5, 1.0], dtype=torch.float64).view(2, 1, 1, 1)
-    u = flux_limited._Solve.apply(make_solve(1e-13), balance, *fields, outside)
+    u = flux_limited.ImplicitFixedPoint.apply(make_solve(1e-13), balance, *fields, outside)
     assert float(balance.residual(u, *fields, outside).abs().max()) < 1e-11 * float(u.abs().max())
 
 
 @each_limiter
 def test_dense_media_diffuse_as_without_a_limit(limiter: str, make):
-    """Uniform and 4000 optical depths thick: R is small, and what is added to the medium as well."""
+    """Uniform and 4000 optical depths thick: R is small, and so is what is added to the medium."""
     dense = torch.full(SHAPE, 500.0, dtype=torch.float64)
     ways = {"limiter": limiter}, {"model": "p1"}
     ours, theirs = (
@@ -123,7 +134,7 @@ def test_both_derivatives_agree_with_differences(limiter: str):
     balance = Balance(box_grid(shape), LIMITERS[limiter])
 
     def solved(*coefficients: Tensor) -> Tensor:
-        return flux_limited._Solve.apply(
+        return flux_limited.ImplicitFixedPoint.apply(
             make_solve(1e-14, SolveMemory(is_warm=False)), balance, *coefficients
         )
 

@@ -1,6 +1,4 @@
-"""Derivatives of a solve: tangent and adjoint agree with differences and with each other, and
-solves are remembered.
-"""
+"""Derivatives of a solve agree with differences and with each other; solves are remembered."""
 
 from __future__ import annotations
 
@@ -8,11 +6,11 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from media import random_values
+from media import dense_matrix, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ddrecon.diffusion.implicit import Solve, SolveMemory, solve_diffusion
+from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers import SOLVERS, hierarchy
 
@@ -25,7 +23,7 @@ def solving(
     memory: SolveMemory | None = None, solver: str = "conjugate_gradient"
 ) -> Callable[..., Tensor]:
     """u as a function of source, loss and the three conductances, solved to rounding."""
-    solve = Solve(SOLVERS[solver], 1e-14, memory or SolveMemory())
+    solve = SolverWithMemory(SOLVERS[solver], 1e-14, memory or SolveMemory())
     return lambda source, loss, *conductances: solve_diffusion(
         solve, Operator(conductances, loss), source
     )
@@ -93,17 +91,29 @@ def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
     )
 
 
-def test_the_adjoint_takes_what_the_forward_solve_made_of_the_operator(
+@pytest.mark.parametrize("colors", [1, 2])
+def test_cotangents_are_those_of_a_dense_solve_by_autograd(colors: int, inputs):
+    leaves = [tensor.requires_grad_() for tensor in inputs((3, 2, 3), colors)]
+    source, loss, *conductances = leaves
+    matrix = dense_matrix(Operator(tuple(conductances), loss))
+    dense = torch.linalg.solve(matrix, source.flatten(1).unsqueeze(-1)).view_as(source)
+    u_bar = torch.randn_like(source)
+    found, expected = (torch.autograd.grad(u, leaves, u_bar) for u in (solving()(*leaves), dense))
+    for bar, known in zip(found, expected, strict=True):
+        torch.testing.assert_close(bar, known, rtol=1e-10, atol=1e-12)
+
+
+def test_the_adjoint_takes_what_the_forward_solve_prepared_of_the_operator(
     inputs, monkeypatch: pytest.MonkeyPatch
 ):
     source, loss, *conductances = (tensor.requires_grad_() for tensor in inputs())
     operator = Operator(tuple(conductances), loss)
-    solve = Solve(SOLVERS["multigrid"], 1e-12, SolveMemory())
+    solve = SolverWithMemory(SOLVERS["multigrid"], 1e-12, SolveMemory())
     u = solve_diffusion(solve, operator, source)
-    assert operator.made
+    assert operator.prepared
 
     def refuse(*_: object) -> None:
-        raise AssertionError("made again")
+        raise AssertionError("prepared again")
 
     monkeypatch.setattr(hierarchy, "coarsen", refuse)
     monkeypatch.setattr(hierarchy.Coarsest, "of", refuse)
@@ -130,10 +140,10 @@ def test_every_solve_is_recorded(inputs):
 @pytest.mark.parametrize("is_warm", [True, False])
 def test_a_second_solve_starts_from_the_first(is_warm: bool, inputs):
     memory, arguments = SolveMemory(is_warm), inputs((4, 5, 3))
-    solve = Solve(SOLVERS["conjugate_gradient"], 1e-10, memory)
+    solve = SolverWithMemory(SOLVERS["conjugate_gradient"], 1e-10, memory)
     operator = Operator(tuple(arguments[2:]), arguments[1])
     first = solve("forward", operator, arguments[0])
-    Solve(solve.solver, 1e-9, memory)("forward", operator, arguments[0])
+    SolverWithMemory(solve.solver, 1e-9, memory)("forward", operator, arguments[0])
     assert memory.records[0].iterations > 0
     assert (memory.records[1].iterations == 0) == is_warm
     assert (memory.last.get(("forward", 0)) is not None) == is_warm

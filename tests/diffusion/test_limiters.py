@@ -1,4 +1,4 @@
-"""Flux limiters: what they are in dense media and in empty space, and that they are smooth between."""
+"""Flux limiters in dense media and in empty space; between, they are smooth."""
 
 from __future__ import annotations
 

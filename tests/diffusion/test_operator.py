@@ -1,6 +1,4 @@
-"""The diffusion operator: a symmetric positive definite M-matrix that keeps energy and converges at
-second order.
-"""
+"""The diffusion operator: a symmetric M-matrix that keeps energy, of second order."""
 
 from __future__ import annotations
 

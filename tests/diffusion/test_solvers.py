@@ -1,6 +1,4 @@
-"""Every solver reaches its tolerance on every system, agrees with a dense solve, and says so when
-it cannot.
-"""
+"""Every solver reaches its tolerance, agrees with a dense solve, and says where it cannot."""
 
 from __future__ import annotations
 

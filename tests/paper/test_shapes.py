@@ -19,11 +19,11 @@ spec.loader.exec_module(shapes)
 
 
 def octahedron(radius: float) -> np.ndarray:
-    """Triangles of the octahedron |x| + |y| + |z| = radius, turned so that no edge is along an axis."""
-    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    """Triangles of |x| + |y| + |z| = radius, rotated so that no edge is along an axis."""
+    rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     signs = [(a, b, c) for a in (1, -1) for b in (1, -1) for c in (1, -1)]
     faces = [np.diag(sign)[:: 1 if np.prod(sign) > 0 else -1] for sign in signs]
-    return radius * np.array(faces) @ turn.T
+    return radius * np.array(faces) @ rotation.T
 
 
 def test_a_closed_surface_is_filled() -> None:
@@ -31,8 +31,8 @@ def test_a_closed_surface_is_filled() -> None:
     points = shapes.centers(shapes.CUBE, (cells,) * 3)
     filled = shapes.is_inside(octahedron(radius), points)
     assert filled.mean() == pytest.approx(4 / 3 * radius**3, rel=0.02)
-    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
-    assert (filled == (np.abs(points @ turn).sum(-1) < radius)).all()
+    rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    assert (filled == (np.abs(points @ rotation).sum(-1) < radius)).all()
 
 
 def test_a_hole_in_a_shape_stays_empty() -> None:

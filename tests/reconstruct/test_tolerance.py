@@ -40,7 +40,7 @@ def test_the_gradient_is_as_exact_as_promised(misfit: float, ball_scene: Scene):
     signs = [torch.where(torch.arange(image.shape[-1]) % 2 == 0, 1.0, -0.5) for image in images]
     changed = [image * (1 - misfit * sign) for image, sign in zip(images, signs, strict=True)]
     targets = dict(zip([view.name for view in scene.views], changed, strict=True))
-    exact, loose = SolveMemory(), SolveMemory(enough=solve_tolerances(misfit))
+    exact, loose = SolveMemory(), SolveMemory(tolerance_floor=solve_tolerances(misfit))
     known, found = (
         differentiated(scene, targets, memory).gradients["density"] for memory in (exact, loose)
     )

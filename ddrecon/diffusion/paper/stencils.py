@@ -1,13 +1,15 @@
-"""Central differences as 3 x 3 x 3 convolutions, on arrays extended by one layer of ghost cells
-around the box.
+"""Central differences as 3 x 3 x 3 convolutions, on arrays with a layer of ghost cells around them.
 
 The stencils of the paper's Appendix B, for cells that need not be cubes: each axis carries its own
 1 / h^2 or 1 / (2 h), which the paper, whose h is the same along all axes, leaves in front. In its
 numbering, with d for a derivative and kappa = 3 D:
 
-- Sigma3 / h^2, the Laplacian, is the sum of neighbors minus the diagonal; Sigma5 / h^2 is that sum by itself, the first of `terms`;
-- Sigma4 / (4 h^2), grad kappa . grad L0, is the product of two `gradient`s; Sigma1 has d kappa in it and Sigma2 d L0;
-- Sigma7, div Q1, is `divergence`, Sigma8 the same of d Q1; Sigma6 and Sigma9 are the derivatives of S and of L1, which autograd takes.
+- Sigma3 / h^2, the Laplacian, is the sum of neighbors minus the diagonal; Sigma5 / h^2 is that sum
+  by itself, the first of `terms`;
+- Sigma4 / (4 h^2), grad kappa . grad L0, is the product of two `gradient`s; Sigma1 has d kappa in
+  it and Sigma2 d L0;
+- Sigma7, div Q1, is `divergence`, Sigma8 the same of d Q1; Sigma6 and Sigma9 are the derivatives of
+  S and of L1, which autograd takes.
 
 Convolution is 30 to 50 times slower than slicing on a CPU (`benchmarks/stencil.py`); it is how the
 paper's sums are written down here.
@@ -56,7 +58,7 @@ class Stencils:
 
 
 def extend(u: Tensor) -> Tensor:
-    """`u` [C, z, y, x] with a layer of ghost cells, each holding what its neighbor in the box does."""
+    """`u` [C, z, y, x] and a layer of ghost cells, each equal to its neighbor in the box."""
     return pad(u, (1,) * 6, mode="replicate")
 
 
@@ -76,26 +78,24 @@ def convolve(extended: Tensor, kernels: Tensor) -> Tensor:
 
 
 def convolve_transposed(values: Tensor, kernels: Tensor) -> Tensor:
-    """The transpose of `convolve`: `values` [C, n, z, y, x] spread to the extended cells they came
-    from.
-    """
+    """The transpose of `convolve`: `values` [C, n, z, y, x] to `[C, z + 2, y + 2, x + 2]`."""
     return conv_transpose3d(values, kernels)[:, 0]
 
 
 def divergence(vector: list[Tensor], stencils: Stencils) -> Tensor:
-    """div of `vector`, three components `[C, z, y, x]` along z, y, x, constant across the faces of
-    the box (Eq. 44).
+    """div of `vector`, three components `[C, z, y, x]` along z, y, x (Eq. 44).
+
+    Ghost cells repeat their neighbors: `vector` is constant across the faces of the box.
     """
     extended = torch.stack([extend(component) for component in vector], 1)
     return conv3d(extended, stencils.gradient.transpose(0, 1))[:, 0]
 
 
 def outward(like: Tensor) -> Tensor:
-    """Components along z, y, x of the normal that points out of the box at every ghost cell, 0 in
-    the box: `[3, z + 2, y + 2, x + 2]`.
+    """The normal out of the box at every ghost cell, 0 in the box: `[3, z + 2, y + 2, x + 2]`.
 
-    Ghost cells at edges and corners of the box lie outside two or three faces; no stencil reaches
-    them.
+    Its components are those along z, y, x. Ghost cells at edges and corners of the box lie outside
+    two or three faces; no stencil reaches them.
     """
     normals = []
     for axis, cells in zip(AXES, like.shape[1:], strict=True):

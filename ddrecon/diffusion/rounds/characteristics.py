@@ -1,12 +1,14 @@
-"""Radiance along one direction through the whole grid, by short characteristics: w . grad I +
-kappa_t I = kappa_s (q + q1 . w) (E11).
+"""Radiance along one direction through the whole grid, by short characteristics (E11).
 
-Slices across the axis along which the direction crosses most cells are visited in the order light
-does. A ray reaches each cell's center from the slice before, where it crossed between centers;
-depth and scattering depth of the step are those of the mean of its ends, and what scatters into the
-ray is linear in depth between them. Radiance is never negative where that is not, and a white
-furnace exact. All steps are made at once but for the one recurrence I_k = passed_k I_{k-1} +
-source_k, differentiated by hand in both modes.
+w . grad I + kappa_t I = kappa_s (q + q1 . w) is integrated from slice to slice. The slices lie
+across the axis along which the direction crosses most cells, and are visited in the order that
+light takes. A ray reaches each cell's center from the slice before, where it crossed between
+centers; depth and scattering depth of the step are those of the mean of its ends, and what scatters
+into the ray is linear in depth between them. Radiance is never negative where that is not, and a
+white furnace is exact.
+
+All steps are computed at once, but for the recurrence I_k = passed_k I_{k-1} + source_k, which is
+differentiated by hand in both modes.
 """
 
 from __future__ import annotations
@@ -28,14 +30,16 @@ SLICES, ROWS, COLUMNS = 0, 2, 3
 Direction = tuple[float, float, float]
 """A unit vector in array order, the way light travels."""
 NEARLY = 1e-9
-"""Drifts this near to none or to a whole cell are taken as that: no interpolation is needed then.
-"""
+"""Drifts this near to none or to a whole cell are taken as that: they need no interpolation."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """How a direction crosses a grid: `order` of array axes that puts slices first, drifts [cells a
-    slice] with their signs, `step` [u].
+    """How a direction crosses a grid, slice by slice.
+
+    `order`: the array axes, slices first; `forward`: 1 or -1, the way the slice number changes;
+    `drift`: by how many rows and columns light moves from one slice to the next, with signs, at
+    most 1; `step`: the length of its path between them [u].
     """
 
     order: tuple[int, int, int, int]
@@ -65,54 +69,62 @@ class Course:
         return values.permute([self.order.index(dim) for dim in range(4)])
 
     def before(self, values: Tensor, is_repeated: bool) -> Tensor:
-        """`values` where rays were one slice earlier; beyond the edges of the box those at its
-        edge, or zero.
+        """`values` where rays were one slice earlier.
+
+        Beyond the faces of the box they are those at the face where they `is_repeated`, else zero.
         """
-        values = _moved(values, COLUMNS, self.drift[1], is_repeated)
-        return _moved(
-            _moved(values, ROWS, self.drift[0], is_repeated), SLICES, self.forward, is_repeated
-        )
+        for dim, drift in ((COLUMNS, self.drift[1]), (ROWS, self.drift[0]), (SLICES, self.forward)):
+            values = _interpolate_upstream(values, dim, drift, is_repeated)
+        return values
 
 
 def radiance_along(
     medium: Medium, light: Moments, inflow: Tensor | None, direction: Direction
 ) -> Tensor:
-    """I [C, z, y, x] at cell centers along unit `direction` of travel (array order), of what
-    `light` scatters into it (E11).
+    """I [C, z, y, x] at cell centers along `direction`, of what `light` scatters into it (E11).
 
-    `light`: the moments q and q1 of all light that scatters, to which `medium` gives (1 - f)
-    kappa_s; `inflow` [C, 1, 1, 1]: the radiance that enters the box, None for none.
+    `direction`: the unit vector of travel (array order); `light`: the moments q and q1 of all light
+    that scatters, to which `medium` gives (1 - f) kappa_s; `inflow` [C, 1, 1, 1]: the radiance that
+    enters the box, None for none.
     """
     course = Course.of(medium.grid, direction)
+    # q + q1 . w at the cells
     z, y, x = light.mean.new_tensor(direction)
-    here = course.lay(light.along((z, y, x)))
-    mass = _crossed(medium.extinction, course)
-    scattering = (
+    scatters = course.lay(light.along((z, y, x)))
+    # over the step to each cell: the depth int kappa_t ds, and int (1 - f) kappa_s ds
+    mass = _step_integral(medium.extinction, course)
+    scattering_mass = (
         mass
         if medium.scattering.field is medium.extinction.field
-        else _crossed(medium.scattering, course)
+        else _step_integral(medium.scattering, course)
     )
     depth = mass * _scale(medium.extinction)
-    line, lost = decayed_line(here, course.before(here, is_repeated=True), depth)
-    source = line * (scattering * ((1 - medium.forward_fraction) * _scale(medium.scattering)))
+    # what scatters along the step and reaches its end, and the part of I that is lost on it
+    line, lost = decayed_line(scatters, course.before(scatters, is_repeated=True), depth)
+    scattering_scale = (1 - medium.forward_fraction) * _scale(medium.scattering)
+    source = line * (scattering_mass * scattering_scale)
     if inflow is None:
         return course.lift(follow(1 - lost, source, course))
-    return course.lift(follow(1 - lost, source - inflow.view(1, -1, 1, 1) * lost, course)) + inflow
+    # Light from outside is there without a medium. The rest, I - inflow, is zero where rays enter
+    # and loses inflow * lost on every step: a white furnace stays exact.
+    source = source - inflow.view(1, -1, 1, 1) * lost
+    return course.lift(follow(1 - lost, source, course)) + inflow
 
 
 def follow(passed: Tensor, source: Tensor, course: Course) -> Tensor:
-    """I [slices, C, rows, columns] with I_k = `passed`_k (I_{k-1} where rays were then) +
-    `source`_k, zero before the first slice.
+    """I_k = `passed`_k (I_{k-1} where rays were then) + `source`_k, slice after slice.
 
+    `[slices, C, rows, columns]`; I is zero before the first slice and beyond the faces of the box.
     `passed` may have one channel where `source` has C.
     """
-    followed: Tensor = _Follow.apply(passed, source, course)
-    return followed
+    radiance: Tensor = _Follow.apply(passed, source, course)
+    return radiance
 
 
-def _crossed(coefficient: Coefficient, course: Course) -> Tensor:
-    """The integral of the coefficient's field over the step to each cell, as linear between its
-    ends; no medium beyond the box.
+def _step_integral(coefficient: Coefficient, course: Course) -> Tensor:
+    """The integral of the coefficient's field over the step to each cell, as a trapezoid.
+
+    There is no medium beyond the box.
     """
     field = course.lay(coefficient.field)
     return (field + course.before(field, is_repeated=False)) * (0.5 * course.step)
@@ -122,21 +134,29 @@ def _scale(coefficient: Coefficient) -> Tensor:
     return coefficient.scale.view(1, -1, 1, 1)
 
 
-def _moved(values: Tensor, dim: int, drift: float, is_repeated: bool) -> Tensor:
-    """`values` at a place `drift` cells, at most one, before each along `dim`, linear between
-    cells.
+def _interpolate_upstream(values: Tensor, dim: int, drift: float, is_repeated: bool) -> Tensor:
+    """`values` at the place `drift` cells, at most one, before each along `dim`.
+
+    They are linear between cells; beyond the last one as in `Course.before`.
     """
     if drift == 0:
         return values
     edge = values.narrow(dim, 0 if drift > 0 else values.shape[dim] - 1, 1)
     edge = edge if is_repeated else torch.zeros_like(edge)
     longer = torch.cat([edge, values] if drift > 0 else [values, edge], dim)
-    one, other = (longer.narrow(dim, start, values.shape[dim]) for start in (0, 1))
-    behind, here = (one, other) if drift > 0 else (other, one)
+    lower, upper = (longer.narrow(dim, start, values.shape[dim]) for start in (0, 1))
+    behind, here = (lower, upper) if drift > 0 else (upper, lower)
     return behind if abs(drift) == 1 else torch.lerp(here, behind, abs(drift))
 
 
 class _Follow(torch.autograd.Function):
+    """With P for the move from one slice to the next, I_k = passed_k P I_{k-1} + source_k.
+
+    The adjoint is the same recurrence backward along the rays,
+    source_bar_k = I_bar_k + P^T (passed_{k+1} source_bar_{k+1}), and
+    passed_bar_k = source_bar_k P I_{k-1}.
+    """
+
     @staticmethod
     def forward(passed: Tensor, source: Tensor, course: Course) -> Tensor:
         return _recur(passed, source, course)
@@ -151,15 +171,14 @@ class _Follow(torch.autograd.Function):
         passed, out = ctx.saved_tensors
         source_bar = _recur_transposed(passed, out_bar, ctx.course)
         passed_bar = source_bar * ctx.course.before(out, is_repeated=False)
-        return (
-            passed_bar if passed.shape == out.shape else passed_bar.sum(1, keepdim=True),
-            source_bar,
-            None,
-        )
+        if passed.shape != out.shape:
+            passed_bar = passed_bar.sum(1, keepdim=True)
+        return passed_bar, source_bar, None
 
     @staticmethod
     def jvp(ctx: Any, d_passed: Tensor | None, d_source: Tensor | None, _: None) -> Tensor:
         passed, out = ctx.saved_tensors
+        # dI_k = passed_k P dI_{k-1} + (dsource_k + dpassed_k P I_{k-1})
         change = torch.zeros_like(out) if d_source is None else d_source
         if d_passed is not None:
             change = change + d_passed * ctx.course.before(out, is_repeated=False)
@@ -169,7 +188,7 @@ class _Follow(torch.autograd.Function):
 def _recur(passed: Tensor, source: Tensor, course: Course) -> Tensor:
     out, arriving = torch.empty_like(source), torch.zeros_like(source[0])
     shift = _Shift(source[0], course.drift)
-    for k in _in_order(len(source), course.forward):
+    for k in _slice_order(len(source), course.forward):
         torch.addcmul(source[k], passed[k], arriving, out=out[k])
         arriving = shift.apply(out[k])
     return out
@@ -179,40 +198,47 @@ def _recur_transposed(passed: Tensor, out_bar: Tensor, course: Course) -> Tensor
     """The adjoint of `_recur` with respect to its source: the same rays, followed backward."""
     source_bar, returning = torch.empty_like(out_bar), torch.zeros_like(out_bar[0])
     shift = _Shift(out_bar[0], (-course.drift[0], -course.drift[1]))
-    for k in _in_order(len(out_bar), -course.forward):
+    for k in _slice_order(len(out_bar), -course.forward):
         torch.add(out_bar[k], returning, out=source_bar[k])
         returning = shift.apply(source_bar[k] * passed[k])
     return source_bar
 
 
-def _in_order(count: int, forward: int) -> range:
+def _slice_order(count: int, forward: int) -> range:
     return range(count) if forward > 0 else range(count - 1, -1, -1)
 
 
 class _Shift:
-    """`_moved` along rows and columns with zeros beyond the edges, in place: slices are many and
-    small.
+    """`_interpolate_upstream` along rows and columns of a slice, with zeros beyond the edges.
+
+    Slices are many and small, so the same buffers serve all of them. A slice v is copied into a
+    frame of zeros one row and one column larger, on the side from which light comes. For a drift
+    along the rows that is positive:
+
+        padded     row 0     0  0  0        here   = padded[1:]    (v itself)
+                   row 1     v0 v0 v0       behind = padded[:-1]   (the row before)
+                   row 2     v1 v1 v1       lerp(here, behind, drift): v where light was
+
+    A negative drift has the zeros last, and `here` and `behind` change places. Columns follow
+    likewise, from the result of the rows.
     """
 
     def __init__(self, like: Tensor, drift: tuple[float, float]):
         channels, height, width = like.shape
-        rows, columns = (abs(d) for d in drift)
-        padded, self.between = (
-            like.new_zeros(channels, height + 1, width + 1),
-            like.new_empty(channels, height, width + 1),
-        )
+        self.weights = abs(drift[0]), abs(drift[1])
+        padded = like.new_zeros(channels, height + 1, width + 1)
+        self.rows_moved = like.new_empty(channels, height, width + 1)
         self.result = torch.empty_like(like)
-        low, left = int(drift[0] > 0), int(drift[1] > 0)
-        self.inner = padded[:, low : low + height, left : left + width]
-        self.weights = rows, columns
-        self.row_ends = padded[:, low : low + height], padded[:, 1 - low : 1 - low + height]
-        self.column_ends = (
-            self.between[:, :, left : left + width],
-            self.between[:, :, 1 - left : 1 - left + width],
-        )
+        # where v itself begins: after the zeros if light comes from lower rows or columns
+        top, left = int(drift[0] > 0), int(drift[1] > 0)
+        self.inner = padded[:, top : top + height, left : left + width]
+        self.rows_here = padded[:, top : top + height]
+        self.rows_behind = padded[:, 1 - top : 1 - top + height]
+        self.columns_here = self.rows_moved[:, :, left : left + width]
+        self.columns_behind = self.rows_moved[:, :, 1 - left : 1 - left + width]
 
     def apply(self, values: Tensor) -> Tensor:
-        """`values` moved; the same buffer at every call."""
+        """`values` where rays were one slice earlier; the same buffer at every call."""
         self.inner.copy_(values)
-        torch.lerp(*self.row_ends, self.weights[0], out=self.between)
-        return torch.lerp(*self.column_ends, self.weights[1], out=self.result)
+        torch.lerp(self.rows_here, self.rows_behind, self.weights[0], out=self.rows_moved)
+        return torch.lerp(self.columns_here, self.columns_behind, self.weights[1], out=self.result)

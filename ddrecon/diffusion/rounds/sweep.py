@@ -1,44 +1,86 @@
-"""One sweep: radiance along every direction of a quadrature, of which only the moments are kept
-(E12).
+"""One sweep: radiance along every direction of a quadrature, of which only moments are kept (E12).
 
-Directions are gone through one at a time, and made again one at a time in the backward pass: memory
-does not grow with their number.
+Directions are gone through one at a time, and computed again one at a time in the backward pass:
+memory does not grow with their number.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.numerics.autodiff import is_forward
 from ddrecon.numerics.quadrature import sphere_quadrature
 
-FLUX = 7
-"""Where the flux of what scatters begins in the parts of a sweep."""
 
+class Parts(NamedTuple):
+    """All tensors that a sweep depends on, as autograd must be given them: one by one.
 
-def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int) -> Moments:
-    """Mean and, where `light` has flux, flux of the radiance that `light` scatters and of `inflow`
-    (see `radiance_along`).
+    `scattering_field` is None where the field is that of extinction; `inflow` is None for no light
+    from outside; `z`, `y`, `x` are the flux of what scatters, None where it has none.
     """
-    shares_field = medium.scattering.field is medium.extinction.field
-    parts = (
-        *(
+
+    extinction_scale: Tensor
+    extinction_field: Tensor
+    scattering_scale: Tensor
+    scattering_field: Tensor | None
+    forward_fraction: Tensor
+    inflow: Tensor | None
+    mean: Tensor
+    z: Tensor | None = None
+    y: Tensor | None = None
+    x: Tensor | None = None
+
+    @staticmethod
+    def of(medium: Medium, light: Moments, inflow: Tensor | None) -> Parts:
+        """The parts of `medium` and of the `light` that scatters in it."""
+        shares_field = medium.scattering.field is medium.extinction.field
+        return Parts(
             medium.extinction.scale,
             medium.extinction.field,
             medium.scattering.scale,
             None if shares_field else medium.scattering.field,
-        ),
-        *(medium.forward_fraction, inflow, light.mean, *(light.flux or ())),
-    )
+            medium.forward_fraction,
+            inflow,
+            light.mean,
+            *(light.flux or ()),
+        )
+
+    @property
+    def flux(self) -> Vector | None:
+        """The flux of the light that scatters."""
+        if self.z is None or self.y is None or self.x is None:
+            return None
+        return self.z, self.y, self.x
+
+    def radiance(self, medium: Medium, direction: Direction) -> Tensor:
+        """I along `direction` (E11), these parts standing for those of `medium`."""
+        field = self.extinction_field if self.scattering_field is None else self.scattering_field
+        medium = replace(
+            medium,
+            extinction=Coefficient(self.extinction_scale, self.extinction_field),
+            scattering=Coefficient(self.scattering_scale, field),
+            forward_fraction=self.forward_fraction,
+        )
+        return radiance_along(medium, Moments(self.mean, self.flux), self.inflow, direction)
+
+
+def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int) -> Moments:
+    """L0' and, where `light` has flux, L1' of the radiance that `light` scatters (E11, E12).
+
+    `light` and `inflow`, light from outside, are those of `radiance_along`; `directions`: how many
+    the quadrature has.
+    """
+    parts = Parts.of(medium, light, inflow)
     mean, *flux = (
-        _sum_over_directions(medium, directions, *parts)
+        _sum_over_directions(medium, directions, parts)
         if is_forward()
         else _Sweep.apply(medium, directions, *parts)
     )
@@ -49,48 +91,47 @@ def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int
 
 
 class _Sweep(torch.autograd.Function):
-    """The moments of all directions, whose backward pass makes each direction's radiance again
-    before it is done with it.
-    """
+    """The moments of all directions; the backward pass computes each direction's radiance again."""
 
     @staticmethod
     def forward(ctx: Any, medium: Medium, directions: int, *parts: Any) -> tuple[Tensor, ...]:
         ctx.medium, ctx.directions = medium, directions
         ctx.save_for_backward(*parts)
-        return _sum_over_directions(medium, directions, *parts)
+        return _sum_over_directions(medium, directions, Parts(*parts))
 
     @staticmethod
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        leaves = [
+    def backward(ctx: Any, *moment_bars: Tensor) -> tuple[Tensor | None, ...]:
+        leaves: list[Any] = [
             part if part is None else part.detach().requires_grad_(need)
             for part, need in zip(ctx.saved_tensors, ctx.needs_input_grad[2:], strict=True)
         ]
         varied = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
         totals = [torch.zeros_like(leaf) for leaf in varied]
-        for direction, weights in _directions(ctx.directions, len(bars)):
+        for direction, weights in _directions(ctx.directions, len(moment_bars)):
+            # I along this direction once more (E11), with the graph of this direction alone
             with torch.enable_grad():
-                radiance = _radiance(ctx.medium, direction, *leaves)
-            bar = torch.stack(
-                [weight * bar for weight, bar in zip(weights, bars, strict=True)]
+                radiance = Parts(*leaves).radiance(ctx.medium, direction)
+            # E12 transposed: I_bar is the sum over moments of weight times moment_bar
+            radiance_bar = torch.stack(
+                [weight * bar for weight, bar in zip(weights, moment_bars, strict=True)]
             ).sum(0)
-            for total, part in zip(
-                totals, torch.autograd.grad(radiance, varied, bar, allow_unused=True), strict=True
-            ):
-                if part is not None:
-                    total += part
-        found = iter(totals)
-        return (
-            None,
-            None,
-            *(None if leaf is None or not leaf.requires_grad else next(found) for leaf in leaves),
+            # E11 transposed, by autograd: what each part receives from this direction
+            bars = torch.autograd.grad(radiance, varied, radiance_bar, allow_unused=True)
+            for total, bar in zip(totals, bars, strict=True):
+                if bar is not None:
+                    total += bar
+        remaining = iter(totals)
+        part_bars = (
+            None if leaf is None or not leaf.requires_grad else next(remaining) for leaf in leaves
         )
+        return None, None, *part_bars
 
 
-def _sum_over_directions(medium: Medium, directions: int, *parts: Any) -> tuple[Tensor, ...]:
-    """The mean of I and, where `parts` have flux, 3 times the mean of I w along z, y, x."""
+def _sum_over_directions(medium: Medium, directions: int, parts: Parts) -> tuple[Tensor, ...]:
+    """The mean of I and, where `parts` have flux, 3 times the mean of I w along z, y, x (E12)."""
     totals: list[Tensor] = []
-    for direction, weights in _directions(directions, 4 if len(parts) > FLUX else 1):
-        radiance = _radiance(medium, direction, *parts)
+    for direction, weights in _directions(directions, 1 if parts.flux is None else 4):
+        radiance = parts.radiance(medium, direction)
         totals = totals or [torch.zeros_like(radiance)] * len(weights)
         totals = [
             torch.add(total, radiance, alpha=weight)
@@ -99,27 +140,12 @@ def _sum_over_directions(medium: Medium, directions: int, *parts: Any) -> tuple[
     return tuple(totals)
 
 
-def _radiance(medium: Medium, direction: Direction, *parts: Any) -> Tensor:
-    """I along `direction`, of a medium and light put together from `parts`."""
-    scale, field, scattering_scale, scattering_field, forward_fraction, inflow, mean, *flux = parts
-    extinction = Coefficient(scale, field)
-    scattering = Coefficient(
-        scattering_scale, field if scattering_field is None else scattering_field
-    )
-    medium = replace(
-        medium, extinction=extinction, scattering=scattering, forward_fraction=forward_fraction
-    )
-    return radiance_along(
-        medium, Moments(mean, (flux[0], flux[1], flux[2]) if flux else None), inflow, direction
-    )
+def _directions(count: int, moments: int) -> Iterator[tuple[Direction, tuple[float, ...]]]:
+    """Each direction w (array order) and the weights of its I in the moments of E12.
 
-
-def _directions(count: int, moments: int) -> list[tuple[Direction, tuple[float, ...]]]:
-    """Each direction (array order) with its weights in the first `moments` of: mean, flux along z,
-    y, x.
+    They are W, 3 W w_z, 3 W w_y and 3 W w_x, W being the quadrature's weight, or the first
+    `moments` of them.
     """
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
-    return [
-        ((z, y, x), (w, 3 * w * z, 3 * w * y, 3 * w * x)[:moments])
-        for (z, y, x), w in zip(points.tolist(), weights.tolist(), strict=True)
-    ]
+    for (z, y, x), w in zip(points.tolist(), weights.tolist(), strict=True):
+        yield (z, y, x), (w, 3 * w * z, 3 * w * y, 3 * w * x)[:moments]

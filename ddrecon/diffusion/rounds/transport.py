@@ -1,5 +1,4 @@
-"""The dial from diffusion to transport: rounds of discrete-ordinates sweeps, each corrected by a
-diffusion solve (E11, E12).
+"""From diffusion to transport: rounds of sweeps, each corrected by a diffusion solve (E11, E12).
 
 A sweep sends what L0, L1 and the sources scatter along each direction of a quadrature, through the
 real geometry, and takes the moments of what arrives. What it changes is passed on by diffusion
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
-from ddrecon.diffusion.implicit import Solve, solve_diffusion
+from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.sweep import sweep
@@ -25,35 +24,37 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 
 
 def run_rounds(
-    problem: DiffusionProblem, light: Moments, solve: Solve[Operator], rounds: int, directions: int
+    problem: DiffusionProblem,
+    light: Moments,
+    solve: SolverWithMemory[Operator],
+    rounds: int,
+    directions: int,
 ) -> Moments:
-    """L0 and L1 after `rounds` of sweeps along so many `directions`, begun at `light`, the solution
-    of `problem` (E12).
+    """L0 and L1 after `rounds` of sweeps along so many `directions` (E12).
+
+    `light`: the solution of `problem` by `solve`, where the first round begins.
     """
     if rounds == 0:
         return light
     operator, right = problem.system
-    medium = problem.medium
-    inflow = (
-        problem.outside
-        if is_varied(problem.outside) or bool((problem.outside != 0).any())
-        else None
-    )
+    medium, outside = problem.medium, problem.outside
+    is_lit_from_outside = is_varied(outside) or bool((outside != 0).any())
     share = recompute(_transport_share, medium, directions)
-    for turn in range(1, rounds + 1):
-        swept = sweep(
-            medium, light.scaled(1.0, medium.mean_cosine).plus(problem.source), inflow, directions
-        )
-        gain = swept.plus(Moments(light.mean, problem.flux(light.mean)).scaled(-1.0, -1.0)).scaled(
-            share, share
-        )
+    for round_index in range(1, rounds + 1):
+        # E11 along every direction, of all light that scatters: q = L0 + Q0 and q1 = g L1 + Q1
+        scatters = light.scaled(1.0, medium.mean_cosine).plus(problem.source)
+        swept = sweep(medium, scatters, outside if is_lit_from_outside else None, directions)
+        # the gains of E12: theta (L0' - L0) and theta (L1' - 3 F(L0))
+        diffuse = Moments(light.mean, problem.flux(light.mean))
+        gain = swept.plus(diffuse.scaled(-1.0, -1.0)).scaled(share, share)
+        # E12's right side: S + kappa_s theta (L0' - L0) - theta (S - A L0); S = A L0 at the start
         source = medium.remaining_scattering * gain.mean
-        if turn > 1:
+        if round_index > 1:
             source = source - share * recompute(_imbalance, operator, right, light.mean)
-        spread = solve_diffusion(
-            replace(solve, turn=turn, start=light.mean.detach()), operator, right + source
-        )
-        light = Moments(spread, problem.flux(spread)).plus(gain)
+        solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
+        mean = solve_diffusion(solve_round, operator, right + source)
+        # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
+        light = Moments(mean, problem.flux(mean)).plus(gain)
     return light
 
 
@@ -66,20 +67,26 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
 
 
 def _transport_share(medium: Medium, directions: int) -> Tensor:
-    """How much of a cell's change by a sweep counts, 1 / (1 + rho^2), the rest being diffusion's
-    (docs/theory.md, section 5).
+    """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E14).
 
-    rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic whose source is linear over steps
-    of depth d diffuses too much; d is that of the mean step. Along an axis of one cell nothing
-    varies, so that steps along it do not count.
+    The rest is diffusion's. rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic diffuses
+    too much if its source is linear over steps of optical depth d; here d is that of the mean step.
+    Returns `[C, z, y, x]` in (0, 1].
     """
+    # the length of a step along each direction; along an axis of one cell nothing varies, so such
+    # steps do not count
     points, weights = sphere_quadrature(
         medium.extinction.scale.new_zeros((), dtype=torch.float64), directions
     )
     courses = [Course.of(medium.grid, tuple(point)) for point in points.tolist()]
-    steps = weights.new_tensor(
+    step_lengths = weights.new_tensor(
         [course.step if medium.grid.shape[course.order[0] - 1] > 1 else 0.0 for course in courses]
     )
-    mean_step = float(weights @ steps / weights[steps > 0].sum().clamp(min=1e-9))
-    half = (0.5 * mean_step * medium.extinction.value).clamp(min=1e-3)
-    return 1 / (1 + (half / torch.tanh(half) - 1) ** 2)
+    # their mean over directions; a grid of one cell has none, and then theta is 1
+    weight_of_steps = weights[step_lengths > 0].sum().clamp(min=1e-9)
+    mean_length = float(weights @ step_lengths / weight_of_steps)
+    # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
+    # 1e-6, theta is 1 already
+    half_depth = (0.5 * mean_length * medium.extinction.value).clamp(min=1e-3)
+    rho = half_depth / torch.tanh(half_depth) - 1
+    return 1 / (1 + rho**2)

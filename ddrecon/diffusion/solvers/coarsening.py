@@ -1,5 +1,4 @@
-"""Half the cells along one axis: what multigrid's coarser grids are made by, one axis after
-another.
+"""Half the cells along one axis: how multigrid coarsens its grids, one axis after another.
 
 Conductances are read as a network of resistors, so that no spacing is needed and cells may be of
 any form. Along the axis a coarse face is half of either pair's inner resistor in series with the
@@ -22,11 +21,10 @@ from ddrecon.diffusion.operator import AXES, Operator, difference, lower_cells, 
 @dataclass(frozen=True)
 class Coarsening:
     """Pairs of neighbors along `axis` become one cell; a last one without a neighbor stays alone.
-    `cells`: how many there were.
 
-    On the faces between pairs, `below` and `above` say where the cells next to the face stand
-    between the coarse cells on either side: 0 is their own coarse cell, 1 the other, and evenly
-    spread resistors make 1/4.
+    `cells`: how many there were. On the faces between pairs, `below` and `above` say where the
+    cells next to the face stand between the coarse cells on either side: 0 is their own coarse
+    cell, 1 the other, and evenly spread resistors make 1/4.
     """
 
     axis: int
@@ -44,8 +42,9 @@ class Coarsening:
         return total
 
     def prolong(self, u: Tensor) -> Tensor:
-        """`u` of the coarse cells, interpolated; where `u` is the same everywhere, so is the
-        result.
+        """`u` of the coarse cells, interpolated.
+
+        Where `u` is the same everywhere, so is the result.
         """
         rise = difference(u, self.axis)
         result = u.new_empty(
@@ -76,19 +75,22 @@ def coarsen(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
 
 
 def _stiffened(along: Tensor, way: Coarsening, operator: Operator) -> Tensor:
-    """`along` with what neighbors across the axis add, where one leans to this side of the face and
-    one to the other.
+    """The coarse conductances `along` the axis, plus the energy of what runs across it (Galerkin).
 
-    A difference u of coarse cells then makes one of (w - w') u between such neighbors. Left out,
-    corrections overshoot where conductances are random: ten times as many iterations at a contrast
-    of 1e6.
+    Cells beside a face between pairs are interpolated with weights w (`below`, `above`). Where w
+    differs from the weight w' of a neighbor across the axis, a difference v of the coarse cells
+    becomes a difference (w - w') v of these neighbors, whose conductance c adds the energy
+    c (w - w')^2 v^2. Left out, corrections overshoot where conductances are random: ten times as
+    many iterations at a contrast of 1e6.
     """
     along = along.clone()
     for across in AXES:
         if across != way.axis:
             conductance = operator.conductances[across - 1]
+            # c (w - w')^2, of the cells below and of those above the faces between pairs
             energy = _below(conductance, way.axis) * difference(way.below, across) ** 2
             energy += _above(conductance, way.axis) * difference(way.above, across) ** 2
+            # half of it to each of the two coarse faces, whose weights are w and w'
             lower_cells(along, across).add_(energy, alpha=0.5)
             upper_cells(along, across).add_(energy, alpha=0.5)
     return along

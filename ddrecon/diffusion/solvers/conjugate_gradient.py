@@ -1,5 +1,6 @@
-"""Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952, doi:10.6028/jres.049.044),
-all colors at once.
+"""Jacobi-preconditioned conjugate gradients, all colors at once, each with its own scalars.
+
+Source: Hestenes and Stiefel 1952, doi:10.6028/jres.049.044.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ CHECK_EVERY = 4
 def conjugate_gradient(
     operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
-    """The solution of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError when it
-    is not reached.
+    """The solution of `operator` u = `source` [C, z, y, x], from `guess`.
+
+    Raises SolveError when it is not reached.
     """
     system = ScaledSystem.of(operator, source)
     y, residual = system.start(guess)

@@ -1,9 +1,9 @@
-"""The V-cycle of multigrid: relaxation on each grid, and a correction from a coarser one, down to a
-few cells that are solved directly.
+"""The V-cycle of multigrid: relaxation on each grid, and a correction from a coarser one.
 
-A cycle is a symmetric positive definite matrix, as a preconditioner of conjugate gradients must be:
-relaxation after the correction is the transpose of that before it, restriction that of
-interpolation, and each relaxation makes every error smaller.
+The coarsest grid has few cells and is solved directly. A cycle is a symmetric positive definite
+matrix, as a preconditioner of conjugate gradients must be: relaxation after the correction is the
+transpose of that before it, restriction that of interpolation, and each relaxation makes every
+error smaller.
 """
 
 from __future__ import annotations
@@ -21,17 +21,20 @@ from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 FEW_CELLS = 128
 """So many cells are solved directly."""
 STRONG = 0.5
-"""Axes whose conductances are weaker than this part of the strongest are not coarsened yet:
-relaxation is slow along them.
+"""Axes whose conductances are weaker than this part of the strongest are not coarsened yet.
+
+Relaxation is slow to even out errors along them.
 """
 SMOOTHEST = 1 / 3
-"""The least eigenvalue that relaxation has to take care of: that of an error that alternates along
-one axis of cubic cells.
+"""The least eigenvalue that relaxation has to take care of.
+
+It is that of an error that alternates along one axis of cubic cells.
 """
 CENTER, REACH = (2 + SMOOTHEST) / 2, (2 - SMOOTHEST) / 2 * math.cos(math.pi / 4)
 STEPS = (1 / (CENTER - REACH), 1 / (CENTER + REACH))
-"""The two relaxations of Chebyshev's polynomial on [`SMOOTHEST`, 2]; no eigenvalue of a scaled
-M-matrix is above 2.
+"""The two relaxations of Chebyshev's polynomial on [`SMOOTHEST`, 2].
+
+No eigenvalue of a scaled M-matrix is above 2.
 """
 
 
@@ -43,8 +46,9 @@ class Coarsest:
 
     @staticmethod
     def of(operator: Operator) -> Coarsest:
-        """The direct solve of `operator`, made in double precision, in which differences of its
-        entries are exact enough.
+        """The direct solve of `operator`, computed in double precision.
+
+        Differences of its entries are exact enough only then.
         """
         shape = operator.loss.shape[1:]
         number = torch.arange(math.prod(shape), device=operator.loss.device).view(1, *shape)
@@ -92,8 +96,9 @@ class Level:
         )
 
     def cycle(self, source: Tensor) -> Tensor:
-        """Roughly y with S A S y = `source` [C, z, y, x]: linear in `source`, symmetric and
-        positive definite.
+        """Roughly y with S A S y = `source` [C, z, y, x].
+
+        Linear in `source`, symmetric and positive definite.
         """
         y = STEPS[0] * source
         for step in STEPS[1:]:

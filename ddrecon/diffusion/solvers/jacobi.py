@@ -1,6 +1,4 @@
-"""Jacobi iteration, as the paper uses it; on the conservative M-matrix it always converges, if
-slowly.
-"""
+"""Jacobi iteration, the paper's method; on the conservative M-matrix it converges, if slowly."""
 
 from __future__ import annotations
 
@@ -14,8 +12,9 @@ CHECK_EVERY = 16
 
 
 def jacobi(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float) -> Solution:
-    """The solution of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError when it
-    is not reached.
+    """The solution of `operator` u = `source` [C, z, y, x], from `guess`.
+
+    Raises SolveError when it is not reached.
     """
     system = ScaledSystem.of(operator, source)
     y, residual = system.start(guess)

@@ -1,8 +1,7 @@
-"""Conjugate gradients preconditioned by a V-cycle of multigrid (Tatebe 1993, NASA CP-3224), all
-colors at once, each with its own scalars.
+"""Conjugate gradients preconditioned by a V-cycle of multigrid (Tatebe 1993, NASA CP-3224).
 
-About ten iterations, whatever the size of the volume. The residual is looked at in each: next to a
-cycle, waiting for a GPU is nothing.
+All colors at once, each with its own scalars. About ten iterations, whatever the size of the
+volume. The residual is looked at in each: next to a cycle, waiting for a GPU is nothing.
 """
 
 from __future__ import annotations
@@ -20,8 +19,9 @@ MAX_ITERATIONS = 2_000
 def multigrid(
     operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float
 ) -> Solution:
-    """The solution of `operator` u = `source` [C, z, y, x], from `guess`; raises SolveError when it
-    is not reached.
+    """The solution of `operator` u = `source` [C, z, y, x], from `guess`.
+
+    Raises SolveError when it is not reached.
     """
     system = ScaledSystem.of(operator, source)
     y, residual = system.start(guess)

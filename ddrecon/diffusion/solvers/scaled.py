@@ -1,4 +1,4 @@
-"""The system scaled to a unit diagonal, which every solver iterates on, and what a solve returns."""
+"""The system scaled to a unit diagonal, which solvers iterate on, and what a solve returns."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from ddrecon.errors import SolveError
 
 @dataclass(frozen=True)
 class Solution:
-    """`value` [C, z, y, x] solves the system to `residual` (relative, largest over the colors),
-    found in `iterations`.
+    """`value` [C, z, y, x] solves the system, reached in so many `iterations`.
+
+    `residual`: how exactly, relative to the right side, largest over the colors.
     """
 
     value: Tensor
@@ -68,8 +69,9 @@ class ScaledSystem:
         return ScaledSystem(matrix, scaled, norm(scaled))
 
     def start(self, guess: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The first iterate, from a guess of u, and its residual; where the guess is worse than
-        zero, zero.
+        """The first iterate, from a guess of u, and its residual.
+
+        Zero where the guess is worse than that, or of another grid.
         """
         nothing = torch.zeros_like(self.source)
         if guess is None or guess.shape != self.source.shape:
@@ -80,8 +82,9 @@ class ScaledSystem:
         return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
 
     def relative(self, residual: Tensor) -> float:
-        """The norm of `residual` over that of the right side, largest over the colors; 0 for a
-        color without source.
+        """The norm of `residual` over that of the right side, largest over the colors.
+
+        0 for a color without source.
         """
         return float(
             (norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)).max()

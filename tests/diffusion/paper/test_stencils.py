@@ -1,6 +1,4 @@
-"""Central differences: exact on polynomials, equal to sums written with indices, and their
-transposes.
-"""
+"""Central differences: exact on polynomials, equal to sums by index, and their transposes."""
 
 from __future__ import annotations
 

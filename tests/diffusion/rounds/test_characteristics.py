@@ -1,17 +1,13 @@
-"""Radiance along one direction: closed forms, a slow twin, symmetry under reversal, and derivatives
-in both modes.
-"""
+"""Radiance along one direction: closed forms, a slow twin, reversal, derivatives."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from itertools import product
 
-import numpy as np
 import pytest
 import torch
 from media import box_grid, half_empty, random_values
+from plain_rays import by_cells
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Course, follow, radiance_along
@@ -42,45 +38,6 @@ def medium_of(
 def random_light(grid: Grid, colors: int = 1) -> Moments:
     mean, z, y, x = (random_values(colors, *grid.shape, seed=seed) for seed in range(4))
     return Moments(1 + mean, (z - 0.5, y - 0.5, x - 0.5))
-
-
-def at_previous(values: Tensor, point: list[float], edge: float | None) -> float:
-    """`values` [z, y, x] at a fractional cell index, at least one of which is whole; beyond the box
-    `edge`, or the nearest cell's.
-    """
-    total = 0.0
-    for corner in product((0, 1), repeat=3):
-        cell, weight = [math.floor(p) + c for p, c in zip(point, corner, strict=True)], 1.0
-        for p, c in zip(point, corner, strict=True):
-            weight *= (p % 1) if c else 1 - p % 1
-        if weight == 0:
-            continue
-        is_outside = any(not 0 <= i < n for i, n in zip(cell, values.shape, strict=True))
-        nearest = tuple(min(max(i, 0), n - 1) for i, n in zip(cell, values.shape, strict=True))
-        total += weight * (edge if is_outside and edge is not None else float(values[nearest]))
-    return total
-
-
-def by_cells(medium: Medium, scatters: Tensor, direction: tuple[float, float, float]) -> Tensor:
-    """I [z, y, x] of a gray medium, cell after cell, the integral along each step by Gauss's rule."""
-    extinction, scattering = medium.extinction.value[0], medium.remaining_scattering[0]
-    speed = [c / h for c, h in zip(direction, medium.grid.spacing, strict=True)]
-    axis = max(range(3), key=lambda a: abs(speed[a]))
-    step = 1 / abs(speed[axis])
-    radiance = torch.zeros_like(extinction)
-    s, weights = (torch.from_numpy(array) for array in np.polynomial.legendre.leggauss(30))
-    for cell in sorted(
-        product(*(range(n) for n in extinction.shape)), key=lambda c: c[axis] * speed[axis]
-    ):
-        point = [round(i - v * step, 12) for i, v in zip(cell, speed, strict=True)]
-        depth = 0.5 * step * (float(extinction[cell]) + at_previous(extinction, point, 0.0))
-        scattered = 0.5 * step * (float(scattering[cell]) + at_previous(scattering, point, 0.0))
-        line = 0.5 * ((1 - s) * scatters[cell] + (1 + s) * at_previous(scatters, point, None))
-        arriving = at_previous(radiance, point, 0.0) * math.exp(-depth)
-        radiance[cell] = arriving + scattered * float(
-            0.5 * weights @ (line * torch.exp(-0.5 * depth * (1 + s)))
-        )
-    return radiance
 
 
 @each_direction

@@ -1,6 +1,4 @@
-"""Transport rounds: where they lead, how fast, that thick cells do not upset them, and what their
-derivatives cost.
-"""
+"""Transport rounds: where they lead, how fast, in thick cells, and what derivatives cost."""
 
 from __future__ import annotations
 
@@ -164,7 +162,7 @@ def test_memory_does_not_grow_with_directions():
 
 
 class ArrayCount(TorchDispatchMode):
-    """The most arrays of at least `size` entries, made by operations, that have been alive at once."""
+    """The most arrays of at least `size` entries that have been alive at once."""
 
     def __init__(self, size: int):
         super().__init__()
