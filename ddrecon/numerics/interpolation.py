@@ -99,34 +99,34 @@ def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
     return points - shift, points + shift
 
 
-def sample_slices(slices: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
+def sample_slices(slices: Tensor, points: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
     """Bilinear values `[N, K, P]` of `slices` [N, K, H, W] at `points` [N, P, 2] (last array axis
     first, in [-1, 1]).
 
-    Beyond the outermost cells' centers the value is theirs. Channels in `smooth` are interpolated
+    Beyond the outermost cells' centers the value is theirs. Channels in `third_order` are interpolated
     to third order.
     """
-    return _interpolate(slices, points[:, :, None], smooth)[..., 0]
+    return _interpolate(slices, points[:, :, None], third_order)[..., 0]
 
 
-def sample_volume(volume: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
+def sample_volume(volume: Tensor, points: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
     """Trilinear values `[K, N, P]` of `volume` [K, D, H, W] at `points` [N, P, 3] (last array axis
     first, in [-1, 1]).
     """
-    return _interpolate(volume[None], points[None, None], smooth)[0, :, 0]
+    return _interpolate(volume[None], points[None, None], third_order)[0, :, 0]
 
 
-def _interpolate(values: Tensor, points: Tensor, smooth: ThirdOrder | None) -> Tensor:
-    """Linear values `[N, K, ...]` of `values` [N, K, ...] at `points`; channels `smooth` less a (1
+def _interpolate(values: Tensor, points: Tensor, third_order: ThirdOrder | None) -> Tensor:
+    """Linear values `[N, K, ...]` of `values` [N, K, ...] at `points`; channels `third_order` less a (1
     - a) / 2 second differences an axis.
 
     a is how far a point has gone from one cell center to the next. Linear interpolation is off by
     that much where a field bends.
     """
-    if smooth is None:
+    if third_order is None:
         return _sample(values, points)
     axes = range(2, values.ndim)
-    chosen = values[:, smooth.channels]
+    chosen = values[:, third_order.channels]
     found = _sample(
         torch.cat([values, *(second_difference(chosen, axis) for axis in axes)], 1), points
     )
@@ -135,7 +135,7 @@ def _interpolate(values: Tensor, points: Tensor, smooth: ThirdOrder | None) -> T
         third_order_weight(points[..., 1 - axis], values.shape[axis])[:, None] * bent
         for axis, bent in zip(axes, bends, strict=True)
     ]
-    return subtract_correction(plain, torch.stack(excesses).sum(0), smooth)
+    return subtract_correction(plain, torch.stack(excesses).sum(0), third_order)
 
 
 def _sample(values: Tensor, points: Tensor) -> Tensor:

@@ -31,10 +31,10 @@ class Weights:
 
     @staticmethod
     def at(
-        coordinate: Tensor, size: int, *, is_smooth: bool = False, fades: bool = False
+        coordinate: Tensor, size: int, *, has_third_order: bool = False, fades: bool = False
     ) -> Weights:
         """Those at `coordinate` [N, R], in [-1, 1], of a line of `size` cells; the excess only
-        where `is_smooth`.
+        where `has_third_order`.
 
         Beyond the outermost cells' centers these count alone, or where it `fades` less and less, to
         nothing one cell further.
@@ -43,7 +43,7 @@ class Weights:
         return Weights(
             linear,
             third_order_weight(coordinate, size)[..., None] * second_difference(linear, 2)
-            if is_smooth
+            if has_third_order
             else None,
         )
 
@@ -56,24 +56,24 @@ class Weights:
 
 
 def sample_lattice(
-    slices: Tensor, rows: Weights, columns: Weights, smooth: ThirdOrder | None = None
+    slices: Tensor, rows: Weights, columns: Weights, third_order: ThirdOrder | None = None
 ) -> Tensor:
     """Values `[N, K, r c]` of `slices` [N, K, H, W] at every pair of `rows` [N, r, H] and `columns`
     [N, c, W].
 
     The same, with the same derivatives, as `sample_slices` at all those points; channels in
-    `smooth` need weights of both kinds.
+    `third_order` need weights of both kinds.
     """
     half = _apply_rows(rows.linear, slices)
     linear = _apply_columns(half, columns.linear)
-    if smooth is None or rows.third_order is None or columns.third_order is None:
+    if third_order is None or rows.third_order is None or columns.third_order is None:
         return linear
-    bent = _apply_rows(rows.third_order, slices[:, smooth.channels])
+    bent = _apply_rows(rows.third_order, slices[:, third_order.channels])
     both = (
-        torch.cat([bent, half[:, smooth.channels]], -1),
+        torch.cat([bent, half[:, third_order.channels]], -1),
         torch.cat([columns.linear, columns.third_order], -1),
     )
-    return subtract_correction(linear, _apply_columns(*both), smooth)
+    return subtract_correction(linear, _apply_columns(*both), third_order)
 
 
 def _apply_rows(matrix: Tensor, values: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ class ThirdOrder:
         return x / (1 + (self.bound * x) ** 2).sqrt()
 
 
-def subdivide(values: Tensor, steps: int, smooth: ThirdOrder | None = None) -> Tensor:
+def subdivide(values: Tensor, steps: int, third_order: ThirdOrder | None = None) -> Tensor:
     """`values` along axis 0 with `steps` - 1 interpolated entries between each pair of neighbors;
     channels are axis 1.
     """
@@ -43,22 +43,22 @@ def subdivide(values: Tensor, steps: int, smooth: ThirdOrder | None = None) -> T
         return values
     low, high = values[:-1], values[1:]
     parts = [low + (high - low) * (i / steps) for i in range(steps)]
-    if smooth is not None:
-        bent = second_difference(values[:, smooth.channels], 0)
+    if third_order is not None:
+        bent = second_difference(values[:, third_order.channels], 0)
         for i in range(1, steps):
             share = i / steps
             parts[i] = subtract_correction(
                 parts[i],
                 0.5 * share * (1 - share) * (bent[:-1] * (1 - share) + bent[1:] * share),
-                smooth,
+                third_order,
             )
     return torch.cat([torch.stack(parts, 1).flatten(0, 1), values[-1:]])
 
 
-def subtract_correction(values: Tensor, amount: Tensor, smooth: ThirdOrder) -> Tensor:
-    """`values` with `amount`, bounded, taken from the channels that are `smooth`."""
-    changed = values[:, smooth.channels] - smooth.bounded(amount)
-    return torch.cat([values[:, : smooth.first], changed, values[:, smooth.last :]], 1)
+def subtract_correction(values: Tensor, amount: Tensor, third_order: ThirdOrder) -> Tensor:
+    """`values` with `amount`, bounded, taken from the channels that are `third_order`."""
+    changed = values[:, third_order.channels] - third_order.bounded(amount)
+    return torch.cat([values[:, : third_order.first], changed, values[:, third_order.last :]], 1)
 
 
 def second_difference(values: Tensor, axis: int) -> Tensor:
