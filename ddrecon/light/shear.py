@@ -31,8 +31,8 @@ def sum_mass_to_cells(
     axis along which the beam crosses most cells.
 
     `field`: [K, z, y, x]; outside the box it falls to zero within half a cell, which keeps the mass
-    of the outer half cells. `direction`: [3], unit, array order, the way light travels. `bound`: the
-    inverse of the most by which each of two corrections may change a mass, 0 for no limit.
+    of the outer half cells. `direction`: [3], unit, array order, the way light travels. `bound`: 1
+    over the most by which each of two corrections may change a mass, 0 for no limit.
 
     Along an axis of the grid the sum is exact. A slanted beam is also looked at on planes midway
     between slices, and its mass is carried back to cells to third order: the two corrections.
@@ -76,7 +76,7 @@ def _sum_mass(
 
 @dataclass(frozen=True)
 class _Shear:
-    """Rays along a beam, on a `lattice` [rows, columns], and where they meet slices of `size` cells.
+    """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
 
     Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
     there is a ray for every cell.

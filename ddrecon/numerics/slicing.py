@@ -27,7 +27,7 @@ class Slicing:
     def of(speed: Sequence[float]) -> Slicing:
         """Slices across the axis along which light of `speed` [cells/u] along z, y, x is fastest.
 
-        Light meets the slices in their order. Of axes that are crossed equally fast it is the first.
+        Light meets the slices in their order. Of axes crossed equally fast it is the first.
         """
         axis = max(range(3), key=lambda a: abs(speed[a]))
         row, column = (other for other in range(3) if other != axis)

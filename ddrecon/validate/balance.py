@@ -16,7 +16,7 @@ from ddrecon.diffusion.closures import CLOSURES
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance, face_fluxes
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import decompose_lights
-from ddrecon.medium.coefficients import has_flux, scale_medium
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.scene import Scene
 
 
@@ -43,7 +43,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
         scene.volume.grid,
         decompose_lights(scene.lights),
     )
-    source = reduced_light(medium, lights, has_flux(medium)).source
+    source = reduced_light(medium, lights, medium.has_flux).source
     diffusion = CLOSURES[scene.diffusion.closure](
         medium.transport_extinction, grid, scene.diffusion.floor
     )
