@@ -5,7 +5,7 @@
 One thread, float32, three colors; 64 x 96 x 64 cells, or as many nodes of view rays as are marched
 at a time. Time is that of forward and backward pass together, and its ratio the median over runs in
 turns. Memory is what is saved for the backward pass beside the inputs, counted by saved-tensor
-hooks. The plain formulas are those of `tests/numerics/plain_formulas.py`.
+hooks. The plain formulas are those of `tests/plain_formulas.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "numerics"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from plain_formulas import RULES, Function, Shape
 
 CELLS: Shape = (64, 3, 96, 64)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from plain_formulas import RULES, Function, Rule, depths, uniform
+from media import random_values
+from plain_formulas import RULES, Function, Rule, depths
 from torch import Tensor
 
 EDGES = {
@@ -21,7 +22,7 @@ EDGES = {
 def case(name: str) -> tuple[Rule, tuple[Tensor, ...]]:
     if name in EDGES:
         rule, shapes, last = EDGES[name]
-        inputs = [uniform(*shape, seed=seed) for seed, shape in enumerate(shapes)]
+        inputs = [random_values(*shape, seed=seed) for seed, shape in enumerate(shapes)]
         return RULES[rule], (*inputs, depths(*last, seed=len(inputs)))
     rule, _, size = name.partition(", ")
     shape = (1, 1, 2, 2) if size else (5, 3, 4, 3)
@@ -43,7 +44,7 @@ def pulled_back(
     """The derivatives by the inputs `varied` of a weighted sum of all results."""
     leaves = [x.clone().requires_grad_(i in varied) for i, x in enumerate(inputs)]
     results = parts(function(*leaves))
-    weights = [uniform(*result.shape, seed=50 + i) for i, result in enumerate(results)]
+    weights = [random_values(*result.shape, seed=50 + i) for i, result in enumerate(results)]
     total = sum((one * weight).sum() for one, weight in zip(results, weights, strict=True))
     return torch.autograd.grad(total, [leaves[i] for i in varied], materialize_grads=True)
 
@@ -58,7 +59,7 @@ def pushed_forward(
         return parts(function(*(changed.get(i, x) for i, x in enumerate(inputs))))
 
     primals = tuple(inputs[i] for i in varied)
-    changes = tuple(uniform(*x.shape, seed=70 + i) - 0.5 for i, x in enumerate(primals))
+    changes = tuple(random_values(*x.shape, seed=70 + i) - 0.5 for i, x in enumerate(primals))
     return torch.func.jvp(of_varied, primals, changes)[1]
 
 

@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from media import random_values
 from torch import Tensor
 
 from ddrecon.numerics.decay import SERIES_BELOW, decay_mean, decayed_line, decayed_sum
@@ -23,11 +24,11 @@ def mean_by_quadrature(begin: float, end: float) -> float:
     return float((np.exp(-(begin + (end - begin) * (nodes + 1) / 2)) * weights).sum() / 2)
 
 
-def segments(random) -> list[Tensor]:
+def segments() -> list[Tensor]:
     """weight, begin, end, scale of some segments, empty ones and both directions among them."""
-    weight, begin, end = (random(6, 1, 4, seed=seed) for seed in range(3))
+    weight, begin, end = (random_values(6, 1, 4, seed=seed) for seed in range(3))
     end[0] = begin[0]
-    return [weight, begin, end, 0.5 + random(3, 1, seed=3)]
+    return [weight, begin, end, 0.5 + random_values(3, 1, seed=3)]
 
 
 @pytest.mark.parametrize("depth", [depth for depth in DEPTHS if depth <= 50])
@@ -51,8 +52,8 @@ def test_derivatives_agree_where_the_series_begins():
     assert slope[0].item() == pytest.approx(slope[1].item(), rel=1e-9)
 
 
-def test_decayed_sums_against_quadrature(random):
-    weight, begin, end, scale = segments(random)
+def test_decayed_sums_against_quadrature():
+    weight, begin, end, scale = segments()
     total = decayed_sum(weight, begin, end, scale)
     for c in range(3):
         for r in range(4):
@@ -66,15 +67,15 @@ def test_decayed_sums_against_quadrature(random):
             assert total[c, r].item() == pytest.approx(sum(parts), rel=1e-13)
 
 
-def test_a_segment_may_be_walked_either_way(random):
-    weight, begin, end, scale = segments(random)
+def test_a_segment_may_be_walked_either_way():
+    weight, begin, end, scale = segments()
     assert torch.equal(
         decayed_sum(weight, begin, end, scale), decayed_sum(weight, end, begin, scale)
     )
 
 
-def test_a_segment_without_depth_is_a_plain_exponential(random):
-    weight, begin, _, scale = segments(random)
+def test_a_segment_without_depth_is_a_plain_exponential():
+    weight, begin, _, scale = segments()
     torch.testing.assert_close(
         decayed_sum(weight, begin, begin, scale),
         (weight * torch.exp(-scale * begin)).sum(0),

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from media import random_values
 from torch import Tensor
 
 from ddrecon.diffusion.operator import harmonic_mean
@@ -41,16 +42,10 @@ class Rule:
     inputs: Callable[[Shape, torch.dtype], tuple[Tensor, ...]]
 
 
-def uniform(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Random numbers in [0, 1)."""
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(shape, generator=generator, dtype=torch.float64).to(dtype)
-
-
 def depths(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
     """Optical depths from 1e-5 to 1e4: a third of them thin, one in ten none at all."""
-    exponent = 9 * uniform(*shape, seed=seed, dtype=dtype) - 5
-    is_empty = uniform(*shape, seed=seed + 100) < 0.1
+    exponent = 9 * random_values(*shape, seed=seed, dtype=dtype) - 5
+    is_empty = random_values(*shape, seed=seed + 100) < 0.1
     return (10**exponent).masked_fill(is_empty, 0)
 
 
@@ -80,15 +75,15 @@ def plain_line(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tensor
 
 def segments(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
     nodes, colors, rows, columns = shape
-    weight, begin = (uniform(nodes, 1, rows * columns, seed=s, dtype=dtype) for s in (1, 2))
+    weight, begin = (random_values(nodes, 1, rows * columns, seed=s, dtype=dtype) for s in (1, 2))
     length = depths(nodes, 1, rows * columns, seed=3, dtype=dtype)
-    is_rising = uniform(nodes, 1, rows * columns, seed=4) < 0.5
+    is_rising = random_values(nodes, 1, rows * columns, seed=4) < 0.5
     end = torch.where(is_rising, begin + length, (begin - length).clamp(min=0))
-    return weight, begin, end, 0.5 + uniform(colors, 1, seed=5, dtype=dtype)
+    return weight, begin, end, 0.5 + random_values(colors, 1, seed=5, dtype=dtype)
 
 
 def steps(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
-    near, far = (uniform(*shape, seed=seed, dtype=dtype) for seed in (1, 2))
+    near, far = (random_values(*shape, seed=seed, dtype=dtype) for seed in (1, 2))
     return near, far, depths(*shape, seed=3, dtype=dtype)
 
 
@@ -106,7 +101,7 @@ def plain_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
 
 def polynomials(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
     nodes, colors, rows, columns = shape
-    coefficients = uniform(10, rows * columns, seed=1, dtype=dtype) - 0.45
+    coefficients = random_values(10, rows * columns, seed=1, dtype=dtype) - 0.45
     return coefficients, depths(nodes, colors, rows * columns, seed=2, dtype=dtype)
 
 
@@ -181,10 +176,12 @@ def plain_swept(*inputs: Tensor) -> tuple[Tensor, ...]:
 
 def light_in_cells(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
     slices, colors, rows, columns = shape
-    field = 3 * uniform(1, slices, rows, columns, seed=1, dtype=dtype)
-    scale, albedo = (0.5 + 0.5 * uniform(colors, 1, 1, 1, seed=s, dtype=dtype) for s in (2, 3))
-    mean = 1 + uniform(colors, slices, rows, columns, seed=4, dtype=dtype)
-    flux = (uniform(colors, slices, rows, columns, seed=5 + a, dtype=dtype) for a in range(3))
+    field = 3 * random_values(1, slices, rows, columns, seed=1, dtype=dtype)
+    scale, albedo = (
+        0.5 + 0.5 * random_values(colors, 1, 1, 1, seed=s, dtype=dtype) for s in (2, 3)
+    )
+    mean = 1 + random_values(colors, slices, rows, columns, seed=4, dtype=dtype)
+    flux = (random_values(colors, slices, rows, columns, seed=5 + a, dtype=dtype) for a in range(3))
     return field, scale, albedo, mean, *flux
 
 
@@ -194,17 +191,19 @@ RULES = {
     "decayed_line": Rule(decayed_line, plain_line, steps),
     "evaluate_positive": Rule(evaluate_positive, plain_positive, polynomials),
     "running_sum": Rule(
-        running_sum, plain_running_sum, lambda shape, dtype: (uniform(*shape, dtype=dtype),)
+        running_sum, plain_running_sum, lambda shape, dtype: (random_values(*shape, dtype=dtype),)
     ),
     "harmonic_mean": Rule(
         lambda u: harmonic_mean(u, 2),
         plain_harmonic_mean,
-        lambda shape, dtype: (0.1 + uniform(*shape, dtype=dtype),),
+        lambda shape, dtype: (0.1 + random_values(*shape, dtype=dtype),),
     ),
     "follow": Rule(
         lambda passed, source: follow(passed, source, course_of(source)),
         plain_follow,
-        lambda shape, dtype: tuple(uniform(*shape, seed=seed, dtype=dtype) for seed in (1, 2)),
+        lambda shape, dtype: tuple(
+            random_values(*shape, seed=seed, dtype=dtype) for seed in (1, 2)
+        ),
     ),
     "sweep": Rule(swept, plain_swept, light_in_cells),
 }
