@@ -23,7 +23,7 @@ _BILINEAR, _BORDER = 0, 1
 
 
 def is_varied(tensor: Tensor) -> bool:
-    """Whether a derivative by `tensor`, or by what it was computed from, is taken in either mode."""
+    """Whether a derivative by `tensor`, or what it was computed from, is taken in either mode."""
     return tensor.requires_grad or forward_ad.unpack_dual(tensor).tangent is not None
 
 

@@ -104,7 +104,7 @@ def _linear(coordinate: Tensor, size: int, fades: bool) -> Tensor:
 
 
 def ramp(place: Tensor, tolerance: float) -> Tensor:
-    """`place` held within 0 and 1; within `tolerance` of a kink its slope is 1/2, the sides' mean."""
+    """`place` held within 0 and 1, with the mean slope 1/2 within `tolerance` of a kink."""
     if not is_varied(place):
         return place.clamp(0, 1)
     held = place.detach()
