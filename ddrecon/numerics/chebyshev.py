@@ -23,8 +23,8 @@ COEFFICIENTS = 10
 SCALE = 4.0
 """The depth s, taken to the middle of the polynomial's interval, x = 0.
 
-It suits the one function that is fitted, the phase function E13: up to g = 0.95 that is off by 0.006
-with 4, by 0.011 with 2 or 6, by 0.06 with 1 and 0.9 with 12.
+It suits the one function that is fitted, the phase function E13: up to g = 0.95 that is off by
+0.006 with 4, by 0.011 with 2 or 6, by 0.06 with 1 and 0.9 with 12.
 """
 DEEPEST = 1e6
 """Stands for infinite depth."""
