@@ -18,7 +18,7 @@ from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
-from ddrecon.numerics.slicing import Slicing
+from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
 
 
@@ -52,7 +52,9 @@ def _sum_mass(
     speed = direction / direction.new_tensor(grid.spacing)
     slicing = Slicing.of(speed.tolist())
     slices = slicing.lay(field)
-    slope = torch.stack([speed[other] for other in slicing.across]) / speed[slicing.axis].abs()
+    slope = (
+        torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
+    )
     step = grid.spacing[slicing.axis] / direction[slicing.axis].abs()
 
     # Shear: rho_k along each ray on slice k, and rho_(k + 1/2) midway to the next, where the field

@@ -1,7 +1,7 @@
 """A volume as slices across one of its axes, in the order in which light meets them.
 
-Both the shear of beams and the slices of view rays are laid out by this one convention. Arrays of
-cells are `[K, z, y, x]`, arrays of slices `[N, K, rows, columns]`.
+The one convention for all that goes through a volume slice by slice: of the two axes in a slice the
+lower one counts rows. Arrays of cells are `[K, z, y, x]`, of slices `[N, K, rows, columns]`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
+
+
+def across(axis: int) -> tuple[int, int]:
+    """The axes along which rows and columns of the slices across `axis` are counted."""
+    row, column = (other for other in range(3) if other != axis)
+    return row, column
 
 
 @dataclass(frozen=True)
@@ -30,13 +36,8 @@ class Slicing:
         Light meets the slices in their order. Of axes crossed equally fast it is the first.
         """
         axis = max(range(3), key=lambda a: abs(speed[a]))
-        row, column = (other for other in range(3) if other != axis)
+        row, column = across(axis)
         return Slicing(axis, (1 + axis, 0, 1 + row, 1 + column), speed[axis] < 0)
-
-    @property
-    def across(self) -> tuple[int, int]:
-        """The axes along which rows and columns of a slice are counted."""
-        return self.order[2] - 1, self.order[3] - 1
 
     def lay(self, cells: Tensor) -> Tensor:
         """The slices `[N, K, rows, columns]` of `cells` [K, z, y, x]."""
