@@ -59,15 +59,15 @@ def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:
     times_down = math.ceil((rows - 1) / (height - 1))
     times_across = 2 * math.ceil((columns / width - 1) / 2) + 1
     if times_down > 1:
-        radiance = _between(radiance, times_down, 0, times_down * (height - 1) + 1, 1)
+        radiance = _interpolate(radiance, times_down, 0, times_down * (height - 1) + 1, 1)
     if times_across > 1:
-        radiance = _between(
+        radiance = _interpolate(
             _wrap(radiance), times_across, times_across - times_across // 2, times_across * width, 2
         )
     return radiance
 
 
-def _between(values: Tensor, times: int, start: int, count: int, dim: int) -> Tensor:
+def _interpolate(values: Tensor, times: int, start: int, count: int, dim: int) -> Tensor:
     """`count` values interpolated linearly between `values` [C, h, w] along `dim`.
 
     They lie at (`start` + i) / `times` steps after the first value, i = 0 to `count` - 1.

@@ -1,9 +1,8 @@
-"""The mass that a beam passes on its way to each cell: the optical depth in the tau of E2, per unit
-of `Coefficient.scale`.
+"""The mass that a beam passes on its way to each cell.
 
-Three steps on whole slices (docs/theory.md section 5, "Beams"): shear the grid until the beam runs
-along an axis, sum along that axis, shear back. What is interpolated is the field and its integral,
-never an exponential of them.
+Times the scale of a `Coefficient` it is the optical depth in the tau of E2. It is found in three
+steps on whole slices: shear the grid until the beam runs along an axis, sum along that axis, shear
+back. What is interpolated is the field and its integral, never an exponential of them.
 """
 
 from __future__ import annotations
