@@ -66,8 +66,7 @@ def _signed_peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
     fraction = forward_fraction(g)
     # phi(x), the part of the peak's light that turns here.
     turned = decay_mean(depth)
-    # h(x) = (exp(-x (1 - g)) - exp(-x)) / (1 - exp(-x)), written as g exp(-x (1 - g)) phi(g x) /
-    # phi(x): nothing cancels, and h(0) = g.
+    # h(x) of E15, written as g exp(-x (1 - g)) phi(g x) / phi(x): nothing cancels, and h(0) = g.
     spread = g * torch.exp((g - 1) * depth) * decay_mean(g * depth) / turned
     # (1 - f) p', what scatters without its peak.
     without_peak = (1 - fraction) * (1 + 3 * scaled_mean_cosine(g) * cosine)
@@ -75,10 +74,11 @@ def _signed_peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
 
 
 def _spread_peak(spread: Tensor, cosine: Tensor) -> Tensor:
-    """q_h of E13: the forward peak, whose moments are 1, 1, 1, h, h^2, ... with h = `spread`.
+    """q_h of E16: the forward peak, whose moments are 1, 1, 1, h, h^2, ... with h = `spread`.
 
     q_h = (p_h - 1 - 3 h w) / h^2 + 1 + 3 w, where w is the `cosine` and p_h the Henyey-Greenstein
-    function. Written so that nothing cancels at small h.
+    function. Written so that nothing cancels at small h ("Without cancellation" beside E13 in
+    docs/theory.md has every step).
     """
     # With a = h - 2 w and r = sqrt(1 + h a): p_h = (1 - h^2) / r^3.
     away = spread - 2 * cosine
