@@ -33,7 +33,7 @@ from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import Sky, decompose_lights
 from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
 from ddrecon.march.integral import Emission, march
-from ddrecon.medium.coefficients import Medium, has_flux, keep_medium, scale_medium
+from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
@@ -97,8 +97,8 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     if not multiply_scatters(medium, scene.diffusion):
         return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     lights = decompose_lights(scene.lights)
-    reduced = reduced_light(medium, lights, has_flux(medium))
-    sky = sum_unscattered_sky(medium, lights, has_flux(medium))
+    reduced = reduced_light(medium, lights, medium.has_flux)
+    sky = sum_unscattered_sky(medium, lights, medium.has_flux)
     source = reduced.source.plus(sky.scaled(1.0, medium.mean_cosine))
     diffuse = solve_diffuse(
         medium, source, ambient_radiance(lights, medium.g), scene.diffusion, memory
@@ -116,7 +116,7 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     if any(isinstance(part, AmbientLight) for part in parts):
         skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
-    if has_flux(medium):
+    if medium.has_flux:
         return LightField(medium, beams, nothing, skies)
     return LightField(medium, beams, sum_unscattered_sky(medium, skies, has_flux=False))
 
@@ -154,13 +154,13 @@ def solve_diffuse(
         diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
         scattering = medium.remaining_scattering
         scattered = source.scaled(scattering, scattering)
-        return solve_printed(medium, diffusion, scattered, outside, by_jacobi, has_flux(medium))
+        return solve_printed(medium, diffusion, scattered, outside, by_jacobi, medium.has_flux)
     solve = SolverWithMemory(SOLVERS[settings.solver], settings.tolerance, memory)
     if settings.model == "flux_limited":
         return solve_flux_limited(
-            medium, LIMITERS[settings.limiter], source, outside, solve, has_flux(medium)
+            medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux
         )
-    problem = DiffusionProblem(medium, closure, source, outside, has_flux(medium))
+    problem = DiffusionProblem(medium, closure, source, outside, medium.has_flux)
     light = solve_conservative(problem, solve)
     return run_rounds(
         problem, light, solve, settings.transport_rounds, settings.transport_directions

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
-from ddrecon.medium.coefficients import has_flux, scale_medium
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.renderer import multiply_scatters
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
@@ -30,7 +30,7 @@ def needed_terms(scene: Scene) -> list[str]:
                 f"{rounds} of sweeps along {scene.diffusion.transport_directions} directions, each with a diffusion solve"
             )
         terms.append(
-            "fluxes Q1 and L1 (g is not 0)" if has_flux(medium) else "no fluxes Q1 and L1 (g = 0)"
+            "fluxes Q1 and L1 (g is not 0)" if medium.has_flux else "no fluxes Q1 and L1 (g = 0)"
         )
     else:
         terms.append("no multiple scattering: no diffusion solve")

@@ -1,4 +1,4 @@
-"""The beam of a directional light inside the volume (docs/theory.md section 1)."""
+"""The beam of a directional light inside the volume: its part of L_ri (E1) and of L_ss (E2)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from ddrecon.numerics.nodes import Nodes
 
 @dataclass(frozen=True)
 class Beam:
-    """A directional light inside the volume: `mass` [K, z, y, x] is the integral of the
-    extinction's field towards the light.
+    """A directional light inside the volume.
 
-    `direction` [3] is its unit direction of travel in array order, `irradiance` [C, 1, 1, 1].
+    `mass` [K, z, y, x]: the integral of the extinction's field from the light to cells' centers;
+    `direction` [3]: unit, the way light travels, in array order; `irradiance` [C, 1, 1, 1] outside.
     """
 
     mass: Tensor
@@ -33,10 +33,11 @@ class Beam:
     def scattered(
         self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
-        """The integral over each segment of `scattering` [N, K, R], and the phase function p, the
-        same all along a ray.
+        """The integral of `scattering` over each segment of view rays, and the phase function p.
 
-        With a forward peak of depth `peak` [N, C, R] at the nodes p changes on the way: the
+        Their product is what E2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s
+        per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [R]. With a
+        forward peak of depth `peak` [N, C, R] at the nodes (E13) it changes along the ray: then the
         integral holds it, and the factor is 1.
         """
         cosine = -(nodes.direction @ self.direction)
@@ -46,20 +47,17 @@ class Beam:
 
 
 def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
-    """The beam of `light`, and the moments of E tau / (4 pi) averaged over each cell along the
-    beam.
+    """The beam of `light` in `medium`, and the moments of E tau / (4 pi) at cells (E2).
+
+    tau is averaged over each cell along the beam, so that the energy taken from the beam is what
+    cells receive, however thick they are.
     """
+    extinction = medium.extinction
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
     entered, step = recompute(
-        sum_mass_to_cells,
-        medium.extinction.field,
-        medium.grid,
-        direction,
-        medium.extinction.mass_bound,
+        sum_mass_to_cells, extinction.field, medium.grid, direction, extinction.mass_bound
     )
-    received = (
-        irradiance / (4 * math.pi) * recompute(medium.extinction.mean_transmittance, entered, step)
-    )
-    beam = Beam(entered + 0.5 * step * medium.extinction.field, direction, irradiance)
+    received = irradiance / (4 * math.pi) * recompute(extinction.mean_transmittance, entered, step)
+    beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
     return beam, beam_moments(received, direction, has_flux)

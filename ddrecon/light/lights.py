@@ -1,5 +1,7 @@
-"""Lights. Vectors are (x, y, z); colors are `[1]` or `[3]`. Every tensor may be varied, in reverse
-and in forward mode.
+"""Lights, as a user describes them.
+
+Vectors are (x, y, z), colors `[1]` or `[3]`. Every tensor may be varied, in reverse and in forward
+mode.
 """
 
 from __future__ import annotations
@@ -11,8 +13,9 @@ from torch import Tensor
 
 @dataclass(eq=False)
 class DirectionalLight:
-    """Parallel light: `direction` [3] the way it travels (any length > 0), `irradiance` [C] on a
-    plane facing it.
+    """Parallel light.
+
+    `direction` [3]: the way it travels, of any length > 0; `irradiance` [C]: on a plane facing it.
     """
 
     direction: Tensor
@@ -28,12 +31,11 @@ class AmbientLight:
 
 @dataclass(eq=False)
 class EnvironmentLight:
-    """A latitude-longitude map of light from infinitely far away; `ddrecon.environment` says which
-    pixel lies where.
+    """A latitude-longitude map of light from infinitely far away.
 
-    `radiance` [C, h, w] >= 0 of every pixel, h >= 2; `scale`: scalar factor on it; `rotation`:
-    scalar, about +y [degrees]; `directions`: how many directions the light on the volume is
-    gathered into.
+    `radiance` [C, h, w] >= 0 of every pixel, h >= 2 (`environment.py` says which lies where);
+    `scale`: scalar factor on it; `rotation`: scalar, about +y [degrees]; `directions`: how many
+    regions the light on the volume is gathered into.
     """
 
     radiance: Tensor
@@ -44,8 +46,9 @@ class EnvironmentLight:
 
 @dataclass(eq=False)
 class PointLight:
-    """Light from one point, inside or outside the box: `position` [3] in u, `intensity` [C], power
-    per solid angle.
+    """Light from one point, inside or outside the box.
+
+    `position` [3] in u; `intensity` [C]: power per solid angle.
     """
 
     position: Tensor

@@ -19,8 +19,9 @@ MARGIN = 0.01
 
 @dataclass(frozen=True)
 class Moments:
-    """`mean` [C, z, y, x] and `flux`, three tensors of that shape along z, y, x; None where light's
-    direction does not matter.
+    """`mean` [C, z, y, x], and `flux`, three tensors of that shape along z, y, x.
+
+    `flux` is None where light's direction does not matter.
     """
 
     mean: Tensor
@@ -50,11 +51,12 @@ class Moments:
         return radiance
 
     def positive_along(self, direction: Vector) -> Tensor:
-        """`along` held at zero: r where r >= m = MARGIN (|L0| + |L1.w|), m (1 + r/m)^2 / 4 from
-        there to -m, and 0 below.
+        """Radiance r = `along`, bent to zero below m = MARGIN (|L0| + |L1 . w|).
 
-        E3 is negative where light is more directed than two terms in angle can say, and where g is not 0 so may L0 be: E4's source
-        then has either sign. Both mean darkness. Without a flux E7's M-matrix keeps L0 >= 0, and what a solve leaves below it is cut off.
+        It is r where r >= m, m (1 + r/m)^2 / 4 from there down to -m, and 0 below. E3 is negative
+        where light is more directed than two terms in angle can say; where g is not 0 so may L0 be,
+        since E4's source then has either sign. Both mean darkness. Without a flux E7's M-matrix
+        keeps L0 >= 0, and what a solve leaves below zero is cut off.
         """
         radiance = self.along(direction)
         if self.flux is None:
@@ -71,8 +73,9 @@ def _vector(components: Iterable[Tensor]) -> Vector:
 
 
 def beam_moments(radiance: Tensor, direction: Tensor, has_flux: bool) -> Moments:
-    """The moments of light that all travels along `direction` [3] (array order): `radiance` and
-    `radiance` w.
+    """The moments of light that all travels along `direction` w: `radiance` and `radiance` w.
+
+    `radiance`: [C, z, y, x]; `direction`: [3] or [3, z, y, x], array order.
     """
     return Moments(
         radiance, _vector(radiance * component for component in direction) if has_flux else None

@@ -1,10 +1,15 @@
-"""Point lights: irradiance I tau / r^2, away from a position inside or outside the box.
+"""Point lights, inside or outside the box.
+
+At x, seen from the light at p, the irradiance and the direction of travel are
+
+    I tau / s,    (x - p) / sqrt(s),    s = max(|x - p|^2, R^2 / 3),
+
+where R is the radius of a sphere of one cell's volume: the mean of 1 / r^2 over such a sphere
+around the light is 3 / R^2. Nearer than that 1 / r^2 grows no more and the direction fades to none,
+so all is finite, with finite derivatives, also for a light in a cell's center.
 
 Every cell is reached by a straight march through the field, from the light or from where its ray
-enters the box, to where it enters the cell; within the cell the field is constant. Nearer than the
-radius R of a sphere of one cell's volume, 1 / r^2 is bounded by its mean over that sphere around
-the light, 3 / R^2, and the light's direction fades to none: all is finite, with finite derivatives,
-also for a light in a cell's center.
+enters the box, to where it enters the cell; within the cell the field is constant.
 """
 
 from __future__ import annotations
@@ -24,9 +29,9 @@ from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.nodes import Nodes
 
-SMOOTH = 8
-"""Order of the norm by which a ray's way through a cell is found: nearly the largest component,
-without its kink where two are equal.
+NORM_ORDER = 8
+"""Order of the norm that gives a ray's path through a cell: nearly the largest component, without
+its kink where two are equal.
 """
 CHUNK_SAMPLES = 1 << 20
 """Samples taken at a time on the way from the light to the cells."""
@@ -34,111 +39,124 @@ CHUNK_SAMPLES = 1 << 20
 
 @dataclass(frozen=True)
 class PointBeam:
-    """A point light inside the volume: `mass` [K, z, y, x] is the integral of the extinction's
-    field towards the light.
+    """A point light inside the volume.
 
-    `position` [3] is in array order, `irradiance` [C, 1, 1, 1] that at a distance of 1 u; squared
-    distances count as at least `least`.
+    `mass` [K, z, y, x]: the integral of the extinction's field from the light to cells' centers;
+    `position` [3]: in array order; `irradiance` [C, 1, 1, 1]: at a distance of 1 u;
+    `least_square` [u^2]: what squared distances count as at least, R^2 / 3.
     """
 
     mass: Tensor
     position: Tensor
     irradiance: Tensor
-    least: float
+    least_square: float
 
     def scattered(
         self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
-        """The integral over each segment of `scattering` [N, K, R] times p / r^2, `[N - 1, K or C,
-        R]`, and a factor of 1.
+        """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`, and 1.
 
-        `peak`: as of `Beam.scattered`. Scattering times p is linear between nodes; 1 / r^2 over a
-        segment is exactly the angle it subtends over the ray's distance.
+        Arguments as of `Beam.scattered`. Scattering times p is linear between nodes.
         """
+        # The light's offset from a view ray: `along` it from each node, and squared, across it.
         offset = nodes.origin - self.position
         foot = (offset * nodes.direction).sum(-1)
-        across = _square(offset - foot[:, None] * nodes.direction, self.least)
+        across = _bounded_square(offset - foot[:, None] * nodes.direction, self.least_square)
         along = foot + nodes.distance
+
+        # The phase function at the nodes, of the angle between light and view ray.
         cosine = (-along / (across + along * along).sqrt())[:, None]
         phase = henyey_greenstein(cosine, g) if peak is None else peaked_phase(peak, cosine, g)
-        apart = across.sqrt()
-        angle = torch.atan2(apart * nodes.lengths, across + along[1:] * along[:-1])
-        return nodes.integral(scattering * phase, angle / apart), 1.0
+
+        # The integral of 1 / r^2 over a segment is the angle it subtends at the light, over the
+        # ray's distance from it: int ds / (d^2 + s^2) = atan(s / d) / d.
+        distance = across.sqrt()
+        angle = torch.atan2(distance * nodes.lengths, across + along[1:] * along[:-1])
+        return nodes.integral(scattering * phase, angle / distance), 1.0
 
 
 def follow_point_light(
     medium: Medium, light: PointLight, has_flux: bool
 ) -> tuple[PointBeam, Moments]:
-    """The beam of `light`, and the moments of I tau / (4 pi r^2) averaged over each cell along the
-    light's ray.
+    """The beam of `light` in `medium`, and the moments of I tau / (4 pi r^2) at cells (E2).
+
+    tau is averaged over each cell along the light's ray.
     """
     grid, extinction = medium.grid, medium.extinction
-    position, irradiance, least = (
-        array_order(light.position),
-        light.intensity.view(-1, 1, 1, 1),
-        _least_square(grid),
-    )
+    position, irradiance = array_order(light.position), light.intensity.view(-1, 1, 1, 1)
+
+    # s, sqrt(s) and the direction of travel, as in the module's docstring.
     centers = torch.stack(torch.broadcast_tensors(*grid.centers(extinction.field)), -1)
-    square = _square(centers - position, least)
+    least_square = _least_square(grid)
+    square = _bounded_square(centers - position, least_square)
     distance = square.sqrt()
     direction = (centers - position) / distance[..., None]
+
+    # The ray's path through a cell is one over its speed [cells/u] along the axis on which it is
+    # fastest, as for beams. Beside the light, where the direction fades and that would grow without
+    # bound, half the path is at most the distance: no ray begins behind its light.
     speed = torch.linalg.vector_norm(
-        direction / direction.new_tensor(grid.spacing), ord=SMOOTH, dim=-1
+        direction / direction.new_tensor(grid.spacing), ord=NORM_ORDER, dim=-1
     )
     step = 1 / torch.maximum(speed, 0.5 / distance)
+
+    # Mass from the light to where the ray enters the cell, and from there to the center.
     entries = centers - 0.5 * step[..., None] * direction
     entered = _mass_to(
         extinction.field, grid, position, entries.flatten(0, 2), (distance - 0.5 * step).flatten()
     )
     mass = entered + 0.5 * step * extinction.field
+
     received = irradiance / (4 * math.pi) / square * extinction.mean_transmittance(entered, step)
-    return PointBeam(mass, position, irradiance, least), beam_moments(
-        received, direction.movedim(-1, 0), has_flux
-    )
+    beam = PointBeam(mass, position, irradiance, least_square)
+    return beam, beam_moments(received, direction.movedim(-1, 0), has_flux)
 
 
 def _least_square(grid: Grid) -> float:
-    """R^2 / 3, R being the radius of a sphere of one cell's volume."""
+    """R^2 / 3 [u^2], R being the radius of a sphere of one cell's volume."""
     return float((0.75 / math.pi * math.prod(grid.spacing)) ** (2 / 3) / 3)
 
 
-def _square(offset: Tensor, least: float) -> Tensor:
+def _bounded_square(offset: Tensor, least: float) -> Tensor:
+    """The squared length of `offset` [..., 3], or `least` where that is more."""
     return (offset * offset).sum(-1).clamp(min=least)
 
 
 def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance: Tensor) -> Tensor:
-    """The integral of `field` [K, z, y, x] from `position`, or the box, to `ends` [P, 3], which are
-    `distance` [P] away.
+    """The integral of `field` [K, z, y, x] from `position` to `ends` [P, 3]; 0 outside the box.
+
+    `distance` [P]: how far `ends` are from `position`. Returns `[K, z, y, x]`.
     """
     pairs = math.ceil(math.hypot(*grid.extent) / (2 * min(grid.spacing)))
-    part = _gauss_pairs(pairs).to(field)[:, None]
+    fraction = _gauss_pairs(pairs).to(field)[:, None]
 
-    def run(ends: Tensor, distance: Tensor) -> Tensor:
+    def integrate(ends: Tensor, distance: Tensor) -> Tensor:
         offset = ends - position
         inside = _part_inside(grid, position, ends)
-        points = ends - (inside * part)[..., None] * offset
+        points = ends - (inside * fraction)[..., None] * offset
         places = 2 * (points - points.new_tensor(grid.lower)) / points.new_tensor(grid.extent) - 1
         values = sample_volume(field, places.flip(-1))
         return values.mean(1) * (inside * distance)
 
     count = max(1, CHUNK_SAMPLES // (2 * pairs))
     chunks = zip(ends.split(count), distance.split(count), strict=True)
-    return torch.cat([recompute(run, *chunk) for chunk in chunks], 1).unflatten(1, grid.shape)
+    return torch.cat([recompute(integrate, *chunk) for chunk in chunks], 1).unflatten(1, grid.shape)
 
 
 def _gauss_pairs(count: int) -> Tensor:
-    """The nodes of Gauss's two-point rule in `count` equal parts of [0, 1], `[2 count]`: they meet
-    the planes of a grid only by accident.
+    """The nodes of Gauss's two-point rule in `count` equal parts of [0, 1], `[2 count]`.
 
-    On such a plane, where interpolation has a kink, the derivative is that of one side.
+    They meet the planes of a grid only by accident, where interpolation has a kink.
     """
     middle, shift = torch.arange(count, dtype=torch.float64) + 0.5, 12**-0.5
     return torch.cat([middle - shift, middle + shift]) / count
 
 
 def _part_inside(grid: Grid, position: Tensor, ends: Tensor) -> Tensor:
-    """Which part of the way from `position` to each of `ends` [P, 3] lies inside the box: 1 for a
-    light inside.
+    """The fraction [P] of the way from `position` to `ends` [P, 3] that lies in the box.
+
+    It is 1 for a light inside. Along each axis on which the light is outside, the way enters at the
+    face on the light's side: of `offset`, what lies `beyond` that face is inside.
     """
     low, high = (position.new_tensor(corner) for corner in (grid.lower, grid.upper))
     is_below, is_above = position < low, position > high

@@ -1,9 +1,6 @@
-"""Light not yet scattered: how much of it reaches each cell, and its moments Q0 and Q1
-(docs/theory.md section 1).
+"""Light not yet scattered, L_ri: its beams, and the moments Q0 and Q1 that are the source of E4.
 
-A beam is followed by three vectorized operations on slices: shear the grid until the light runs
-along an axis, sum cumulatively along that axis, shear back. Density and optical depth are
-interpolated, never their exponentials.
+Here are directional and point lights and the radiance of ambient light; skies are in `skylight.py`.
 """
 
 from __future__ import annotations
@@ -24,8 +21,9 @@ from ddrecon.medium.coefficients import Medium
 
 @dataclass(frozen=True)
 class ReducedLight:
-    """Light of directional and point lights not yet scattered: `beams`, and their `source` Q0, Q1
-    averaged over cells (no Q1 for g = 0).
+    """Light of directional and point lights not yet scattered.
+
+    `source`: Q0 and Q1 of all `beams` together, averaged over cells; no Q1 where it was not wanted.
     """
 
     beams: tuple[Beam | PointBeam, ...]
@@ -33,8 +31,10 @@ class ReducedLight:
 
 
 def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> ReducedLight:
-    """The light of directional and point `lights` that reaches each cell unscattered; `has_flux`:
-    whether Q1 is needed (g is not 0).
+    """The light of directional and point `lights` that reaches each cell unscattered.
+
+    Q0 = sum of E tau / (4 pi) and Q1 = 3 g' sum of E tau w / (4 pi) over lights that go along w, g'
+    being the mean cosine of the scattering that remains. Without `has_flux` no Q1 is computed.
     """
     beams: list[Beam | PointBeam] = []
     total = Moments(torch.zeros_like(medium.extinction.value))
@@ -51,7 +51,7 @@ def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> R
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
-    """The radiance `[C, 1, 1, 1]` that all ambient `lights` together send in from every direction."""
+    """The radiance `[C, 1, 1, 1]` of all ambient `lights` together, the same from everywhere."""
     radiances = [light.radiance for light in lights if isinstance(light, AmbientLight)]
     return (
         torch.stack(torch.broadcast_tensors(*radiances, like.new_zeros(1))).sum(0).view(-1, 1, 1, 1)

@@ -1,4 +1,9 @@
-"""The mass that light passes on its way to each cell, by a shear of the grid."""
+"""The mass that a beam passes on its way to each cell.
+
+Times the scale of a `Coefficient` it is the optical depth in the tau of E2. It is found in three
+steps on whole slices: shear the grid until the beam runs along an axis, sum along that axis, shear
+back. What is interpolated is the field and its integral, never an exponential of them.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +17,25 @@ from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
+from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
 
 
 def sum_mass_to_cells(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """The integral of `field` from the box to where a beam enters each cell's slice, and its path
-    length within a slice [u].
+    """The mass up to where a beam enters each cell's slice, and its path within a slice [u].
 
-    `field`: [K, z, y, x]; `direction`: [3], unit, array order, the way light travels. Slices are
-    those across the axis along which the beam crosses most cells. Outside the box the field falls
-    to zero within half a cell, which keeps the mass of the outer half cells. The sum over slices is
-    exact for light along an axis; for slanted light it is refined by planes between them, and
-    carried back to cells to third order, by corrections bounded by 1 / `bound`. Returns `[K, z, y,
-    x]` and a scalar.
+    The mass is the integral of `field` along the beam, from the box on. Slices are those across the
+    axis along which the beam crosses most cells.
+
+    `field`: [K, z, y, x]; outside the box it falls to zero within half a cell, which keeps the mass
+    of the outer half cells. `direction`: [3], unit, array order, the way light travels. `bound`: 1
+    over the most by which each of two corrections may change a mass, 0 for no limit.
+
+    Along an axis of the grid the sum is exact. A slanted beam is also looked at on planes midway
+    between slices, and its mass is carried back to cells to third order: the two corrections.
+    Returns `[K, z, y, x]` and a scalar.
     """
     if field.shape[0] == 1:
         return _sum_mass(field, grid, direction, bound)
@@ -38,30 +47,40 @@ def _sum_mass(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
     """What `sum_mass_to_cells` returns, of one field [1, z, y, x]."""
+    # From one slice to the next the beam goes `step` and drifts by `slope`, in rows and columns.
     speed = direction / direction.new_tensor(grid.spacing)
-    axis = int(speed.detach().abs().argmax())
-    order = [axis + 1, 0] + [1 + other for other in range(3) if other != axis]
-    slices = field.permute(order)
-    is_reversed = bool(direction[axis] < 0)
-    if is_reversed:
-        slices = slices.flip(0)
-    slope = torch.stack([speed[other] for other in range(3) if other != axis]) / speed[axis].abs()
-    step = grid.spacing[axis] / direction[axis].abs()
+    slicing = Slicing.of(speed.tolist())
+    slices = slicing.lay(field)
+    slope = (
+        torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
+    )
+    step = grid.spacing[slicing.axis] / direction[slicing.axis].abs()
+
+    # Shear: rho_k along each ray on slice k, and rho_(k + 1/2) midway to the next, where the field
+    # is the mean of both slices.
     shear = _Shear.of(slices, slope)
-    centers, middles = shear.there(slices, 0.0), shear.there(0.5 * (slices[1:] + slices[:-1]), 0.5)
-    bends = middles - 0.5 * (centers[1:] + centers[:-1])
-    finer = running_sum(torch.cat([torch.zeros_like(centers[:1]), bends])) * (0.5 * step)
-    smooth = ThirdOrder(0, 1, bound)
-    entered = shear.back((running_sum(centers) - centers) * step + smooth.bounded(finer), smooth)
-    if is_reversed:
-        entered = entered.flip(0)
-    return entered.permute([order.index(dim) for dim in range(4)]), step
+    on_slices = shear.to_rays(slices, 0.0)
+    midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
+
+    # Trapezoids over half steps are more than those over whole ones by
+    # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
+    bends = midway - 0.5 * (on_slices[1:] + on_slices[:-1])
+    refinement = running_sum(torch.cat([torch.zeros_like(on_slices[:1]), bends])) * (0.5 * step)
+
+    # The mass of all slices passed: step sum over j < k of rho_j.
+    third_order = ThirdOrder(0, 1, bound)
+    passed = (running_sum(on_slices) - on_slices) * step + third_order.bounded(refinement)
+
+    # Shear back, from rays to cells.
+    return slicing.lift(shear.to_cells(passed, third_order)), step
 
 
 @dataclass(frozen=True)
 class _Shear:
-    """Slices of `size` cells on a `lattice` that holds all of them, slice k shifted by -k `slope`
-    cells, slice 0 beginning at `first`.
+    """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
+
+    Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
+    there is a ray for every cell.
     """
 
     slope: Tensor
@@ -71,7 +90,7 @@ class _Shear:
 
     @staticmethod
     def of(slices: Tensor, slope: Tensor) -> _Shear:
-        """That of `slices` [N, K, H, W]."""
+        """The rays that meet `slices` [N, K, H, W]."""
         height, width = slices.shape[2:]
         rows, columns = (
             math.floor(abs(s) * (slices.shape[0] - 1) + 1e-9) + 1 for s in slope.tolist()
@@ -84,9 +103,10 @@ class _Shear:
             (rows * is_on[0], columns * is_on[1]),
         )
 
-    def there(self, slices: Tensor, shift: float) -> Tensor:
-        """`slices` [N, K, H, W], numbered from `shift`, on the lattice; they fall to zero one cell
-        beyond their outermost centers.
+    def to_rays(self, slices: Tensor, shift: float) -> Tensor:
+        """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
+
+        They fall to zero one cell beyond their outermost centers.
         """
         places = self._places(slices, shift, self.lattice, self.size, 1)
         rows, columns = (
@@ -95,20 +115,21 @@ class _Shear:
         )
         return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
 
-    def back(self, sheared: Tensor, smooth: ThirdOrder) -> Tensor:
-        """Slices of values `sheared` on the lattice, in cells again."""
-        places = self._places(sheared, 0.0, self.size, self.lattice, -1)
+    def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
+        """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
+        places = self._places(values, 0.0, self.size, self.lattice, -1)
         rows, columns = (
-            Weights.at(place, size, is_smooth=True)
+            Weights.at(place, size, has_third_order=True)
             for place, size in zip(places, self.lattice, strict=True)
         )
-        return sample_lattice(sheared, rows, columns, smooth).unflatten(-1, self.size)
+        return sample_lattice(values, rows, columns, third_order).unflatten(-1, self.size)
 
     def _places(
         self, like: Tensor, shift: float, points: tuple[int, int], cells: tuple[int, int], sign: int
     ) -> list[Tensor]:
-        """Where rows and columns of `points` fall among those of `cells`, slice by slice, in [-1,
-        1].
+        """Where rows and columns of `points` fall among those of `cells`, [N, count] in [-1, 1].
+
+        `sign` is 1 for rays among cells, -1 for cells among rays.
         """
         index = torch.arange(like.shape[0], dtype=like.dtype, device=like.device) + shift
         lines = []

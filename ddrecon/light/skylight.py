@@ -1,4 +1,7 @@
-"""Light of skies not yet scattered, direction by direction."""
+"""Light of skies not yet scattered: a march for each direction, one at a time.
+
+Only sums over directions are kept, so memory does not grow with their number.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +21,17 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 
 
 def ambient_sky(radiance: Tensor) -> Sky:
-    """Ambient light of `radiance` [C, 1, 1, 1] as light from the directions of a quadrature over
-    the sphere.
-    """
+    """Ambient light of `radiance` [C, 1, 1, 1], as light from the directions of a quadrature."""
     directions, weights = sphere_quadrature(radiance)
     irradiance = 4 * math.pi * weights[:, None] * radiance.flatten()
     return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
 
 
 def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments:
-    """Light of all skies in `lights` not yet scattered, to first order in angle: int L_ri and 3 int
-    L_ri w over the sphere, over 4 pi.
+    """Light of all skies in `lights` not yet scattered, to first order in angle.
 
-    One direction at a time, so that memory does not grow with their number.
+    Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
+    and Q1 but for g (docs/theory.md section 1). Without `has_flux` there is no flux.
     """
     total = Moments(torch.zeros_like(medium.extinction.value))
     for sky in _lit_skies(lights):
@@ -41,11 +42,10 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool
 
 
 def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
-    """What one scattering turns `towards` a camera (unit, its components broadcast to cells) of the
-    light of `skies`, `[C, z, y, x]`.
+    """Radiance `[C, z, y, x]` that `skies` scatter once `towards` a camera, per length and kappa_s.
 
-    Per unit length and kappa_s, by the exact phase function: sum of p E tau / (4 pi), one direction
-    at a time.
+    That is the inner integral of E2, sum over directions of p E tau / (4 pi), with the exact phase
+    function p. `towards`: unit, its components broadcast to cells.
     """
     total = torch.zeros_like(medium.extinction.value)
     for sky in _lit_skies(skies):
@@ -67,6 +67,7 @@ def _lit_skies(lights: Sequence[object]) -> list[Sky]:
 def _scatter_direction(
     medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector
 ) -> Tensor:
+    """p E tau at cells: what the light going along `travel` scatters `towards` a camera."""
     visible = _attenuate_direction(medium, travel, irradiance, None).mean
     z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
     return visible * henyey_greenstein(z + y + x, medium.g)
@@ -75,14 +76,15 @@ def _scatter_direction(
 def _attenuate_direction(
     medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None
 ) -> Moments:
-    """`irradiance` ([C] or scalar) and `vector` [3, C], each times the transmittance along
-    `direction`, averaged over cells.
+    """`irradiance` ([C] or scalar) and `vector` [3, C], each times tau along `direction`.
+
+    tau is averaged over each cell.
     """
-    visible = medium.extinction.mean_transmittance(
-        *sum_mass_to_cells(
-            medium.extinction.field, medium.grid, direction, medium.extinction.mass_bound
-        )
+    extinction = medium.extinction
+    entered, step = sum_mass_to_cells(
+        extinction.field, medium.grid, direction, extinction.mass_bound
     )
+    visible = extinction.mean_transmittance(entered, step)
     mean = visible * irradiance.view(-1, 1, 1, 1)
     if vector is None:
         return Moments(mean)

@@ -167,7 +167,7 @@ class Slices:
         return Weights.at(
             self._scaled(places, which, slices),
             slices.shape[2 + which],
-            is_smooth=self.smooth is not None,
+            has_third_order=self.smooth is not None,
         )
 
     def _distance(self, origin: Tensor, direction: Tensor) -> Tensor:

@@ -1,9 +1,7 @@
-"""The participating medium: cross sections times density, and what delta-Eddington scaling makes of
-them.
+"""The participating medium: cross sections times density, with or without delta-Eddington scaling.
 
-Colors are the leading axis, of size 1 (gray) or 3. A coefficient is kept as `scale * field` so that
-constant cross sections need only one field, the density, to be marched through, whatever the number
-of colors.
+Colors are the leading axis, of size 1 (gray) or 3. A coefficient is kept as `scale * field`: where
+cross sections are constant, rays need march through one field only, the density, for all colors.
 """
 
 from __future__ import annotations
@@ -21,12 +19,11 @@ from ddrecon.numerics.decay import decay_mean
 
 @dataclass(eq=False)
 class Volume:
-    """What a user describes: `density` [z, y, x] >= 0 and cross sections per unit density, on a
-    grid.
+    """What a user describes: density, and cross sections per unit density, on a `grid`.
 
-    `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each `[C]` or per cell `[C, z, y,
-    x]` with C = 1 or 3; `g`: mean cosine of scattering, scalar in (-1, 1). Tensors may be replaced
-    or require gradients.
+    `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
+    [C] or per cell [C, z, y, x] with C = 1 or 3; `g`: mean cosine of scattering, scalar in (-1, 1).
+    Tensors may be replaced or require gradients. Raises ValueError where shapes disagree.
     """
 
     grid: Grid
@@ -38,7 +35,8 @@ class Volume:
     def __post_init__(self) -> None:
         if tuple(self.density.shape) != self.grid.shape:
             raise ValueError(
-                f"density is {tuple(self.density.shape)} but the grid has {self.grid.shape} cells [z, y, x]"
+                f"density is {tuple(self.density.shape)} but the grid has {self.grid.shape} "
+                "cells [z, y, x]"
             )
 
 
@@ -56,30 +54,30 @@ class Coefficient:
 
     @property
     def mass_bound(self) -> Tensor:
-        """The inverse of the most that third-order interpolation may change an integral of `field`
-        by: half an optical depth.
+        """1 over the most by which third-order corrections may change an integral of `field`.
+
+        That is half an optical depth, in the mean over colors.
         """
         return 2 * self.scale.mean()
 
     def mean_transmittance(self, entered: Tensor, step: Tensor) -> Tensor:
         """exp(-depth) averaged over each cell, `[C, z, y, x]`.
 
-        The light has `entered` mass behind it (the integral of `field`, [K, z, y, x]); `step`: what
-        it crosses [u], scalar or [z, y, x].
+        `entered` [K, z, y, x]: the integral of `field` up to where light enters the cell; `step`:
+        the light's path through the cell [u], scalar or [z, y, x].
         """
         return torch.exp(-self.scale * entered) * decay_mean(self.scale * (self.field * step))
 
 
 @dataclass(frozen=True)
 class Medium:
-    """Coefficients of one medium, seen with the part `forward_fraction` f of its scattering taken
-    as not scattered.
+    """Coefficients of a medium of whose scattering the part f counts as not scattered.
 
-    `scattering` is kappa_s itself, which beams scatter by with the exact phase function of mean
-    cosine `g`; `extinction` is kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the
-    scattering that remains. `peak` times the integral of the extinction's field is the depth f
-    kappa_s of the forward peak: `[C, 1, 1, 1]`, `[C, z, y, x]` where cross sections vary, None
-    without a peak.
+    f is `forward_fraction`, the forward peak's. `absorption` is kappa_a. `scattering` is all of
+    kappa_s, by which beams scatter with the exact phase function of mean cosine `g`. `extinction`
+    is kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that remains. `peak` is
+    f kappa_s per unit of the extinction's field: times a mass, it is the depth x of E13. It is
+    [C, 1, 1, 1], or [C, z, y, x] where cross sections vary, and None without a peak.
     """
 
     grid: Grid
@@ -98,22 +96,30 @@ class Medium:
 
     @property
     def transport_extinction(self) -> Tensor:
-        """kappa_tr = kappa_a + (1 - g) kappa_s [1/u], `[C, z, y, x]`; delta-Eddington scaling
-        leaves it unchanged.
+        """kappa_tr = kappa_a + (1 - g) kappa_s [1/u], `[C, z, y, x]`.
+
+        Delta-Eddington scaling leaves it unchanged.
         """
         return self.absorption.value + (1 - self.g) * self.scattering.value
 
+    @property
+    def has_flux(self) -> bool:
+        """Whether light's direction matters to scattering: g is not 0, or is being varied."""
+        return is_varied(self.g) or bool(self.g.detach() != 0)
+
 
 def scale_medium(volume: Volume) -> Medium:
-    """The delta-Eddington scaled medium of `volume`, which the whole image is rendered by
-    (docs/theory.md, section 5).
+    """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
+
+    f and g' are `forward_fraction` and `scaled_mean_cosine` of `phase.py`, where the source is.
     """
     return _medium(volume, forward_fraction(volume.g), scaled_mean_cosine(volume.g))
 
 
 def keep_medium(volume: Volume) -> Medium:
-    """The medium of `volume` as it is, by which path tracing separates single from multiple
-    scattering.
+    """The medium of `volume` as it is, with f = 0.
+
+    Path tracing separates single from multiple scattering by it.
     """
     return _medium(volume, torch.zeros_like(volume.g), volume.g)
 
@@ -136,13 +142,14 @@ def _medium(volume: Volume, fraction: Tensor, mean_cosine: Tensor) -> Medium:
         g=volume.g,
         mean_cosine=mean_cosine,
         forward_fraction=fraction,
-        peak=_peak(extinction, fraction * sigma_s) if bool(fraction > 0) else None,
+        peak=_peak_per_mass(extinction, fraction * sigma_s) if bool(fraction > 0) else None,
     )
 
 
-def _peak(extinction: Tensor, forward: Tensor) -> Tensor:
-    """`forward` scattering per unit of what is summed as mass: density, or `extinction` where that
-    varies (0 where there is none).
+def _peak_per_mass(extinction: Tensor, forward: Tensor) -> Tensor:
+    """`forward` scattering per unit of what is summed as mass.
+
+    That is density, or `extinction` where that varies; 0 where there is none.
     """
     extinction, forward = torch.broadcast_tensors(extinction, forward)
     if extinction.shape[1:].numel() == 1:
@@ -152,8 +159,3 @@ def _peak(extinction: Tensor, forward: Tensor) -> Tensor:
 
 def _broadcast(sigma: Tensor) -> Tensor:
     return sigma if sigma.ndim == 4 else sigma.view(-1, 1, 1, 1)
-
-
-def has_flux(medium: Medium) -> bool:
-    """Whether light's direction matters to scattering: g is not 0, or is being differentiated."""
-    return is_varied(medium.g) or bool(medium.g.detach() != 0)

@@ -22,11 +22,10 @@ def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
 
 
 def forward_fraction(g: Tensor) -> Tensor:
-    """The fraction f of scattering that delta-Eddington scaling treats as not scattered: g^2 for g
-    > 0, else 0.
+    """The fraction f of scattering that counts as not scattered: g^2 for g > 0, else 0.
 
     A phase function with g <= 0 has no forward peak to remove; f and its derivative are continuous
-    at g = 0. Source: Joseph, Wiscombe, Weinman 1976,
+    at g = 0. Source: delta-Eddington scaling, Joseph, Wiscombe, Weinman 1976,
     doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
     """
     return g.clamp(min=0) ** 2
@@ -38,44 +37,55 @@ def scaled_mean_cosine(g: Tensor) -> Tensor:
 
 
 def peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
-    """What turns a beam into a view ray: scattered once, or only by the forward peak on a way of
-    peak `depth` (docs/theory.md E13), >= 0.
+    """S (docs/theory.md E13), >= 0: what replaces the phase function from a beam into a view ray.
 
-    `depth` >= 0: f times the optical depth of scattering from where the light enters to where the
-    view ray leaves; at 0 this is `henyey_greenstein`. `cosine`: as there, broadcast against
-    `depth`; `g` >= 0, scalar. Where it would be negative, since scattering without its peak has
-    only two moments, it is 0.
+    It holds light scattered once, and light that the forward peak alone scattered. `depth` x >= 0:
+    f times the optical depth of scattering from where the light enters, by the point where it
+    turns, to where the view ray leaves; at 0 this is `henyey_greenstein`. `cosine`: as there,
+    broadcast against `depth`; `g` >= 0, scalar. It is 0 where it would be negative, since
+    scattering without its peak has only two moments.
     """
-    return _peaked(depth, cosine, g).clamp(min=0)
+    return _signed_peaked_phase(depth, cosine, g).clamp(min=0)
 
 
 def peaked_phase_along(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
-    """`peaked_phase` where only `depth` [N, C, R] changes along rays, each with its own `cosine`
-    [R], by a polynomial of each ray.
+    """`peaked_phase` at `depth` [N, C, R] along R rays, each with one `cosine` [R], by polynomials.
 
-    Exact at no depth, elsewhere off by no more than 0.007 up to g = 0.95, relative to the
-    function's value or to 1 where that is less.
+    Exact at depth 0; elsewhere off by at most 0.007 up to g = 0.95, relative to the function's
+    value or to 1 where that is less.
     """
-    return evaluate_positive(
-        fit_chebyshev(lambda depths: _peaked(depths, cosine.double(), g.double()), depth), depth
-    )
+
+    def along_depth(depths: Tensor) -> Tensor:
+        return _signed_peaked_phase(depths, cosine.double(), g.double())
+
+    return evaluate_positive(fit_chebyshev(along_depth, depth), depth)
 
 
-def _peaked(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
+def _signed_peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
+    """S of E13 before it is held at zero."""
     fraction = forward_fraction(g)
-    some = decay_mean(depth)
-    spread = g * torch.exp((g - 1) * depth) * decay_mean(g * depth) / some
-    rest = (1 - fraction) * (1 + 3 * scaled_mean_cosine(g) * cosine)
-    return rest + fraction * some * _peak(spread, cosine)
+    # phi(x), the part of the peak's light that turns here.
+    turned = decay_mean(depth)
+    # h(x) of E15, written as g exp(-x (1 - g)) phi(g x) / phi(x): nothing cancels, and h(0) = g.
+    spread = g * torch.exp((g - 1) * depth) * decay_mean(g * depth) / turned
+    # (1 - f) p', what scatters without its peak.
+    without_peak = (1 - fraction) * (1 + 3 * scaled_mean_cosine(g) * cosine)
+    return without_peak + fraction * turned * _spread_peak(spread, cosine)
 
 
-def _peak(spread: Tensor, cosine: Tensor) -> Tensor:
-    """The forward peak, whose moments are 1, 1, 1, h, h^2, ... with h = `spread`.
+def _spread_peak(spread: Tensor, cosine: Tensor) -> Tensor:
+    """q_h of E16: the forward peak, whose moments are 1, 1, 1, h, h^2, ... with h = `spread`.
 
-    It is (p_h - 1 - 3 h cosine) / h^2 + 1 + 3 cosine of the Henyey-Greenstein function p_h, written
-    so that nothing cancels at small h.
+    q_h = (p_h - 1 - 3 h w) / h^2 + 1 + 3 w, where w is the `cosine` and p_h the Henyey-Greenstein
+    function. Written so that nothing cancels at small h ("Without cancellation" beside E13 in
+    docs/theory.md has every step).
     """
+    # With a = h - 2 w and r = sqrt(1 + h a): p_h = (1 - h^2) / r^3.
     away = spread - 2 * cosine
     root = (1 + spread * away).sqrt()
-    curved = (1 + root * (2 + root * (3 + 1.5 * root))) / (root**3 * (root + 1) ** 2)
-    return 3 * cosine - 1.5 + 1.5 * spread * away + (1 - spread * spread) * away * away * curved
+    # C in 1 / r^3 = 1 - (3/2) h a + (h a)^2 C: since h a = r^2 - 1,
+    # C = (1 - (5/2) r^3 + (3/2) r^5) / (r^3 (r^2 - 1)^2), where (r - 1)^2 is divided out.
+    curvature = (1 + root * (2 + root * (3 + 1.5 * root))) / (root**3 * (root + 1) ** 2)
+    # (3/2) h a = (3/2) h^2 - 3 h w, so the terms 1 + 3 h w cancel by algebra, and all that is left
+    # holds h^2: q_h = 3 w - 3/2 + (3/2) h a + (1 - h^2) a^2 C.
+    return 3 * cosine - 1.5 + 1.5 * spread * away + (1 - spread * spread) * away * away * curvature

@@ -1,5 +1,6 @@
-"""What the physics asks of automatic differentiation: whether a number is being varied, what to
-keep, recomputation instead of memory.
+"""Automatic differentiation: is a number varied, what to keep, what to recompute.
+
+Every name of torch that is private, or not documented, stands in this file.
 """
 
 from __future__ import annotations
@@ -13,12 +14,16 @@ from torch.autograd import forward_ad
 from torch.autograd.graph import saved_tensors_hooks
 
 T = TypeVar("T")
+_GRID_SAMPLE_BACKWARD = {
+    4: torch.ops.aten.grid_sampler_2d_backward,
+    5: torch.ops.aten.grid_sampler_3d_backward,
+}
+_BILINEAR, _BORDER = 0, 1
+"""How these call interpolation and the padding that repeats the outermost cells."""
 
 
 def is_varied(tensor: Tensor) -> bool:
-    """Whether a derivative with respect to `tensor`, or something it was made from, is being taken,
-    in either mode.
-    """
+    """Whether a derivative by `tensor`, or what it was computed from, is taken in either mode."""
     return tensor.requires_grad or forward_ad.unpack_dual(tensor).tangent is not None
 
 
@@ -28,55 +33,68 @@ def is_forward() -> bool:
 
 
 def keep(ctx: Any, *tensors: Tensor) -> None:
-    """Saves `tensors` in the context of a custom function, for both modes; for forward mode only
-    while it is on.
+    """Saves `tensors` in the context of a custom function, for both modes.
 
-    Unlike what is saved for the backward pass, what is saved for forward mode stays in memory where
-    a backward pass is to recompute it.
+    For forward mode only while it is on: unlike what is saved for the backward pass, that stays in
+    memory where a backward pass is to recompute it.
     """
     ctx.save_for_backward(*tensors)
     if is_forward():
         ctx.save_for_forward(*tensors)
 
 
-def recompute(function: Callable[..., T], *arguments: object) -> T:
-    """`function(*arguments)`, which must not draw random numbers: the backward pass computes it
-    again and keeps only the arguments.
+def grid_sample_adjoint(
+    output_bar: Tensor, values: Tensor, points: Tensor, needs: tuple[bool, bool]
+) -> tuple[Tensor, Tensor]:
+    """The backward pass of torch's `grid_sample`: cotangents of `values` and `points`.
 
-    What `torch.utils.checkpoint` does, without importing torch's compiler, which takes two seconds
-    of every run.
+    For linear interpolation with the outermost cells repeated. `needs`: which of both are wanted.
+    """
+    cotangents: tuple[Tensor, Tensor] = _GRID_SAMPLE_BACKWARD[values.ndim](
+        output_bar.contiguous(), values, points, _BILINEAR, _BORDER, False, list(needs)
+    )
+    return cotangents
+
+
+def recompute(function: Callable[..., T], *arguments: object) -> T:
+    """`function(*arguments)`, of which only the arguments are kept for the backward pass.
+
+    That computes it again, so `function` must not draw random numbers. It is what
+    `torch.utils.checkpoint` does, without importing torch's compiler, which takes two seconds of
+    every run.
     """
     if not torch.is_grad_enabled():
         return function(*arguments)
-    again = _Again(lambda: function(*arguments))
+    again = _Recomputation(lambda: function(*arguments))
     with saved_tensors_hooks(again.pack, again.unpack):
         return function(*arguments)
 
 
-class _Again:
-    """Numbers in place of the tensors that `function` saves for its backward pass, and these
-    tensors when they are asked for.
+class _Recomputation:
+    """Numbers in place of the tensors that `function` saves for its backward pass.
+
+    When the first is asked for, `function` runs again and saves the same tensors in the same order.
     """
 
     def __init__(self, function: Callable[[], object]):
         self.function = function
         self.count = 0
-        self.made: dict[int, Tensor] = {}
+        self.saved: dict[int, Tensor] = {}
 
     def pack(self, _: Tensor) -> int:
         self.count += 1
         return self.count - 1
 
     def unpack(self, number: int) -> Tensor:
-        if number not in self.made:
-            self._make()
-        return self.made.pop(number)
+        if number not in self.saved:
+            self._run()
+        return self.saved.pop(number)
 
-    def _make(self) -> None:
-        made: list[Tensor] = []
+    def _run(self) -> None:
+        saved: list[Tensor] = []
         with (
             torch.enable_grad(),
-            saved_tensors_hooks(lambda tensor: made.append(tensor.detach()), made.__getitem__),
+            saved_tensors_hooks(lambda tensor: saved.append(tensor.detach()), saved.__getitem__),
         ):
             self.function()
-        self.made = dict(enumerate(made))
+        self.saved = dict(enumerate(saved))

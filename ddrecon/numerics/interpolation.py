@@ -1,9 +1,11 @@
-"""Linear interpolation in slices and volumes, differentiable in both directions.
+"""Linear interpolation in slices and volumes, differentiable in reverse and in forward mode.
 
-torch's `grid_sample` has no forward-mode derivative; these two functions add it. And where points
-lie on cells' centers its slope is that of the side rounding picks: here it is the mean of both, as
-central differences have it. Coordinates are in torch's convention: -1 and 1 are the outer faces of
-the first and last cell (`align_corners=False`), the last axis of the array comes first.
+torch's `grid_sample` has no forward mode; it is added here. And where points lie on cells' centers
+its slope is that of the side that rounding picks; here it is the mean of both, as central
+differences have it.
+
+Coordinates are in torch's convention: -1 and 1 are the outer faces of the first and last cell
+(`align_corners=False`), and the last axis of the array comes first.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from ddrecon.numerics.autodiff import keep
+from ddrecon.numerics.autodiff import grid_sample_adjoint, keep
 from ddrecon.numerics.third_order import (
     ThirdOrder,
     kink_width,
@@ -23,17 +25,59 @@ from ddrecon.numerics.third_order import (
     third_order_weight,
 )
 
-_BACKWARD = {4: torch.ops.aten.grid_sampler_2d_backward, 5: torch.ops.aten.grid_sampler_3d_backward}
-_BORDER = 1
-"""How those two call the padding that repeats the outermost cells."""
+
+def sample_slices(slices: Tensor, points: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
+    """Bilinear values `[N, K, P]` of `slices` [N, K, H, W] at `points` [N, P, 2].
+
+    Points are in [-1, 1], last array axis first; beyond the outermost cells' centers the value is
+    theirs. Channels of `third_order` are interpolated to third order.
+    """
+    return _interpolate(slices, points[:, :, None], third_order)[..., 0]
+
+
+def sample_volume(volume: Tensor, points: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
+    """Trilinear values `[K, N, P]` of `volume` [K, D, H, W] at `points` [N, P, 3].
+
+    As `sample_slices`.
+    """
+    return _interpolate(volume[None], points[None, None], third_order)[0, :, 0]
+
+
+def _interpolate(values: Tensor, points: Tensor, third_order: ThirdOrder | None) -> Tensor:
+    """Values `[N, K, ...]` of `values` [N, K, ...] at `points`, linear or to third order.
+
+    A part a of the way from one center to the next, linear interpolation is too large by a (1 - a)
+    / 2 times the second difference: of channels in `third_order` that is taken off, for each axis.
+    """
+    if third_order is None:
+        return _sample(values, points)
+
+    # All values and second differences in one look-up.
+    axes = range(2, values.ndim)
+    curved = values[:, third_order.channels]
+    differences = [second_difference(curved, axis) for axis in axes]
+    sampled = _sample(torch.cat([values, *differences], 1), points)
+    linear, *bends = sampled.split([values.shape[1]] + [curved.shape[1]] * len(axes), 1)
+
+    # a (1 - a) / 2 times the second difference along each axis; `points` count axes from the last.
+    corrections = [
+        third_order_weight(points[..., 1 - axis], values.shape[axis])[:, None] * bend
+        for axis, bend in zip(axes, bends, strict=True)
+    ]
+    return subtract_correction(linear, torch.stack(corrections).sum(0), third_order)
+
+
+def _sample(values: Tensor, points: Tensor) -> Tensor:
+    sampled: Tensor = _Sample.apply(values, points)
+    return sampled
 
 
 class _Sample(torch.autograd.Function):
+    """torch's `grid_sample`, with forward mode and slopes that are the mean of both sides'."""
+
     @staticmethod
     def forward(values: Tensor, points: Tensor) -> Tensor:
-        return grid_sample(
-            values, points, mode="bilinear", padding_mode="border", align_corners=False
-        )
+        return _grid_sample(values, points)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
@@ -45,49 +89,44 @@ class _Sample(torch.autograd.Function):
         values, points = ctx.saved_tensors
         values_bar = points_bar = None
         if ctx.needs_input_grad[0]:
-            values_bar = _adjoint(output_bar, values, points, (True, False))[0]
+            values_bar = grid_sample_adjoint(output_bar, values, points, (True, False))[0]
         if ctx.needs_input_grad[1]:
-            points_bar = _slope(output_bar, values, points)
+            points_bar = _points_bar(output_bar, values, points)
         return values_bar, points_bar
 
     @staticmethod
     def jvp(ctx: Any, d_values: Tensor | None, d_points: Tensor | None) -> Tensor:
         values, points = ctx.saved_tensors
-        out = values.new_zeros(values.shape[:2] + points.shape[1:-1])
+        d_output = values.new_zeros(values.shape[:2] + points.shape[1:-1])
+        # The values enter linearly.
         if d_values is not None:
-            out = out + grid_sample(
-                d_values, points, mode="bilinear", padding_mode="border", align_corners=False
-            )
+            d_output = d_output + _grid_sample(d_values, points)
+        # The slope of one channel is what the backward pass gives for a cotangent of 1 there.
         if d_points is not None:
             for channel in range(values.shape[1]):
-                one = torch.zeros_like(out)
+                one = torch.zeros_like(d_output)
                 one[:, channel] = 1
-                out[:, channel] += (_slope(one, values, points) * d_points).sum(-1)
-        return out
+                d_output[:, channel] += (_points_bar(one, values, points) * d_points).sum(-1)
+        return d_output
 
 
-def _adjoint(
-    output_bar: Tensor, values: Tensor, points: Tensor, needs: tuple[bool, bool]
-) -> tuple[Tensor, Tensor]:
-    found: tuple[Tensor, Tensor] = _BACKWARD[values.ndim](
-        output_bar.contiguous(), values, points, 0, _BORDER, False, list(needs)
-    )
-    return found
+def _grid_sample(values: Tensor, points: Tensor) -> Tensor:
+    return grid_sample(values, points, mode="bilinear", padding_mode="border", align_corners=False)
 
 
-def _slope(output_bar: Tensor, values: Tensor, points: Tensor) -> Tensor:
-    """The derivative by `points`: where a point lies on a kink, a cell's center along some axis,
-    the mean of those on both sides.
-    """
-    sides = _sides(values, points)
-    return torch.stack(
-        [_adjoint(output_bar, values, side, (False, True))[1] for side in sides]
-    ).mean(0)
+def _points_bar(output_bar: Tensor, values: Tensor, points: Tensor) -> Tensor:
+    """The cotangent of `points`: where one lies on a kink, the mean of those on both sides."""
+    cotangents = [
+        grid_sample_adjoint(output_bar, values, side, (False, True))[1]
+        for side in _sides(values, points)
+    ]
+    return torch.stack(cotangents).mean(0)
 
 
 def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
-    """`points`, or where some lie on kinks, those points shifted to both sides along the axes on
-    which they do.
+    """`points`; where some lie on kinks, cells' centers along some axis, a little to both sides.
+
+    They are shifted along the axes on which they do.
     """
     sizes = points.new_tensor(values.shape[:1:-1])
     place = ((points + 1) * sizes - 1) / 2
@@ -97,47 +136,3 @@ def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
         return (points,)
     shift = is_on_kink * (4 * near / sizes)
     return points - shift, points + shift
-
-
-def sample_slices(slices: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
-    """Bilinear values `[N, K, P]` of `slices` [N, K, H, W] at `points` [N, P, 2] (last array axis
-    first, in [-1, 1]).
-
-    Beyond the outermost cells' centers the value is theirs. Channels in `smooth` are interpolated
-    to third order.
-    """
-    return _interpolate(slices, points[:, :, None], smooth)[..., 0]
-
-
-def sample_volume(volume: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
-    """Trilinear values `[K, N, P]` of `volume` [K, D, H, W] at `points` [N, P, 3] (last array axis
-    first, in [-1, 1]).
-    """
-    return _interpolate(volume[None], points[None, None], smooth)[0, :, 0]
-
-
-def _interpolate(values: Tensor, points: Tensor, smooth: ThirdOrder | None) -> Tensor:
-    """Linear values `[N, K, ...]` of `values` [N, K, ...] at `points`; channels `smooth` less a (1
-    - a) / 2 second differences an axis.
-
-    a is how far a point has gone from one cell center to the next. Linear interpolation is off by
-    that much where a field bends.
-    """
-    if smooth is None:
-        return _sample(values, points)
-    axes = range(2, values.ndim)
-    chosen = values[:, smooth.channels]
-    found = _sample(
-        torch.cat([values, *(second_difference(chosen, axis) for axis in axes)], 1), points
-    )
-    plain, *bends = found.split([values.shape[1]] + [chosen.shape[1]] * len(axes), 1)
-    excesses = [
-        third_order_weight(points[..., 1 - axis], values.shape[axis])[:, None] * bent
-        for axis, bent in zip(axes, bends, strict=True)
-    ]
-    return subtract_correction(plain, torch.stack(excesses).sum(0), smooth)
-
-
-def _sample(values: Tensor, points: Tensor) -> Tensor:
-    found: Tensor = _Sample.apply(values, points)
-    return found

@@ -1,4 +1,4 @@
-"""Where view rays are sampled, and how what is linear between samples is integrated."""
+"""Nodes, where rays are sampled, and integrals of what is linear between them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Nodes:
-    """N nodes on each of R rays: rays' `origin` and unit `direction` [R, 3] (array order), nodes'
-    `distance` [N, R] from the origin [u].
+    """N nodes on each of R rays.
+
+    `origin` and unit `direction` [R, 3] of the rays, in array order; `distance` [N, R]: from the
+    origin to the nodes [u].
     """
 
     origin: Tensor
@@ -23,11 +25,10 @@ class Nodes:
         return self.distance[1:] - self.distance[:-1]
 
     def integral(self, values: Tensor, measure: Tensor | None = None) -> Tensor:
-        """The integral over each segment of what is linear between `values` [N, channels, R], by
-        length or another `measure` [N - 1, R].
+        """The integral `[N - 1, K, R]` over each segment of what is linear between nodes.
+
+        `values`: [N, K, R] at the nodes; `measure` [N - 1, R]: of each segment, by default its
+        length.
         """
-        return (
-            0.5
-            * (values[:-1] + values[1:])
-            * (self.lengths if measure is None else measure)[:, None]
-        )
+        over = self.lengths if measure is None else measure
+        return 0.5 * (values[:-1] + values[1:]) * over[:, None]

@@ -1,9 +1,8 @@
-"""Directions and weights that integrate over the sphere: rules of Lebedev, exact for polynomials up
-to some degree.
+"""Directions and weights that integrate over the sphere, by Lebedev's rules.
 
-They are symmetric under every rotation and reflection of the cube, so no axis of the grid is
-preferred. Sources: Lebedev 1975, doi:10.1016/0041-5553(75)90133-0, and 1976,
-doi:10.1016/0041-5553(76)90100-2.
+They are exact for polynomials up to some degree, and symmetric under every rotation and reflection
+of the cube, so no axis of the grid is preferred. Sources: Lebedev 1975,
+doi:10.1016/0041-5553(75)90133-0, and 1976, doi:10.1016/0041-5553(76)90100-2.
 """
 
 from __future__ import annotations
@@ -44,8 +43,9 @@ DEGREES = {26: 7, 50: 11, 86: 15}
 
 
 def sphere_quadrature(like: Tensor, count: int = 50) -> tuple[Tensor, Tensor]:
-    """Unit directions `[count, 3]` and weights `[count]` whose sum is 1: the mean over the sphere
-    is the weighted sum.
+    """Unit directions `[count, 3]` and weights `[count]` whose sum is 1.
+
+    The weighted sum over the directions is the mean over the sphere. `count`: a key of `DEGREES`.
     """
     directions: list[tuple[float, ...]] = []
     weights: list[float] = []

@@ -1,5 +1,7 @@
-"""Sums along the first axis, slice by slice: `cumsum` strides through memory there, and turns
-arrays around in its backward pass.
+"""Sums along the first axis, slice by slice.
+
+torch's `cumsum` strides through memory there, and reverses arrays in its backward pass: it takes
+three to five times as long (`benchmarks/by_hand.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +19,8 @@ def running_sum(values: Tensor) -> Tensor:
 
 
 class _RunningSum(torch.autograd.Function):
+    """The running sum, whose adjoint is that from the other end."""
+
     @staticmethod
     def forward(values: Tensor) -> Tensor:
         return _accumulate(values, range(len(values)))
@@ -35,7 +39,7 @@ class _RunningSum(torch.autograd.Function):
 
 
 def _accumulate(values: Tensor, order: range) -> Tensor:
-    """The sums so far of `values` along axis 0, taken in `order`."""
+    """The sum so far of `values` along axis 0, visited in `order`."""
     total = values.clone(memory_format=torch.contiguous_format)
     for before, index in pairwise(order):
         total[index] += total[before]

@@ -1,16 +1,16 @@
-"""Interpolation of slices where rows and columns of points are the same for all of a slice: one
-matrix for each, applied in turn.
+"""Interpolation of slices at all pairs of some rows and some columns.
+
+It is a product with one matrix for the rows and one for the columns of each slice.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.autodiff import keep
+from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.third_order import (
     ThirdOrder,
     kink_width,
@@ -22,8 +22,9 @@ from ddrecon.numerics.third_order import (
 
 @dataclass(frozen=True)
 class Weights:
-    """What each cell of a line counts for at R places, `[N, R, size]`: for `linear` values, and for
-    their `third_order` interpolation.
+    """What each cell of a line counts for at R places, in N slices: `[N, R, size]`.
+
+    `linear`: for linear interpolation; `third_order`: for what third order takes off it.
     """
 
     linear: Tensor
@@ -31,24 +32,22 @@ class Weights:
 
     @staticmethod
     def at(
-        coordinate: Tensor, size: int, *, is_smooth: bool = False, fades: bool = False
+        coordinate: Tensor, size: int, *, has_third_order: bool = False, fades: bool = False
     ) -> Weights:
-        """Those at `coordinate` [N, R], in [-1, 1], of a line of `size` cells; the excess only
-        where `is_smooth`.
+        """Those at `coordinate` [N, R], in [-1, 1], of a line of `size` cells.
 
-        Beyond the outermost cells' centers these count alone, or where it `fades` less and less, to
-        nothing one cell further.
+        Beyond the outermost cells' centers these count alone; where it `fades` less and less, to
+        nothing one cell further. Weights of third order only where it `has_third_order`.
         """
         linear = _linear(coordinate, size, fades)
-        return Weights(
-            linear,
-            third_order_weight(coordinate, size)[..., None] * second_difference(linear, 2)
-            if is_smooth
-            else None,
-        )
+        if not has_third_order:
+            return Weights(linear)
+        # a (1 - a) / 2 times the second difference at the place, itself linear between cells.
+        bend = second_difference(linear, 2)
+        return Weights(linear, third_order_weight(coordinate, size)[..., None] * bend)
 
     def between(self, first: int, last: int) -> Weights:
-        """Those of lines `first` to before `last`."""
+        """Those of slices `first` to before `last`."""
         return Weights(
             self.linear[first:last],
             None if self.third_order is None else self.third_order[first:last],
@@ -56,45 +55,45 @@ class Weights:
 
 
 def sample_lattice(
-    slices: Tensor, rows: Weights, columns: Weights, smooth: ThirdOrder | None = None
+    slices: Tensor, rows: Weights, columns: Weights, third_order: ThirdOrder | None = None
 ) -> Tensor:
-    """Values `[N, K, r c]` of `slices` [N, K, H, W] at every pair of `rows` [N, r, H] and `columns`
-    [N, c, W].
+    """Values `[N, K, r c]` of `slices` [N, K, H, W] at all pairs of r `rows` and c `columns`.
 
-    The same, with the same derivatives, as `sample_slices` at all those points; channels in
-    `smooth` need weights of both kinds.
+    The same, with the same derivatives, as `sample_slices` at all those points. Channels of
+    `third_order` need weights of both kinds.
     """
-    half = _apply_rows(rows.linear, slices)
-    linear = _apply_columns(half, columns.linear)
-    if smooth is None or rows.third_order is None or columns.third_order is None:
+    in_rows = _apply_rows(rows.linear, slices)
+    linear = _apply_columns(in_rows, columns.linear)
+    if third_order is None or rows.third_order is None or columns.third_order is None:
         return linear
-    bent = _apply_rows(rows.third_order, slices[:, smooth.channels])
-    both = (
-        torch.cat([bent, half[:, smooth.channels]], -1),
-        torch.cat([columns.linear, columns.third_order], -1),
-    )
-    return subtract_correction(linear, _apply_columns(*both), smooth)
+
+    # Corrections for rows times linear columns, plus linear rows times corrections for columns: one
+    # product with both beside each other.
+    bends = _apply_rows(rows.third_order, slices[:, third_order.channels])
+    both = torch.cat([bends, in_rows[:, third_order.channels]], -1)
+    correction = _apply_columns(both, torch.cat([columns.linear, columns.third_order], -1))
+    return subtract_correction(linear, correction, third_order)
 
 
 def _apply_rows(matrix: Tensor, values: Tensor) -> Tensor:
     """`matrix` [N, r, H] times each channel of `values` [N, K, H, W]: `[N, K, r, W]`."""
     channels, width = values.shape[1], values.shape[3]
-    found = torch.bmm(matrix, values.transpose(1, 2).flatten(2))
-    return found.unflatten(2, (channels, width)).transpose(1, 2)
+    product = torch.bmm(matrix, values.transpose(1, 2).flatten(2))
+    return product.unflatten(2, (channels, width)).transpose(1, 2)
 
 
 def _apply_columns(values: Tensor, matrix: Tensor) -> Tensor:
     """Each channel of `values` [N, K, r, W] times `matrix` [N, c, W]: `[N, K, r c]`."""
-    channels, rows = values.shape[1:3]
-    return (
-        torch.bmm(values.flatten(1, 2), matrix.transpose(1, 2))
-        .unflatten(1, (channels, rows))
-        .flatten(2)
-    )
+    product = torch.bmm(values.flatten(1, 2), matrix.transpose(1, 2))
+    return product.unflatten(1, values.shape[1:3]).flatten(2)
 
 
 def _linear(coordinate: Tensor, size: int, fades: bool) -> Tensor:
-    """Weights of linear interpolation; on a cell's center the slope is the mean of both sides'."""
+    """Weights of linear interpolation; on a cell's center the slope is the mean of both sides'.
+
+    How far a place has come on the way from one cell to the next, less how far on the way from that
+    one on, is what that cell counts for.
+    """
     place = ((coordinate + 1) * size - 1) / 2
     index = torch.arange(-1, size, dtype=place.dtype, device=place.device)
     passed = ramp(place[..., None] - (index if fades else index[1:-1]), kink_width(place, size))
@@ -105,33 +104,12 @@ def _linear(coordinate: Tensor, size: int, fades: bool) -> Tensor:
 
 
 def ramp(place: Tensor, tolerance: float) -> Tensor:
-    """`place` held within 0 and 1; within `tolerance` of a kink its slope is the mean of both
-    sides', 1/2.
-    """
-    held: Tensor = _Ramp.apply(place, tolerance)
-    return held
-
-
-class _Ramp(torch.autograd.Function):
-    @staticmethod
-    def forward(place: Tensor, tolerance: float) -> Tensor:
+    """`place` held within 0 and 1, with the mean slope 1/2 within `tolerance` of a kink."""
+    if not is_varied(place):
         return place.clamp(0, 1)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, float], output: Tensor) -> None:
-        place, ctx.tolerance = inputs
-        keep(ctx, place)
-
-    @staticmethod
-    def backward(ctx: Any, held_bar: Tensor) -> tuple[Tensor, None]:
-        return held_bar * _ramp_slope(ctx.saved_tensors[0], ctx.tolerance), None
-
-    @staticmethod
-    def jvp(ctx: Any, d_place: Tensor, _: None) -> Tensor:
-        return d_place * _ramp_slope(ctx.saved_tensors[0], ctx.tolerance)
-
-
-def _ramp_slope(place: Tensor, tolerance: float) -> Tensor:
-    outer = (place > -tolerance) & (place < 1 + tolerance)
-    inner = (place > tolerance) & (place < 1 - tolerance)
-    return 0.5 * (outer.to(place.dtype) + inner.to(place.dtype))
+    held = place.detach()
+    is_near = (held > -tolerance) & (held < 1 + tolerance)
+    is_inside = (held > tolerance) & (held < 1 - tolerance)
+    slope = 0.5 * (is_near.to(place.dtype) + is_inside.to(place.dtype))
+    # The second term is 0 and has the slope.
+    return held.clamp(0, 1) + slope * (place - held)

@@ -1,4 +1,8 @@
-"""Third-order interpolation: what linear interpolation lacks where a field bends."""
+"""Third-order interpolation: what is taken off linear interpolation where a field bends.
+
+A part a of the way between two neighbors, linear interpolation is too large by a (1 - a) / 2 times
+the second difference.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import torch
 from torch import Tensor
 
 KINK = 16
-"""Units in the last place, of a coordinate counted in cells, within which a point counts as lying
+"""Within so many units in the last place, of a coordinate counted in cells, a point counts as lying
 on a cell's center.
 """
 
@@ -17,8 +21,8 @@ on a cell's center.
 class ThirdOrder:
     """Channels, `first` to before `last`, that are interpolated to third order rather than second.
 
-    What that adds to a value, x, is bounded smoothly, x / sqrt(1 + (`bound` x)^2), so that jumps of
-    a field do no harm.
+    The correction x is bounded smoothly, as x / sqrt(1 + (`bound` x)^2), so that jumps of a field
+    do no harm. `bound` is 1 over the most it may be; 0 sets no limit.
     """
 
     first: int
@@ -35,30 +39,29 @@ class ThirdOrder:
         return x / (1 + (self.bound * x) ** 2).sqrt()
 
 
-def subdivide(values: Tensor, steps: int, smooth: ThirdOrder | None = None) -> Tensor:
-    """`values` along axis 0 with `steps` - 1 interpolated entries between each pair of neighbors;
-    channels are axis 1.
+def subdivide(values: Tensor, steps: int, third_order: ThirdOrder | None = None) -> Tensor:
+    """`values` along axis 0 with `steps` - 1 interpolated entries between each pair of neighbors.
+
+    Axis 1 are channels; those of `third_order` are interpolated to third order.
     """
     if steps == 1:
         return values
     low, high = values[:-1], values[1:]
     parts = [low + (high - low) * (i / steps) for i in range(steps)]
-    if smooth is not None:
-        bent = second_difference(values[:, smooth.channels], 0)
+    if third_order is not None:
+        bend = second_difference(values[:, third_order.channels], 0)
         for i in range(1, steps):
-            share = i / steps
-            parts[i] = subtract_correction(
-                parts[i],
-                0.5 * share * (1 - share) * (bent[:-1] * (1 - share) + bent[1:] * share),
-                smooth,
-            )
+            a = i / steps
+            # The second difference there, itself linear between neighbors.
+            correction = 0.5 * a * (1 - a) * (bend[:-1] * (1 - a) + bend[1:] * a)
+            parts[i] = subtract_correction(parts[i], correction, third_order)
     return torch.cat([torch.stack(parts, 1).flatten(0, 1), values[-1:]])
 
 
-def subtract_correction(values: Tensor, amount: Tensor, smooth: ThirdOrder) -> Tensor:
-    """`values` with `amount`, bounded, taken from the channels that are `smooth`."""
-    changed = values[:, smooth.channels] - smooth.bounded(amount)
-    return torch.cat([values[:, : smooth.first], changed, values[:, smooth.last :]], 1)
+def subtract_correction(values: Tensor, correction: Tensor, third_order: ThirdOrder) -> Tensor:
+    """`values` with `correction`, bounded, taken off the channels of `third_order`."""
+    corrected = values[:, third_order.channels] - third_order.bounded(correction)
+    return torch.cat([values[:, : third_order.first], corrected, values[:, third_order.last :]], 1)
 
 
 def second_difference(values: Tensor, axis: int) -> Tensor:
@@ -74,13 +77,20 @@ def kink_width(place: Tensor, size: int) -> float:
 
 
 def third_order_weight(coordinate: Tensor, size: int) -> Tensor:
-    """a (1 - a) / 2: 0 at cell centers, 1/8 midway, 0 beyond the outermost; on a kink its slope is
-    the mean of both sides'.
+    """a (1 - a) / 2 at `coordinate` in [-1, 1] along `size` cells.
+
+    It is 0 at cells' centers, 1/8 midway, and 0 beyond the outermost centers; on a kink its slope
+    is the mean of both sides'.
     """
     place = ((coordinate + 1) * size - 1) / 2
-    apart = place - place.round()
-    is_on_kink = apart.abs() < kink_width(place, size)
-    inner = 0.5 * apart.abs() * (1 - apart.abs())
+    offset = place - place.round()
+    is_on_kink = offset.abs() < kink_width(place, size)
+
+    # The same from either neighbor: a = |offset| from the nearer one.
+    inner = 0.5 * offset.abs() * (1 - offset.abs())
     within = torch.where((place > 0) & (place < size - 1), inner, torch.zeros_like(inner))
+
+    # At centers the value is 0. Slopes of both sides, -1/2 and 1/2, cancel, but at the outermost
+    # ones, where that of the outer side is 0.
     end = (place.round() == 0).to(place.dtype) - (place.round() == size - 1).to(place.dtype)
     return torch.where(is_on_kink, 0.25 * end * (place - place.detach()), within)

@@ -16,7 +16,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, face_fluxes
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import decompose_lights
-from ddrecon.medium.coefficients import has_flux, scale_medium
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.scene import Scene
 
 
@@ -37,7 +37,7 @@ class Balance:
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
     """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
     medium, grid, settings = scale_medium(scene.volume), scene.volume.grid, scene.diffusion
-    lights, is_directed = decompose_lights(scene.lights), has_flux(medium)
+    lights, is_directed = decompose_lights(scene.lights), medium.has_flux
     problem = DiffusionProblem(
         medium,
         lambda extinction: CLOSURES[settings.closure](extinction, grid, settings.floor),

@@ -16,7 +16,7 @@ from ddrecon.light.environment import (
     environment_radiance,
     pixel_moments,
     refine_map,
-    turn_directions,
+    rotate_directions,
 )
 from ddrecon.light.lights import EnvironmentLight
 
@@ -85,7 +85,7 @@ def test_a_quarter_turn_rolls_the_map():
 def test_turning_the_map_is_turning_the_viewer():
     radiance, ways = random_values(3, 6, 8), directions(50)
     light = light_of(radiance, rotation=33.0)
-    found = environment_radiance(light, array_order(turn_directions(ways, light.rotation)))
+    found = environment_radiance(light, array_order(rotate_directions(ways, light.rotation)))
     torch.testing.assert_close(
         found, environment_radiance(light_of(radiance), array_order(ways)), rtol=1e-11, atol=1e-12
     )

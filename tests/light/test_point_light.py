@@ -106,7 +106,7 @@ def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
 
 
 def test_the_depth_of_a_smooth_blob_converges_at_second_order():
-    """From a light inside: the integral of a Gaussian along a line from there, an error function."""
+    """From a light inside: the integral of a Gaussian along a line, an error function."""
     width, errors, counts = 0.15, [], [8, 12, 18, 27]
     for count in counts:
         grid = Grid((count, count + 2, count), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5))

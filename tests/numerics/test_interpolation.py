@@ -100,7 +100,7 @@ def test_volumes_have_both_derivatives(wanted: tuple[bool, bool]):
     assert torch.autograd.gradcheck(sample_volume, inputs, check_forward_ad=True)
 
 
-# --- kinks -----------------------------------------------------------------------------------------------------------
+# --- kinks ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -136,7 +136,7 @@ def test_both_modes_agree_at_kinks():
     torch.testing.assert_close((bar * change).sum(), (tangent * weight).sum(), rtol=1e-12, atol=0)
 
 
-# --- third order -----------------------------------------------------------------------------------------------------
+# --- third order ---------------------------------------------------------------------------------
 
 
 def centers(cells: int) -> Tensor:

@@ -23,7 +23,7 @@ def point_by_point(
 
 def by_matrices(slices: Tensor, rows: Tensor, columns: Tensor, smooth: ThirdOrder | None) -> Tensor:
     down, along = (
-        Weights.at(line, size, is_smooth=smooth is not None)
+        Weights.at(line, size, has_third_order=smooth is not None)
         for line, size in zip((rows, columns), slices.shape[2:], strict=True)
     )
     return sample_lattice(slices, down, along, smooth)

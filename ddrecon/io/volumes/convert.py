@@ -17,8 +17,7 @@ def convert(sources: Sequence[Path], output: Path, *, may_exist: bool) -> list[P
     """Writes all fields of the volumes `sources` to `output`, in the format of its suffix.
 
     Returns what was written. Raises UsageError where `output` is there and may not be or its folder
-    is missing, FormatError
-    for volumes of different cells or boxes, and for none at all.
+    is missing, FormatError for volumes of different cells or boxes, and for none at all.
     """
     require_format(output)
     require_free_files([output], may_exist=may_exist)

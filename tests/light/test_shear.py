@@ -1,0 +1,279 @@
+"""The mass that a beam passes, against a slow twin that follows one ray a cell in plain Python."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from media import box_grid, convergence_order, half_empty, random_values
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.light.shear import sum_mass_to_cells
+
+DIRECTIONS = [
+    (1.0, 0.0, 0.0),
+    (0.0, -1.0, 0.0),
+    (0.8, 0.3, -0.5),
+    (-0.2, 0.9, 0.4),
+    (0.3, -0.1, -0.7),
+    (1.0, 1.0, 1.0),
+]
+SLANTED = [(0.8, 0.3, -0.5), (-0.2, 0.9, 0.4), (0.3, -0.1, -0.7)]
+
+
+def unit(direction: tuple[float, ...]) -> Tensor:
+    vector = torch.tensor(direction, dtype=torch.float64)
+    return vector / vector.norm()
+
+
+def by_rays(field: Tensor, grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """The mass [z, y, x], and how far each cell's ray stays from the sides [cells].
+
+    From every cell's center back towards the light, a slice at a time: the field where the ray
+    meets the slices, and midway between two of them the mean of both. The sides are the outermost
+    cells' centers. Shares no code with the package.
+    """
+    speed = [d / h for d, h in zip(direction.tolist(), grid.spacing, strict=True)]
+    axis = max(range(3), key=lambda a: abs(speed[a]))
+    back = [-s / abs(speed[axis]) for s in speed]
+    values = field.tolist()
+
+    def cell_value(place: tuple[int, ...]) -> float:
+        z, y, x = place
+        is_inside = all(0 <= i < size for i, size in zip(place, grid.shape, strict=True))
+        return values[z][y][x] if is_inside else 0.0
+
+    def on_slice(slice_index: int, place: list[float]) -> float:
+        """Bilinear within a slice, at `place` [cells]; zeros surround the box."""
+        low = [slice_index if a == axis else math.floor(p) for a, p in enumerate(place)]
+        total = 0.0
+        for up in itertools.product(*((0,) if a == axis else (0, 1) for a in range(3))):
+            corner = tuple(i + u for i, u in zip(low, up, strict=True))
+            weights = (1 - abs(place[a] - corner[a]) for a in range(3) if a != axis)
+            total += math.prod(weights) * cell_value(corner)
+        return total
+
+    mass, margin = torch.zeros_like(field), torch.zeros_like(field)
+    for cell in itertools.product(*map(range, grid.shape)):
+        passed, place, nearest = 0.0, [float(i) for i in cell], math.inf
+        index, toward_light = cell[axis], round(back[axis])
+        while 0 <= index + toward_light < grid.shape[axis]:
+            between = [p + b / 2 for p, b in zip(place, back, strict=True)]
+            before = [p + b for p, b in zip(place, back, strict=True)]
+            here, there = on_slice(index, place), on_slice(index + toward_light, before)
+            midway = (on_slice(index, between) + on_slice(index + toward_light, between)) / 2
+            passed += there + (midway - (here + there) / 2) / 2
+            place, index = before, index + toward_light
+        for a in {0, 1, 2} - {axis}:
+            ends = cell[a], place[a]
+            nearest = min(nearest, *ends, *(grid.shape[a] - 1 - end for end in ends))
+        mass[cell], margin[cell] = passed / abs(speed[axis]), nearest
+    return mass, margin
+
+
+@pytest.mark.parametrize(
+    "direction", [d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)], ids=str
+)
+def test_where_rays_run_through_centers_the_mass_is_that_of_each_ray(direction):
+    """Along axes, and diagonals of cubic cells, nothing is interpolated: exact on any field."""
+    upper = (1.25, 1.3, 0.9) if direction.count(0) == 2 else (1.25, 1.0, 1.5)
+    grid, field = Grid((5, 4, 6), (0, 0, 0), upper), random_values(5, 4, 6)
+    entered, step = sum_mass_to_cells(field[None], grid, unit(direction))
+    torch.testing.assert_close(
+        entered[0], by_rays(field, grid, unit(direction))[0], rtol=0, atol=1e-14
+    )
+    paths = [h / abs(d) for h, d in zip(grid.spacing, unit(direction).tolist(), strict=True) if d]
+    assert step.item() == pytest.approx(min(paths), rel=1e-15)
+
+
+@pytest.mark.parametrize("direction", SLANTED, ids=str)
+@pytest.mark.parametrize("slope", [(0.0, 0.0, 0.0), (0.4, -0.3, 0.7)], ids=["even", "linear"])
+def test_in_an_even_or_linear_field_the_mass_is_that_of_each_ray(direction, slope):
+    """Where no ray comes within two cells of the sides: interpolation of both is exact there."""
+    grid = Grid((11, 12, 11), (0, 0, 0), (1.0, 1.2, 0.9))
+    z, y, x = torch.meshgrid(
+        *(torch.arange(size, dtype=torch.float64) for size in grid.shape), indexing="ij"
+    )
+    field = 20 + slope[0] * z + slope[1] * y + slope[2] * x
+    entered, _ = sum_mass_to_cells(field[None], grid, unit(direction))
+    wanted, margin = by_rays(field, grid, unit(direction))
+    assert int((margin >= 2).sum()) > 100
+    torch.testing.assert_close(entered[0][margin >= 2], wanted[margin >= 2], rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("direction", SLANTED, ids=str)
+def test_the_mass_of_a_smooth_field_comes_to_be_that_of_each_ray(direction):
+    """At second order: the field is interpolated linearly, at other places for either."""
+    counts, errors = (6, 9, 13), []
+    for count in counts:
+        grid = Grid((count, count + 1, count), (-1, -1, -1), (1, 1, 1))
+        z, y, x = torch.meshgrid(
+            *(axis.flatten() for axis in grid.centers(torch.zeros((), dtype=torch.float64))),
+            indexing="ij",
+        )
+        field = torch.exp(-4 * (x * x + y * y + z * z))
+        entered, _ = sum_mass_to_cells(field[None], grid, unit(direction))
+        wanted, _ = by_rays(field, grid, unit(direction))
+        errors.append(float((entered[0] - wanted).square().mean().sqrt()))
+    assert convergence_order([1 / count for count in counts], errors) > 1.8, errors
+
+
+# --- closed forms and symmetries ------------------------------------------------------------------
+
+
+def mass_to_centers(field: Tensor, grid: Grid, direction: Tensor) -> Tensor:
+    """The integral of `field` [z, y, x] from the box to each cell's center."""
+    entered, step = sum_mass_to_cells(field[None], grid, direction)
+    return entered[0] + 0.5 * step * field
+
+
+def path_to_centers(grid: Grid, direction: Tensor) -> Tensor:
+    """The distance a beam has come inside the box when it reaches each cell's center."""
+    distances = []
+    for center, low, high, along in zip(
+        grid.centers(direction), grid.lower, grid.upper, direction.tolist(), strict=True
+    ):
+        distances.append(
+            (center - (low if along > 0 else high)) / along
+            if along
+            else torch.full_like(center, math.inf)
+        )
+    return torch.stack(torch.broadcast_tensors(*distances)).amin(0)
+
+
+WIDTH = 0.09
+
+
+def blob(grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """A Gaussian in the middle of the box at cell centers, and its integral along `direction` from
+    infinity to there.
+    """
+    middle = [(low + high) / 2 for low, high in zip(grid.lower, grid.upper, strict=True)]
+    offset = torch.stack(
+        torch.broadcast_tensors(
+            *(axis - m for axis, m in zip(grid.centers(direction), middle, strict=True))
+        ),
+        -1,
+    )
+    along = offset @ direction
+    across = (offset**2).sum(-1) - along**2
+    gaussian = torch.exp(-(offset**2).sum(-1) / (2 * WIDTH**2))
+    integral = (
+        torch.exp(-across / (2 * WIDTH**2))
+        * WIDTH
+        * math.sqrt(math.pi / 2)
+        * (1 + torch.erf(along / WIDTH / math.sqrt(2)))
+    )
+    return gaussian, integral
+
+
+@pytest.mark.parametrize("cells", [(8, 12, 6), (16, 24, 12)], ids=str)
+@pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
+def test_in_a_homogeneous_box_depth_is_path_length(
+    direction: tuple[float, ...], cells: tuple[int, int, int]
+):
+    """Exactly where the beam enters across its main axis; elsewhere edges are smeared, by less than
+    half a cell is crossed in.
+    """
+    grid, heading = box_grid(cells), unit(direction)
+    error = (
+        mass_to_centers(torch.ones(cells, dtype=torch.float64), grid, heading)
+        - path_to_centers(grid, heading)
+    ).abs()
+    speeds = [abs(along) / step for along, step in zip(heading.tolist(), grid.spacing, strict=True)]
+    assert float(error.max()) < max(
+        1e-14, 0.5 * max((1 / speed for speed in speeds if speed), default=0)
+    )
+    axis = speeds.index(max(speeds))
+    depth = torch.arange(cells[axis], dtype=torch.float64)
+    depth = (depth if direction[axis] > 0 else depth.flip(0)).view(
+        [-1 if a == axis else 1 for a in range(3)]
+    )
+    is_inside = torch.ones(cells, dtype=torch.bool)
+    for other in {0, 1, 2} - {axis}:
+        drift = depth * speeds[other] / speeds[axis]
+        from_low = torch.arange(cells[other]).view([-1 if a == other else 1 for a in range(3)])
+        from_high = cells[other] - 1 - from_low
+        behind, ahead = (from_low, from_high) if direction[other] > 0 else (from_high, from_low)
+        is_inside &= (behind >= drift + 2) & ((ahead >= 2) | (direction[other] == 0))
+    assert is_inside.any()
+    assert float(error[is_inside].max()) < 1e-14
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
+def test_the_depth_of_a_smooth_blob_converges_at_second_order(direction: tuple[float, ...]):
+    errors, counts = [], [4, 6, 9, 12]
+    for count in counts:
+        grid = box_grid((4 * count, 5 * count, 3 * count))
+        field, integral = blob(grid, unit(direction))
+        errors.append(
+            float(((mass_to_centers(field, grid, unit(direction)) - integral) ** 2).mean().sqrt())
+        )
+    assert convergence_order([1 / count for count in counts], errors) >= 1.8, errors
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.permutations(range(3)), st.tuples(*[st.sampled_from([1, -1])] * 3), st.integers(0, 2))
+def test_a_mirrored_or_turned_world_is_mirrored_or_turned(order_of_axes, signs, seed: int):
+    """Entered mass commutes with every symmetry of the cube, cells being turned with the field."""
+    generator = torch.Generator().manual_seed(seed)
+    field, direction = (
+        torch.rand(4, 3, 5, generator=generator, dtype=torch.float64),
+        torch.rand(3, generator=generator, dtype=torch.float64) - 0.5,
+    )
+    direction = direction / direction.norm()
+    grid = Grid((4, 3, 5), (0, 0, 0), (1.0, 1.3, 0.9))
+    flips = [axis for axis, sign in enumerate(signs) if sign < 0]
+
+    def turned(values: Tensor) -> Tensor:
+        return values.permute(order_of_axes).flip(flips)
+
+    upper = tuple(grid.extent[axis] for axis in order_of_axes)
+    turned_direction = direction[list(order_of_axes)] * torch.tensor(signs)
+    expected, step = sum_mass_to_cells(field[None], grid, direction)
+    found, turned_step = sum_mass_to_cells(
+        turned(field)[None], Grid(tuple(turned(field).shape), (0, 0, 0), upper), turned_direction
+    )
+    torch.testing.assert_close(found[0], turned(expected[0]), rtol=0, atol=1e-13)
+    assert turned_step == pytest.approx(step.item(), rel=1e-14)
+
+
+def test_entered_mass_is_linear_in_the_field():
+    grid, direction = box_grid((4, 3, 5)), unit((0.5, -0.3, 0.4))
+    one, other = random_values(1, 4, 3, 5, seed=1), random_values(1, 4, 3, 5, seed=2)
+    together = sum_mass_to_cells(one + 2 * other, grid, direction)[0]
+    torch.testing.assert_close(
+        together,
+        sum_mass_to_cells(one, grid, direction)[0]
+        + 2 * sum_mass_to_cells(other, grid, direction)[0],
+        rtol=1e-13,
+        atol=1e-15,
+    )
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.2, -0.3), (-1.0, -0.3, 0.1)], ids=str)
+def test_mass_is_conserved(direction: tuple[float, ...]):
+    """What a beam has met when it enters the last slice is all mass before it, as long as no shadow
+    leaves through the sides.
+    """
+    grid = Grid((6, 20, 20), (0, 0, 0), (1.2, 5.0, 4.0))
+    field = torch.zeros(1, *grid.shape, dtype=torch.float64)
+    field[:, :, 7:13, 7:13] = random_values(6, 6, 6)
+    entered, step = sum_mass_to_cells(field, grid, unit(direction))
+    last = -1 if direction[0] > 0 else 0
+    before = field.sum() - field[:, last].sum()
+    torch.testing.assert_close(entered[:, last].sum(), step * before, rtol=1e-13, atol=0)
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.4, -0.5, 0.6)], ids=str)
+def test_entered_mass_has_both_derivatives(direction: tuple[float, ...]):
+    grid, field = box_grid((3, 2, 3)), half_empty(1, 3, 2, 3).requires_grad_()
+    heading = unit(direction)
+    assert torch.autograd.gradcheck(
+        lambda f: sum_mass_to_cells(f, grid, heading)[0], field, check_forward_ad=True
+    )
