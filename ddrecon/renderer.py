@@ -30,7 +30,8 @@ from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import Sky, decompose_lights
 from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
-from ddrecon.march.integral import Emission, march
+from ddrecon.march.emission import Emission
+from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Medium, has_flux, keep_medium, scale_medium
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.scene import Scene, View

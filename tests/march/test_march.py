@@ -16,9 +16,10 @@ from ddrecon.cameras import Camera, Rays, cast_rays
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import reduced_light
+from ddrecon.march import bands, samplers
 from ddrecon.march import integral as march_module
-from ddrecon.march import samplers, slices
-from ddrecon.march.integral import Emission, march
+from ddrecon.march.emission import Emission
+from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.numerics.nodes import Nodes
@@ -140,7 +141,7 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
 
     whole = marched()
     monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
-    monkeypatch.setattr(slices, "BAND", 1)
+    monkeypatch.setattr(bands, "BAND", 1)
     for one, other in zip(whole, marched(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
