@@ -30,4 +30,5 @@ def choose_sampler(
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):
         return Bands.of(channels, grid, axis, bool(along[0] < 0), steps)
-    return Equidistant(channels, grid, float((crossing.far - crossing.near).max()), steps)
+    longest = float((crossing.far - crossing.near).detach().max())
+    return Equidistant(channels, grid, longest, steps)
