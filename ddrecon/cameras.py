@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ddrecon.grid import Triple, array_order
+from ddrecon.grid import Grid, Triple, array_order
 
 
 @dataclass(eq=False)
@@ -84,7 +84,8 @@ def _rotation(vector: Tensor) -> Tensor:
 class Rays:
     """View rays, in array order.
 
-    `origin` [R, 3] in u; `direction` [R, 3], of unit length, away from the camera. `eye` [3] is the point all rays of a perspective camera pass through, None for parallel rays.
+    `origin` [R, 3] in u; `direction` [R, 3], of unit length, away from the camera. `eye` [3] is the
+    point that all rays of a perspective camera pass through, None for parallel rays.
     """
 
     origin: Tensor
@@ -94,6 +95,19 @@ class Rays:
     def select(self, index: Tensor) -> Rays:
         """The rays at `index`."""
         return Rays(self.origin[index], self.direction[index], self.eye)
+
+    def towards_eye(self, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
+        """Unit directions from the cells of `grid` to the camera: z, y, x, each for `[z, y, x]`.
+
+        All rays through a cell's center have the same direction, so light that leaves along them
+        is a field of the camera, interpolated like any other.
+        """
+        if self.eye is None:
+            z, y, x = -self.direction[0]
+            return z, y, x
+        z, y, x = (e - c for e, c in zip(self.eye, grid.centers(self.eye), strict=True))
+        distance = (z**2 + y**2 + x**2).sqrt().clamp(min=torch.finfo(self.eye.dtype).tiny)
+        return z / distance, y / distance, x / distance
 
     @staticmethod
     def join(bundles: Sequence[Rays]) -> Rays:
@@ -108,7 +122,8 @@ class Rays:
 def look_at(origin: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Camera-to-world matrix `[3, 4]` of a camera at `origin` that looks at `target`.
 
-    All three vectors are `[3]` (x, y, z). Raises ValueError when origin and target coincide or `up` is parallel to the view direction.
+    All three vectors are `[3]` (x, y, z). Raises ValueError when origin and target coincide or `up`
+    is parallel to the view direction.
     """
     forward = target - origin
     right = torch.linalg.cross(forward, up)
