@@ -12,6 +12,8 @@ from click.testing import Result
 from ddrecon.validate import hard
 from ddrecon.validate.hard_cases import CASES, HardCase, empty, full
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., Result]
 BENCH = ["bench", "--hard", "-q"]
 

@@ -27,6 +27,8 @@ from ddrecon.grid import Grid
 from ddrecon.renderer import render, solve_light, view_components
 from ddrecon.scene import Scene, View
 
+pytestmark = pytest.mark.slow
+
 ALBEDOS = (0.5, 0.9, 0.99, 1.0)
 SUNS = (1.0, 0.6, 0.3)
 """Cosines mu0 of the light with the normal."""

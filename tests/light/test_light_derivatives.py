@@ -18,6 +18,8 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLigh
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 
+pytestmark = pytest.mark.slow
+
 
 def tensor(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)

@@ -22,6 +22,8 @@ from ddrecon.reference.export import export_scene
 from ddrecon.reference.trace import Traced, Tracer, open_tracer
 from ddrecon.scene import Scene, View
 
+pytestmark = pytest.mark.slow
+
 NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
 COLOR = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
 NEAR: list[Light] = [

@@ -21,6 +21,8 @@ from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)")
 
 LOWER, UPPER = (-0.2, -0.8, -0.3), (0.8, 0.4, 0.5)

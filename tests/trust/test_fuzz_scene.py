@@ -24,6 +24,8 @@ from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
 from ddrecon.scene_file.load import MAX_BYTES
 
+pytestmark = pytest.mark.slow
+
 CASES = settings(
     derandomize=True,
     database=None,

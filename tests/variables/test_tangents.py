@@ -15,6 +15,8 @@ from ddrecon.scene import Scene
 from ddrecon.variables.tangents import render_tangent, variation
 from ddrecon.variables.values import value_of, with_values
 
+pytestmark = pytest.mark.slow
+
 STEP = 1e-5
 
 

@@ -8,7 +8,7 @@ import itertools
 
 import pytest
 import torch
-from media import box_grid, convergence_order, random_values
+from media import box_grid, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.paper.stencils import (
@@ -64,16 +64,16 @@ def test_gradients_of_quadratics_and_laplacians_of_cubics_are_exact(
         z, y, x = (c**n if n >= 0 else 0 * c for c, n in zip(coordinates, exponents, strict=True))
         return (z * y * x).expand([n + 2 for n in SHAPE])
 
-    def derivative(axis: int, of: tuple[int, ...]) -> Tensor:
-        factor = of[axis] * (of[axis] - 1 if convergence_order == 2 else 1)
+    def derivative(axis: int, order: int, of: tuple[int, ...]) -> Tensor:
+        factor = of[axis] * (of[axis] - 1 if order == 2 else 1)
         return factor * inside(
-            monomial([n - convergence_order * (axis == other) for other, n in enumerate(of)])
+            monomial([n - order * (axis == other) for other, n in enumerate(of)])
         )
 
     gradient = convolve(monomial(list(powers))[None], stencils.gradient)[0]
     torch.testing.assert_close(
         gradient,
-        torch.stack([derivative(axis, powers) for axis in range(3)]),
+        torch.stack([derivative(axis, 1, powers) for axis in range(3)]),
         rtol=1e-12,
         atol=1e-12,
     )
@@ -81,7 +81,7 @@ def test_gradients_of_quadratics_and_laplacians_of_cubics_are_exact(
     neighbors = convolve(monomial(list(cubic))[None], stencils.terms)[0, 0]
     laplacian = neighbors - inside(monomial(list(cubic))) * sum(2 / h**2 for h in grid.spacing)
     torch.testing.assert_close(
-        laplacian, sum(derivative(axis, cubic) for axis in range(3)), rtol=1e-11, atol=1e-11
+        laplacian, sum(derivative(axis, 2, cubic) for axis in range(3)), rtol=1e-11, atol=1e-11
     )
 
 
