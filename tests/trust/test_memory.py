@@ -28,7 +28,10 @@ COMMANDS = {
     "gradcheck": ["gradcheck", "scene.yaml"],
     "check": ["check", "scene.yaml"],
 }
-LINE = r"scene\.yaml:3:15: volume\.resolution: takes about [\d.]+ GiB, but this machine has [\d.]+ [GM]iB free; this would fit: .*"
+LINE = (
+    r"scene\.yaml:3:15: volume\.resolution: takes about [\d.]+ GiB, "
+    r"but this machine has [\d.]+ [GM]iB free; this would fit: .*"
+)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
