@@ -1,7 +1,6 @@
-"""View rays no closer together than a volume can tell: a lattice of rays, between which pixels are
-interpolated.
+"""View rays no closer together than a volume can tell: pixels are interpolated between them.
 
-The lattice is regular in the plane through the box's center, across the axis along which rays cross
+Their lattice is regular in the plane through the box's center, across the axis along which rays cross
 most cells. So it is in every slice, and interpolation there is a small matrix for rows and one for
 columns (the shear-warp factorization, doi:10.1145/192161.192283): products of matrices in place of
 gathers, and of scatters in the backward pass.
@@ -23,7 +22,7 @@ from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.third_order import ThirdOrder, second_difference
 
 MARGIN = 2
-"""Lattice rays beyond the outermost pixels: interpolation reaches so far."""
+"""Lattice rays beyond the outermost pixels: as far as interpolation reaches."""
 FEWER = 2
 """A lattice is worth its interpolation where pixels have so many times as many rays."""
 RAYS_PER_VOXEL = 2
@@ -108,6 +107,7 @@ def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
             index = torch.arange(a, b + 1, dtype=direction.dtype, device=direction.device)
             yield grid.lower[other] + 0.5 * step + step * index
 
+    # Any two lines of each kind tell where all rays are among lines without end.
     unit = Lattice(axis, 0.5 * (low + high), eye, direction, *lines((0, 0), (1, 1)))
     places = unit.places(hitting).detach()
     first = [math.floor(place) - MARGIN for place in places.amin(0).tolist()]
@@ -135,6 +135,7 @@ def is_rough(values: Tensor, tolerance: float, places: Tensor) -> Tensor:
     they are large at edges sharper than the lattice as well.
     """
     values = values.detach()
+    # Fourth differences along rows and columns; of each place, the largest of the four rays around.
     uneven = sum(second_difference(second_difference(values, axis), axis).abs() for axis in (1, 2))
     cells = max_pool2d(torch.as_tensor(uneven).sum(0, keepdim=True), 2, 1)[0]
     rows, columns = places.detach().floor().long().unbind(-1)

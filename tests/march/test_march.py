@@ -182,7 +182,7 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, monkeypat
 
 @pytest.mark.parametrize("view", ["perspective", "oblique", "orthographic"])
 def test_slices_and_equal_steps_agree_in_the_limit(view: str, monkeypatch):
-    """Both interpolate the same fields, along other nodes: their difference vanishes as steps grow."""
+    """Both interpolate the same fields, at other nodes: with steps their difference vanishes."""
     emission, bundle = (
         emission_of(box_grid((3, 5, 4)), random_values(3, 5, 4)),
         cast_rays(make_camera(size=(7, 6), **CAMERAS[view])),
@@ -287,7 +287,7 @@ def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: boo
 
 
 def test_forward_scattering_is_brightest_against_the_light():
-    """Through a thin slab, where attenuation hardly matters: p(1) / p(-1) = ((1 + g) / (1 - g))^3."""
+    """p(1) / p(-1) = ((1 + g) / (1 - g))^3 of a thin slab, where attenuation hardly matters."""
     against, along = (
         float(render(with_density(slab(8, 0.8, (0.0, 0.0, z)), 1e-6)).mean()) for z in (1.0, -1.0)
     )
