@@ -1,9 +1,9 @@
 """View rays no closer together than a volume can tell: pixels are interpolated between them.
 
-Their lattice is regular in the plane through the box's center, across the axis along which rays cross
-most cells. So it is in every slice, and interpolation there is a small matrix for rows and one for
-columns (the shear-warp factorization, doi:10.1145/192161.192283): products of matrices in place of
-gathers, and of scatters in the backward pass.
+Their lattice is regular in the plane through the box's center, across the axis along which rays
+cross most cells. So it is in every slice, and interpolation there is a small matrix for rows and
+one for columns (the shear-warp factorization, doi:10.1145/192161.192283): products of matrices in
+place of gathers, and of scatters in the backward pass.
 """
 
 from __future__ import annotations
