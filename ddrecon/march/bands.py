@@ -40,12 +40,14 @@ class Bands:
     def of(channels: Channels, grid: Grid, axis: int, is_reversed: bool, steps: int) -> Bands:
         """Those of `channels`, `steps` planes a cell along `axis`, from below or `is_reversed`."""
         fields, count = channels.values, grid.shape[axis]
+        # Planes through the cell centers and in both faces of the box, in cells: 0, 0.5, 1.5, ...
         place = torch.arange(count + 2, dtype=fields.dtype, device=fields.device) - 0.5
         planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
         index = (place - 0.5).clamp(0, count - 1).long()
         if is_reversed:
             index, planes = index.flip(0), planes.flip(0)
         row, column = across(axis)
+        # Rows are the second dimension in memory, so that each band of a plane is one piece.
         slices = (
             fields.permute(1 + axis, 1 + row, 0, 1 + column).index_select(0, index).transpose(1, 2)
         )
@@ -73,8 +75,9 @@ class Bands:
         return self._meet(rows, torch.arange(rows.shape[1], device=rows.device).split(count))
 
     def _meet(self, rows: Tensor, chunks: Sequence[Tensor]) -> list[tuple[Tensor, Slices]]:
-        """Each of `chunks` of rays, which cross `rows` [2, R] [u] of the first and the last plane,
-        and what they meet.
+        """Each of `chunks` of rays, and what they meet.
+
+        The rays cross `rows` [2, R] [u] of the first and of the last plane.
         """
         lows, highs = (
             torch.stack([extreme(rows[:, chunk]) for chunk in chunks]).tolist()
@@ -104,7 +107,7 @@ class Bands:
             return min(max(cell, 0), grid.shape[row] - 1) // BAND
 
         first, last = band(low, -REACH), band(high, REACH)
-        # Where nothing is met, two empty planes are left: a ray has at least one segment.
+        # Where these bands hold nothing, two planes are left: a ray has at least one segment.
         spans = [span for span in self.spans[first : last + 1] if span is not None]
         begin = max(min((span[0] for span in spans), default=1) - 1, 0)
         end = max((span[1] for span in spans), default=0) + 2
@@ -121,8 +124,9 @@ class Bands:
 
 
 def _spans(bands: tuple[Tensor, ...], matter: int) -> list[tuple[int, int] | None]:
-    """The first and last plane where each of `bands` holds anything in its first `matter` channels;
-    all planes where that is 0.
+    """The first and last plane where each of `bands` holds anything in its first `matter` channels.
+
+    All planes where `matter` is 0.
     """
     if not matter:
         return [(0, len(band) - 1) for band in bands]

@@ -64,8 +64,10 @@ def march(
 
 
 def _needs_own_ray(values: Tensor, places: Tensor, tolerance: float, behind: float) -> Tensor:
-    """At which of `places` the image may be off by more than `tolerance`, interpolated from the
-    `values` [2 C, r, c] of a lattice: bool [P].
+    """Which pixels, at `places` [P, 2] of a lattice, are not to be interpolated: bool [P].
+
+    Those where the `values` [2 C, r, c] of the lattice say that this may change the image by more
+    than `tolerance` of its root mean square.
     """
     scattered, opacity = values.detach().chunk(2)
     brightness = float((scattered + behind * (1 - opacity)).square().mean().sqrt())
@@ -73,8 +75,9 @@ def _needs_own_ray(values: Tensor, places: Tensor, tolerance: float, behind: flo
 
 
 def _assemble(emission: Emission, rays: Rays, parts: Sequence[Part]) -> tuple[Tensor, Tensor]:
-    """Radiance and transmittance [C, R] along `rays`: those of `parts`, later ones on top of
-    earlier ones, and 0 and 1 elsewhere.
+    """Radiance and transmittance [C, R] along `rays`: those of `parts`, and 0 and 1 elsewhere.
+
+    Where a ray is in several parts the last of them counts.
     """
     values = emission.diffuse.new_zeros(2 * emission.colors, len(rays.direction))
     for index, along in parts:

@@ -1,6 +1,4 @@
-"""View rays: what the box lets through and what it scatters towards the camera, in closed form
-where there is one.
-"""
+"""View rays: what the box lets through and scatters towards the camera, by closed forms."""
 
 from __future__ import annotations
 

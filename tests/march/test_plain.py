@@ -75,9 +75,7 @@ def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scene:
-    """A random medium; nothing scatters twice under a sky alone, which lights it direction by
-    direction then.
-    """
+    """A random medium; under a sky alone nothing scatters twice: it is lit by all directions."""
     model = "none" if isinstance(lights[0], EnvironmentLight) else "p1"
     cross_sections = {"sigma_a": (0.5, 1.0, 0.2), "sigma_s": (3.0, 2.0, 1.0)}
     scene = make_scene(
@@ -103,8 +101,9 @@ def march_twin(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tens
 
 
 def differences(of: Callable[[Callable[..., Any], int], list[Tensor]]) -> list[list[float]]:
-    """How far each of the quantities `of(marcher, steps)` by the two marches are apart, for STEPS,
-    relative to its norm.
+    """How far apart the two marches are, relative to the norm, at STEPS.
+
+    Of each of the quantities `of(marcher, steps)`.
     """
     apart = []
     for steps in STEPS:

@@ -1,5 +1,6 @@
-"""Memory is predicted before it is taken: too much is refused with what would fit, and a shortage
-is told in one line.
+"""Memory is predicted before it is taken.
+
+Too much is refused with what would fit, and a shortage is one line.
 """
 
 from __future__ import annotations
