@@ -22,9 +22,10 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.march.bands import Bands
 from ddrecon.march.box import cross_box
+from ddrecon.march.emission import Channels
 from ddrecon.march.samplers import choose_sampler
-from ddrecon.march.slices import Slices
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.renderer import LightField, solve_light, view_image
 from ddrecon.scene import Scene
@@ -59,20 +60,19 @@ class Case:
         grid, bundle = self.scene.volume.grid, cast_rays(self.camera)
         crossing = cross_box(grid, bundle)
         fields = torch.cat([leaf.detach() for leaf in self.leaves])
-        sampler = choose_sampler(fields, None, 0, grid, bundle, crossing, 1)
-        if not isinstance(sampler, Slices):
+        sampler = choose_sampler(Channels(fields), grid, bundle, crossing, 1)
+        if not isinstance(sampler, Bands):
             raise SystemExit("the view is not one by slices")
+        whole = sampler.slices
         for chunk in torch.arange(len(crossing.hit)).split((1 << 18) // sampler.nodes):
             chosen = bundle.select(crossing.hit[chunk])
-            distance = (
-                sampler.planes[:, None] - chosen.origin[:, sampler.axis]
-            ) / chosen.direction[:, sampler.axis]
+            distance = whole.distances(chosen.origin, chosen.direction)
             places = chosen.origin + distance[..., None] * chosen.direction
             points = (
                 2 * (places - places.new_tensor(grid.lower)) / places.new_tensor(grid.extent) - 1
             )
-            slices = torch.cat(sampler.bands, 2).requires_grad_()
-            across = [axis for axis in (2, 1, 0) if axis != sampler.axis]
+            slices = torch.cat(whole.bands, 2).requires_grad_()
+            across = [axis for axis in (2, 1, 0) if axis != whole.axis]
             sample_slices(slices, points[..., across].contiguous()).sum().backward()
 
 

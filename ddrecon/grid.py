@@ -29,7 +29,7 @@ class Grid:
 
     @staticmethod
     def from_xyz(resolution: tuple[int, int, int], lower: Triple, upper: Triple) -> Grid:
-        """The grid of `resolution` = (nx, ny, nz) cells between world corners given as (x, y, z)."""
+        """The grid of `resolution` = (nx, ny, nz) cells between world corners (x, y, z)."""
         x, y, z = resolution
         return Grid((z, y, x), (lower[2], lower[1], lower[0]), (upper[2], upper[1], upper[0]))
 
@@ -63,9 +63,7 @@ class Grid:
         return (lx + ux) / 2, (ly + uy) / 2, (lz + uz) / 2
 
     def centers(self, like: Tensor) -> list[Tensor]:
-        """World coordinates [u] of the cell centers: one tensor per axis, shaped to broadcast to
-        `[z, y, x]`.
-        """
+        """World coordinates [u] of the cell centers along z, y, x, each for `[z, y, x]`."""
         coordinates = []
         for axis, (cells, low, step) in enumerate(
             zip(self.shape, self.lower, self.spacing, strict=True)
@@ -75,15 +73,11 @@ class Grid:
         return coordinates
 
     def coarsen(self, factor: int) -> Grid:
-        """The grid over the same box with about `factor` times fewer cells along each axis (at
-        least one).
-        """
+        """The same box with about `factor` times fewer cells along each axis (at least one)."""
         z, y, x = (max(1, round(cells / factor)) for cells in self.shape)
         return Grid((z, y, x), self.lower, self.upper)
 
 
 def array_order(vector: Tensor) -> Tensor:
-    """A vector `[..., 3]` given as (x, y, z) in array order (z, y, x), or back: the swap is its own
-    inverse.
-    """
+    """A vector `[..., 3]` given as (x, y, z) in array order (z, y, x), or the other way round."""
     return vector.flip(-1)

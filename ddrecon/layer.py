@@ -14,8 +14,7 @@ from ddrecon.variables.values import with_values
 
 
 class VolumeRenderer(torch.nn.Module):
-    """Renders the views of `scene` with whatever fields its caller puts in place of the scene's
-    own.
+    """Renders the views of `scene`, with fields of its caller in place of the scene's own.
 
     Solutions are remembered from one call to the next as starting points, unless
     `scene.diffusion.warm_start` is off.
@@ -42,9 +41,7 @@ class VolumeRenderer(torch.nn.Module):
         (`ddrecon.variables`). What is not given is the scene's. Raises KeyError for a name the
         scene does not have, ValueError for a density of another shape than the grid's.
         """
-        given = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
-        chosen = {name: value for name, value in given.items() if value is not None} | dict(
-            values or {}
-        )
+        fields = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
+        given = {name: value for name, value in fields.items() if value is not None}
         self.memory.records.clear()
-        return render(with_values(self.scene, chosen), view, self.memory)
+        return render(with_values(self.scene, {**given, **(values or {})}), view, self.memory)

@@ -12,9 +12,7 @@ import torch
 from ddrecon.march.integral import CHUNK_NODES
 
 GIVEN_BACK = 2**25
-"""Arrays larger than this many bytes leave the process when they are done with; smaller ones stay
-with its allocator (glibc's).
-"""
+"""Arrays of more bytes leave the process when they are done with; smaller ones stay with glibc."""
 SHORTAGES = (
     "not enough memory",
     "out of memory",
@@ -27,9 +25,9 @@ SHORTAGES = (
 
 @dataclass(frozen=True)
 class Needs:
-    """What the memory of a scene depends on: `resolution` (x, y, z), `colors` (1 or 3), bytes of a
-    number, pixels of all views.
+    """What the memory of a scene depends on.
 
+    `resolution` (x, y, z), `colors` (1 or 3), `size`: bytes of a number, `pixels` of all views.
     `varied` is how many fields are optimized, each color counted; None where nothing is.
     """
 
@@ -48,43 +46,76 @@ class Needs:
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
 
-def memory_of(needs: Needs) -> int:
-    """Bytes that rendering all views takes at its peak, with derivatives where something is
-    optimized, without torch itself.
+@dataclass(frozen=True)
+class Arrays:
+    """How many numbers are alive at the peak, in each cell, marched node and pixel of all views.
 
-    Fitted to what `benchmarks/memory.py` measures, in numbers per cell and in buffers of marched
-    nodes. Those that are alive at a time are known well; where arrays stay with the allocator it
-    holds up to twice as much, for others of the same size.
+    By what they are for: one array each, whatever the scene (`once`), or of every `color`, `varied`
+    field, or color of L1 (`flux`), of transport rounds (`rounds`), of a flux limiter (`limited`).
     """
-    colors, size, cells = needs.colors, needs.size, needs.cells
-    flux, rounds, limited = needs.has_flux, needs.has_rounds, needs.is_limited
-    numbers, buffers, kept = (
-        17.0 + (21 + 3 * flux + 16 * rounds + 7 * limited) * colors,
-        6.0 + 2 * colors,
-        1.1,
-    )
-    images = 3
-    if needs.varied is not None:
-        numbers = 50 + 15 * needs.varied + (7 + 13 * flux + 34 * rounds + 32 * limited) * colors
-        buffers, kept = (
-            12 * colors + 4 * needs.varied,
-            1.9 if size * colors * cells <= GIVEN_BACK else 1.5,
-        )
-        images = 9  # targets, those of a coarser level, renders
-    factor = kept if size * cells <= GIVEN_BACK else 1.1
-    return int(size * ((numbers * cells + buffers * CHUNK_NODES) * factor + images * needs.pixels))
+
+    cell: dict[str, int]
+    node: dict[str, int]
+    pixel: int
+
+
+RENDER = Arrays(
+    cell={"once": 17, "color": 21, "flux": 3, "rounds": 16, "limited": 7},
+    node={"once": 6, "color": 2},
+    pixel=3,
+)
+OPTIMIZE = Arrays(
+    cell={"once": 50, "varied": 15, "color": 7, "flux": 13, "rounds": 34, "limited": 32},
+    node={"color": 12, "varied": 4},
+    pixel=9,  # targets, those of a coarser level, renders
+)
+"""Fitted to what `benchmarks/memory.py` measures."""
+
+
+def memory_of(needs: Needs) -> int:
+    """Bytes that rendering all views takes at its peak, without torch itself.
+
+    With derivatives where something is optimized.
+    """
+    arrays = RENDER if needs.varied is None else OPTIMIZE
+    counts = {
+        "once": 1,
+        "color": needs.colors,
+        "varied": needs.varied or 0,
+        "flux": needs.colors * needs.has_flux,
+        "rounds": needs.colors * needs.has_rounds,
+        "limited": needs.colors * needs.is_limited,
+    }
+    in_cells = needs.cells * sum(number * counts[name] for name, number in arrays.cell.items())
+    at_nodes = CHUNK_NODES * sum(number * counts[name] for name, number in arrays.node.items())
+    held = (in_cells + at_nodes) * _overhead(needs)
+    return int(needs.size * (held + arrays.pixel * needs.pixels))
+
+
+def _overhead(needs: Needs) -> float:
+    """How many times as much as is alive the process holds.
+
+    Where arrays stay with the allocator it holds up to twice as much, for others of the same size.
+    """
+    if needs.varied is None or needs.size * needs.cells > GIVEN_BACK:
+        return 1.1
+    return 1.9 if needs.size * needs.colors * needs.cells <= GIVEN_BACK else 1.5
 
 
 def shortage(needs: Needs, device: torch.device) -> str | None:
-    """What to say of a scene with such `needs` where it does not fit into the memory that is free
-    on `device`; None where it does.
+    """What to say of a scene with such `needs` that does not fit into the free memory of `device`.
+
+    None where it does.
     """
     needed, free = memory_of(needs), free_memory(device)
     if free is None or needed <= free:
         return None
     place = "this machine" if device.type == "cpu" else "the GPU"
     fits = [words for words, other in _smaller(needs, free) if memory_of(other) <= free]
-    return f"takes about {gibibytes(needed)}, but {place} has {gibibytes(free)} free; this would fit: {', or '.join(fits) or 'nothing'}"
+    return (
+        f"takes about {gibibytes(needed)}, but {place} has {gibibytes(free)} free; "
+        f"this would fit: {', or '.join(fits) or 'nothing'}"
+    )
 
 
 def _smaller(needs: Needs, free: int) -> Iterator[tuple[str, Needs]]:
@@ -110,8 +141,9 @@ def _scaled(resolution: tuple[int, int, int], part: float) -> tuple[int, int, in
 
 
 def free_memory(device: torch.device) -> int | None:
-    """Bytes that this process can still take on `device`, by what the system and its limits on
-    groups of processes say; None if unknown.
+    """Bytes that this process can still take on `device`, None if unknown.
+
+    By what the system says, and its limits on groups of processes.
     """
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
@@ -128,19 +160,15 @@ def _available() -> int | None:
             1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")
         )
     except (OSError, StopIteration, ValueError):
-        return (
-            os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-            if hasattr(os, "sysconf")
-            else None
-        )
+        if not hasattr(os, "sysconf"):
+            return None
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _group_limits(
     root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")
 ) -> Iterator[int]:
-    """What is left of the memory of each control group this process is in, of either version of
-    them.
-    """
+    """Bytes left to each control group of this process, by either version of Linux's."""
     try:
         lines = own.read_text().splitlines()
     except OSError:
@@ -160,14 +188,14 @@ def _group_limits(
 
 
 def _left(root: Path, path: str, limit: str, usage: str, cached: str) -> Iterator[int]:
+    """Bytes left to the group at `path` and to each that it is in, by these of its files."""
     for folder in (root / path.lstrip("/"), *(root / path.lstrip("/")).parents):
         try:
-            most, used = (folder / limit).read_text().strip(), int((folder / usage).read_text())
-            statistics = dict(
-                line.split() for line in (folder / "memory.stat").read_text().splitlines()
-            )
-            if most != "max":
-                yield int(most) - used + int(statistics.get(cached, 0))
+            allowed, used = (folder / limit).read_text().strip(), int((folder / usage).read_text())
+            lines = (folder / "memory.stat").read_text().splitlines()
+            if allowed != "max":
+                given_back = dict(line.split() for line in lines).get(cached, 0)
+                yield int(allowed) - used + int(given_back)
         except (OSError, ValueError):
             pass
         if folder == root:

@@ -1,8 +1,7 @@
-"""The paper on one page: light not yet scattered, light scattered many times, and the view rays
-that collect both.
+"""The paper on one page: light not yet scattered, light scattered often, rays that collect both.
 
-`render` composes only the terms a scene needs: no diffusion solve when the model is `none` or
-nothing scatters, no quadrature over directions but where unscattered ambient light is asked for by
+`render` composes only the terms that a scene needs: no diffusion solve when the model is `none` or
+nothing scatters, no quadrature over directions unless unscattered ambient light is asked for by
 itself, no fluxes Q1 and L1 when g = 0, one color when all is gray.
 """
 
@@ -27,12 +26,13 @@ from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import Sky, decompose_lights
 from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
-from ddrecon.march.integral import Emission, march
+from ddrecon.march.emission import Emission
+from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.scene import Scene, View
@@ -41,11 +41,12 @@ from ddrecon.settings import DiffusionSettings
 
 @dataclass(frozen=True)
 class LightField:
-    """All light inside a medium: `beams` of directional and point lights, and `outgoing`, what one
-    more scattering makes of the rest.
+    """All light inside a medium.
 
-    `outgoing` is per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3. `skies` are those whose
-    light it lacks: they scatter by the exact phase function, into each camera's rays anew.
+    `beams` are those of directional and point lights (E2). `outgoing` is what one more scattering
+    makes of the other light, per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3. `skies` are
+    those whose light it lacks: they scatter by the exact phase function, into each camera's rays
+    anew.
     """
 
     medium: Medium
@@ -56,8 +57,9 @@ class LightField:
 
 @dataclass(frozen=True)
 class Components:
-    """The terms of E1, each [3, h, w]; they sum to the image. Forward-peaked light counts as
-    `multiple`, as in path tracing.
+    """The terms of E1, each [3, h, w], which sum to the image.
+
+    Light scattered forward once more counts as `multiple`, as in path tracing.
     """
 
     reduced: Tensor
@@ -66,8 +68,7 @@ class Components:
 
 
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
-    """Images `[views, 3, h, w]` (linear radiance) of all views of `scene`, or of the one named
-    `view`.
+    """Images `[views, 3, h, w]` (linear radiance) of all views, or of the one named `view`.
 
     Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume`
     and of its lights. `memory` carries the last solutions from one call to the next, as starting
@@ -82,33 +83,35 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
 
 def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> list[Tensor]:
-    """The images `[3, h, w]` of `views`, which may differ in size, in the one light field of
-    `scene`.
-    """
+    """The images `[3, h, w]` of `views`, which may differ in size, in one light field."""
     light_field = solve_light(scene, memory)
     return [view_image(light_field, scene, view.camera) for view in views]
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
-    """The light inside the volume of `scene`: E4 and E5 on top of the reduced light, or that alone
-    where nothing scatters twice.
+    """The light inside the volume of `scene`: reduced light, and what is scattered often (E4, E5).
+
+    Reduced light alone where nothing scatters twice.
     """
     medium = scale_medium(scene.volume)
     if not multiply_scatters(medium, scene.diffusion):
         return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
+    # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
     lights = decompose_lights(scene.lights)
     reduced = reduced_light(medium, lights, medium.has_flux)
     sky = sum_unscattered_sky(medium, lights, medium.has_flux)
     source = reduced.source.plus(sky.scaled(1.0, medium.mean_cosine))
-    diffuse = solve_diffuse(
-        medium, source, ambient_radiance(lights, medium.g), scene.diffusion, memory
-    )
+    outside = ambient_radiance(lights, medium.g)
+    # L0 and L1: E4 to E6.
+    diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
+    # E3, of skies as well; beams are scattered by E2 on each view ray.
     return LightField(medium, reduced.beams, _scatter_once_more(medium, diffuse.plus(sky)))
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
-    """The light inside `medium` that has not been scattered: beams, and by quadrature over
-    directions ambient light and skies.
+    """The light inside `medium` that has not been scattered.
+
+    Beams, and by quadrature over directions ambient light and skies.
     """
     parts = decompose_lights(lights)
     beams = reduced_light(medium, parts, False).beams
@@ -127,8 +130,9 @@ def _scatter_once_more(medium: Medium, light: Moments) -> Moments:
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
-    """Whether light may be scattered more than once: the model is not `none`, and sigma_s is not 0
-    or is being differentiated.
+    """Whether light may be scattered more than once.
+
+    It may where the model is not `none`, and sigma_s is not 0 or is being differentiated.
     """
     return settings.model != "none" and (
         is_varied(medium.scattering.scale) or bool((medium.scattering.scale != 0).any())
@@ -142,8 +146,9 @@ def solve_diffuse(
     settings: DiffusionSettings,
     memory: SolveMemory,
 ) -> Moments:
-    """L0 and L1 (E4 to E6) of `source`, Q0 and Q1 of beams, and of ambient light `outside` [C, 1,
-    1, 1], by the scheme of `settings`.
+    """L0 and L1 (E4 to E6), by the scheme of `settings`.
+
+    `source`: Q0 and Q1; `outside` [C, 1, 1, 1]: the radiance of ambient light.
     """
 
     def closure(transport_extinction: Tensor) -> Tensor:
@@ -172,21 +177,19 @@ def view_image(
 ) -> Tensor:
     """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1).
 
-    `derivatives` says which of its radiance passes derivatives on: `all`, `single` (E2 of beams,
-    and what is seen unscattered) or `diffusion` (E3, with the ambient light in it). The image is
-    the same.
+    `derivatives` says which radiance passes derivatives on: `all`, `single` (E2 of beams, and what
+    is seen unscattered) or `diffusion` (E3, with the ambient light in it). The image is the same.
     """
     if derivatives == "all":
         emission = _emission(light_field, cast_rays(camera))
         return _image(emission, scene, camera)
     nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
-    once, often = replace(light_field, outgoing=nothing), replace(light_field, beams=(), skies=())
-    parts = {"single": (once, scene), "diffusion": (often, _without_background(scene))}
-    kept = view_image(*parts.pop(derivatives), camera)
-    ((rest_field, rest_scene),) = parts.values()
+    single = replace(light_field, outgoing=nothing), scene
+    diffusion = replace(light_field, beams=(), skies=()), _without_background(scene)
+    varied, fixed = {"single": (single, diffusion), "diffusion": (diffusion, single)}[derivatives]
     with torch.no_grad():
-        rest = view_image(rest_field, rest_scene, camera)
-    return kept + rest.detach()
+        rest = view_image(*fixed, camera).detach()
+    return view_image(*varied, camera) + rest
 
 
 def _without_background(scene: Scene) -> Scene:
@@ -218,9 +221,9 @@ def _image(emission: Emission, scene: Scene, camera: Camera) -> Tensor:
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
-    """What the medium sends towards the camera that `bundle` belongs to."""
+    """What the medium sends towards the camera that `bundle` belongs to (E2, E3)."""
     medium = light_field.medium
-    towards = _towards_camera(medium, bundle)
+    towards = bundle.towards_eye(medium.grid)
     diffuse = recompute(light_field.outgoing.positive_along, towards)
     if light_field.skies:
         diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
@@ -236,31 +239,9 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
 
 
 def _background(lights: Sequence[Light], bundle: Rays) -> Tensor:
-    """The radiance [C, R] of ambient light and environment maps along `bundle`, where nothing is in
-    the way.
-    """
+    """The radiance [C, R] of ambient light and environment maps along `bundle`, unattenuated."""
     total = ambient_radiance(lights, bundle.direction).view(-1, 1)
     for light in lights:
         if isinstance(light, EnvironmentLight):
             total = total + environment_radiance(light, bundle.direction)
     return total
-
-
-def _towards_camera(medium: Medium, bundle: Rays) -> Vector:
-    """Components along z, y, x, each broadcasting to `[z, y, x]`, of unit directions from the cells
-    towards the camera.
-
-    All rays through a cell's center have the same direction, so that outgoing light is a field of
-    the camera, interpolated like any other.
-    """
-    if bundle.eye is None:
-        z, y, x = -bundle.direction[0]
-        return z, y, x
-    offsets = [e - c for e, c in zip(bundle.eye, medium.grid.centers(bundle.eye), strict=True)]
-    distance = (
-        (offsets[0] ** 2 + offsets[1] ** 2 + offsets[2] ** 2)
-        .sqrt()
-        .clamp(min=torch.finfo(bundle.eye.dtype).tiny)
-    )
-    z, y, x = (offset / distance for offset in offsets)
-    return z, y, x

@@ -1,8 +1,7 @@
-"""What a scene is once it is tensors: a volume, its lights and its views, with the settings they
-are rendered by.
+"""What a scene is as tensors: a volume, its lights and its views, and the settings of both.
 
-Records here are values the physics and the reconstruction read; how they are written in a file is
-`ddrecon.scene_file`'s business.
+The physics and the reconstruction read these records; `ddrecon.scene_file` has how they are written
+in a file.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ class View:
 
 @dataclass(eq=False)
 class Scene:
-    """A loaded scene. `optimize`, `starts` and `path` are what its file says of reconstruction, and
-    where that file lies.
+    """A loaded scene.
 
-    `starts` holds, for each optimized parameter, the value it starts from.
+    `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
+    optimized parameter starts from.
     """
 
     volume: Volume
@@ -60,6 +59,5 @@ class Scene:
         for view in self.views:
             if view.name == name:
                 return view
-        raise KeyError(
-            f"no view {name!r}; the views are {', '.join(view.name for view in self.views)}"
-        )
+        names = ", ".join(view.name for view in self.views)
+        raise KeyError(f"no view {name!r}; the views are {names}")

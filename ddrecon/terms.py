@@ -14,30 +14,27 @@ from ddrecon.settings import DiffusionSettings
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
-    medium = scale_medium(scene.volume)
+    medium, settings = scale_medium(scene.volume), scene.diffusion
     colors = medium.extinction.scale.shape[0]
+    is_diffuse = multiply_scatters(medium, settings)
     terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
-    terms += _light_terms(scene.lights, multiply_scatters(medium, scene.diffusion))
-    if multiply_scatters(medium, scene.diffusion) and bool(medium.g > 0):
+    terms += _light_terms(scene.lights, is_diffuse)
+    if not is_diffuse:
+        return [*terms, "no multiple scattering: no diffusion solve"]
+    if bool(medium.g > 0):
         terms.append("delta-Eddington scaling of the forward peak (g > 0)")
-    if multiply_scatters(medium, scene.diffusion):
+    terms.append(f"multiple scattering by {settings.model} diffusion, {_method(settings)}")
+    if settings.transport_rounds:
         terms.append(
-            f"multiple scattering by {scene.diffusion.model} diffusion, {_how(scene.diffusion)}"
+            f"{_count(settings.transport_rounds, 'transport round')} of sweeps along "
+            f"{settings.transport_directions} directions, each with a diffusion solve"
         )
-        if scene.diffusion.transport_rounds:
-            rounds = _counted(scene.diffusion.transport_rounds, "transport round")
-            terms.append(
-                f"{rounds} of sweeps along {scene.diffusion.transport_directions} directions, each with a diffusion solve"
-            )
-        terms.append(
-            "fluxes Q1 and L1 (g is not 0)" if medium.has_flux else "no fluxes Q1 and L1 (g = 0)"
-        )
-    else:
-        terms.append("no multiple scattering: no diffusion solve")
+    has_fluxes = medium.has_flux
+    terms.append("fluxes Q1 and L1 (g is not 0)" if has_fluxes else "no fluxes Q1 and L1 (g = 0)")
     return terms
 
 
-def _how(settings: DiffusionSettings) -> str:
+def _method(settings: DiffusionSettings) -> str:
     if settings.scheme == "printed":
         return "smooth closure, printed scheme by Jacobi iteration"
     if settings.model == "flux_limited":
@@ -50,24 +47,22 @@ def _light_terms(lights: Sequence[Light], is_diffuse: bool) -> list[str]:
     for kind, name in ((DirectionalLight, "directional light"), (PointLight, "point light")):
         count = sum(isinstance(light, kind) for light in lights)
         if count:
-            terms.append(f"transmittance towards {_counted(count, name)}")
-    way = (
-        "as inflow of the diffusion through the box's faces"
-        if is_diffuse
-        else "by quadrature over 50 directions"
-    )
+            terms.append(f"transmittance towards {_count(count, name)}")
+    ambient = "by quadrature over 50 directions"
+    if is_diffuse:
+        ambient = "as inflow of the diffusion through the box's faces"
     if any(isinstance(light, AmbientLight) for light in lights):
-        terms.append(f"ambient light, {way}")
-    return terms + [
-        _environment_term(light, way) for light in lights if isinstance(light, EnvironmentLight)
-    ]
+        terms.append(f"ambient light, {ambient}")
+    maps = [light for light in lights if isinstance(light, EnvironmentLight)]
+    return terms + [_environment_term(light, ambient) for light in maps]
 
 
-def _environment_term(light: EnvironmentLight, way: str) -> str:
+def _environment_term(light: EnvironmentLight, ambient: str) -> str:
     (height, width), (suns, directions) = light.radiance.shape[1:], count_suns(light)
-    as_beams = f"{_counted(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
-    return f"environment map {width} x {height}: {as_beams}sky by {_counted(directions, 'direction')}, its mean {way}"
+    beams = f"{_count(suns, 'sun')} as beam{'s' if suns > 1 else ''}, " if suns else ""
+    sky = f"sky by {_count(directions, 'direction')}, its mean {ambient}"
+    return f"environment map {width} x {height}: {beams}{sky}"
 
 
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' if count > 1 else ''}"
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number > 1 else ''}"

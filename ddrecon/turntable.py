@@ -1,6 +1,4 @@
-"""Cameras around a volume: one view's camera turned about the upright axis through the middle of
-the box.
-"""
+"""Cameras around a volume: one view's, turned about the upright axis through the box's middle."""
 
 from __future__ import annotations
 
@@ -17,13 +15,14 @@ from ddrecon.scene import Scene, View
 
 
 def upright_axis(cameras: Sequence[Camera]) -> int:
-    """Which of x, y, z (0, 1, 2) points up: the axis nearest to the sum of the cameras' up vectors."""
+    """Which of x, y, z (0, 1, 2) points up: the one nearest to the sum of `cameras`' up vectors."""
     return int(torch.stack([camera.pose[:, 1] for camera in cameras]).sum(0).abs().argmax())
 
 
 def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Camera:
-    """`camera` turned by `angle` [rad] about the line along `axis` (0, 1, 2: x, y, z) through
-    `center` (x, y, z).
+    """`camera` turned by `angle` [rad] about a line along `axis` (0, 1, 2: x, y, z).
+
+    The line runs through `center` (x, y, z).
     """
     middle = camera.pose.new_tensor(center)
     rotation = _rotation(axis, angle).to(camera.pose)
@@ -32,21 +31,20 @@ def turn_camera(camera: Camera, axis: int, angle: float, center: Triple) -> Came
 
 
 def place_turntable(scene: Scene, view: View, count: int) -> list[View]:
-    """`count` >= 1 views, `ring_000` that of `view` and the others like it in equal steps once
-    around the volume of `scene`.
+    """`count` >= 1 views, from `view` in equal steps once around the volume of `scene`.
+
+    They are called `ring_000`, which is that of `view`, `ring_001` and so on.
     """
     axis, center = upright_axis([item.camera for item in scene.views]), scene.volume.grid.center_xyz
-    steps = [2 * math.pi * index / count for index in range(count)]
+    angles = [2 * math.pi * index / count for index in range(count)]
     return [
         View(f"ring_{index:03d}", turn_camera(view.camera, axis, angle, center))
-        for index, angle in enumerate(steps)
+        for index, angle in enumerate(angles)
     ]
 
 
 def _rotation(axis: int, angle: float) -> Tensor:
-    """The matrix [3, 3] that turns by `angle` about `axis`, counterclockwise seen from its positive
-    end.
-    """
+    """The matrix [3, 3] that turns by `angle` about `axis`, right-handed, in double precision."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = torch.eye(3, dtype=torch.float64)
     matrix[first, first] = matrix[second, second] = math.cos(angle)

@@ -150,7 +150,7 @@ def test_samples_are_centers_of_equal_parts(samples: int):
     assert second_moments.tolist() == pytest.approx(expected, abs=1e-14)
 
 
-# --- twists ----------------------------------------------------------------------------------------------------------
+# --- twists ---
 
 PIVOT = (0.2, -0.1, 0.4)
 small_twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(
@@ -159,8 +159,8 @@ small_twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(
 
 
 @given(small_twists)
-def test_a_twisted_pose_is_rigid(twist: torch.Tensor):
-    turn = twist(camera(), twist, PIVOT).pose[:, :3]
+def test_a_twisted_pose_is_rigid(change: torch.Tensor):
+    turn = twist(camera(), change, PIVOT).pose[:, :3]
     torch.testing.assert_close(turn.T @ turn, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-13)
     assert torch.linalg.det(turn) > 0
 
@@ -175,19 +175,19 @@ def test_no_twist_changes_nothing():
 
 
 @given(small_twists)
-def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(twist: torch.Tensor):
+def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(change: torch.Tensor):
     """Only a shift moves the pivot in the camera's own frame, by just as much the other way."""
     pivot = torch.tensor(PIVOT, dtype=torch.float64)
 
     def seen(view: Camera) -> torch.Tensor:
         return view.pose[:, :3].T @ (pivot - view.pose[:, 3])
 
-    turn = twist.clone()
+    turn = change.clone()
     turn[3:] = 0
     torch.testing.assert_close(
         seen(twist(camera(), turn, PIVOT)), seen(camera()), rtol=0, atol=1e-13
     )
-    shift = twist - turn
+    shift = change - turn
     torch.testing.assert_close(
         seen(twist(camera(), shift, PIVOT)), seen(camera()) - shift[3:], rtol=0, atol=1e-13
     )
@@ -196,9 +196,9 @@ def test_a_turn_keeps_the_pivot_where_the_camera_sees_it(twist: torch.Tensor):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_rotation_vector_turns_by_its_length_about_its_axis_right_handed(axis: int):
     """A quarter turn about a camera axis takes the next axis to the one after it."""
-    twist = torch.zeros(6, dtype=torch.float64)
-    twist[axis] = math.pi / 2
-    before, after = camera().pose, twist(camera(), twist, PIVOT).pose
+    change = torch.zeros(6, dtype=torch.float64)
+    change[axis] = math.pi / 2
+    before, after = camera().pose, twist(camera(), change, PIVOT).pose
     torch.testing.assert_close(after[:, axis], before[:, axis], rtol=0, atol=1e-13)
     torch.testing.assert_close(
         after[:, (axis + 1) % 3], before[:, (axis + 2) % 3], rtol=0, atol=1e-13

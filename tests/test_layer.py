@@ -1,6 +1,4 @@
-"""The renderer as a layer: a network trains through it, and torch's function transforms see the
-same derivatives.
-"""
+"""The renderer as a layer: networks train through it, and so do torch's function transforms."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def volume_with(scene: Scene, **fields: Any) -> Scene:
     return replace(scene, volume=replace(scene.volume, **fields))
 
 
-# --- what images are made of -----------------------------------------------------------------------------------------
+# --- what images are made of ---
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.5])
@@ -96,7 +96,7 @@ def test_views_are_rendered_by_name_and_must_agree_in_size():
         render(scene)
 
 
-# --- white furnace ---------------------------------------------------------------------------------------------------
+# --- white furnace ---
 
 RADIUS = 0.35
 
@@ -197,7 +197,7 @@ def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float):
     assert bool((once < 1).all()) and bool((once > 0.5).all())
 
 
-# --- scalings and symmetries -----------------------------------------------------------------------------------------
+# --- scalings and symmetries ---
 
 
 def test_images_are_linear_in_light():
@@ -327,7 +327,7 @@ def test_a_denser_absorber_is_darker():
         )
 
 
-# --- derivatives of whole images -------------------------------------------------------------------------------------
+# --- derivatives of whole images ---
 
 CONFIGURATIONS: dict[str, dict[str, Any]] = {
     "isotropic, directional, perspective": {},

@@ -1,1 +1,1 @@
-"""The integral along view rays."""
+"""The integral along view rays. Read `plain.py` first: it is all of it, in plain sums."""

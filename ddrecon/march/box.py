@@ -13,8 +13,10 @@ from ddrecon.grid import Grid
 
 @dataclass(frozen=True)
 class Crossing:
-    """The part of each ray inside the box: where rays `hit` it (indices), and distances [u] to
-    `near` and `far` there.
+    """The part of each ray inside the box.
+
+    `hit`: indices of the rays that meet it; distances [u] at which these enter, `near`, and leave,
+    `far`.
     """
 
     hit: Tensor
@@ -34,13 +36,15 @@ def cross_box(grid: Grid, rays: Rays) -> Crossing:
 
 
 def intersect_box(grid: Grid, rays: Rays) -> tuple[Tensor, Tensor]:
-    """Distances [u] at which each of `rays` enters the box of `grid`, in front of the camera, and
-    leaves it: less far where it misses.
+    """Distances [u] at which `rays` enter the box of `grid`, in front of the camera, and leave it.
+
+    A ray that misses leaves no later than it enters. The slab test of Kay and Kajiya 1986,
+    doi:10.1145/15922.15916.
     """
     low, high = (rays.direction.new_tensor(corner) for corner in (grid.lower, grid.upper))
     tiny = torch.finfo(rays.direction.dtype).tiny
-    safe = torch.where(
-        rays.direction.abs() < tiny, torch.full_like(rays.direction, tiny), rays.direction
-    )
-    one, other = (low - rays.origin) / safe, (high - rays.origin) / safe
+    # Along a slab a ray stays within it for ever, or never enters it.
+    is_along = rays.direction.abs() < tiny
+    direction = torch.where(is_along, torch.full_like(rays.direction, tiny), rays.direction)
+    one, other = (low - rays.origin) / direction, (high - rays.origin) / direction
     return torch.minimum(one, other).amax(-1).clamp(min=0), torch.maximum(one, other).amin(-1)

@@ -9,38 +9,32 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
+from ddrecon.march.emission import Channels
 from ddrecon.numerics.interpolation import sample_volume
-from ddrecon.numerics.third_order import ThirdOrder
 
 CELLS_PER_NODE = 16
-"""In large volumes rays at equal steps have at least a node for so many cells at a time: each time
-the backward pass fills an array of all cells.
+"""At most so many cells of a large volume to a node marched at a time: for every chunk of rays the
+backward pass fills an array of all cells.
 """
 
 
 class Equidistant:
-    """Values at equal steps along rays, wherever these run."""
+    """Values at equal steps along rays, wherever these run: at least `steps` to a cell.
 
-    def __init__(
-        self, fields: Tensor, smooth: ThirdOrder | None, grid: Grid, longest: float, steps: int
-    ):
-        self.smooth = smooth
-        self.fields, self.lower, self.extent = (
-            fields,
-            fields.new_tensor(grid.lower),
-            fields.new_tensor(grid.extent),
-        )
+    `longest` is the longest way of a ray inside the box of `grid` [u].
+    """
+
+    def __init__(self, channels: Channels, grid: Grid, longest: float, steps: int):
+        self.fields, self.third_order = channels.values, channels.third_order
+        self.lower = self.fields.new_tensor(grid.lower)
+        self.extent = self.fields.new_tensor(grid.extent)
         self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
 
     def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Equidistant]]:
-        """All of `rays`, `count` at a time or in large volumes more: their indices, and what they
-        meet.
-        """
+        """All of `rays`, `count` at a time and in large volumes more: indices, and what they meet."""
         size = max(count, self.fields[0].numel() // (CELLS_PER_NODE * self.nodes))
-        return [
-            (chunk, self)
-            for chunk in torch.arange(len(rays.direction), device=rays.direction.device).split(size)
-        ]
+        indices = torch.arange(len(rays.direction), device=rays.direction.device)
+        return [(chunk, self) for chunk in indices.split(size)]
 
     def sample(
         self, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor
@@ -49,5 +43,5 @@ class Equidistant:
         part = torch.linspace(0, 1, self.nodes, dtype=near.dtype, device=near.device)[:, None]
         distance = near + part * (far - near)
         points = 2 * (origin + distance[..., None] * direction - self.lower) / self.extent - 1
-        values = sample_volume(self.fields, points.flip(-1), self.smooth)
+        values = sample_volume(self.fields, points.flip(-1), self.third_order)
         return values.transpose(0, 1), distance

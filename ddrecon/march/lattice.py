@@ -1,17 +1,16 @@
-"""View rays no closer together than a volume can tell: a lattice of rays, between which pixels are
-interpolated.
+"""View rays no closer together than a volume can tell: pixels are interpolated between them.
 
-The lattice is regular in the plane through the box's center, across the axis along which rays cross
-most cells. So it is in every slice, and interpolation there is a small matrix for rows and one for
-columns (the shear-warp factorization, doi:10.1145/192161.192283): products of matrices in place of
-gathers, and of scatters in the backward pass.
+Their lattice is regular in the plane through the box's center, across the axis along which rays
+cross most cells. So it is in every slice, and interpolation there is a small matrix for rows and
+one for columns (the shear-warp factorization, doi:10.1145/192161.192283): products of matrices in
+place of gathers, and of scatters in the backward pass.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,7 +22,7 @@ from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.third_order import ThirdOrder, second_difference
 
 MARGIN = 2
-"""Lattice rays beyond the outermost pixels: interpolation reaches so far."""
+"""Lattice rays beyond the outermost pixels: as far as interpolation reaches."""
 FEWER = 2
 """A lattice is worth its interpolation where pixels have so many times as many rays."""
 RAYS_PER_VOXEL = 2
@@ -36,14 +35,13 @@ jump.
 
 @dataclass(frozen=True)
 class Lattice:
-    """Rays through `rows` x `columns` [u], places along the two axes `across`, in the plane across
-    `axis` at `middle` [u].
+    """Rays through a lattice of places in the plane across `axis` at `middle` [u].
 
-    They come from the point `eye` [3], or where that is None are parallel to `direction` [3].
+    `rows` and `columns` are the places along the two axes across that one [u]. The rays come from
+    the point `eye` [3], or where that is None are parallel to `direction` [3].
     """
 
     axis: int
-    across: tuple[int, int]
     middle: float
     eye: Tensor | None
     direction: Tensor
@@ -56,10 +54,10 @@ class Lattice:
         return len(self.rows), len(self.columns)
 
     def rays(self, rows: Tensor, extent: float) -> Rays:
-        """The rays of some `rows` [u], row by row; parallel ones begin `extent` before the plane."""
+        """Rays of some `rows` [u], row by row; parallel ones begin `extent` before the plane."""
         places = torch.meshgrid(rows, self.columns, indexing="ij")
         point = [torch.full_like(places[0], self.middle)] * 3
-        for axis, place in zip(self.across, places, strict=True):
+        for axis, place in zip(across(self.axis), places, strict=True):
             point[axis] = place
         points = torch.stack(point, -1).flatten(0, 1)
         if self.eye is None:
@@ -69,76 +67,76 @@ class Lattice:
     def places(self, bundle: Rays) -> Tensor:
         """Where rays cross the lattice's plane, `[R, 2]`, in rows and columns."""
         distance = (self.middle - bundle.origin[:, self.axis]) / bundle.direction[:, self.axis]
-        lines = []
-        for axis, line in zip(self.across, (self.rows, self.columns), strict=True):
-            lines.append(
-                (bundle.origin[:, axis] + distance * bundle.direction[:, axis] - line[0])
-                / (line[1] - line[0])
-            )
-        return torch.stack(lines, -1)
+        counted = []
+        for axis, line in zip(across(self.axis), (self.rows, self.columns), strict=True):
+            place = bundle.origin[:, axis] + distance * bundle.direction[:, axis]
+            counted.append((place - line[0]) / (line[1] - line[0]))
+        return torch.stack(counted, -1)
 
     def crossings(self, planes: Tensor, which: int, line: Tensor) -> Tensor:
-        """Where in `planes` [N] across `axis` rays through `line` [R] run, some rows (`which` = 0)
-        or columns (1): `[N, R]` [u].
+        """Where rays through `line` [R] cross `planes` [N] across `axis`: `[N, R]` [u].
+
+        `line` holds some rows (`which` = 0) or columns (1) of the lattice.
         """
-        apart, axis = planes[:, None] - self.middle, self.across[which]
+        apart, axis = planes[:, None] - self.middle, across(self.axis)[which]
         if self.eye is None:
             return line + apart * (self.direction[axis] / self.direction[self.axis])
         return line + apart / (self.middle - self.eye[self.axis]) * (line - self.eye[axis])
 
 
+def across(axis: int) -> tuple[int, int]:
+    """The two axes of a slice across `axis`: those of its rows and of its columns."""
+    row, column = (other for other in range(3) if other != axis)
+    return row, column
+
+
 def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:
     """The lattice across `axis` in place of rays of one camera, all `hitting` the box.
 
-    None where these are no more work themselves, or the camera is not beyond the slices along
-    `axis`.
+    None where these are no more work themselves, or the camera is not beyond the slices.
     """
     eye, direction = hitting.eye, hitting.direction[0]
-    if (
-        eye is not None
-        and grid.lower[axis] - grid.spacing[axis]
-        < float(eye[axis].detach())
-        < grid.upper[axis] + grid.spacing[axis]
-    ):
+    low, high, margin = grid.lower[axis], grid.upper[axis], grid.spacing[axis]
+    if eye is not None and low - margin < float(eye[axis].detach()) < high + margin:
         return None
-    row, column = (other for other in range(3) if other != axis)
-    middle = 0.5 * (grid.lower[axis] + grid.upper[axis])
-    steps = [grid.spacing[other] / RAYS_PER_VOXEL for other in (row, column)]
-    starts = [
-        grid.lower[other] + 0.5 * step for other, step in zip((row, column), steps, strict=True)
-    ]
 
-    def lattice(first: Sequence[int], last: Sequence[int]) -> Lattice:
-        rows, columns = (
-            start + step * torch.arange(a, b + 1, dtype=direction.dtype, device=direction.device)
-            for start, step, a, b in zip(starts, steps, first, last, strict=True)
-        )
-        return Lattice(axis, (row, column), middle, eye, direction, rows, columns)
+    def lines(first: Sequence[int], last: Sequence[int]) -> Iterator[Tensor]:
+        """Rows and columns `first` to `last`; number 0 lies half a step within the box."""
+        for other, a, b in zip(across(axis), first, last, strict=True):
+            step = grid.spacing[other] / RAYS_PER_VOXEL
+            index = torch.arange(a, b + 1, dtype=direction.dtype, device=direction.device)
+            yield grid.lower[other] + 0.5 * step + step * index
 
-    places = lattice((0, 0), (1, 1)).places(hitting).detach()
-    first = [math.floor(low) - MARGIN for low in places.amin(0).tolist()]
-    last = [math.ceil(high) + MARGIN for high in places.amax(0).tolist()]
-    count = math.prod(b - a + 1 for a, b in zip(first, last, strict=True))
-    return lattice(first, last) if FEWER * count <= len(places) else None
+    # Any two lines of each kind tell where all rays are among lines without end.
+    unit = Lattice(axis, 0.5 * (low + high), eye, direction, *lines((0, 0), (1, 1)))
+    places = unit.places(hitting).detach()
+    first = [math.floor(place) - MARGIN for place in places.amin(0).tolist()]
+    last = [math.ceil(place) + MARGIN for place in places.amax(0).tolist()]
+    rows, columns = lines(first, last)
+    if FEWER * len(rows) * len(columns) > len(places):
+        return None
+    return replace(unit, rows=rows, columns=columns)
 
 
 def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
-    """`values` [K, r, c] of lattice rays, interpolated to third order at `places` [P, 2] (rows,
-    columns), `[K, P]`, and held at zero.
+    """`values` [K, r, c] of lattice rays at `places` [P, 2] (rows, columns): `[K, P]`.
+
+    They are interpolated to third order, and held at zero.
     """
     sizes = places.new_tensor(values.shape[1:])
     points = ((2 * places + 1) / sizes - 1).flip(-1)
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0].clamp(min=0)
 
 
-def is_rough(values: Tensor, most: float, places: Tensor) -> Tensor:
-    """Which of `places` [P, 2] lie where interpolation of `values` [K, r, c] may be off by more
-    than `most` in all of them together.
+def is_rough(values: Tensor, tolerance: float, places: Tensor) -> Tensor:
+    """At which of `places` [P, 2] interpolation may be off by more than `tolerance`: bool [P].
 
-    Judged by fourth differences, which are large at edges sharper than the lattice as well.
+    That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
+    they are large at edges sharper than the lattice as well.
     """
     values = values.detach()
+    # Fourth differences along rows and columns; of each place, the largest of the four rays around.
     uneven = sum(second_difference(second_difference(values, axis), axis).abs() for axis in (1, 2))
     cells = max_pool2d(torch.as_tensor(uneven).sum(0, keepdim=True), 2, 1)[0]
     rows, columns = places.detach().floor().long().unbind(-1)
-    return DOUBT * cells[rows, columns] > most
+    return DOUBT * cells[rows, columns] > tolerance

@@ -6,28 +6,13 @@ import math
 
 import torch
 
-from ddrecon.cameras import Camera, Rays, cast_rays
+from ddrecon.cameras import Camera, cast_rays
 from ddrecon.grid import Grid
+from ddrecon.march.box import cross_box
 
 COARSER = 8
 MOST_PIXELS = 2**18
 """Images are made about this small before they are looked at closely."""
-
-
-def rays_hit_box(view_rays: Rays, grid: Grid) -> torch.Tensor:
-    """Which rays pass through the box of `grid` in front of their origin: bool [R], by the slab
-    test (Kay and Kajiya 1986).
-    """
-    direction = torch.where(
-        view_rays.direction == 0,
-        torch.finfo(view_rays.direction.dtype).tiny ** 0.5,
-        view_rays.direction,
-    )
-    lower, upper = (view_rays.origin.new_tensor(corner) for corner in (grid.lower, grid.upper))
-    first, second = (lower - view_rays.origin) / direction, (upper - view_rays.origin) / direction
-    enter = torch.minimum(first, second).amax(dim=-1)
-    leave = torch.maximum(first, second).amin(dim=-1)
-    return leave > enter.clamp_min(0)
 
 
 def sees_box(camera: Camera, grid: Grid) -> bool:
@@ -36,7 +21,7 @@ def sees_box(camera: Camera, grid: Grid) -> bool:
     """
     finer = max(1, math.ceil(math.sqrt(camera.size[0] * camera.size[1] / MOST_PIXELS)))
     return any(
-        bool(rays_hit_box(cast_rays(image), grid).any())
+        cross_box(grid, cast_rays(image)).hit.numel() > 0
         for image in (camera.resize(COARSER * finer), camera.resize(finer))
     )
 

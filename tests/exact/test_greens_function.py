@@ -1,6 +1,4 @@
-"""Light from one point of an infinite homogeneous medium: exp(-r / L) / (4 pi D r), L = sqrt(D /
-kappa_a).
-"""
+"""Light from a point of an infinite medium: exp(-r / L) / (4 pi D r), L = sqrt(D / kappa_a)."""
 
 from __future__ import annotations
 

@@ -50,9 +50,7 @@ each_albedo = pytest.mark.parametrize("albedo", ALBEDOS)
 
 
 def half_space(albedo: float, sun: float, cells: int = 192, rounds: int = 0) -> Scene:
-    """5,000 optical depths below z = 0, lit by a beam from above at cosine `sun`, seen at all of
-    `VIEWS`.
-    """
+    """5,000 optical depths below z = 0, lit from above at cosine `sun`, seen at all of `VIEWS`."""
     ratio = 1.06 ** (192 / cells)
     layers = ratio ** torch.arange(cells, dtype=torch.float64)
     density = (5000 / layers.sum() * layers * cells).view(-1, 1, 1)

@@ -17,7 +17,8 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import DirectionalLight, PointLight
 from ddrecon.light.point_light import follow_point_light
 from ddrecon.light.reduced import reduced_light
-from ddrecon.march.integral import Emission, march
+from ddrecon.march.emission import Emission
+from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.renderer import render
 from ddrecon.scene import Scene

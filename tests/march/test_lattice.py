@@ -14,8 +14,9 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.march import integral as march_module
 from ddrecon.march.box import cross_box
+from ddrecon.march.emission import Channels
 from ddrecon.march.integral import march
-from ddrecon.march.lattice import Lattice, choose_lattice
+from ddrecon.march.lattice import Lattice, across, choose_lattice
 from ddrecon.march.samplers import choose_sampler
 from ddrecon.march.slices import Slices
 from ddrecon.renderer import _emission, render, solve_light
@@ -57,7 +58,7 @@ def scene_of():
 def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
     bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
-    slices = choose_sampler(scene.volume.density[None], None, 0, grid, bundle, crossing, 1)
+    slices = choose_sampler(Channels(scene.volume.density[None]), grid, bundle, crossing, 1).slices
     return choose_lattice(grid, slices.axis, bundle.select(crossing.hit)), slices
 
 
@@ -86,10 +87,10 @@ def test_places_and_crossings_are_those_of_the_rays(view: dict, scene_of):
     ]
     points = (bundle.origin + distance[..., None] * bundle.direction).unflatten(1, rows.shape)
     torch.testing.assert_close(
-        points[..., lattice.across[0]], down[:, :, None].expand(-1, -1, rows.shape[1])
+        points[..., across(lattice.axis)[0]], down[:, :, None].expand(-1, -1, rows.shape[1])
     )
     torch.testing.assert_close(
-        points[..., lattice.across[1]], along[:, None, :].expand(-1, rows.shape[0], -1)
+        points[..., across(lattice.axis)[1]], along[:, None, :].expand(-1, rows.shape[0], -1)
     )
 
 

@@ -1,6 +1,4 @@
-"""View rays: what the box lets through and what it scatters towards the camera, in closed form
-where there is one.
-"""
+"""View rays: what the box lets through and scatters towards the camera, by closed forms."""
 
 from __future__ import annotations
 
@@ -16,9 +14,10 @@ from ddrecon.cameras import Camera, Rays, cast_rays
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import reduced_light
+from ddrecon.march import bands, samplers
 from ddrecon.march import integral as march_module
-from ddrecon.march import samplers, slices
-from ddrecon.march.integral import Emission, march
+from ddrecon.march.emission import Emission
+from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.numerics.nodes import Nodes
@@ -140,7 +139,7 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
 
     whole = marched()
     monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
-    monkeypatch.setattr(slices, "BAND", 1)
+    monkeypatch.setattr(bands, "BAND", 1)
     for one, other in zip(whole, marched(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
@@ -181,7 +180,7 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, monkeypat
 
 @pytest.mark.parametrize("view", ["perspective", "oblique", "orthographic"])
 def test_slices_and_equal_steps_agree_in_the_limit(view: str, monkeypatch):
-    """Both interpolate the same fields, along other nodes: their difference vanishes as steps grow."""
+    """Both interpolate the same fields, at other nodes: with steps their difference vanishes."""
     emission, bundle = (
         emission_of(box_grid((3, 5, 4)), random_values(3, 5, 4)),
         cast_rays(make_camera(size=(7, 6), **CAMERAS[view])),
@@ -286,7 +285,7 @@ def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: boo
 
 
 def test_forward_scattering_is_brightest_against_the_light():
-    """Through a thin slab, where attenuation hardly matters: p(1) / p(-1) = ((1 + g) / (1 - g))^3."""
+    """p(1) / p(-1) = ((1 + g) / (1 - g))^3 of a thin slab, where attenuation hardly matters."""
     against, along = (
         float(render(with_density(slab(8, 0.8, (0.0, 0.0, z)), 1e-6)).mean()) for z in (1.0, -1.0)
     )

@@ -1,5 +1,6 @@
-"""Memory is predicted before it is taken: too much is refused with what would fit, and a shortage
-is told in one line.
+"""Memory is predicted before it is taken.
+
+Too much is refused with what would fit, and a shortage is one line.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ COMMANDS = {
     "check": ["check", "scene.yaml"],
 }
 LINE = (
-    r"scene\.yaml:3:15: volume\.resolution: takes about [\d.]+ GiB, but this machine has [\d.]+ "
-    r"[GM]iB free; this would fit: .*"
+    r"scene\.yaml:3:15: volume\.resolution: takes about [\d.]+ GiB, "
+    r"but this machine has [\d.]+ [GM]iB free; this would fit: .*"
 )
 
 

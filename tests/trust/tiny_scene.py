@@ -21,14 +21,15 @@ lights:
 views:
   - name: front
     image: front.npy
-    camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30}
+    camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [8, 6]}
   - name: side
     image: side.npy
-    camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30}
+    camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30, resolution: [8, 6]}
   - name: test
     image: side.npy
     split: test
-    camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1}
+    camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1,
+             resolution: [8, 6]}
 optimize:
   iterations: 10
   views_per_iteration: 1

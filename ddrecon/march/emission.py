@@ -1,0 +1,130 @@
+"""What a volume sends towards one camera, and which of its fields view rays interpolate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.light.beam import Beam
+from ddrecon.light.point_light import PointBeam
+from ddrecon.medium.coefficients import Coefficient
+from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.third_order import ThirdOrder
+
+
+@dataclass(frozen=True)
+class Emission:
+    """What a volume sends towards one camera.
+
+    Emission per unit length is kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2 and E3.
+    `diffuse` [C, z, y, x] is the radiance that scatters into the camera's rays from all light but
+    beams; `g` is the mean cosine of p. Point lights have E = I / r^2. `peak` is the medium's: what
+    its forward peak does to p (E13).
+    """
+
+    grid: Grid
+    extinction: Coefficient
+    scattering: Coefficient
+    beams: tuple[Beam | PointBeam, ...]
+    diffuse: Tensor
+    g: Tensor
+    peak: Tensor | None
+
+    @property
+    def colors(self) -> int:
+        """How many colors leave: 3 as soon as medium or any light has 3."""
+        return max(
+            self.diffuse.shape[0],
+            self.extinction.scale.shape[0],
+            *(beam.irradiance.shape[0] for beam in self.beams),
+            1,
+        )
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The fields of an `Emission` that rays sample.
+
+    In cells each is `[channels, z, y, x]`, at nodes of rays `[N, channels, R]`. There is one mass
+    for each beam. `scattering` is the tensor `extinction` itself where both coefficients have the
+    same field. A `peak` that is the same everywhere is `[C, 1, 1, 1]`, and at nodes `[C, 1]`.
+    """
+
+    extinction: Tensor
+    diffuse: Tensor
+    masses: tuple[Tensor, ...]
+    scattering: Tensor
+    peak: Tensor | None
+
+    @staticmethod
+    def in_cells(emission: Emission) -> Sampled:
+        """The fields of `emission` in all cells."""
+        return Sampled(
+            emission.extinction.field,
+            emission.diffuse,
+            tuple(beam.mass for beam in emission.beams),
+            emission.scattering.field,
+            emission.peak,
+        )
+
+    def pack(self) -> Tensor:
+        """The different fields as channels of one tensor, which one interpolation serves."""
+        return torch.cat(self._fields())
+
+    def unpack(self, values: Tensor) -> Sampled:
+        """The same fields at nodes, from `values` [N, channels, R] of the channels of `pack`."""
+        fields = iter(values.split([field.shape[0] for field in self._fields()], 1))
+        extinction, diffuse = next(fields), next(fields)
+        masses = tuple(next(fields) for _ in self.masses)
+        scattering = next(fields) if self._has_own_scattering else extinction
+        peak = self.peak
+        if peak is not None:
+            peak = next(fields) if _is_field(peak) else peak.view(-1, 1)
+        return Sampled(extinction, diffuse, masses, scattering, peak)
+
+    def _fields(self) -> list[Tensor]:
+        fields = [self.extinction, self.diffuse, *self.masses]
+        if self._has_own_scattering:
+            fields.append(self.scattering)
+        if self.peak is not None and _is_field(self.peak):
+            fields.append(self.peak)
+        return fields
+
+    @property
+    def _has_own_scattering(self) -> bool:
+        return self.scattering is not self.extinction
+
+
+def _is_field(peak: Tensor) -> bool:
+    """Whether a medium's `peak` differs from cell to cell."""
+    return peak.shape[1:].numel() > 1
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Fields to interpolate: `values` [channels, z, y, x], linearly or to `third_order`.
+
+    Where the first `matter` channels are zero nothing is to be seen, and slices leave that out; 0:
+    something may be anywhere.
+    """
+
+    values: Tensor
+    third_order: ThirdOrder | None = None
+    matter: int = 0
+
+
+def pack_channels(emission: Emission) -> Channels:
+    """The fields of `emission` as `Channels`: masses to third order, the others linearly.
+
+    Nothing is left out as empty where the medium is varied: derivatives by the density of empty
+    cells are wanted, and must be those of what is rendered.
+    """
+    cells = Sampled.in_cells(emission)
+    first = cells.extinction.shape[0] + cells.diffuse.shape[0]
+    last = first + sum(mass.shape[0] for mass in cells.masses)
+    third_order = ThirdOrder(first, last, emission.extinction.mass_bound) if cells.masses else None
+    is_fixed = not (is_varied(cells.extinction) or is_varied(cells.scattering))
+    return Channels(cells.pack(), third_order, cells.extinction.shape[0] if is_fixed else 0)

@@ -1,0 +1,83 @@
+"""The view-ray integral in plain sums: read this first (docs/theory.md E1-E3).
+
+`march_plainly` is what `ddrecon.march.integral.march` computes, at equal steps along every ray and
+differentiated by autograd alone. The renderer takes the other, which is faster and needs less
+memory; tests hold the two side by side. They differ in two details: `march` interpolates masses to
+third order, and for parallel light it evaluates E13 as a polynomial.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+from ddrecon.cameras import Rays
+from ddrecon.grid import Grid
+from ddrecon.light.beam import Beam
+from ddrecon.light.point_light import PointBeam
+from ddrecon.march.box import intersect_box
+from ddrecon.march.emission import Emission
+from ddrecon.medium.phase import henyey_greenstein, peaked_phase
+
+
+def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
+    """Radiance [C, R] scattered towards the camera along `rays`, and transmittance [C, R] (E1).
+
+    Second order in the length of a step; `steps` >= 1 is how many each ray takes inside the box.
+    """
+    grid = emission.grid
+    near, far = intersect_box(grid, rays)
+    part = torch.linspace(0, 1, steps + 1, dtype=near.dtype, device=near.device)
+    distance = near + part[:, None] * (far - near).clamp(min=0)
+    points = rays.origin + distance[..., None] * rays.direction
+    # What is between the camera and each node: the integral of the extinction's field, and tau.
+    extinction = _interpolate(grid, emission.extinction.field, points)
+    passed = pad(torch.cumulative_trapezoid(extinction, distance, dim=1), (0, 0, 1, 0))
+    scale = emission.extinction.scale.view(-1, 1, 1)
+    # E3: the radiance (L0 + g L1 . w) that one more scattering turns towards the camera.
+    radiance = _interpolate(grid, emission.diffuse, points)
+    for beam in emission.beams:
+        # E2: p E tau / (4 pi), where tau is what lies between the light and the node.
+        travel, irradiance = _unattenuated(beam, points, rays.direction)
+        cosine = -(travel * rays.direction).sum(-1)
+        mass = _interpolate(grid, beam.mass, points)
+        if emission.peak is None:
+            phase = henyey_greenstein(cosine, emission.g)
+        else:
+            # E13: the forward peak spreads the light on its way to the node and to the camera.
+            depth = _interpolate(grid, emission.peak, points) * (passed + mass)
+            phase = peaked_phase(depth, cosine, emission.g)
+        radiance = radiance + phase * irradiance / (4 * math.pi) * torch.exp(-scale * mass)
+    # E2 + E3: the integral of tau kappa_s times that, and tau of the whole way.
+    scattering = _interpolate(grid, emission.scattering.value, points)
+    tau = torch.exp(-scale * passed)
+    scattered = torch.trapezoid(tau * scattering * radiance, distance, dim=1)
+    return scattered, tau[:, -1].expand_as(scattered)
+
+
+def _interpolate(grid: Grid, field: Tensor, points: Tensor) -> Tensor:
+    """`field` [C, z, y, x] at `points` [N, R, 3]: `[C, N, R]`, linear between cells' centers."""
+    low, extent = points.new_tensor(grid.lower), points.new_tensor(grid.extent)
+    places = (2 * (points - low) / extent - 1).flip(-1)
+    sampled = grid_sample(
+        field[None], places[None, None], padding_mode="border", align_corners=False
+    )
+    return sampled[0, :, 0]
+
+
+def _unattenuated(
+    beam: Beam | PointBeam, points: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The direction of travel and E [C, ...] of light that reaches `points` through nothing.
+
+    Rays along `direction` pass a point light at a squared distance of at least `beam.least_square`.
+    """
+    if isinstance(beam, Beam):
+        return beam.direction, beam.irradiance[..., 0]
+    offset = points - beam.position
+    along = (offset * direction).sum(-1)
+    square = along**2 + (offset.square().sum(-1) - along**2).clamp(min=beam.least_square)
+    return offset / square.sqrt()[..., None], beam.irradiance[..., 0] / square
