@@ -17,7 +17,8 @@ from tqdm import tqdm
 from ddrecon.errors import DivergenceError, FormatError, SceneError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
-from ddrecon.reconstruct.loop import Reconstruction, Row
+from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.run.checkpoint import LAST, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log

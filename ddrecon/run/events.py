@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.extras import load_extra
-from ddrecon.reconstruct.loop import Row
+from ddrecon.reconstruct.log import Row
 
 FOLDER = "tensorboard"
 """Where a run's folder keeps its events."""

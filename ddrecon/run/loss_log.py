@@ -11,7 +11,7 @@ from typing import Any
 
 from ddrecon.errors import DataWarning
 from ddrecon.io.files.atomic import flush, refusals, replace_file
-from ddrecon.reconstruct.loop import Row
+from ddrecon.reconstruct.log import Row
 
 COLUMNS = [field.name for field in fields(Row)]
 KINDS: list[Callable[[str], Any]] = [

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.io.images.movies import animation_of, encode_frames
 from ddrecon.io.images.table import png_of
-from ddrecon.reconstruct.loop import Row
+from ddrecon.reconstruct.log import Row
 from ddrecon.renderer import LightField, view_image
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
