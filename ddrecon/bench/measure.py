@@ -23,6 +23,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
+from ddrecon.variables.values import with_values
 
 BLOCK = 4
 """Gradients are compared as sums over blocks of so many cells along each side."""
@@ -71,15 +72,13 @@ def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
     """Renders the first view of `scene` from nothing, and differentiates the mean of its image;
     gradients are summed to `blocks`.
     """
-    density = scene.volume.density
-    scene.volume.density = density.detach().clone().requires_grad_()
-    memory = SolveMemory()
+    density = scene.volume.density.detach().clone().requires_grad_()
+    varied, memory = with_values(scene, {"density": density}), SolveMemory()
     start = _now(density)
-    image = render_each(scene, scene.views[:1], memory)[0]
+    image = render_each(varied, varied.views[:1], memory)[0]
     middle = _now(density)
-    (gradient,) = torch.autograd.grad(image.mean(), scene.volume.density)
+    (gradient,) = torch.autograd.grad(image.mean(), density)
     end = _now(density)
-    scene.volume.density = density
     iterations = memory.records[0].iterations if memory.records else 0
     sums = block_sums(gradient, blocks), block_sums(gradient * density.detach(), blocks)
     return Shot(image.detach(), *sums, middle - start, end - middle, iterations)
