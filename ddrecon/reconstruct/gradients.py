@@ -1,4 +1,4 @@
-"""The derivative of the image loss with respect to everything that is optimized, view by view.
+"""The derivative of the image loss by everything that is optimized, view by view.
 
 The light inside the volume is solved once and held as if it were given; each view's derivative goes
 back to it at once and is added up there, and the sum goes back through the solve. So memory does

@@ -1,4 +1,4 @@
-"""Checkpoints: the state of a run in one file of tensors and plain values. The last two are kept."""
+"""Checkpoints: files of tensors and plain values that hold the state of a run; two are kept."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def require_variation(scene: Scene, parameter: str) -> None:
 
 
 def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
-    """The `report` of what was rendered to `folder` as lines: files, quality and time of each view."""
+    """What `render` prints of its `report`: files, quality and time of each view."""
     lines = []
     for name, files in report["files"].items():
         notes = [f"{report['seconds']['views'][name]:.2f} s"]
