@@ -1,8 +1,7 @@
-"""Time and error of each variant: its image and the gradient of the image's mean by density, in
-turns with all others.
+"""Time and error of each variant's image, and of the gradient of its mean by density.
 
-The numerical error is against the same model solved exactly, in double precision; the whole error
-is against path tracing.
+Variants take turns. The numerical error is against the same model solved exactly, in double
+precision; the whole error is against path tracing.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 @dataclass(frozen=True)
 class Shot:
-    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density,
-    summed over blocks [z, y, x].
+    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density.
 
-    `by_amount` is the gradient times density, summed likewise: what changes as all density there
-    grows by a factor. Empty cells, which path tracers do not see, have no part in it.
+    `gradient` is summed over blocks [z, y, x], and so is `by_amount`, the gradient times density:
+    what changes as all density there grows by a factor. Empty cells, which path tracers do not see,
+    have no part in it.
     """
 
     image: Tensor
@@ -49,28 +48,22 @@ class Shot:
 
 @dataclass
 class Timing:
-    """The shots of one variant; `seconds` are of the image, and of image and gradient together,
-    medians over the turns.
-    """
+    """The shots of one variant; `seconds` are medians over the turns."""
 
     shots: list[Shot] = field(default_factory=list)
 
     @property
     def seconds(self) -> tuple[float, float]:
         """Median seconds of an image, and of an image with its gradient."""
-        image, both = zip(
-            *(
-                (shot.image_seconds, shot.image_seconds + shot.gradient_seconds)
-                for shot in self.shots
-            ),
-            strict=True,
-        )
+        image = [shot.image_seconds for shot in self.shots]
+        both = [shot.image_seconds + shot.gradient_seconds for shot in self.shots]
         return statistics.median(image), statistics.median(both)
 
 
 def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
-    """Renders the first view of `scene` from nothing, and differentiates the mean of its image;
-    gradients are summed to `blocks`.
+    """An image of the first view of `scene`, rendered from nothing, with its gradient.
+
+    The gradient is that of the image's mean by density, summed to `blocks`.
     """
     density = scene.volume.density.detach().clone().requires_grad_()
     varied, memory = with_values(scene, {"density": density}), SolveMemory()
@@ -87,10 +80,10 @@ def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
 def measure(
     contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress
 ) -> dict[str, Timing]:
-    """By name, the timings of all `contestants` that can be solved, each once in every turn, so
-    that what else runs slows all alike.
+    """The timings by name of all `contestants` that can be solved.
 
-    One is run once before, uncounted: the first work of a process takes longer.
+    Each runs once in every turn, so that what else runs slows all alike. One is run once before,
+    uncounted: the first work of a process takes longer.
     """
     timings = {name: Timing() for name in contestants}
     with suppress(SolveError):
@@ -105,8 +98,9 @@ def measure(
 
 
 def exact_shots(variants: Sequence[Variant], scene: Scene, progress: Progress) -> dict[str, Shot]:
-    """By name, what each variant of `scene` (in double precision) comes to when solved exactly;
-    alike models are solved once.
+    """The exact solution of each variant of `scene`, which is in double precision, by name.
+
+    Alike models are solved once.
     """
     blocks, known = blocks_of(scene), dict[tuple[object, ...], Shot]()
     for variant in progress(variants, "exact solutions"):
@@ -138,8 +132,9 @@ def correlation(one: Tensor, other: Tensor) -> float:
 
 
 def block_sums(gradient: Tensor, blocks: tuple[int, int, int]) -> Tensor:
-    """`gradient` [z, y, x] summed over `blocks`, whatever its own grid: the effect of scaling
-    density there.
+    """`gradient` [z, y, x] summed over `blocks`, whatever its own grid.
+
+    It is the effect of scaling density there.
     """
     mean = adaptive_avg_pool3d(gradient[None], blocks)[0]
     return mean * (gradient.numel() / mean.numel())

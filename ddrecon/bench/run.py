@@ -23,8 +23,9 @@ from ddrecon.scene import Scene
 
 TURNS = 2
 PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
-"""Paths a pixel that Mitsuba is tried with; the truth is the mean of `TRUTH_PASSES` of the most, by
-other paths.
+"""Paths a pixel that Mitsuba is tried with.
+
+The truth is the mean of `TRUTH_PASSES` of the most, by other paths.
 """
 TRUTH_PASSES = 4
 QUICK_CELLS = 60_000
@@ -87,10 +88,8 @@ def against_path_tracing(rows: Sequence[Row]) -> list[str]:
 
     Its own error falls with the square root of time.
     """
-    base, traced = (
-        rows[0],
-        [row for row in rows if row.name.startswith("Mitsuba") and row.image_error],
-    )
+    base = rows[0]
+    traced = [row for row in rows if row.name.startswith("Mitsuba") and row.image_error]
     if not traced or not base.image_error:
         return []
     last = traced[-1]
@@ -102,9 +101,10 @@ def against_path_tracing(rows: Sequence[Row]) -> list[str]:
     ]
     if last.gradient_correlation is not None:
         ratio = last.both_seconds / base.both_seconds
+        theirs, ours = last.gradient_correlation, base.gradient_correlation or 0.0
         lines.append(
             f"image and gradient take {last.name} {ratio:.0f} times as long as base; "
-            f"gradients correlate with the truth's by {last.gradient_correlation:.3f} and {base.gradient_correlation or 0.0:.3f}"
+            f"gradients correlate with the truth's by {theirs:.3f} and {ours:.3f}"
         )
     return lines
 

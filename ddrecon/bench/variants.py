@@ -16,7 +16,9 @@ from ddrecon.settings import DiffusionSettings
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is tried: tolerances of solves, models, transport rounds with directions, steps a voxel,
+    """What is tried.
+
+    These are tolerances of solves, models, transport rounds with directions, steps a voxel,
     tolerances of interpolated pixels, and factors by which the grid is made coarser.
     """
 
@@ -31,8 +33,9 @@ class Sweep:
 QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (0, 0.05), (2,))
 EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
 EXACT_LIMITED = 1e-5
-"""The tolerance in place of that for `flux_limited`, whose damped iteration gains a digit in many
-minutes.
+"""The tolerance in place of that for `flux_limited`.
+
+Its damped iteration gains a digit in many minutes.
 """
 EXACT_STEPS = 3
 
@@ -60,8 +63,9 @@ def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
 
 
 def exactly(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows and
-    marched in finer steps, ray by ray.
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows.
+
+    It is marched in finer steps, ray by ray.
     """
     render = replace(
         scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel), tolerance=0.0
@@ -73,7 +77,7 @@ def exactly(scene: Scene) -> Scene:
 
 
 def model_of(scene: Scene) -> tuple[object, ...]:
-    """What `exactly` keeps of a scene: scenes for which this is the same have the same exact image."""
+    """What two scenes must share for their exact images to be the same."""
     return scene.volume.grid.shape, _effective(replace(scene.diffusion, **EXACT))
 
 

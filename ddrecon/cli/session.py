@@ -64,7 +64,7 @@ class Session:
         return self.build(self.read(path))
 
     def pick_views(self, scene: Scene, names: tuple[str, ...]) -> list[View]:
-        """The views of `scene` called `names`, or all; raises UsageError for a name that is none."""
+        """The views of `scene` called `names`, or all; raises UsageError for an unknown name."""
         known = [view.name for view in scene.views]
         unknown = [name for name in names if name not in known]
         if unknown:
