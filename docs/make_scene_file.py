@@ -1,26 +1,28 @@
-"""Makes docs/scene_file.md, the manual of scene files, from the schema: keys, kinds, limits and
-defaults are those the program checks.
+"""Makes docs/scene_file.md, the manual of scene files, from the schema.
 
-python docs/make_scene_file.py
+Keys, kinds, limits and defaults are those the program checks. Run it after each change of them:
+
+    python docs/make_scene_file.py
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from ddrecon import settings
 from ddrecon.scene_file import schema
-from ddrecon.settings import DiffusionSettings, RenderSettings
-from ddrecon.variables.kinds import KINDS
+from ddrecon.variables.kinds import KINDS, Kind
 
 PAGE = Path(__file__).parent / "scene_file.md"
 KIND_NAMES = {
     schema.Color: "number or [r, g, b]",
     schema.Quantity: "number, [r, g, b] or {file: ...}",
     schema.Density: "number or {file: ...}",
-    schema.Start: "number, list or {file: ...}",
+    settings.Start: "number, list or {file: ...}",
     schema.Triple: "[x, y, z]",
     schema.Count: "[nx, ny, nz]",
     schema.Size: "[width, height]",
@@ -37,33 +39,52 @@ KIND_NAMES = {
 """How a user would call what a key takes."""
 
 INTRODUCTION = """\
-Every key, with what it takes, its limits and its default, made from the program's own schema. Vectors are x, y, z; lengths are in a world
-unit u of your choice; `1e-3` is a number; paths are relative to the scene file. Anything unknown, repeated or out of its limits is
-refused with file, line, column and key."""
-VOLUME = "The box, and what is in it. Either `sigma_a` and `sigma_s`, or `sigma_t` and `albedo`."
+Every key, with what it takes, its limits and its default, made from the program's own schema.
+
+- Vectors are x, y, z.
+- Lengths are in a world unit u of your choice.
+- `1e-3` is a number.
+- Paths are relative to the scene file.
+
+Anything unknown, repeated or out of its limits is refused with file, line, column and key."""
+VOLUME = """\
+The box, and what is in it.
+Give either `sigma_a` and `sigma_s`, or `sigma_t` and `albedo`."""
 SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "volume",
         schema.VolumeSection,
         VOLUME,
         {
-            "density": "What scatters and absorbs, per cell; everything else is multiplied by it. `{constant: 0.1}` is the same as `0.1`.",
-            "bounds": "The corners of the box [u], `{min: [x, y, z], max: [x, y, z]}`; of the field's file where left out.",
+            "density": (
+                "What scatters and absorbs, per cell; everything else is multiplied by it. "
+                "`{constant: 0.1}` is the same as `0.1`."
+            ),
+            "bounds": (
+                "The corners of the box [u], `{min: [x, y, z], max: [x, y, z]}`; of the field's "
+                "file where left out."
+            ),
             "resolution": "Cells along x, y and z; those of the field's file where left out.",
             "sigma_a": "Absorption coefficient per unit of density [1/u].",
             "sigma_s": "Scattering coefficient per unit of density [1/u].",
-            "sigma_t": "Extinction coefficient per unit of density [1/u]: absorption and scattering together.",
+            "sigma_t": (
+                "Extinction coefficient per unit of density [1/u]: absorption and scattering "
+                "together."
+            ),
             "albedo": "Single-scattering albedo: the part of the extinction that scatters.",
-            "g": "Mean cosine of the scattering angle (asymmetry parameter) of the Henyey-Greenstein phase function; above 0 is forward.",
+            "g": (
+                "Mean cosine of the scattering angle (asymmetry parameter) of the "
+                "Henyey-Greenstein phase function; above 0 is forward."
+            ),
         },
     ),
     (
         "volume.density, sigma_a, ...: {file: ...}",
-        schema.FieldFile,
-        "A field from a volume file; formats are told of in [formats.md](formats.md).",
+        settings.FieldFile,
+        "A field from a volume file, in one of these [formats](formats.md).",
         {
             "file": "Relative to the scene file.",
-            "name": "What the field is called in the file, where that is not its name here.",
+            "name": "The field's name in the file, where that is not its name here.",
         },
     ),
     (
@@ -71,7 +92,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         schema.DirectionalSection,
         "Parallel light, such as the sun's.",
         {
-            "direction": "The way the light travels, of any length.",
+            "direction": "The direction in which the light travels, of any length.",
             "irradiance": "On a plane that faces it, in units of radiance times steradian.",
         },
     ),
@@ -86,12 +107,16 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "lights: {type: environment}",
         schema.EnvironmentSection,
-        "A latitude-longitude map (HDRI), +y up, oriented as Mitsuba's `envmap`. Small bright regions become suns.",
+        "A latitude-longitude map (HDRI), +y up, oriented as Mitsuba's `envmap`.\n"
+        "Small bright regions become suns.",
         {
             "file": "An image of linear radiance: .exr, .hdr, .npy, .tif.",
             "scale": "Factor on its pixels.",
             "rotation": "About +y, in degrees.",
-            "directions": "How many directions its light on the volume is gathered into: more are slower and closer.",
+            "directions": (
+                "Directions into which its light on the volume is gathered; more are slower and "
+                "more exact."
+            ),
         },
     ),
     (
@@ -106,12 +131,15 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "views",
         schema.ViewSection,
-        "A list of pictures or of cameras to render. Or a ring, or NeRF cameras: see the next table.",
+        "A list of pictures, or of cameras to render.\n"
+        "Or a ring, or NeRF cameras: see the next table.",
         {
-            "name": "Files of the view are called so.",
+            "name": "Files of the view have this name.",
             "camera": "Where it is seen from; see below.",
-            "image": "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg and .webp are decoded from sRGB; "
-            "alpha 0 is empty.",
+            "image": (
+                "The picture: .exr, .hdr, .npy and float .tif are linear, .png, .jpg and .webp "
+                "are decoded from sRGB; alpha 0 is empty."
+            ),
             "mask": "A picture of the same size, black where pixels are ignored.",
             "split": "`test` views are never optimized on, and always reported.",
             "weight": "How much a training view counts.",
@@ -124,8 +152,14 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "ring": "Cameras in a circle; see below.",
             "transforms": "`transforms.json` of NeRF, instant-ngp or nerfstudio, read as it is.",
-            "images": "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted, belong to the cameras in turn.",
-            "test_every": "For transforms that say nothing of splits: of every so many views, the first is a test view.",
+            "images": (
+                "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted, "
+                "belong to the cameras in turn."
+            ),
+            "test_every": (
+                "For transforms without splits: one view in this many, the first of them, is a "
+                "test view."
+            ),
         },
     ),
     (
@@ -138,49 +172,59 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "fov": "Horizontal field of view, in degrees.",
             "height": "Of the circle above the target [u].",
             "target": "What they look at [u].",
-            "up": "Which way is up in their images.",
-            "resolution": "Pixels; left out where images say it.",
+            "up": "The direction that is up in their images.",
+            "resolution": "Pixels; left out where there are images.",
         },
     ),
     (
         "camera: {type: perspective}",
         schema.PerspectiveSection,
-        "A pinhole camera. Either `origin`, `target` and `up`, or `matrix`.",
+        "A pinhole camera.\nGive either `origin`, `target` and `up`, or `matrix`.",
         {
             "fov": "Horizontal field of view, in degrees.",
-            "principal_point": "Where the axis meets the image, as parts of its width and height from the top left.",
+            "principal_point": (
+                "Where the axis meets the image, as parts of its width and height from the top "
+                "left."
+            ),
             "pixel_aspect": "Height of a pixel over its width.",
             "origin": "Where the camera stands [u].",
             "target": "A point on its axis [u].",
-            "up": "Which way is up in the image.",
-            "matrix": "Camera to world, with OpenGL axes: the columns are right, up, backward and origin.",
+            "up": "The direction that is up in the image.",
+            "matrix": (
+                "Camera to world, with OpenGL axes: the columns are right, up, backward and origin."
+            ),
             "resolution": "Pixels; left out where the view has an image.",
         },
     ),
     (
         "camera: {type: orthographic}",
         schema.OrthographicSection,
-        "Parallel rays, as a satellite far away sees. Its other keys are those of a perspective camera.",
+        "Parallel rays, as a satellite far away sees.\n"
+        "Its other keys are those of a perspective camera.",
         {
             "width": "Of the image [u].",
         },
     ),
     (
         "render",
-        RenderSettings,
+        settings.RenderSettings,
         "How view rays are sampled.",
         {
             "samples_per_pixel": "Rays a pixel, over its area; one goes through its center.",
             "steps_per_voxel": "Samples a cell along a ray.",
-            "tolerance": "Pixels finer than half a cell are interpolated between rays, but where they may change by more than "
-            "this part of the image's root mean square. 0: every pixel has a ray of its own.",
+            "tolerance": (
+                "Pixels finer than half a cell are interpolated between rays, but where they may"
+                " change by more than this part of the image's root mean square. 0: every pixel "
+                "has a ray of its own."
+            ),
             "background": "Whether ambient light and environment maps are seen behind the volume.",
         },
     ),
     (
         "diffusion",
-        DiffusionSettings,
-        "How light that is scattered more than once is found. [settings.md](settings.md) says how to choose.",
+        settings.DiffusionSettings,
+        "How light that is scattered more than once is found.\n"
+        "[Settings](settings.md) says how to choose.",
         {
             "model": "`none` leaves such light out; `flux_limited` is the paper's for thin smoke.",
             "scheme": "`printed` is the paper's own discretization, for comparison.",
@@ -190,13 +234,16 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "solver": "Of the linear system.",
             "tolerance": "Relative residual of a solve.",
             "warm_start": "Whether a solve begins at the last one's solution.",
-            "transport_rounds": "Sweeps along rays that take diffusion towards the transport equation: 1 or 2 bring images within 2 %.",
+            "transport_rounds": (
+                "Sweeps along rays that take diffusion towards the transport equation: 1 or 2 "
+                "bring images within 2 %."
+            ),
             "transport_directions": "Directions of such a sweep.",
         },
     ),
     (
         "optimize",
-        schema.OptimizeSettings,
+        settings.OptimizeSettings,
         "What `ddrecon optimize` finds, and how.",
         {
             "parameters": "What to find: names, as in the last table, with their settings.",
@@ -204,23 +251,35 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "loss": "What is made small, as a mean over pixels.",
             "optimizer": "How.",
             "views_per_iteration": "Training views drawn at random for each iteration; 0 for all.",
-            "derivatives": "Which light passes derivatives on: all, that scattered once, or that of the diffusion.",
-            "refine_at": "Fractions of the run at which cells and pixels become half as large: coarse to fine.",
+            "derivatives": (
+                "Which light passes derivatives on: all, only light scattered once, or only the "
+                "diffusion's."
+            ),
+            "refine_at": (
+                "Fractions of the run at which cells and pixels become half as large: coarse to "
+                "fine."
+            ),
         },
     ),
     (
         "optimize.parameters: {NAME: ...}",
-        schema.ParameterSettings,
+        settings.ParameterSettings,
         "Settings of one parameter; all may be left out, `{}`.",
         {
-            "init": "Where it starts; from what the scene says unless given.",
+            "init": "Where it starts; at the scene's own value unless given.",
             "lr": "Learning rate, in the parameter's own unit; chosen by its size unless given.",
-            "min": "It is kept at least this large.",
-            "max": "And at most this large.",
-            "tv": "Weight of its total variation, which smooths a field. 1 would weigh as much as the whole brightness of the pictures. "
-            f"Unless given, {KINDS['density'].tv:g} for density and 0 for others.",
+            "min": "Its smallest value.",
+            "max": "Its largest value.",
+            "tv": (
+                "Weight of its total variation, which smooths a field. 1 would weigh as much as "
+                f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
+                " density and 0 for others."
+            ),
             "l1": "Weight of its mean, which empties what no picture needs.",
-            "field": "Whether it differs from cell to cell; as where it starts unless given. Density always does.",
+            "field": (
+                "Whether it differs from cell to cell; unless given, as its start does. Density "
+                "always does."
+            ),
         },
     ),
 ]
@@ -300,35 +359,37 @@ def _default(field: Field[Any]) -> str:
         return ""
     if isinstance(value, tuple):
         return f"`[{', '.join(f'{entry:g}' for entry in value)}]`"
-    return f"`{str(value).lower() if isinstance(value, bool) else f'{value:g}' if isinstance(value, float) else value}`"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
 
 def _parameters() -> str:
     """The table of what can be optimized."""
     rows = []
     for name, kind in KINDS.items():
-        limits = (
-            ""
-            if kind.low == -float("inf")
-            else f"{kind.low:g} to {kind.high:g}"
-            if kind.high < float("inf")
-            else f"at least {kind.low:g}"
-        )
-        rows.append(
-            f"| `{name}` | {limits} | {'yes' if kind.is_color else ''} | {'yes' if kind.is_cellwise else ''} |"
-        )
-    told = (
-        "What can be found. N is a light's place in the list, counted from 0, NAME a view's name."
+        by_color, by_cell = ("yes" if holds else "" for holds in (kind.is_color, kind.is_cellwise))
+        rows.append(f"| `{name}` | {_limits(kind)} | {by_color} | {by_cell} |")
+    return "\n".join(
+        [
+            "## Names of parameters",
+            "",
+            "What can be found.",
+            "N is a light's place in the list, counted from 0; NAME is a view's name.",
+            "[Commands](cli.md#names-of-parameters) has the same names, by light.",
+            "",
+            "| name | kept within | by color | from cell to cell |",
+            "|---|---|---|---|",
+            *rows,
+        ]
     )
-    head = [
-        "## Names of parameters",
-        "",
-        told,
-        "",
-        "| name | kept within | by color | from cell to cell |",
-        "|---|---|---|---|",
-    ]
-    return "\n".join([*head, *rows])
+
+
+def _limits(kind: Kind) -> str:
+    """What values of a `kind` are kept within, in words."""
+    if kind.low == -math.inf:
+        return ""
+    return f"{kind.low:g} to {kind.high:g}" if kind.high < math.inf else f"at least {kind.low:g}"
 
 
 if __name__ == "__main__":

@@ -4,26 +4,21 @@ same derivatives.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 import torch
+from media import box_grid, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.layer import VolumeRenderer
 from ddrecon.renderer import render
-from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
 
 
-def test_a_tiny_network_learns_the_density_behind_an_image(
-    make_scene: Callable[..., Scene], box: Callable[..., Any]
-) -> None:
+def test_a_tiny_network_learns_the_density_behind_an_image() -> None:
     torch.manual_seed(0)
-    grid = box(SHAPE)
+    grid = box_grid(SHAPE)
     z, y, x = torch.broadcast_tensors(*grid.centers(torch.zeros(())))
     truth = torch.nn.functional.softplus(3 * x - 2 * y + z)
     layer = VolumeRenderer(make_scene(truth, ambient=(0.2,), tolerance=1e-5))
@@ -47,10 +42,8 @@ def test_a_tiny_network_learns_the_density_behind_an_image(
     assert losses[-1] < 0.02 * losses[0]
 
 
-def test_anything_by_name_replaces_what_the_scene_has(
-    make_scene: Callable[..., Scene], random: Callable[..., Tensor]
-) -> None:
-    scene = make_scene(random(*SHAPE), ambient=(0.2,))
+def test_anything_by_name_replaces_what_the_scene_has() -> None:
+    scene = make_scene(random_values(*SHAPE), ambient=(0.2,))
     brighter = {
         "lights.0.irradiance": 2 * value_of(scene, "lights.0.irradiance"),
         "lights.1.radiance": 2 * value_of(scene, "lights.1.radiance"),
@@ -74,23 +67,21 @@ NAMES = [
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("name", NAMES)
-def test_function_transforms_agree_with_backward(
-    make_scene: Callable[..., Scene], random: Callable[..., Tensor], name: str, dtype: torch.dtype
-) -> None:
+def test_function_transforms_agree_with_backward(name: str, dtype: torch.dtype) -> None:
     scene = make_scene(
-        random(*SHAPE, dtype=dtype),
+        random_values(*SHAPE, dtype=dtype),
         g=0.3,
         ambient=(0.2,),
         tolerance=1e-13 if dtype == torch.float64 else 1e-6,
     )
     value = value_of(scene, name)
-    change = random(*value.shape, seed=1, dtype=dtype) - 0.5
+    change = random_values(*value.shape, seed=1, dtype=dtype) - 0.5
 
     def image(moved: Tensor) -> Tensor:
         return render(with_values(scene, {name: moved}))
 
     out, tangent = torch.func.jvp(image, (value,), (change,))
-    weight = random(*out.shape, seed=2, dtype=dtype)
+    weight = random_values(*out.shape, seed=2, dtype=dtype)
     leaf = value.clone().requires_grad_()
     (gradient,) = torch.autograd.grad((image(leaf) * weight).sum(), leaf)
     one, other = (tangent * weight).sum(), (gradient * change).sum()

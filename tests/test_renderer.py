@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -38,7 +39,7 @@ def volume_with(scene: Scene, **fields: Any) -> Scene:
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.5])
-def test_components_sum_to_the_image(g: float, make_scene, half_empty):
+def test_components_sum_to_the_image(g: float):
     scene = make_scene(half_empty(*SHAPE), g=g, **BOTH)
     parts = components(scene)
     torch.testing.assert_close(
@@ -48,18 +49,18 @@ def test_components_sum_to_the_image(g: float, make_scene, half_empty):
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.5])
-def test_without_a_model_nothing_scatters_twice(g: float, make_scene, half_empty):
+def test_without_a_model_nothing_scatters_twice(g: float):
     parts = components(make_scene(half_empty(*SHAPE), g=g, model="none", **BOTH))
     torch.testing.assert_close(parts.multiple, torch.zeros_like(parts.multiple), rtol=0, atol=1e-15)
     assert bool((parts.single > 0).any())
 
 
-def test_without_scattering_only_reduced_light_is_seen(make_scene, half_empty):
+def test_without_scattering_only_reduced_light_is_seen():
     parts = components(make_scene(half_empty(*SHAPE), sigma_s=(0.0,), **BOTH))
     assert not parts.single.any() and not parts.multiple.any() and bool((parts.reduced > 0).all())
 
 
-def test_reduced_light_is_ambient_light_attenuated(make_scene, half_empty):
+def test_reduced_light_is_ambient_light_attenuated():
     """A directional light is not seen: no pixel looks straight into it."""
     density = half_empty(*SHAPE)
     absorbing = make_scene(
@@ -74,7 +75,7 @@ def test_reduced_light_is_ambient_light_attenuated(make_scene, half_empty):
 
 
 @pytest.mark.parametrize("solver", ["jacobi", "conjugate_gradient"])
-def test_the_solver_does_not_matter(solver: str, make_scene, half_empty):
+def test_the_solver_does_not_matter(solver: str):
     scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
     torch.testing.assert_close(
         render(replace(scene, diffusion=replace(scene.diffusion, solver=solver))),
@@ -84,7 +85,7 @@ def test_the_solver_does_not_matter(solver: str, make_scene, half_empty):
     )
 
 
-def test_views_are_rendered_by_name_and_must_agree_in_size(make_scene, make_camera, half_empty):
+def test_views_are_rendered_by_name_and_must_agree_in_size():
     scene = make_scene(half_empty(*SHAPE))
     scene.views += [View("other", make_camera(eye=(-2.5, 0.0, 1.0)))]
     both = render(scene)
@@ -100,7 +101,7 @@ def test_views_are_rendered_by_name_and_must_agree_in_size(make_scene, make_came
 RADIUS = 0.35
 
 
-def ball(make_scene, make_camera, thickness: float, g: float) -> Scene:
+def ball(thickness: float, g: float) -> Scene:
     grid = Grid((18, 20, 22), (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     radius = sum(axis**2 for axis in grid.centers(torch.zeros(1, dtype=torch.float64))).sqrt()
     density = (radius < RADIUS).double() * thickness / (2 * RADIUS)
@@ -126,11 +127,11 @@ def misses(camera: Camera, radius: float) -> Tensor:
 
 @pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
 @pytest.mark.parametrize("thickness", [0.0, 1.0, 10.0])
-def test_a_white_furnace_is_white(thickness: float, g: float, make_scene, make_camera):
+def test_a_white_furnace_is_white(thickness: float, g: float):
     """Albedo 1 under radiance 1 from everywhere: radiance 1 everywhere, and not even rounding where
     nothing is in the way.
     """
-    scene = ball(make_scene, make_camera, thickness, g)
+    scene = ball(thickness, g)
     image = render(scene)[0]
     is_miss = misses(scene.views[0].camera, RADIUS + 0.1)
     assert bool(is_miss.any()) and bool((image[:, is_miss] == 1).all())
@@ -141,9 +142,7 @@ def test_a_white_furnace_is_white(thickness: float, g: float, make_scene, make_c
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
-def test_a_white_furnace_is_white_where_the_medium_touches_its_box(
-    g: float, make_scene, half_empty
-):
+def test_a_white_furnace_is_white_where_the_medium_touches_its_box(g: float):
     scene = make_scene(
         half_empty(*SHAPE), sigma_a=(0.0,), sigma_s=(6.0,), g=g, directional=None, ambient=(1.0,)
     )
@@ -152,7 +151,7 @@ def test_a_white_furnace_is_white_where_the_medium_touches_its_box(
 
 
 @pytest.mark.parametrize("g", [0.5, 0.9, -0.5])
-def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float, make_scene, random):
+def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float):
     """The beam's power plus the flux of diffuse light, 4 pi / 3 L1, is the same at every depth of a
     wide slab.
 
@@ -160,7 +159,7 @@ def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float, make_scene, r
     """
     grid, sigma = Grid((8, 1, 1), (0.0, 0.0, 0.0), (1.0, 1e9, 1e9)), 3.0
     scene = make_scene(
-        random(*grid.shape),
+        random_values(*grid.shape),
         grid=grid,
         sigma_a=(0.0,),
         sigma_s=(sigma,),
@@ -179,9 +178,7 @@ def test_a_slab_that_absorbs_nothing_passes_all_power_on(g: float, make_scene, r
 
 
 @pytest.mark.parametrize("g", [0.6, -0.6])
-def test_a_parallel_camera_is_a_perspective_one_from_afar(
-    g: float, make_scene, make_camera, half_empty
-):
+def test_a_parallel_camera_is_a_perspective_one_from_afar(g: float):
     far = 1e4
     images = []
     for half_width, is_perspective in ((0.45, False), (0.45 / far, True)):
@@ -193,8 +190,8 @@ def test_a_parallel_camera_is_a_perspective_one_from_afar(
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])
-def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float, make_scene, make_camera):
-    scene = ball(make_scene, make_camera, 1.0, g)
+def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float):
+    scene = ball(1.0, g)
     parts = components(scene)
     once = (parts.reduced + parts.single)[:, ~misses(scene.views[0].camera, RADIUS - 0.1)]
     assert bool((once < 1).all()) and bool((once > 0.5).all())
@@ -203,7 +200,7 @@ def test_unscattered_ambient_light_never_exceeds_a_white_furnace(g: float, make_
 # --- scalings and symmetries -----------------------------------------------------------------------------------------
 
 
-def test_images_are_linear_in_light(make_scene, half_empty):
+def test_images_are_linear_in_light():
     scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
     beam, ambient = scene.lights
     mixed = [
@@ -216,7 +213,7 @@ def test_images_are_linear_in_light(make_scene, half_empty):
     torch.testing.assert_close(render(replace(scene, lights=mixed)), parts, rtol=1e-10, atol=0)
 
 
-def test_gray_is_three_equal_colors(make_scene, half_empty):
+def test_gray_is_three_equal_colors():
     density = half_empty(*SHAPE)
     gray = make_scene(
         density, sigma_a=(0.5,), sigma_s=(6.0,), g=0.4, directional=(3.0,), ambient=(0.5,)
@@ -233,7 +230,7 @@ def test_gray_is_three_equal_colors(make_scene, half_empty):
 
 
 @pytest.mark.parametrize("colored", ["light", "medium"])
-def test_each_color_is_a_gray_scene_of_its_own(colored: str, make_scene, half_empty):
+def test_each_color_is_a_gray_scene_of_its_own(colored: str):
     density = half_empty(*SHAPE)
     light, sigma_a, sigma_s = (
         ((3.0, 2.0, 1.0), (0.5,) * 3, (6.0,) * 3)
@@ -269,7 +266,7 @@ def test_each_color_is_a_gray_scene_of_its_own(colored: str, make_scene, half_em
 @pytest.mark.parametrize(
     "view", [{}, PARALLEL, INSIDE], ids=["perspective", "orthographic", "inside"]
 )
-def test_a_world_of_another_size_looks_the_same(view: dict, make_scene, make_camera, half_empty):
+def test_a_world_of_another_size_looks_the_same(view: dict):
     """All lengths times 3, all cross sections divided by 3."""
     scale, scene = 3.0, make_scene(half_empty(*SHAPE), g=0.4, camera=make_camera(**view), **BOTH)
     grid, camera, volume = scene.volume.grid, scene.views[0].camera, scene.volume
@@ -288,7 +285,7 @@ def test_a_world_of_another_size_looks_the_same(view: dict, make_scene, make_cam
     torch.testing.assert_close(render(large), render(scene), rtol=1e-10, atol=0)
 
 
-def test_density_and_cross_sections_only_matter_as_a_product(make_scene, half_empty):
+def test_density_and_cross_sections_only_matter_as_a_product():
     scene = make_scene(half_empty(*SHAPE), g=0.4, **BOTH)
     volume = scene.volume
     other = volume_with(
@@ -298,7 +295,7 @@ def test_density_and_cross_sections_only_matter_as_a_product(make_scene, half_em
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4])
-def test_a_mirrored_world_looks_mirrored(g: float, make_scene, make_camera, half_empty):
+def test_a_mirrored_world_looks_mirrored(g: float):
     """Volume, light and camera mirrored in x, the light along no axis."""
     density, grid = half_empty(*SHAPE), Grid(SHAPE, (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
     image = render(
@@ -318,7 +315,7 @@ def test_a_mirrored_world_looks_mirrored(g: float, make_scene, make_camera, half
     torch.testing.assert_close(mirrored.flip(-1), image, rtol=1e-10, atol=0)
 
 
-def test_a_denser_absorber_is_darker(make_scene, half_empty):
+def test_a_denser_absorber_is_darker():
     density = half_empty(*SHAPE)
     images = [
         render(make_scene(density, sigma_a=(sigma,), **BOTH))[0] for sigma in (0.0, 1.0, 10.0)
@@ -365,15 +362,15 @@ each_configuration = pytest.mark.parametrize(
 
 
 @pytest.fixture
-def build(make_scene, make_camera, half_empty, random) -> Callable[[dict[str, Any]], Scene]:
+def build() -> Callable[[dict[str, Any]], Scene]:
     def make(configuration: dict[str, Any]) -> Scene:
         options = dict(configuration)
         shape, view = options.pop("shape", SHAPE), options.pop("view", {})
         density = half_empty(*shape, seed=7) * (not options.pop("is_empty", False))
         if options.pop("has_fields", False):
             options |= {
-                "sigma_a": 2 * random(3, *shape, seed=8),
-                "sigma_s": 8 * random(3, *shape, seed=9),
+                "sigma_a": 2 * random_values(3, *shape, seed=8),
+                "sigma_s": 8 * random_values(3, *shape, seed=9),
             }
         return make_scene(density, camera=make_camera(size=(3, 4), **view), **options)
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
+from media import make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.renderer import render
-from ddrecon.scene import Scene
 from ddrecon.turntable import place_turntable, turn_camera, upright_axis
 
 CENTER = (0.1, -0.2, 0.3)
@@ -59,10 +57,8 @@ def test_the_upright_axis_is_the_one_the_cameras_agree_on(
     assert upright_axis([looking(origin, up) for origin in origins]) == axis
 
 
-def test_a_ring_begins_at_its_view_and_goes_once_around(
-    make_scene: Callable[..., Scene], random: Callable[..., Tensor]
-) -> None:
-    scene = make_scene(random(4, 5, 6))
+def test_a_ring_begins_at_its_view_and_goes_once_around() -> None:
+    scene = make_scene(random_values(4, 5, 6))
     views = place_turntable(scene, scene.views[0], 8)
     assert [view.name for view in views] == [f"ring_{index:03d}" for index in range(8)]
     assert torch.allclose(views[0].camera.pose, scene.views[0].camera.pose, atol=1e-15)
@@ -74,10 +70,8 @@ def test_a_ring_begins_at_its_view_and_goes_once_around(
     )
 
 
-def test_a_volume_turned_by_a_quarter_looks_the_same_to_a_camera_turned_with_it(
-    make_scene: Callable[..., Scene], random: Callable[..., Tensor]
-) -> None:
-    density, grid = random(5, 4, 5), Grid((5, 4, 5), (-0.3, -0.6, -0.5), (0.7, 0.4, 0.5))
+def test_a_volume_turned_by_a_quarter_looks_the_same_to_a_camera_turned_with_it() -> None:
+    density, grid = random_values(5, 4, 5), Grid((5, 4, 5), (-0.3, -0.6, -0.5), (0.7, 0.4, 0.5))
     scene = make_scene(density, grid=grid, directional=None, ambient=(1.0,))
     turned_density = (
         density.transpose(0, 2).flip(0).contiguous()

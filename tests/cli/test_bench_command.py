@@ -14,6 +14,8 @@ from ddrecon.scene import Scene
 from ddrecon.validate import hard
 from ddrecon.validate.hard_cases import CASES, HardCase, empty, full
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., Result]
 BENCH = ["bench", "--hard", "-q"]
 

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from ddrecon import __version__
 from ddrecon.cli.commands import main
 
-README = (Path(__file__).parents[2] / "README.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "cli.md").read_text()
 PROGRAM = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
 
 
@@ -91,5 +91,5 @@ def test_a_shell_is_told_how_to_complete(shell: str) -> None:
     )
     assert (
         f"_DDRECON_COMPLETE={shell}_complete" in told
-        and f"_DDRECON_COMPLETE={shell}_source ddrecon" in README
+        and f"_DDRECON_COMPLETE={shell}_source ddrecon" in PAGE
     )

@@ -8,6 +8,7 @@ import math
 
 import pytest
 import torch
+from media import box_grid, half_empty, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR, geometric, inverse_distance
@@ -17,47 +18,47 @@ each_closure = pytest.mark.parametrize("closure", CLOSURES.values(), ids=CLOSURE
 
 
 @each_closure
-def test_dense_media_have_one_third_of_the_transport_length(closure, box):
+def test_dense_media_have_one_third_of_the_transport_length(closure):
     kappa = torch.full((1, 2, 3, 4), 1e10, dtype=torch.float64)
     torch.testing.assert_close(
-        closure(kappa, box((2, 3, 4)), FLOOR), 1 / (3 * kappa), rtol=1e-8, atol=0
+        closure(kappa, box_grid((2, 3, 4)), FLOOR), 1 / (3 * kappa), rtol=1e-8, atol=0
     )
 
 
 @each_closure
-def test_the_coefficient_is_positive_and_falls_with_density(closure, box):
+def test_the_coefficient_is_positive_and_falls_with_density(closure):
     kappa = torch.logspace(-8, 8, 33, dtype=torch.float64).view(-1, 1, 1, 1).expand(-1, 2, 3, 4)
-    coefficient = closure(kappa, box((2, 3, 4)), FLOOR)
+    coefficient = closure(kappa, box_grid((2, 3, 4)), FLOOR)
     assert bool((coefficient > 0).all()) and bool((coefficient.diff(dim=0) <= 0).all())
 
 
 @each_closure
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_empty_space_is_finite_and_has_a_finite_derivative(closure, dtype: torch.dtype, box):
+def test_empty_space_is_finite_and_has_a_finite_derivative(closure, dtype: torch.dtype):
     kappa = torch.zeros(1, 2, 3, 4, dtype=dtype, requires_grad=True)
-    coefficient = closure(kappa, box((2, 3, 4)), FLOOR)
+    coefficient = closure(kappa, box_grid((2, 3, 4)), FLOOR)
     (slope,) = torch.autograd.grad(coefficient.sum(), kappa)
     assert bool(coefficient.isfinite().all()) and bool(slope.isfinite().all())
 
 
 @each_closure
-def test_derivatives(closure, box, half_empty):
+def test_derivatives(closure):
     kappa: Tensor = (10 * half_empty(2, 2, 3, 2)).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda k: closure(k, box((2, 3, 2)), FLOOR), kappa, atol=1e-8, check_forward_ad=True
+        lambda k: closure(k, box_grid((2, 3, 2)), FLOOR), kappa, atol=1e-8, check_forward_ad=True
     )
 
 
-def test_the_smooth_floor_is_that_of_a_box_of_fixed_optical_thickness(box):
-    grid = box((2, 3, 4))
+def test_the_smooth_floor_is_that_of_a_box_of_fixed_optical_thickness():
+    grid = box_grid((2, 3, 4))
     empty = CLOSURES["smooth"](torch.zeros(1, *grid.shape, dtype=torch.float64), grid, FLOOR)
     torch.testing.assert_close(
         min(grid.extent) / (3 * empty), torch.full_like(empty, FLOOR), rtol=1e-14, atol=0
     )
 
 
-def test_distances_are_those_summed_cell_by_cell(box, half_empty):
-    grid = box((3, 4, 2))
+def test_distances_are_those_summed_cell_by_cell():
+    grid = box_grid((3, 4, 2))
     weight: Tensor = half_empty(2, *grid.shape) + 0.03 / sum(grid.extent)
     places = torch.stack([c.expand(grid.shape) for c in grid.centers(weight)]).flatten(1)
     apart = (places[:, :, None] - places[:, None]).square().sum(0).sqrt()
@@ -101,13 +102,13 @@ def test_distances_on_a_fine_grid_are_interpolated():
     )
 
 
-def test_finite_differences_may_step_below_zero(box, random):
+def test_finite_differences_may_step_below_zero():
     """D stays positive there, and its slope at zero is the same from both sides."""
-    kappa: Tensor = random(1, 3, 4, 2) * (random(1, 3, 4, 2, seed=1) > 0.5)
-    below, above = (geometric(kappa + change, box((3, 4, 2))) for change in (-1e-5, 1e-5))
+    kappa: Tensor = random_values(1, 3, 4, 2) * (random_values(1, 3, 4, 2, seed=1) > 0.5)
+    below, above = (geometric(kappa + change, box_grid((3, 4, 2))) for change in (-1e-5, 1e-5))
     here = kappa.clone().requires_grad_()
     _, slope = torch.autograd.functional.jvp(
-        lambda k: geometric(k, box((3, 4, 2))), here, torch.ones_like(kappa)
+        lambda k: geometric(k, box_grid((3, 4, 2))), here, torch.ones_like(kappa)
     )
     torch.testing.assert_close((above - below) / 2e-5, slope, rtol=1e-7, atol=0)
-    assert bool((geometric(kappa - 0.4, box((3, 4, 2))) > 0).all())
+    assert bool((geometric(kappa - 0.4, box_grid((3, 4, 2))) > 0).all())

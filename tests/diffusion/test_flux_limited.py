@@ -8,6 +8,7 @@ import math
 
 import pytest
 import torch
+from media import box_grid, half_empty, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -27,7 +28,7 @@ SHAPE = (3, 4, 3)
 
 
 @pytest.fixture
-def make(make_scene, half_empty):
+def make():
     """A half-empty scene of three colors."""
 
     def scene(density: Tensor | None = None, **changes) -> Scene:
@@ -57,25 +58,25 @@ def test_steepness_of_exponential_light_is_its_rate():
     )
 
 
-def test_even_light_and_no_light_have_no_steepness(box):
+def test_even_light_and_no_light_have_no_steepness():
     for value in (0.0, 2.0):
         u = torch.full((2, 3, 4, 2), value, dtype=torch.float64, requires_grad=True)
-        q = steepness_square(u, box((3, 4, 2)))
+        q = steepness_square(u, box_grid((3, 4, 2)))
         (slope,) = torch.autograd.grad(q.sum(), u)
         assert bool((q == 0).all()) and bool((slope == 0).all())
 
 
 @each_limiter
-def test_the_light_found_balances(limiter: str, make, box, random):
-    balance = Balance(box(SHAPE), LIMITERS[limiter])
-    fields = [5 * random(2, *SHAPE, seed=seed) for seed in range(3)]
+def test_the_light_found_balances(limiter: str, make):
+    balance = Balance(box_grid(SHAPE), LIMITERS[limiter])
+    fields = [5 * random_values(2, *SHAPE, seed=seed) for seed in range(3)]
     outside = torch.tensor([0.5, 1.0], dtype=torch.float64).view(2, 1, 1, 1)
     u = flux_limited._Solve.apply(make_solve(1e-13), balance, *fields, outside)
     assert float(balance.residual(u, *fields, outside).abs().max()) < 1e-11 * float(u.abs().max())
 
 
 @each_limiter
-def test_dense_media_diffuse_as_without_a_limit(limiter: str, make, box):
+def test_dense_media_diffuse_as_without_a_limit(limiter: str, make):
     """Uniform and 4000 optical depths thick: R is small, and what is added to the medium as well."""
     dense = torch.full(SHAPE, 500.0, dtype=torch.float64)
     ways = {"limiter": limiter}, {"model": "p1"}
@@ -107,17 +108,19 @@ def test_a_white_furnace_is_white(limiter: str, g: float, make):
 
 
 @each_limiter
-def test_both_derivatives_agree_with_differences(limiter: str, random, box):
+def test_both_derivatives_agree_with_differences(limiter: str):
     shape = (2, 3, 2)
     inputs = [
-        4 * random(1, *shape, seed=seed) * (seed > 0 or random(1, *shape, seed=9) > 0.5)
+        4
+        * random_values(1, *shape, seed=seed)
+        * (seed > 0 or random_values(1, *shape, seed=9) > 0.5)
         for seed in range(3)
     ]
-    flux = [random(1, *shape, seed=seed) for seed in (4, 5, 6)]
+    flux = [random_values(1, *shape, seed=seed) for seed in (4, 5, 6)]
     arguments = [
         t.double().requires_grad_() for t in (*inputs, torch.full((1, 1, 1, 1), 0.5), *flux)
     ]
-    balance = Balance(box(shape), LIMITERS[limiter])
+    balance = Balance(box_grid(shape), LIMITERS[limiter])
 
     def solved(*coefficients: Tensor) -> Tensor:
         return flux_limited._Solve.apply(
@@ -130,8 +133,8 @@ def test_both_derivatives_agree_with_differences(limiter: str, random, box):
 
 
 @each_limiter
-def test_the_tangent_is_the_transpose_of_the_adjoint(limiter: str, make, half_empty, random):
-    density, direction = half_empty(*SHAPE), random(*SHAPE, seed=3) - 0.5
+def test_the_tangent_is_the_transpose_of_the_adjoint(limiter: str, make):
+    density, direction = half_empty(*SHAPE), random_values(*SHAPE, seed=3) - 0.5
     scene, leaf = make(limiter=limiter), density.clone().requires_grad_()
     image = render(with_values(scene, {"density": leaf}))
     image_bar = torch.randn_like(image)

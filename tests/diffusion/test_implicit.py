@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from media import random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -31,7 +32,7 @@ def solving(
 
 
 @pytest.fixture
-def inputs(random):
+def inputs():
     """source, loss and conductances of a small system of two colors, or of a gray operator under a
     colored source.
     """
@@ -39,8 +40,11 @@ def inputs(random):
     def make(shape: tuple[int, int, int] = (2, 3, 2), colors: int = 2) -> list[Tensor]:
         faces = [[n - (axis == other) for other, n in enumerate(shape)] for axis in range(3)]
         return [
-            random(2, *shape) - 0.5,
-            *(1 + random(colors, *size, seed=1 + i) for i, size in enumerate([shape, *faces])),
+            random_values(2, *shape) - 0.5,
+            *(
+                1 + random_values(colors, *size, seed=1 + i)
+                for i, size in enumerate([shape, *faces])
+            ),
         ]
 
     return make

@@ -8,6 +8,7 @@ import math
 
 import pytest
 import torch
+from media import dense_matrix, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
@@ -50,9 +51,9 @@ def operator_of(diffusion: Tensor, grid: Grid) -> Operator:
     return Operator((c_z, c_y, c_x), boundary_loss(diffusion, grid))
 
 
-def patchy(random, patch: int, contrast: float, dtype: torch.dtype, cells: int = 16) -> Operator:
+def patchy(patch: int, contrast: float, dtype: torch.dtype, cells: int = 16) -> Operator:
     """D random and the same within patches of so many cells a side."""
-    patches = random(1, *(cells // patch,) * 3)
+    patches = random_values(1, *(cells // patch,) * 3)
     diffusion = 0.1 * contrast**-patches
     for axis in AXES:
         diffusion = diffusion.repeat_interleave(patch, axis)
@@ -77,16 +78,16 @@ def test_a_cycle_is_symmetric_and_positive_definite(shape: tuple[int, int, int])
     assert float(torch.linalg.eigvalsh(matrix).min()) > 0
 
 
-def test_a_cycle_stays_so_at_random_contrasts(random):
-    operator = patchy(random, 1, 1e6, torch.float64, cells=8)
+def test_a_cycle_stays_so_at_random_contrasts():
+    operator = patchy(1, 1e6, torch.float64, cells=8)
     matrix = matrix_of(Level.of(operator).cycle, operator.loss.shape)
     assert float((matrix - matrix.mT).abs().max()) < 1e-13 * float(matrix.abs().max())
     assert float(torch.linalg.eigvalsh(matrix).min()) > 0
 
 
-def test_a_cycle_in_single_precision_is_symmetric_to_rounding(random):
+def test_a_cycle_in_single_precision_is_symmetric_to_rounding():
     operator = uneven((16, 24, 20), contrast=1e6, dtype=torch.float32)
-    a, b = (random(2, 16, 24, 20, seed=seed, dtype=torch.float32) - 0.5 for seed in (1, 2))
+    a, b = (random_values(2, 16, 24, 20, seed=seed, dtype=torch.float32) - 0.5 for seed in (1, 2))
     cycle = Level.of(operator).cycle
     there, back = (float((p.double() * cycle(q).double()).sum()) for p, q in ((a, b), (b, a)))
     assert abs(there - back) < 1e-5 * float(a.norm() * cycle(b).norm())
@@ -94,13 +95,11 @@ def test_a_cycle_in_single_precision_is_symmetric_to_rounding(random):
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("cells", [2, 5, 6])
-def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(
-    axis: int, cells: int, random
-):
+def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(axis: int, cells: int):
     shape = tuple(cells if a == axis else 3 for a in AXES)
-    operator = patchy_box(random, shape)
+    operator = patchy_box(shape)
     way, coarse = coarsen(operator, axis)
-    fine, u = random(2, *shape, seed=5), random(2, *coarse.loss.shape[1:], seed=6)
+    fine, u = random_values(2, *shape, seed=5), random_values(2, *coarse.loss.shape[1:], seed=6)
     torch.testing.assert_close(
         (way.restrict(fine) * u).sum(), (fine * way.prolong(u)).sum(), rtol=1e-13, atol=0
     )
@@ -110,20 +109,21 @@ def test_interpolation_is_the_transpose_of_restriction_and_keeps_constants(
     torch.testing.assert_close(coarse.loss.sum(), operator.loss.sum())
 
 
-def patchy_box(random, shape: tuple[int, ...]) -> Operator:
+def patchy_box(shape: tuple[int, ...]) -> Operator:
     faces = [
-        random(2, *(n - (a == axis) for a, n in zip(AXES, shape, strict=True)), seed=axis) + 0.01
+        random_values(2, *(n - (a == axis) for a, n in zip(AXES, shape, strict=True)), seed=axis)
+        + 0.01
         for axis in AXES
     ]
-    return Operator((faces[0], faces[1], faces[2]), random(2, *shape, seed=9))
+    return Operator((faces[0], faces[1], faces[2]), random_values(2, *shape, seed=9))
 
 
 @pytest.mark.parametrize("cells", [6, 7])
-def test_along_one_axis_the_coarse_operator_is_that_of_its_interpolation(cells: int, random):
+def test_along_one_axis_the_coarse_operator_is_that_of_its_interpolation(cells: int):
     """In a row of resistors a current through a face between pairs has the same energy before and
     after.
     """
-    faces = random(1, 1, 1, cells - 1) + 0.01
+    faces = random_values(1, 1, 1, cells - 1) + 0.01
     none = torch.zeros(1, 0, 1, cells), torch.zeros(1, 1, 0, cells)
     way, coarse = coarsen(
         Operator((*none, faces), torch.zeros(1, 1, 1, cells, dtype=torch.float64)), 3
@@ -136,40 +136,41 @@ def test_along_one_axis_the_coarse_operator_is_that_of_its_interpolation(cells: 
     torch.testing.assert_close(current[..., 3], coarse.conductances[2][..., 1])
 
 
-def test_few_cells_are_solved_directly(random, dense):
-    operator = patchy_box(random, (3, 4, 5))
-    source = random(2, 3, 4, 5, seed=7)
-    exact = torch.linalg.solve(dense(operator), source.flatten(1)).view_as(source)
+def test_few_cells_are_solved_directly():
+    operator = patchy_box((3, 4, 5))
+    source = random_values(2, 3, 4, 5, seed=7)
+    exact = torch.linalg.solve(dense_matrix(operator), source.flatten(1)).view_as(source)
     torch.testing.assert_close(Coarsest.of(operator).correction(source), exact)
 
 
-def test_iterations_do_not_grow_with_the_number_of_cells(random):
+def test_iterations_do_not_grow_with_the_number_of_cells():
     counts = [
-        multigrid(uneven((n, n, n)), random(2, n, n, n), None, 1e-6).iterations for n in (8, 16, 32)
+        multigrid(uneven((n, n, n)), random_values(2, n, n, n), None, 1e-6).iterations
+        for n in (8, 16, 32)
     ]
     assert max(counts) <= counts[0] + 2 and max(counts) <= 15
 
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_boxes_and_cells_of_any_form_take_few_iterations(form: str, dtype: torch.dtype, random):
+def test_boxes_and_cells_of_any_form_take_few_iterations(form: str, dtype: torch.dtype):
     shape, sides = FORMS[form]
     assert (
         multigrid(
-            uneven(shape, sides, dtype=dtype), random(2, *shape, dtype=dtype), None, 1e-6
+            uneven(shape, sides, dtype=dtype), random_values(2, *shape, dtype=dtype), None, 1e-6
         ).iterations
         <= 15
     )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype, random):
+def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype):
     """Random in every cell they take more, but less than a third of those of conjugate gradients
     alone.
     """
-    source = random(1, 16, 16, 16, dtype=dtype)
-    assert multigrid(patchy(random, 4, 1e6, dtype), source, None, 1e-6).iterations <= 15
-    operator = patchy(random, 1, 1e6, dtype)
+    source = random_values(1, 16, 16, 16, dtype=dtype)
+    assert multigrid(patchy(4, 1e6, dtype), source, None, 1e-6).iterations <= 15
+    operator = patchy(1, 1e6, dtype)
     assert (
         3 * multigrid(operator, source, None, 1e-6).iterations
         < conjugate_gradient(operator, source, None, 1e-6).iterations
@@ -177,15 +178,15 @@ def test_patches_of_a_million_to_one_take_few_iterations(dtype: torch.dtype, ran
 
 
 @pytest.mark.parametrize("contrast", [1.0, 1e6])
-def test_the_solution_is_that_of_conjugate_gradients(contrast: float, random):
-    operator, source = uneven((9, 14, 11), contrast=contrast), random(2, 9, 14, 11)
+def test_the_solution_is_that_of_conjugate_gradients(contrast: float):
+    operator, source = uneven((9, 14, 11), contrast=contrast), random_values(2, 9, 14, 11)
     found, known = (
         solve(operator, source, None, 1e-12).value for solve in (multigrid, conjugate_gradient)
     )
     torch.testing.assert_close(found, known, rtol=1e-8, atol=0)
 
 
-def test_conductances_shared_by_colors_may_be_given_once(random):
+def test_conductances_shared_by_colors_may_be_given_once():
     shape = (6, 9, 7)
     operator = uneven(shape)
     shared = Operator(
@@ -193,14 +194,14 @@ def test_conductances_shared_by_colors_may_be_given_once(random):
         operator.loss[:1] + torch.tensor([0.0, 1.0, 5.0]).view(-1, 1, 1, 1),
     )
     spread = Operator(tuple(c.expand(3, -1, -1, -1) for c in shared.conductances), shared.loss)
-    source = random(3, *shape)
+    source = random_values(3, *shape)
     torch.testing.assert_close(
         multigrid(shared, source, None, 1e-9).value, multigrid(spread, source, None, 1e-9).value
     )
 
 
-def test_what_is_made_of_an_operator_is_made_once(random, monkeypatch: pytest.MonkeyPatch):
-    operator, source = uneven((6, 9, 7)), random(2, 6, 9, 7)
+def test_what_is_made_of_an_operator_is_made_once(monkeypatch: pytest.MonkeyPatch):
+    operator, source = uneven((6, 9, 7)), random_values(2, 6, 9, 7)
     multigrid(operator, source, None, 1e-6)
     made = operator.once(Level.of)
     assert made.matrix is operator.once(ScaledMatrix.of)

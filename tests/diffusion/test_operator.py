@@ -8,6 +8,7 @@ import math
 
 import pytest
 import torch
+from media import box_grid, convergence_order, dense_matrix, make_operator, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.operator import (
@@ -26,23 +27,23 @@ SHAPES = [(4, 3, 5), (1, 4, 3), (3, 1, 4), (4, 3, 1), (1, 1, 5), (1, 1, 1)]
 
 
 @pytest.fixture(params=SHAPES, ids=str)
-def grid(request, box) -> Grid:
-    return box(request.param)
+def grid(request) -> Grid:
+    return box_grid(request.param)
 
 
 @pytest.fixture
-def diffusion(grid: Grid, random) -> Tensor:
+def diffusion(grid: Grid) -> Tensor:
     """Diffusion coefficients over four decades, two colors."""
-    return 10 ** (4 * random(2, *grid.shape, seed=1) - 3)
+    return 10 ** (4 * random_values(2, *grid.shape, seed=1) - 3)
 
 
 @pytest.fixture
-def absorption(grid: Grid, random) -> Tensor:
-    return random(2, *grid.shape, seed=2)
+def absorption(grid: Grid) -> Tensor:
+    return random_values(2, *grid.shape, seed=2)
 
 
 @pytest.fixture
-def operator(grid: Grid, diffusion: Tensor, absorption: Tensor, make_operator) -> Operator:
+def operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
     return make_operator(grid, diffusion, absorption)
 
 
@@ -50,12 +51,15 @@ def inner(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum((1, 2, 3))
 
 
-def test_the_operator_is_the_matrix_written_with_loops(operator: Operator, random, dense):
-    u = random(*operator.loss.shape)
-    expected = (dense(operator) @ u.flatten(1)[..., None]).view_as(u)
+def test_the_operator_is_the_matrix_written_with_loops(operator: Operator):
+    u = random_values(*operator.loss.shape)
+    expected = (dense_matrix(operator) @ u.flatten(1)[..., None]).view_as(u)
     torch.testing.assert_close(operator.apply(u), expected, rtol=1e-13, atol=1e-13)
     torch.testing.assert_close(
-        operator.diagonal.flatten(1), dense(operator).diagonal(dim1=1, dim2=2), rtol=1e-14, atol=0
+        operator.diagonal.flatten(1),
+        dense_matrix(operator).diagonal(dim1=1, dim2=2),
+        rtol=1e-14,
+        atol=0,
     )
 
 
@@ -74,24 +78,24 @@ def test_conductances_and_losses_against_explicit_faces(grid: Grid, diffusion: T
     torch.testing.assert_close(boundary_loss(diffusion, grid), loss, rtol=1e-14, atol=0)
 
 
-def test_the_operator_is_symmetric(operator: Operator, random):
-    u, v = (random(*operator.loss.shape, seed=seed) - 0.5 for seed in (3, 4))
+def test_the_operator_is_symmetric(operator: Operator):
+    u, v = (random_values(*operator.loss.shape, seed=seed) - 0.5 for seed in (3, 4))
     scale = inner(operator.apply(u.abs()).abs(), v.abs())
     assert bool(
         ((inner(u, operator.apply(v)) - inner(operator.apply(u), v)).abs() < 1e-12 * scale).all()
     )
 
 
-def test_the_operator_is_a_positive_definite_m_matrix(operator: Operator, dense):
-    matrix = dense(operator)
+def test_the_operator_is_a_positive_definite_m_matrix(operator: Operator):
+    matrix = dense_matrix(operator)
     off_diagonal = matrix - torch.diag_embed(matrix.diagonal(dim1=1, dim2=2))
     assert bool((off_diagonal <= 0).all()) and bool((operator.diagonal > 0).all())
     assert bool((torch.linalg.eigvalsh(matrix) > 0).all())
     assert bool((torch.linalg.inv(matrix) >= -1e-12 * torch.linalg.inv(matrix).abs().max()).all())
 
 
-def test_accumulate_is_the_transpose_of_difference(grid: Grid, random):
-    u = random(2, *grid.shape) - 0.5
+def test_accumulate_is_the_transpose_of_difference(grid: Grid):
+    u = random_values(2, *grid.shape) - 0.5
     for axis in AXES:
         faces = torch.randn_like(difference(u, axis))
         torch.testing.assert_close(
@@ -102,8 +106,8 @@ def test_accumulate_is_the_transpose_of_difference(grid: Grid, random):
         )
 
 
-def test_the_operator_is_difference_conductance_difference(operator: Operator, random):
-    u = random(*operator.loss.shape)
+def test_the_operator_is_difference_conductance_difference(operator: Operator):
+    u = random_values(*operator.loss.shape)
     expected = operator.loss * u
     for axis, faces in zip(AXES, operator.conductances, strict=True):
         expected = expected + accumulate(faces * difference(u, axis), axis)
@@ -119,15 +123,14 @@ def test_energy_is_kept(
     operator: Operator,
     has_source_flux: bool,
     has_outside: bool,
-    random,
-    dense,
 ):
     """Absorbed plus leaked, less what came in, is what was injected: scattering along source_flux
     only moves light around.
     """
-    injected = random(2, *grid.shape, seed=5)
+    injected = random_values(2, *grid.shape, seed=5)
     source_flux = [
-        random(2, *grid.shape, seed=6 + axis) - 0.5 if has_source_flux else None for axis in AXES
+        random_values(2, *grid.shape, seed=6 + axis) - 0.5 if has_source_flux else None
+        for axis in AXES
     ]
     outside = (
         torch.tensor([0.7, 1.3], dtype=torch.float64).view(2, 1, 1, 1) if has_outside else None
@@ -136,7 +139,7 @@ def test_energy_is_kept(
     for axis in AXES:
         faces = face_fluxes(None, source_flux[axis - 1], diffusion, grid, axis)
         source = source - faces.diff(dim=axis) / grid.spacing[axis - 1]
-    u = torch.linalg.solve(dense(operator), source.flatten(1)).view_as(source)
+    u = torch.linalg.solve(dense_matrix(operator), source.flatten(1)).view_as(source)
     volume, leaked = math.prod(grid.spacing), torch.zeros(2, dtype=torch.float64)
     for axis, step in zip(AXES, grid.spacing, strict=True):
         faces = face_fluxes(u, source_flux[axis - 1], diffusion, grid, axis, outside).movedim(
@@ -158,9 +161,9 @@ def test_light_that_is_the_same_outside_and_inside_does_not_flow(grid: Grid, dif
 
 
 def test_the_divergence_of_the_fluxes_is_the_operator(
-    grid: Grid, diffusion: Tensor, absorption: Tensor, operator: Operator, random
+    grid: Grid, diffusion: Tensor, absorption: Tensor, operator: Operator
 ):
-    u = random(2, *grid.shape, seed=5)
+    u = random_values(2, *grid.shape, seed=5)
     divergence = sum(
         face_fluxes(u, None, diffusion, grid, axis).diff(dim=axis) / grid.spacing[axis - 1]
         for axis in AXES
@@ -202,7 +205,7 @@ def manufactured(position: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor
     return tuple(t.detach() for t in (u, diffusion, absorption, absorption * u - divergence))
 
 
-def discrete_error(cells: int, make_operator, solve) -> float:
+def discrete_error(cells: int, solve) -> float:
     grid = Grid((cells, cells, cells // 2), (0.0, 0.0, 0.0), EXTENT)
     position = [
         axis.clone()
@@ -213,18 +216,16 @@ def discrete_error(cells: int, make_operator, solve) -> float:
     return float((error**2).mean().sqrt() / (u**2).mean().sqrt())
 
 
-def test_a_manufactured_solution_is_approached_at_second_order(make_operator, order):
+def test_a_manufactured_solution_is_approached_at_second_order():
     counts = [8, 16, 32]
     errors = [
-        discrete_error(
-            cells, make_operator, lambda op, s: conjugate_gradient(op, s, None, 1e-11).value
-        )
+        discrete_error(cells, lambda op, s: conjugate_gradient(op, s, None, 1e-11).value)
         for cells in counts
     ]
-    assert order([1 / cells for cells in counts], errors) >= 1.9, errors
+    assert convergence_order([1 / cells for cells in counts], errors) >= 1.9, errors
 
 
-def test_the_source_flux_of_a_slab_is_exact(order, make_operator, dense):
+def test_the_source_flux_of_a_slab_is_exact():
     """One dimension, D and kappa_s Q1 constant, nothing else: L0 is linear between the faces and
     odd about the middle.
 
@@ -236,7 +237,9 @@ def test_the_source_flux_of_a_slab_is_exact(order, make_operator, dense):
     diffusion = torch.full((1, *grid.shape), coefficient, dtype=torch.float64)
     faces = face_fluxes(None, torch.full_like(diffusion, flux), diffusion, grid, 1)
     operator = make_operator(grid, diffusion, torch.zeros_like(diffusion))
-    u = torch.linalg.solve(dense(operator)[0], -(faces.diff(dim=1) / grid.spacing[0]).flatten())
+    u = torch.linalg.solve(
+        dense_matrix(operator)[0], -(faces.diff(dim=1) / grid.spacing[0]).flatten()
+    )
     slope = flux / (1 + length / 4 / coefficient)
     torch.testing.assert_close(
         u, slope * (grid.centers(u)[0].flatten() - length / 2), rtol=1e-6, atol=1e-8

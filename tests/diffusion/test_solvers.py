@@ -8,6 +8,7 @@ import sys
 
 import pytest
 import torch
+from media import box_grid, dense_matrix, make_operator, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
@@ -21,18 +22,20 @@ each_dtype = pytest.mark.parametrize("dtype", TOLERANCES, ids=str)
 
 
 @pytest.fixture
-def system(box, random, make_operator):
+def system():
     """An operator whose first color has equal conductances everywhere and whose last spans
     `contrast`, and a source.
     """
 
     def make(dtype: torch.dtype, contrast: float = 1e3, colors: int = 2) -> tuple[Operator, Tensor]:
         spread = torch.linspace(0, 1, colors, dtype=torch.float64).view(-1, 1, 1, 1)
-        diffusion = 0.1 * contrast ** -(spread * random(colors, *SHAPE, seed=1))
+        diffusion = 0.1 * contrast ** -(spread * random_values(colors, *SHAPE, seed=1))
         operator = make_operator(
-            box(SHAPE), diffusion.to(dtype), (0.1 * random(colors, *SHAPE, seed=2)).to(dtype)
+            box_grid(SHAPE),
+            diffusion.to(dtype),
+            (0.1 * random_values(colors, *SHAPE, seed=2)).to(dtype),
         )
-        return operator, random(colors, *SHAPE, seed=3, dtype=dtype)
+        return operator, random_values(colors, *SHAPE, seed=3, dtype=dtype)
 
     return make
 
@@ -57,9 +60,11 @@ def test_the_residual_is_reached(solve, dtype: torch.dtype, contrast: float, sys
 
 
 @each_dtype
-def test_the_solution_is_that_of_a_dense_solve(solve, dtype: torch.dtype, system, dense):
+def test_the_solution_is_that_of_a_dense_solve(solve, dtype: torch.dtype, system):
     operator, source = system(dtype)
-    exact = torch.linalg.solve(dense(operator).double(), source.double().flatten(1)).view_as(source)
+    exact = torch.linalg.solve(dense_matrix(operator).double(), source.double().flatten(1)).view_as(
+        source
+    )
     found = solve(operator, source, None, TOLERANCES[dtype]).value
     assert float((found - exact).norm() / exact.norm()) < 100 * TOLERANCES[dtype]
 
@@ -93,10 +98,10 @@ def test_a_start_closer_by_takes_fewer_iterations(solve, system):
 
 
 @pytest.mark.parametrize("is_fitting", [True, False])
-def test_a_useless_start_does_no_harm(solve, is_fitting: bool, system, random):
+def test_a_useless_start_does_no_harm(solve, is_fitting: bool, system):
     """A guess that is worse than zero, or of another grid, is not used."""
     operator, source = system(torch.float64)
-    guess = 1e9 * random(*source.shape) if is_fitting else random(2, 3, 3, 3)
+    guess = 1e9 * random_values(*source.shape) if is_fitting else random_values(2, 3, 3, 3)
     assert torch.equal(
         solve(operator, source, guess, 1e-8).value, solve(operator, source, None, 1e-8).value
     )

@@ -18,6 +18,8 @@ from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.validate.hard_cases import CASES
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 

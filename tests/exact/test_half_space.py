@@ -12,13 +12,13 @@ what transport rounds make of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from media import convergence_order, make_scene
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
@@ -26,6 +26,8 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.renderer import render, solve_light, view_components
 from ddrecon.scene import Scene, View
+
+pytestmark = pytest.mark.slow
 
 ALBEDOS = (0.5, 0.9, 0.99, 1.0)
 SUNS = (1.0, 0.6, 0.3)
@@ -47,9 +49,7 @@ after one round and 0.0138 after four, where 50 directions have converged.
 each_albedo = pytest.mark.parametrize("albedo", ALBEDOS)
 
 
-def half_space(
-    make_scene: Callable[..., Scene], albedo: float, sun: float, cells: int = 192, rounds: int = 0
-) -> Scene:
+def half_space(albedo: float, sun: float, cells: int = 192, rounds: int = 0) -> Scene:
     """5,000 optical depths below z = 0, lit by a beam from above at cosine `sun`, seen at all of
     `VIEWS`.
     """
@@ -160,41 +160,35 @@ def test_h_of_a_medium_that_absorbs_nothing_is_the_tabulated_one(cosine: float, 
 
 @each_albedo
 @pytest.mark.parametrize("sun", SUNS)
-def test_light_scattered_once_is_the_closed_form(albedo: float, sun: float, make_scene):
-    scene = half_space(make_scene, albedo, sun)
+def test_light_scattered_once_is_the_closed_form(albedo: float, sun: float):
+    scene = half_space(albedo, sun)
     field = solve_light(scene, SolveMemory())
     found = [float(view_components(field, scene, view.camera).single[0]) for view in scene.views]
     assert found == pytest.approx([single(albedo, sun, view) for view in VIEWS], rel=1e-3)
 
 
 @each_albedo
-def test_p1_is_its_own_closed_form(albedo: float, make_scene, order):
+def test_p1_is_its_own_closed_form(albedo: float):
     """Approached at second order: what departs from the exact radiance is P1's own error, not the
     discretization's.
     """
     counts, errors = (48, 96, 192), []
     for cells in counts:
-        found = [
-            radiance
-            for sun in SUNS
-            for radiance in seen(half_space(make_scene, albedo, sun, cells))
-        ]
+        found = [radiance for sun in SUNS for radiance in seen(half_space(albedo, sun, cells))]
         wanted = [
             single(albedo, sun, view) + p1_multiple(albedo, sun, view)
             for sun in SUNS
             for view in VIEWS
         ]
         errors.append(relative_rms(found, wanted))
-    assert errors[-1] < 2e-4 and order([1 / cells for cells in counts], errors) > 1.8, errors
+    assert errors[-1] < 2e-4 and convergence_order([1 / cells for cells in counts], errors) > 1.8, (
+        errors
+    )
 
 
 @pytest.mark.parametrize("rounds", ROUNDS)
 @each_albedo
-def test_reflected_radiance_is_chandrasekhars(albedo: float, rounds: int, make_scene):
-    found = [
-        radiance
-        for sun in SUNS
-        for radiance in seen(half_space(make_scene, albedo, sun, rounds=rounds))
-    ]
+def test_reflected_radiance_is_chandrasekhars(albedo: float, rounds: int):
+    found = [radiance for sun in SUNS for radiance in seen(half_space(albedo, sun, rounds=rounds))]
     wanted = [exact(albedo, sun, view) for sun in SUNS for view in VIEWS]
     assert relative_rms(found, wanted) < ERRORS[rounds][albedo]

@@ -5,11 +5,11 @@ order of the discretization.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
+from media import box_grid, make_operator, make_scene, random_values
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
@@ -24,9 +24,12 @@ ONE, OTHER = (-2.0, -2.1, -1.0), (1.2, -0.3, -1.9)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_two_cells_send_each_other_the_same_light(solver: str, box, random, make_operator):
-    grid = box((5, 4, 6))
-    diffusion, absorption = 10 ** (3 * random(1, *grid.shape) - 2), random(1, *grid.shape, seed=1)
+def test_two_cells_send_each_other_the_same_light(solver: str):
+    grid = box_grid((5, 4, 6))
+    diffusion, absorption = (
+        10 ** (3 * random_values(1, *grid.shape) - 2),
+        random_values(1, *grid.shape, seed=1),
+    )
     operator = make_operator(grid, diffusion, absorption)
 
     def received(source: tuple[int, ...], detector: tuple[int, ...]) -> float:
@@ -63,7 +66,7 @@ def power_seen(
     return float(parts.single[0].mean()), float(parts.multiple[0].mean())
 
 
-def asymmetry(make_scene: Callable[..., Scene], cells: int, g: float) -> tuple[float, float]:
+def asymmetry(cells: int, g: float) -> tuple[float, float]:
     """How much what goes from ONE to OTHER differs from what goes the reverse way, of single and of
     multiple scattering.
     """
@@ -76,6 +79,6 @@ def asymmetry(make_scene: Callable[..., Scene], cells: int, g: float) -> tuple[f
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5, -0.5])
-def test_light_and_camera_may_change_places(g: float, make_scene):
-    coarse, fine = (asymmetry(make_scene, cells, g) for cells in (12, 24))
+def test_light_and_camera_may_change_places(g: float):
+    coarse, fine = (asymmetry(cells, g) for cells in (12, 24))
     assert max(fine) < 0.002 and sum(fine) < 0.45 * sum(coarse), (coarse, fine)

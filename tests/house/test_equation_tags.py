@@ -39,8 +39,12 @@ def test_tags_are_found(text: str, found: set[int]) -> None:
     assert tags(text) == found
 
 
-def test_theory_states_the_equations() -> None:
-    assert set(range(1, 11)) <= STATED
+ABOUT_DERIVATIVES = {10}
+"""Stated for readers alone: what is differentiated, which no single line computes."""
+
+
+def test_theory_states_the_equations_without_a_gap() -> None:
+    assert set(range(1, max(STATED) + 1)) == STATED and len(STATED) >= 13
 
 
 def test_every_tag_in_the_code_is_stated() -> None:
@@ -49,4 +53,4 @@ def test_every_tag_in_the_code_is_stated() -> None:
 
 
 def test_every_equation_of_the_model_is_cited_in_the_code() -> None:
-    assert set(range(1, 10)) - set().union(*CITED.values()) == set()
+    assert set().union(*CITED.values()) | ABOUT_DERIVATIVES == STATED

@@ -9,11 +9,12 @@ from types import ModuleType
 
 import pytest
 
+from ddrecon import settings
 from ddrecon.scene_file import schema
 
 DOCS = Path(__file__).parents[2] / "docs"
 ELSEWHERE = {schema.Constant, schema.Bounds, schema.PoseSection, schema.SceneTree}
-"""Records whose keys are told of with those of others."""
+"""Records whose keys are explained with those of others."""
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +32,13 @@ def test_the_page_is_what_the_schema_makes_of_it(manual: ModuleType) -> None:
     )
 
 
-def test_every_key_of_every_record_is_told_of(manual: ModuleType) -> None:
-    records = {
-        value for value in vars(schema).values() if isinstance(value, type) and is_dataclass(value)
-    } - ELSEWHERE
-    told = {record: set(texts) for _, record, _, texts in manual.SECTIONS}
-    assert set(told) == records
+def test_every_key_of_every_record_is_explained(manual: ModuleType) -> None:
+    names = [*vars(schema).values(), *vars(settings).values()]
+    records = {value for value in names if isinstance(value, type) and is_dataclass(value)}
+    explained = {record: set(texts) for _, record, _, texts in manual.SECTIONS}
+    assert set(explained) == records - ELSEWHERE
     pose = {field.name for field in fields(schema.PoseSection)}
-    for record, keys in told.items():
+    for record, keys in explained.items():
         known = {field.name for field in fields(record)}
         assert keys == known - (pose if record is schema.OrthographicSection else set())
 

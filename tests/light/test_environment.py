@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from media import random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -47,21 +48,21 @@ def center(row: int, column: int, height: int, width: int) -> tuple[float, float
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:], ids=str)
-def test_a_pixel_is_seen_in_its_direction(height: int, width: int, random):
-    light = light_of(random(2, height, width))
+def test_a_pixel_is_seen_in_its_direction(height: int, width: int):
+    light = light_of(random_values(2, height, width))
     for row, column in ((1, 0), (1, width - 1), (height - 2, 1)):
         assert seen(light, *center(row, column, height, width)) == pytest.approx(
             light.radiance[:, row, column].tolist(), rel=1e-12
         )
 
 
-def test_between_pixels_radiance_is_their_mean_also_across_the_seam(random):
-    light = light_of(random(1, 5, 8))
+def test_between_pixels_radiance_is_their_mean_also_across_the_seam():
+    light = light_of(random_values(1, 5, 8))
     corners = light.radiance[0, 1:3][:, [7, 0]].mean().item()
     assert seen(light, *center(1.5, -0.5, 5, 8)) == pytest.approx([corners], rel=1e-12)
 
 
-def test_straight_up_and_down_are_the_first_and_last_row(random):
+def test_straight_up_and_down_are_the_first_and_last_row():
     light = light_of(
         torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64).view(1, 3, 1).expand(1, 3, 4)
     )
@@ -70,8 +71,8 @@ def test_straight_up_and_down_are_the_first_and_last_row(random):
     )
 
 
-def test_a_quarter_turn_rolls_the_map(random):
-    radiance, ways = random(3, 6, 8), array_order(directions(50))
+def test_a_quarter_turn_rolls_the_map():
+    radiance, ways = random_values(3, 6, 8), array_order(directions(50))
     expected = environment_radiance(light_of(radiance.roll(-2, 2)), ways)
     torch.testing.assert_close(
         environment_radiance(light_of(radiance, rotation=90.0), ways),
@@ -81,8 +82,8 @@ def test_a_quarter_turn_rolls_the_map(random):
     )
 
 
-def test_turning_the_map_is_turning_the_viewer(random):
-    radiance, ways = random(3, 6, 8), directions(50)
+def test_turning_the_map_is_turning_the_viewer():
+    radiance, ways = random_values(3, 6, 8), directions(50)
     light = light_of(radiance, rotation=33.0)
     found = environment_radiance(light, array_order(turn_directions(ways, light.rotation)))
     torch.testing.assert_close(
@@ -90,8 +91,12 @@ def test_turning_the_map_is_turning_the_viewer(random):
     )
 
 
-def test_what_is_seen_is_linear_in_scale_and_radiance(random):
-    one, other, ways = random(3, 4, 6, seed=1), random(3, 4, 6, seed=2), array_order(directions(20))
+def test_what_is_seen_is_linear_in_scale_and_radiance():
+    one, other, ways = (
+        random_values(3, 4, 6, seed=1),
+        random_values(3, 4, 6, seed=2),
+        array_order(directions(20)),
+    )
     parts = 2 * environment_radiance(light_of(one), ways) + 6 * environment_radiance(
         light_of(other), ways
     )
@@ -101,12 +106,12 @@ def test_what_is_seen_is_linear_in_scale_and_radiance(random):
 
 
 @pytest.mark.parametrize("rotation", [0.0, 37.0, 90.0, -200.0])
-def test_maps_look_as_they_do_in_mitsuba(rotation: float, random):
+def test_maps_look_as_they_do_in_mitsuba(rotation: float):
     mitsuba = pytest.importorskip(
         "mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)"
     )
     mitsuba.set_variant("scalar_rgb")
-    radiance, ways = random(3, 6, 10), directions(300)
+    radiance, ways = random_values(3, 6, 10), directions(300)
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(radiance.permute(1, 2, 0).float().numpy()))
     turn = mitsuba.ScalarTransform4f().rotate([0, 1, 0], rotation)
     environment = mitsuba.load_dict(
@@ -135,9 +140,9 @@ def test_solid_angles_sum_to_the_sphere(height: int, width: int):
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES[1:3], ids=str)
-def test_moments_integrate_the_bilinear_map(height: int, width: int, random):
+def test_moments_integrate_the_bilinear_map(height: int, width: int):
     """Against a sum over 300 x 600 directions."""
-    light = light_of(random(1, height, width))
+    light = light_of(random_values(1, height, width))
     rows, columns = 300, 600
     down = math.pi * (torch.arange(rows, dtype=torch.float64) + 0.5) / rows
     around = 2 * math.pi * (torch.arange(columns, dtype=torch.float64) + 0.5) / columns
@@ -155,8 +160,8 @@ def test_moments_integrate_the_bilinear_map(height: int, width: int, random):
 
 
 @pytest.mark.parametrize("size", [(9, 9), (24, 48), (25, 10)], ids=str)
-def test_a_refined_map_is_the_same_function(size: tuple[int, int], random):
-    radiance, ways = random(2, 7, 5), array_order(directions(100))
+def test_a_refined_map_is_the_same_function(size: tuple[int, int]):
+    radiance, ways = random_values(2, 7, 5), array_order(directions(100))
     fine = refine_map(radiance, *size)
     assert fine.shape[1] >= size[0] and fine.shape[2] >= size[1]
     torch.testing.assert_close(
@@ -168,11 +173,11 @@ def test_a_refined_map_is_the_same_function(size: tuple[int, int], random):
 
 
 @pytest.mark.parametrize("name", ["radiance", "scale", "rotation", "direction"])
-def test_what_is_seen_has_both_derivatives(name: str, random):
+def test_what_is_seen_has_both_derivatives(name: str):
     values = {
-        "radiance": random(2, 4, 5),
-        "scale": random(),
-        "rotation": 100 * random(seed=1),
+        "radiance": random_values(2, 4, 5),
+        "scale": random_values(),
+        "rotation": 100 * random_values(seed=1),
         "direction": array_order(directions(6)),
     }
 
@@ -188,9 +193,9 @@ def test_what_is_seen_has_both_derivatives(name: str, random):
     )
 
 
-def test_straight_up_has_finite_derivatives(random):
+def test_straight_up_has_finite_derivatives():
     light, way = (
-        light_of(random(2, 4, 5)),
+        light_of(random_values(2, 4, 5)),
         torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64, requires_grad=True),
     )
     (slope,) = torch.autograd.grad(environment_radiance(light, way).sum(), way)

@@ -10,12 +10,15 @@ from typing import Any
 
 import pytest
 import torch
+from media import half_empty, make_camera, make_scene
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
+
+pytestmark = pytest.mark.slow
 
 
 def tensor(*values: float) -> Tensor:
@@ -53,7 +56,7 @@ each_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS.keys())
 
 
 @pytest.fixture
-def build(make_scene, make_camera, half_empty) -> Callable[[dict[str, Any]], Scene]:
+def build() -> Callable[[dict[str, Any]], Scene]:
     def make(way: dict[str, Any]) -> Scene:
         options = dict(way)
         return make_scene(

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from media import box_grid, convergence_order, half_empty, make_camera, make_scene
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
@@ -67,11 +68,9 @@ def cell_center(grid: Grid, z: int, y: int, x: int) -> tuple[float, float, float
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
-def test_without_a_medium_light_falls_with_the_square_of_the_distance(
-    position: tuple[float, ...], box
-):
+def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: tuple[float, ...]):
     """Everywhere but in the light's own cell."""
-    grid = box((10, 12, 9))
+    grid = box_grid((10, 12, 9))
     received = follow_point_light(
         medium_of(grid, torch.zeros(grid.shape, dtype=torch.float64)), light_at(position), True
     )[1]
@@ -90,8 +89,8 @@ def test_without_a_medium_light_falls_with_the_square_of_the_distance(
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE, (0.0, 3.0, 0.0)], ids=str)
-def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...], box):
-    grid = box((7, 6, 5))
+def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...]):
+    grid = box_grid((7, 6, 5))
     beam = follow_point_light(
         medium_of(grid, torch.ones(grid.shape, dtype=torch.float64)), light_at(position), False
     )[0]
@@ -106,7 +105,7 @@ def test_in_a_homogeneous_box_depth_is_path_length(position: tuple[float, ...], 
         )
 
 
-def test_the_depth_of_a_smooth_blob_converges_at_second_order(order):
+def test_the_depth_of_a_smooth_blob_converges_at_second_order():
     """From a light inside: the integral of a Gaussian along a line from there, an error function."""
     width, errors, counts = 0.15, [], [8, 12, 18, 27]
     for count in counts:
@@ -129,10 +128,10 @@ def test_the_depth_of_a_smooth_blob_converges_at_second_order(order):
                 .sqrt()
             )
         )
-    assert order([1 / count for count in counts], errors) >= 1.7, errors
+    assert convergence_order([1 / count for count in counts], errors) >= 1.7, errors
 
 
-def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form(make_camera):
+def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
     """kappa_s I / (4 pi) times the integral of 1 / r^2 along a ray: I (angle subtended) / (distance
     of the ray).
     """
@@ -162,7 +161,7 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form(make_ca
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])
-def test_from_afar_a_point_light_is_a_directional_one(g: float, make_scene, half_empty, order):
+def test_from_afar_a_point_light_is_a_directional_one(g: float):
     """With irradiance I / r^2, up to the angle r subtends: first order in 1 / r. The depth is found
     by another quadrature on this coarse grid, of a density that is the same in every cell.
     """
@@ -179,9 +178,9 @@ def test_from_afar_a_point_light_is_a_directional_one(g: float, make_scene, half
         )
         images.append(render(replace(scene, lights=[point])))
     errors = [float((image - images[-1]).norm() / images[-1].norm()) for image in images[:-1]]
-    assert order([1 / distance for distance in distances], errors) == pytest.approx(1, abs=0.05), (
-        errors
-    )
+    assert convergence_order([1 / distance for distance in distances], errors) == pytest.approx(
+        1, abs=0.05
+    ), errors
     parallel = render(
         replace(
             scene, lights=[DirectionalLight(-towards, torch.tensor([3.0], dtype=torch.float64))]
@@ -190,7 +189,7 @@ def test_from_afar_a_point_light_is_a_directional_one(g: float, make_scene, half
     assert float((images[-1] - parallel).norm() / parallel.norm()) < 0.1
 
 
-def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one(make_scene, order):
+def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one():
     """The two ways to find depths agree as cells shrink."""
     errors, counts = [], [8, 16, 32]
     for count in counts:
@@ -209,13 +208,14 @@ def test_a_far_point_light_lights_a_fine_grid_as_a_directional_one(make_scene, o
         )
         images = [render(replace(scene, lights=[light])) for light in (point, parallel)]
         errors.append(float((images[0] - images[1]).norm() / images[1].norm()))
-    assert errors[-1] < 1e-2 and order([1 / count for count in counts[1:]], errors[1:]) > 1.5, (
-        errors
-    )
+    assert (
+        errors[-1] < 1e-2
+        and convergence_order([1 / count for count in counts[1:]], errors[1:]) > 1.5
+    ), errors
 
 
 @pytest.mark.parametrize("position", [OUTSIDE, INSIDE], ids=["outside", "inside"])
-def test_a_moved_world_looks_the_same(position: tuple[float, ...], make_scene, half_empty):
+def test_a_moved_world_looks_the_same(position: tuple[float, ...]):
     scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light_at(position)])
     image, shift = render(scene), (3.0, -2.0, 5.0)
     grid, view = scene.volume.grid, scene.views[0]
@@ -240,7 +240,7 @@ def test_a_moved_world_looks_the_same(position: tuple[float, ...], make_scene, h
     torch.testing.assert_close(render(moved), image, rtol=1e-9, atol=0)
 
 
-def test_images_are_linear_in_intensity(make_scene, half_empty):
+def test_images_are_linear_in_intensity():
     scene = make_scene(half_empty(*SHAPE), g=0.4)
     one, other = (
         render(replace(scene, lights=[light_at(INSIDE, color)]))
@@ -255,9 +255,7 @@ def test_images_are_linear_in_intensity(make_scene, half_empty):
 
 
 @pytest.mark.parametrize("where", ["center", "corner", "face", "face of the box", "eye"])
-def test_a_light_on_a_cell_is_finite_with_finite_derivatives(
-    where: str, make_scene, make_camera, half_empty
-):
+def test_a_light_on_a_cell_is_finite_with_finite_derivatives(where: str):
     scene = make_scene(
         half_empty(*SHAPE), g=0.4, camera=make_camera(eye=(0.05, 0.1, 0.15), half_width=0.8)
     )
@@ -279,11 +277,11 @@ def test_a_light_on_a_cell_is_finite_with_finite_derivatives(
     )
 
 
-def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere(box):
+def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere():
     """3 / R^2, the mean of 1 / r^2 over a sphere of one cell's volume around the light, and no
     flux: light leaves on all sides.
     """
-    grid = box((5, 4, 6))
+    grid = box_grid((5, 4, 6))
     received = follow_point_light(
         medium_of(grid, torch.zeros(5, 4, 6, dtype=torch.float64)),
         light_at(cell_center(grid, 2, 1, 3)),
@@ -296,7 +294,7 @@ def test_a_light_in_a_cell_hands_it_the_mean_of_its_sphere(box):
     assert max(abs(component[0, 2, 1, 3].item()) for component in received.flux) < 1e-12
 
 
-def test_single_precision_follows_double(make_scene, half_empty):
+def test_single_precision_follows_double():
     images = []
     for dtype in (torch.float32, torch.float64):
         scene = make_scene(half_empty(*SHAPE, dtype=dtype), g=0.4)

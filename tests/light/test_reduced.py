@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from media import box_grid, convergence_order, half_empty, random_values
 from torch import Tensor
 
 from ddrecon.grid import Grid
@@ -81,9 +82,9 @@ def blob(grid: Grid, direction: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("direction", [d for d in DIRECTIONS if d.count(0.0) == 2], ids=str)
-def test_along_an_axis_depths_are_cumulative_sums(direction: tuple[float, ...], box, random):
+def test_along_an_axis_depths_are_cumulative_sums(direction: tuple[float, ...]):
     """Exactly, cell by cell, on any field."""
-    grid, field = box((4, 3, 5)), random(4, 3, 5)
+    grid, field = box_grid((4, 3, 5)), random_values(4, 3, 5)
     axis = max(range(3), key=lambda a: abs(direction[a]))
     entered, step = sum_mass_to_cells(field[None], grid, unit(direction))
     assert step.item() == pytest.approx(grid.spacing[axis], rel=1e-15)
@@ -97,12 +98,12 @@ def test_along_an_axis_depths_are_cumulative_sums(direction: tuple[float, ...], 
 @pytest.mark.parametrize("cells", [(8, 12, 6), (16, 24, 12)], ids=str)
 @pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
 def test_in_a_homogeneous_box_depth_is_path_length(
-    direction: tuple[float, ...], cells: tuple[int, int, int], box
+    direction: tuple[float, ...], cells: tuple[int, int, int]
 ):
     """Exactly where the beam enters across its main axis; elsewhere edges are smeared, by less than
     half a cell is crossed in.
     """
-    grid, heading = box(cells), unit(direction)
+    grid, heading = box_grid(cells), unit(direction)
     error = (
         mass_to_centers(torch.ones(cells, dtype=torch.float64), grid, heading)
         - path_to_centers(grid, heading)
@@ -128,17 +129,15 @@ def test_in_a_homogeneous_box_depth_is_path_length(
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
-def test_the_depth_of_a_smooth_blob_converges_at_second_order(
-    direction: tuple[float, ...], box, order
-):
+def test_the_depth_of_a_smooth_blob_converges_at_second_order(direction: tuple[float, ...]):
     errors, counts = [], [4, 6, 9, 12]
     for count in counts:
-        grid = box((4 * count, 5 * count, 3 * count))
+        grid = box_grid((4 * count, 5 * count, 3 * count))
         field, integral = blob(grid, unit(direction))
         errors.append(
             float(((mass_to_centers(field, grid, unit(direction)) - integral) ** 2).mean().sqrt())
         )
-    assert order([1 / count for count in counts], errors) >= 1.8, errors
+    assert convergence_order([1 / count for count in counts], errors) >= 1.8, errors
 
 
 @settings(max_examples=25, deadline=None)
@@ -167,9 +166,9 @@ def test_a_mirrored_or_turned_world_is_mirrored_or_turned(order_of_axes, signs, 
     assert turned_step == pytest.approx(step.item(), rel=1e-14)
 
 
-def test_entered_mass_is_linear_in_the_field(box, random):
-    grid, direction = box((4, 3, 5)), unit((0.5, -0.3, 0.4))
-    one, other = random(1, 4, 3, 5, seed=1), random(1, 4, 3, 5, seed=2)
+def test_entered_mass_is_linear_in_the_field():
+    grid, direction = box_grid((4, 3, 5)), unit((0.5, -0.3, 0.4))
+    one, other = random_values(1, 4, 3, 5, seed=1), random_values(1, 4, 3, 5, seed=2)
     together = sum_mass_to_cells(one + 2 * other, grid, direction)[0]
     torch.testing.assert_close(
         together,
@@ -181,13 +180,13 @@ def test_entered_mass_is_linear_in_the_field(box, random):
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.2, -0.3), (-1.0, -0.3, 0.1)], ids=str)
-def test_mass_is_conserved(direction: tuple[float, ...], random):
+def test_mass_is_conserved(direction: tuple[float, ...]):
     """What a beam has met when it enters the last slice is all mass before it, as long as no shadow
     leaves through the sides.
     """
     grid = Grid((6, 20, 20), (0, 0, 0), (1.2, 5.0, 4.0))
     field = torch.zeros(1, *grid.shape, dtype=torch.float64)
-    field[:, :, 7:13, 7:13] = random(6, 6, 6)
+    field[:, :, 7:13, 7:13] = random_values(6, 6, 6)
     entered, step = sum_mass_to_cells(field, grid, unit(direction))
     last = -1 if direction[0] > 0 else 0
     before = field.sum() - field[:, last].sum()
@@ -195,8 +194,8 @@ def test_mass_is_conserved(direction: tuple[float, ...], random):
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.4, -0.5, 0.6)], ids=str)
-def test_entered_mass_has_both_derivatives(direction: tuple[float, ...], box, half_empty):
-    grid, field = box((3, 2, 3)), half_empty(1, 3, 2, 3).requires_grad_()
+def test_entered_mass_has_both_derivatives(direction: tuple[float, ...]):
+    grid, field = box_grid((3, 2, 3)), half_empty(1, 3, 2, 3).requires_grad_()
     heading = unit(direction)
     assert torch.autograd.gradcheck(
         lambda f: sum_mass_to_cells(f, grid, heading)[0], field, check_forward_ad=True
@@ -219,12 +218,12 @@ def reduced(grid: Grid, density: Tensor, lights: list, **medium) -> ReducedLight
 
 
 @pytest.mark.parametrize("depth_per_cell", [1e-3, 1.0, 30.0])
-def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float, random):
+def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float):
     """What a column of any thickness absorbs and scatters is what the beam loses: E (1 -
     exp(-depth)).
     """
     grid = Grid((6, 1, 2), (0, 0, 0), (1.5, 1, 1))
-    density = depth_per_cell / grid.spacing[0] * random(*grid.shape)
+    density = depth_per_cell / grid.spacing[0] * random_values(*grid.shape)
     light = DirectionalLight(
         torch.tensor([0, 0, -2.0], dtype=torch.float64),
         torch.tensor([2.0, 2.0], dtype=torch.float64),
@@ -236,24 +235,24 @@ def test_the_source_of_a_beam_is_the_average_over_the_cell(depth_per_cell: float
     torch.testing.assert_close(lost, 2.0 * -torch.expm1(-depth), rtol=1e-13, atol=0)
 
 
-def test_the_flux_of_a_beam_is_its_mean_times_its_direction(box, random):
+def test_the_flux_of_a_beam_is_its_mean_times_its_direction():
     light = DirectionalLight(
         torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64),
         torch.tensor([2.0, 1.0], dtype=torch.float64),
     )
-    light_field = reduced(box((3, 4, 2)), random(3, 4, 2), [light], g=-0.4)
+    light_field = reduced(box_grid((3, 4, 2)), random_values(3, 4, 2), [light], g=-0.4)
     travel = unit((0.5, -2.0, 1.0))
     torch.testing.assert_close(light_field.beams[0].direction, travel, rtol=0, atol=1e-15)
     expected = 3 * -0.4 * light_field.source.mean * travel.view(3, 1, 1, 1, 1)
     torch.testing.assert_close(torch.stack(light_field.source.flux), expected, rtol=1e-14, atol=0)
 
 
-def test_without_a_medium_a_beam_arrives_whole(box):
+def test_without_a_medium_a_beam_arrives_whole():
     light = DirectionalLight(
         torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64),
         torch.tensor([2.0, 1.0], dtype=torch.float64),
     )
-    light_field = reduced(box((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64), [light])
+    light_field = reduced(box_grid((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64), [light])
     for color in range(2):
         expected = torch.full(
             (3, 4, 2), light.irradiance[color].item() / (4 * math.pi), dtype=torch.float64
@@ -262,10 +261,10 @@ def test_without_a_medium_a_beam_arrives_whole(box):
     assert not light_field.beams[0].mass.any()
 
 
-def test_without_a_medium_ambient_light_is_the_same_everywhere(box):
+def test_without_a_medium_ambient_light_is_the_same_everywhere():
     radiance = torch.tensor([0.7, 2.0], dtype=torch.float64).view(2, 1, 1, 1)
     light = unscattered_ambient(
-        medium_in(box((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64)), radiance
+        medium_in(box_grid((3, 4, 2)), torch.zeros(3, 4, 2, dtype=torch.float64)), radiance
     )
     torch.testing.assert_close(light.mean, radiance.expand(2, 3, 4, 2), rtol=1e-15, atol=0)
     assert max(float(component.abs().max()) for component in light.flux) < 1e-14
@@ -313,15 +312,15 @@ def test_in_a_wide_slab_ambient_light_is_the_sum_over_directions():
         assert light.flux[0][0, cell, 4, 4].item() == pytest.approx(flux, rel=1e-10, abs=1e-14)
 
 
-def test_ambient_lights_add_up(random):
-    like, colors = torch.zeros(1, dtype=torch.float64), [random(1), random(3, seed=1)]
+def test_ambient_lights_add_up():
+    like, colors = torch.zeros(1, dtype=torch.float64), [random_values(1), random_values(3, seed=1)]
     total = ambient_radiance([AmbientLight(color) for color in colors], like)
     torch.testing.assert_close(total.flatten(), colors[0] + colors[1], rtol=1e-15, atol=0)
     assert not ambient_radiance([], like).any()
 
 
-def test_beams_add_up(box, random):
-    grid, density = box((3, 4, 2)), random(3, 4, 2)
+def test_beams_add_up():
+    grid, density = box_grid((3, 4, 2)), random_values(3, 4, 2)
     ways, colors = ([1.0, -2.0, 0.5], [-0.3, 0.1, 1.0]), ([2.0, 1.0], [0.5])
     lights = [
         DirectionalLight(density.new_tensor(way), density.new_tensor(color))

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from media import half_empty, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
@@ -84,10 +85,10 @@ def test_directions_are_spread_evenly(count: int):
 @pytest.mark.parametrize("directions", [1, 6, 48])
 @pytest.mark.parametrize("size", [(2, 3), (5, 8), (32, 64)], ids=str)
 def test_power_and_first_moment_of_a_map_are_those_of_its_parts(
-    size: tuple[int, int], directions: int, random
+    size: tuple[int, int], directions: int
 ):
     """All that a map without suns sends in, and the vector along which it goes."""
-    light = light_of(random(3, *size), scale=1.3, rotation=25.0, directions=directions)
+    light = light_of(random_values(3, *size), scale=1.3, rotation=25.0, directions=directions)
     (ambient, sky) = decompose_map(light)
     moments = 1.3 * (
         torch.from_numpy(pixel_moments(*size)).flatten(1) @ light.radiance.flatten(1).T
@@ -115,9 +116,9 @@ def test_with_a_sun_power_is_kept_and_the_sky_is_the_rest():
     assert bool((ambient.radiance < 1).all()) and count_suns(light) == (1, len(sky.travel))
 
 
-def test_there_are_at_most_four_suns(random):
+def test_there_are_at_most_four_suns():
     radiance = torch.zeros(1, 16, 32, dtype=torch.float64)
-    radiance[0, 8, ::5] = 1 + random(7)
+    radiance[0, 8, ::5] = 1 + random_values(7)
     assert count_suns(light_of(radiance))[0] == MAX_SUNS
 
 
@@ -132,7 +133,7 @@ def test_a_constant_map_is_ambient_light_whatever_the_directions(directions: int
 
 @pytest.mark.parametrize("model", ["p1", "none"])
 @pytest.mark.parametrize("g", [0.0, 0.6])
-def test_a_constant_map_looks_as_ambient_light_does(g: float, model: str, make_scene, half_empty):
+def test_a_constant_map_looks_as_ambient_light_does(g: float, model: str):
     scene = make_scene(half_empty(*SHAPE), g=g, model=model, ambient=(0.7, 0.2, 0.4))
     constant = light_of(
         torch.tensor([0.7, 0.2, 0.4], dtype=torch.float64).view(3, 1, 1).expand(3, 6, 8),
@@ -146,9 +147,7 @@ def test_a_constant_map_looks_as_ambient_light_does(g: float, model: str, make_s
     "place", [(32, 64, 9, 40), (32, 64, 16, 0), (16, 32, 8, 19), (16, 32, 12, 31)], ids=str
 )
 @pytest.mark.parametrize("g", [0.0, 0.6])
-def test_a_hot_pixel_is_a_directional_light(
-    g: float, place: tuple[int, int, int, int], make_scene, half_empty
-):
+def test_a_hot_pixel_is_a_directional_light(g: float, place: tuple[int, int, int, int]):
     scene = make_scene(half_empty(*SHAPE), g=g)
     environment, directional = hot_pixel(*place)
     images = [
@@ -158,13 +157,11 @@ def test_a_hot_pixel_is_a_directional_light(
     assert relative_error(*images) < 0.02
 
 
-def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance(
-    make_scene, random, half_empty
-):
+def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance():
     scene, one, other = (
         make_scene(half_empty(*SHAPE), g=0.4),
-        random(3, 6, 8, seed=1),
-        random(3, 6, 8, seed=2),
+        random_values(3, 6, 8, seed=1),
+        random_values(3, 6, 8, seed=2),
     )
 
     def image(radiance: Tensor, scale: float) -> Tensor:
@@ -177,7 +174,7 @@ def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance(
     torch.testing.assert_close(image(sunny, 2.5), 2.5 * image(sunny, 1.0), rtol=1e-9, atol=0)
 
 
-def test_a_turned_world_looks_the_same(make_scene):
+def test_a_turned_world_looks_the_same():
     """Map, volume and camera turned by 90 degrees about +y."""
     grid = Grid((5, 4, 5), (-0.5, -0.6, -0.5), (0.5, 0.6, 0.5))
     density = torch.rand(5, 4, 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -197,7 +194,7 @@ def test_a_turned_world_looks_the_same(make_scene):
 
 
 @pytest.mark.parametrize("quarter", [1, 3])
-def test_a_quarter_turn_rolls_the_map(quarter: int, make_scene, half_empty):
+def test_a_quarter_turn_rolls_the_map(quarter: int):
     """Up to how the regions lie, which turn with the map."""
     scene, radiance = make_scene(half_empty(*SHAPE), g=0.3), banded(24, 48)
     turned, rolled = (
@@ -210,7 +207,7 @@ def test_a_quarter_turn_rolls_the_map(quarter: int, make_scene, half_empty):
     )
 
 
-def test_more_directions_change_little(make_scene, half_empty):
+def test_more_directions_change_little():
     scene, radiance = make_scene(half_empty(*SHAPE), g=0.3), banded(24, 48)
     images = [
         render(replace(scene, lights=[light_of(radiance, directions=n)]))
@@ -220,7 +217,7 @@ def test_more_directions_change_little(make_scene, half_empty):
     assert fine < middle / 2 < coarse / 4 and middle < 2e-3
 
 
-def test_components_sum_to_the_image_and_the_background_is_the_map(make_scene, half_empty):
+def test_components_sum_to_the_image_and_the_background_is_the_map():
     scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light_of(uneven(6, 8))])
     parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
     torch.testing.assert_close(
@@ -250,15 +247,15 @@ def saved_bytes(scene: Scene, directions: int) -> int:
     return sum(storages.values())
 
 
-def test_memory_does_not_grow_with_directions(make_scene, random):
+def test_memory_does_not_grow_with_directions():
     """But for some hundred bytes of a direction's own numbers; a field of this grid has 32 kB."""
-    scene = make_scene(random(16, 16, 16), g=0.3)
+    scene = make_scene(random_values(16, 16, 16), g=0.3)
     few, many = saved_bytes(scene, 12), saved_bytes(scene, 96)
     assert many - few < 84 * 4000, (few, many)
 
 
 @pytest.mark.parametrize("case", ["sunny", "cloudy", "black"])
-def test_images_have_finite_derivatives_by_every_number(case: str, make_scene, half_empty):
+def test_images_have_finite_derivatives_by_every_number(case: str):
     radiance = {
         "sunny": uneven(6, 8),
         "cloudy": torch.rand(3, 6, 8).double(),
@@ -271,7 +268,7 @@ def test_images_have_finite_derivatives_by_every_number(case: str, make_scene, h
     assert all(bool(torch.isfinite(slope).all()) for slope in slopes) and bool(slopes[0].any())
 
 
-def test_single_precision_follows_double(make_scene, half_empty):
+def test_single_precision_follows_double():
     images = []
     for dtype in (torch.float32, torch.float64):
         scene, light = (

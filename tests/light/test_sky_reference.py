@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from media import make_camera, make_scene
 from torch import Tensor
 
 from ddrecon.grid import Grid
@@ -94,9 +95,7 @@ def traced_once(mitsuba: Any, density: Tensor, radiance: Tensor, g: float) -> Te
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6])
-def test_light_scattered_once_is_within_3_percent_of_path_tracing(
-    g: float, make_scene, make_camera
-):
+def test_light_scattered_once_is_within_3_percent_of_path_tracing(g: float):
     mitsuba = pytest.importorskip(
         "mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)"
     )

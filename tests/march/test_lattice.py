@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from media import box_grid, make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
@@ -39,7 +40,7 @@ def blob(grid: Grid) -> Tensor:
 
 
 @pytest.fixture
-def scene_of(make_scene, make_camera, box):
+def scene_of():
     """A blob in a small grid, before light from behind, seen in many more pixels than rays can tell
     apart.
     """
@@ -47,7 +48,7 @@ def scene_of(make_scene, make_camera, box):
     def scene(view: dict, **changes) -> Scene:
         camera = make_camera(**({"size": (54, 60), "half_width": 0.3} | view))
         return make_scene(
-            blob(box((6, 8, 7))), ambient=(0.4,), camera=camera, **({"g": 0.3} | changes)
+            blob(box_grid((6, 8, 7))), ambient=(0.4,), camera=camera, **({"g": 0.3} | changes)
         )
 
     return scene
@@ -161,7 +162,7 @@ def test_where_a_lattice_cannot_be_or_would_not_pay_pixels_have_their_own_rays(
 @pytest.mark.parametrize(
     "name", ["density", "g", "views.view.camera.rotation_x", "views.view.camera.y"]
 )
-def test_derivatives_are_those_of_the_interpolated_image(view: dict, name: str, scene_of, random):
+def test_derivatives_are_those_of_the_interpolated_image(view: dict, name: str, scene_of):
     """In forward mode as by central differences, and in reverse as in forward mode."""
     scene = replace(scene_of(view), render=INTERPOLATED)
     variable = name if name in ("density", "g") else name.rpartition(".")[0]
@@ -177,7 +178,7 @@ def test_derivatives_are_those_of_the_interpolated_image(view: dict, name: str, 
     difference = (plus - minus) / (2 * step)
     assert float((tangent - difference).norm()) < 1e-6 * float(difference.norm())
     leaf = value.clone().requires_grad_()
-    weight = random(*tangent.shape)
+    weight = random_values(*tangent.shape)
     (bar,) = torch.autograd.grad(
         (render(with_values(scene, {variable: leaf})) * weight).sum(), leaf
     )

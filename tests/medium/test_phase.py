@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from media import box_grid, random_values
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
 from ddrecon.medium.phase import (
@@ -114,10 +115,10 @@ def test_the_scaling_has_a_continuous_derivative_at_zero(function):
 
 
 @pytest.mark.parametrize("g", MEAN_COSINES)
-def test_scaling_leaves_the_transport_extinction_alone(g: float, random, box):
-    sigma_a, sigma_s = random(3, seed=1), random(3, seed=2)
-    density = random(2, 3, 4)
-    volume = Volume(box((2, 3, 4)), density, sigma_a, sigma_s, scalar(g))
+def test_scaling_leaves_the_transport_extinction_alone(g: float):
+    sigma_a, sigma_s = random_values(3, seed=1), random_values(3, seed=2)
+    density = random_values(2, 3, 4)
+    volume = Volume(box_grid((2, 3, 4)), density, sigma_a, sigma_s, scalar(g))
     exact = (sigma_a + (1 - g) * sigma_s).view(3, 1, 1, 1) * density
     for medium in (scale_medium(volume), keep_medium(volume)):
         torch.testing.assert_close(medium.transport_extinction, exact, rtol=1e-14, atol=0)
@@ -136,12 +137,12 @@ def test_scaling_leaves_the_transport_extinction_alone(g: float, random, box):
 
 
 @pytest.mark.parametrize("medium_of", [scale_medium, keep_medium])
-def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of, random, box):
+def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of):
     sigma_a, sigma_s, density, grid = (
-        random(3, seed=1),
-        random(3, seed=2),
-        random(2, 3, 4),
-        box((2, 3, 4)),
+        random_values(3, seed=1),
+        random_values(3, seed=2),
+        random_values(2, 3, 4),
+        box_grid((2, 3, 4)),
     )
     fields = [sigma.view(3, 1, 1, 1).expand(3, *grid.shape) for sigma in (sigma_a, sigma_s)]
     constant, varying = (
@@ -154,9 +155,15 @@ def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of, r
         )
 
 
-def test_a_density_of_another_shape_is_refused(random, box):
+def test_a_density_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"\(2, 3, 5\).*\(2, 3, 4\)"):
-        Volume(box((2, 3, 4)), random(2, 3, 5), random(1), random(1), scalar(0.0))
+        Volume(
+            box_grid((2, 3, 4)),
+            random_values(2, 3, 5),
+            random_values(1),
+            random_values(1),
+            scalar(0.0),
+        )
 
 
 @pytest.mark.parametrize("g", [0.1, 0.5, 0.85, 0.95])

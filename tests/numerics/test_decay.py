@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from media import random_values
 from torch import Tensor
 
 from ddrecon.numerics.decay import SERIES_BELOW, decay_mean, decayed_line, decayed_sum
@@ -20,13 +21,11 @@ def mean_by_quadrature(begin: float, end: float) -> float:
     return float((np.exp(-(begin + (end - begin) * (nodes + 1) / 2)) * weights).sum() / 2)
 
 
-def segments(
-    random, fields: int = 1, colors: int = 3, dtype: torch.dtype = torch.float64
-) -> list[Tensor]:
+def segments(fields: int = 1, colors: int = 3, dtype: torch.dtype = torch.float64) -> list[Tensor]:
     """weight, begin, end, scale of some segments, empty ones and both directions among them."""
-    weight, begin, end = (random(6, fields, 4, seed=seed, dtype=dtype) for seed in range(3))
+    weight, begin, end = (random_values(6, fields, 4, seed=seed, dtype=dtype) for seed in range(3))
     end[0] = begin[0]
-    return [weight, begin, end, 0.5 + random(colors, 1, seed=3, dtype=dtype)]
+    return [weight, begin, end, 0.5 + random_values(colors, 1, seed=3, dtype=dtype)]
 
 
 @pytest.mark.parametrize("depth", [depth for depth in DEPTHS if depth <= 50])
@@ -59,8 +58,8 @@ def test_derivatives_agree_where_the_series_begins():
     assert slope[0].item() == pytest.approx(slope[1].item(), rel=1e-9)
 
 
-def test_decayed_sums_against_quadrature(random):
-    weight, begin, end, scale = segments(random)
+def test_decayed_sums_against_quadrature():
+    weight, begin, end, scale = segments()
     total = decayed_sum(weight, begin, end, scale)
     for c in range(3):
         for r in range(4):
@@ -74,15 +73,15 @@ def test_decayed_sums_against_quadrature(random):
             assert total[c, r].item() == pytest.approx(sum(parts), rel=1e-13)
 
 
-def test_a_segment_may_be_walked_either_way(random):
-    weight, begin, end, scale = segments(random)
+def test_a_segment_may_be_walked_either_way():
+    weight, begin, end, scale = segments()
     assert torch.equal(
         decayed_sum(weight, begin, end, scale), decayed_sum(weight, end, begin, scale)
     )
 
 
-def test_a_segment_without_depth_is_a_plain_exponential(random):
-    weight, begin, _, scale = segments(random)
+def test_a_segment_without_depth_is_a_plain_exponential():
+    weight, begin, _, scale = segments()
     torch.testing.assert_close(
         decayed_sum(weight, begin, begin, scale),
         (weight * torch.exp(-scale * begin)).sum(0),
@@ -94,9 +93,9 @@ def test_a_segment_without_depth_is_a_plain_exponential(random):
 @pytest.mark.parametrize(
     ("fields", "weights", "colors"), [(1, 1, 1), (1, 1, 3), (3, 3, 3), (1, 3, 3), (3, 1, 3)]
 )
-def test_decayed_sums_have_both_derivatives(fields: int, weights: int, colors: int, random):
-    _, begin, end, scale = segments(random, fields, colors)
-    weight = random(6, weights, 4, seed=9)
+def test_decayed_sums_have_both_derivatives(fields: int, weights: int, colors: int):
+    _, begin, end, scale = segments(fields, colors)
+    weight = random_values(6, weights, 4, seed=9)
     begin, end = begin[:, :, :2], end[:, :, :2] + 1e-3
     inputs = [tensor.clone().requires_grad_() for tensor in (weight[:, :, :2], begin, end, scale)]
     assert torch.autograd.gradcheck(
@@ -147,11 +146,11 @@ def test_a_decayed_line_against_quadrature(depth: float):
 
 
 @pytest.mark.parametrize(("near", "far"), [(1, 1), (3, 1), (1, 3), (3, 3)])
-def test_decayed_lines_have_both_derivatives(near: int, far: int, random):
+def test_decayed_lines_have_both_derivatives(near: int, far: int):
     depth = torch.tensor(DEPTHS[1:6], dtype=torch.float64).view(-1, 1, 1).expand(-1, 3, 2) * (
-        1 + 0.1 * random(5, 3, 2)
+        1 + 0.1 * random_values(5, 3, 2)
     )
-    inputs = [random(5, near, 2, seed=1), random(5, far, 2, seed=2), depth]
+    inputs = [random_values(5, near, 2, seed=1), random_values(5, far, 2, seed=2), depth]
     inputs = [tensor.clone().requires_grad_() for tensor in inputs]
     assert torch.autograd.gradcheck(
         decayed_line, inputs, eps=1e-7, atol=1e-7, rtol=1e-6, check_forward_ad=True

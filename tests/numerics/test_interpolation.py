@@ -9,16 +9,17 @@ import math
 
 import pytest
 import torch
+from media import convergence_order, random_values
 from torch import Tensor
 
 from ddrecon.numerics.interpolation import sample_slices, sample_volume
 from ddrecon.numerics.third_order import ThirdOrder, subdivide
 
 
-def interior_points(random, count: int, shape: tuple[int, ...]) -> Tensor:
+def interior_points(count: int, shape: tuple[int, ...]) -> Tensor:
     """Points between the first and the last cell center, last array axis first."""
     reach = torch.tensor([1 - 1 / cells for cells in reversed(shape)], dtype=torch.float64)
-    return (2 * random(count, len(shape), seed=5) - 1) * reach
+    return (2 * random_values(count, len(shape), seed=5) - 1) * reach
 
 
 def linear_field(shape: tuple[int, ...], slope: Tensor) -> Tensor:
@@ -47,8 +48,8 @@ def interpolated(values: Tensor, point: Tensor) -> Tensor:
     return total
 
 
-def test_slices_against_explicit_corners(random):
-    slices, points = random(2, 3, 4, 5), 2.6 * random(2, 9, 2, seed=1) - 1.3
+def test_slices_against_explicit_corners():
+    slices, points = random_values(2, 3, 4, 5), 2.6 * random_values(2, 9, 2, seed=1) - 1.3
     sampled = sample_slices(slices, points)
     for n, p in itertools.product(range(2), range(9)):
         torch.testing.assert_close(
@@ -56,8 +57,8 @@ def test_slices_against_explicit_corners(random):
         )
 
 
-def test_volumes_against_explicit_corners(random):
-    volume, points = random(2, 3, 4, 5), 2.6 * random(1, 9, 3, seed=1) - 1.3
+def test_volumes_against_explicit_corners():
+    volume, points = random_values(2, 3, 4, 5), 2.6 * random_values(1, 9, 3, seed=1) - 1.3
     sampled = sample_volume(volume, points)
     for p in range(9):
         torch.testing.assert_close(
@@ -65,23 +66,23 @@ def test_volumes_against_explicit_corners(random):
         )
 
 
-def test_linear_fields_are_exact_in_slices(random):
-    slope, shape = random(2), (4, 6)
-    points = interior_points(random, 20, shape)
+def test_linear_fields_are_exact_in_slices():
+    slope, shape = random_values(2), (4, 6)
+    points = interior_points(20, shape)
     sampled = sample_slices(linear_field(shape, slope)[None, None], points[None])[0, 0]
     torch.testing.assert_close(sampled, points @ slope, rtol=0, atol=1e-14)
 
 
-def test_linear_fields_are_exact_in_volumes(random):
-    slope, shape = random(3), (4, 6, 3)
-    points = interior_points(random, 20, shape)
+def test_linear_fields_are_exact_in_volumes():
+    slope, shape = random_values(3), (4, 6, 3)
+    points = interior_points(20, shape)
     sampled = sample_volume(linear_field(shape, slope)[None], points[None])[0, 0]
     torch.testing.assert_close(sampled, points @ slope, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
-def test_slices_have_both_derivatives(wanted: tuple[bool, bool], random):
-    slices, points = random(2, 2, 3, 4), 2.4 * random(2, 5, 2, seed=1) - 1.2
+def test_slices_have_both_derivatives(wanted: tuple[bool, bool]):
+    slices, points = random_values(2, 2, 3, 4), 2.4 * random_values(2, 5, 2, seed=1) - 1.2
     inputs = [
         tensor.requires_grad_(is_wanted)
         for tensor, is_wanted in zip((slices, points), wanted, strict=True)
@@ -90,8 +91,8 @@ def test_slices_have_both_derivatives(wanted: tuple[bool, bool], random):
 
 
 @pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
-def test_volumes_have_both_derivatives(wanted: tuple[bool, bool], random):
-    volume, points = random(2, 3, 2, 4), 2.4 * random(2, 3, 3, seed=1) - 1.2
+def test_volumes_have_both_derivatives(wanted: tuple[bool, bool]):
+    volume, points = random_values(2, 3, 2, 4), 2.4 * random_values(2, 3, 3, seed=1) - 1.2
     inputs = [
         tensor.requires_grad_(is_wanted)
         for tensor, is_wanted in zip((volume, points), wanted, strict=True)
@@ -103,9 +104,9 @@ def test_volumes_have_both_derivatives(wanted: tuple[bool, bool], random):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_the_slope_at_a_kink_is_the_mean_of_both_sides(random, dtype: torch.dtype):
+def test_the_slope_at_a_kink_is_the_mean_of_both_sides(dtype: torch.dtype):
     """At cell centers along one axis, between them along the other."""
-    slices = random(1, 1, 5, 7, dtype=dtype)
+    slices = random_values(1, 1, 5, 7, dtype=dtype)
     columns, row = torch.arange(1, 6, dtype=dtype), torch.tensor(1.3, dtype=dtype)
     points = torch.stack([(2 * columns + 1) / 7 - 1, ((2 * row + 1) / 5 - 1).expand(5)], -1)[
         None
@@ -119,8 +120,8 @@ def test_the_slope_at_a_kink_is_the_mean_of_both_sides(random, dtype: torch.dtyp
     torch.testing.assert_close(bars[0, :, 1], 5 / 2 * across, rtol=1e-3, atol=1e-3)
 
 
-def test_both_modes_agree_at_kinks(random):
-    slices, change = random(2, 3, 4, 5), random(2, 6, 2, seed=1)
+def test_both_modes_agree_at_kinks():
+    slices, change = random_values(2, 3, 4, 5), random_values(2, 6, 2, seed=1)
     points = torch.stack(
         torch.broadcast_tensors(
             torch.tensor([-0.4, 0.0]).double(), torch.tensor([[-0.25], [0.25], [0.1]]).double()
@@ -129,7 +130,7 @@ def test_both_modes_agree_at_kinks(random):
     )
     points = points.reshape(1, 6, 2).expand(2, -1, -1).contiguous()
     _, tangent = torch.func.jvp(lambda moved: sample_slices(slices, moved), (points,), (change,))
-    weight = random(*tangent.shape, seed=2)
+    weight = random_values(*tangent.shape, seed=2)
     leaf = points.clone().requires_grad_()
     (bar,) = torch.autograd.grad((sample_slices(slices, leaf) * weight).sum(), leaf)
     torch.testing.assert_close((bar * change).sum(), (tangent * weight).sum(), rtol=1e-12, atol=0)
@@ -142,31 +143,31 @@ def centers(cells: int) -> Tensor:
     return (2 * torch.arange(cells, dtype=torch.float64) + 1) / cells - 1
 
 
-def test_sums_of_squares_are_exact_in_smooth_channels_alone(random):
+def test_sums_of_squares_are_exact_in_smooth_channels_alone():
     """In slices and volumes, away from the outermost cells; the other channels stay bilinear."""
     y, x = torch.meshgrid(centers(8), centers(10), indexing="ij")
-    field, points = 3 * x * x - 2 * y * y + x, 0.6 * (2 * random(1, 20, 2) - 1)
+    field, points = 3 * x * x - 2 * y * y + x, 0.6 * (2 * random_values(1, 20, 2) - 1)
     found = sample_slices(torch.stack([field, field, field])[None], points, ThirdOrder(1, 2))[0]
     wanted = 3 * points[0, :, 0] ** 2 - 2 * points[0, :, 1] ** 2 + points[0, :, 0]
     torch.testing.assert_close(found[1], wanted, rtol=0, atol=1e-14)
     assert torch.equal(found[0], found[2]) and float((found[0] - wanted).abs().max()) > 1e-3
     z, y, x = torch.meshgrid(centers(6), centers(8), centers(10), indexing="ij")
-    places = 0.45 * (2 * random(1, 20, 3) - 1)
+    places = 0.45 * (2 * random_values(1, 20, 3) - 1)
     found = sample_volume((x * x - y * y + 2 * z * z)[None], places, ThirdOrder(0, 1))[0, 0]
     a, b, c = places[0].unbind(-1)
     torch.testing.assert_close(found, a * a - b * b + 2 * c * c, rtol=0, atol=1e-14)
 
 
-def test_smooth_channels_converge_at_third_order(random, order):
-    points, counts, errors = 0.5 * (2 * random(1, 400, 2) - 1), [12, 24, 48], []
+def test_smooth_channels_converge_at_third_order():
+    points, counts, errors = 0.5 * (2 * random_values(1, 400, 2) - 1), [12, 24, 48], []
     for count in counts:
         y, x = torch.meshgrid(centers(count), centers(count), indexing="ij")
         found = sample_slices(torch.sin(3 * x + y)[None, None], points, ThirdOrder(0, 1))[0, 0]
         errors.append(float((found - torch.sin(3 * points[0, :, 0] + points[0, :, 1])).norm()))
-    assert order([1 / count for count in counts], errors) > 2.7
+    assert convergence_order([1 / count for count in counts], errors) > 2.7
 
 
-def test_subdivided_squares_are_exact_in_smooth_channels(random):
+def test_subdivided_squares_are_exact_in_smooth_channels():
     line = torch.arange(7, dtype=torch.float64)
     values = torch.stack([line * line, line * line], 1)
     found = subdivide(values, 3, ThirdOrder(1, 2))
@@ -176,8 +177,8 @@ def test_subdivided_squares_are_exact_in_smooth_channels(random):
 
 
 @pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)], ids=str)
-def test_smooth_channels_have_both_derivatives(wanted: tuple[bool, bool], random):
-    slices, points = random(2, 3, 4, 5), 1.6 * random(2, 7, 2, seed=1) - 0.8
+def test_smooth_channels_have_both_derivatives(wanted: tuple[bool, bool]):
+    slices, points = random_values(2, 3, 4, 5), 1.6 * random_values(2, 7, 2, seed=1) - 0.8
     inputs = tuple(
         item.clone().requires_grad_(is_wanted)
         for item, is_wanted in zip((slices, points), wanted, strict=True)

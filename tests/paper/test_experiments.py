@@ -24,6 +24,8 @@ from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import value_of, with_values
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 CONFIGS = {config.stem: config for config in sorted((ROOT / "configs" / "paper").glob("*.yaml"))}
 RECONSTRUCTIONS = [name for name in CONFIGS if name != "fig08"]

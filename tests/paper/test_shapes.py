@@ -19,7 +19,7 @@ spec.loader.exec_module(shapes)
 
 
 def octahedron(radius: float) -> np.ndarray:
-    """Triangles of the octahedron |x| + |y| + |z| = radius, turned so that no edge follows an axis."""
+    """Triangles of the octahedron |x| + |y| + |z| = radius, turned so that no edge is along an axis."""
     turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     signs = [(a, b, c) for a in (1, -1) for b in (1, -1) for c in (1, -1)]
     faces = [np.diag(sign)[:: 1 if np.prod(sign) > 0 else -1] for sign in signs]

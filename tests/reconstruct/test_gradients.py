@@ -4,11 +4,11 @@ of views.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -31,16 +31,15 @@ NAMES = (
 
 
 @pytest.fixture
-def scene(
-    make_scene: Callable[..., Scene],
-    make_camera: Callable[..., object],
-    random: Callable[..., Tensor],
-) -> Scene:
-    base = make_scene(random(*SHAPE), g=0.3, ambient=(0.2, 0.3, 0.4))
+def scene() -> Scene:
+    base = make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2, 0.3, 0.4))
     eyes = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5), "three": (-1.8, 0.4, -1.5)}
     return replace(
         base,
-        views=[View(name, make_camera(eye), random(3, 4, 5, seed=2)) for name, eye in eyes.items()],
+        views=[
+            View(name, make_camera(eye), random_values(3, 4, 5, seed=2))
+            for name, eye in eyes.items()
+        ],
     )
 
 

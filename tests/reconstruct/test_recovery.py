@@ -22,6 +22,8 @@ from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, OptimizeSettings, ParameterSettings
 from ddrecon.variables.values import value_of, with_values
 
+pytestmark = pytest.mark.slow
+
 BLOBS = (
     (0.0, 0.0, 0.0, 0.3),
     (0.15, 0.1, 0.05, 0.2),

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
 
 from ddrecon.errors import SceneError
 from ddrecon.io.volumes.table import read_field
@@ -20,6 +21,8 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLigh
 from ddrecon.reference.export import export_scene
 from ddrecon.reference.trace import Traced, Tracer, open_tracer
 from ddrecon.scene import Scene, View
+
+pytestmark = pytest.mark.slow
 
 NEEDED = "the reference needs Mitsuba 3 (the extra `reference`)"
 COLOR = torch.tensor([3.0, 2.0, 1.0], dtype=torch.float64)
@@ -62,7 +65,7 @@ def sky() -> EnvironmentLight:
     return EnvironmentLight(radiance, COLOR[2], 25 * COLOR[2])
 
 
-def with_an_orthographic_view(scene: Scene, make_camera) -> Scene:
+def with_an_orthographic_view(scene: Scene) -> Scene:
     return replace(
         scene,
         views=[
@@ -72,8 +75,8 @@ def with_an_orthographic_view(scene: Scene, make_camera) -> Scene:
     )
 
 
-def test_volumes_and_the_box_are_those_of_the_scene(make_scene, random, tmp_path: Path) -> None:
-    scene = make_scene(random(3, 4, 5), sigma_a=random(3, 3, 4, 5, seed=1))
+def test_volumes_and_the_box_are_those_of_the_scene(tmp_path: Path) -> None:
+    scene = make_scene(random_values(3, 4, 5), sigma_a=random_values(3, 3, 4, 5, seed=1))
     written = export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(file.name for file in written)
     field = read_field(tmp_path / "scene.sigma_t.vol", "sigma_t")
@@ -88,16 +91,14 @@ def test_volumes_and_the_box_are_those_of_the_scene(make_scene, random, tmp_path
 
 
 @pytest.mark.parametrize("with_sky", [False, True])
-def test_a_gray_scene_opened_is_the_scene_traced(
-    make_scene, make_camera, random, tmp_path: Path, with_sky: bool
-) -> None:
+def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
     lights = NEAR
     if with_sky:
         pytest.importorskip("OpenEXR")
         lights = [*NEAR, sky()]
     scene = with_an_orthographic_view(
-        make_scene(random(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4), make_camera
+        make_scene(random_values(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4)
     )
     scene = replace(scene, lights=lights)
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
@@ -110,11 +111,9 @@ def test_a_gray_scene_opened_is_the_scene_traced(
         )
 
 
-def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(
-    make_scene, random, tmp_path: Path
-) -> None:
+def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason=NEEDED)
-    scene = make_scene(0.3 * random(3, 4, 5))
+    scene = make_scene(0.3 * random_values(3, 4, 5))
     export_scene(scene, tmp_path / "scene.xml", may_exist=False)
     tracer = tracer_of(scene)
     theirs, ours = (
@@ -125,8 +124,8 @@ def test_a_colorful_scene_opened_is_the_scene_traced_to_noise(
     assert ours.distance(theirs.image) < 1.5 * np.hypot(theirs.noise, ours.noise)
 
 
-def test_what_is_there_stays(make_scene, random, tmp_path: Path) -> None:
-    scene, path = make_scene(random(3, 4, 5)), tmp_path / "scene.xml"
+def test_what_is_there_stays(tmp_path: Path) -> None:
+    scene, path = make_scene(random_values(3, 4, 5)), tmp_path / "scene.xml"
     (tmp_path / "scene.sigma_t.vol").write_text("mine")
     with pytest.raises(SceneError, match=r"scene.sigma_t.vol: already there"):
         export_scene(scene, path, may_exist=False)
@@ -135,6 +134,8 @@ def test_what_is_there_stays(make_scene, random, tmp_path: Path) -> None:
     assert read_field(tmp_path / "scene.sigma_t.vol", "sigma_t").resolution == (5, 4, 3)
 
 
-def test_no_folder(make_scene, random, tmp_path: Path) -> None:
+def test_no_folder(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="there is no folder"):
-        export_scene(make_scene(random(3, 4, 5)), tmp_path / "none" / "scene.xml", may_exist=False)
+        export_scene(
+            make_scene(random_values(3, 4, 5)), tmp_path / "none" / "scene.xml", may_exist=False
+        )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
@@ -32,8 +33,8 @@ def moved(matrix: np.ndarray, point: tuple[float, float, float]) -> np.ndarray:
     return (matrix @ [*point, 1.0])[:3]
 
 
-def test_the_box_and_its_volume_lie_where_the_grid_lies(make_scene, random) -> None:
-    scene = make_scene(random(*SHAPE))
+def test_the_box_and_its_volume_lie_where_the_grid_lies() -> None:
+    scene = make_scene(random_values(*SHAPE))
     lower, upper = scene.volume.grid.bounds_xyz
     description = described(scene)
     for place, corners in (
@@ -45,11 +46,9 @@ def test_the_box_and_its_volume_lie_where_the_grid_lies(make_scene, random) -> N
 
 
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_the_middle_of_a_films_edges_is_seen_along_our_rays(
-    make_scene, make_camera, random, is_perspective: bool
-) -> None:
+def test_the_middle_of_a_films_edges_is_seen_along_our_rays(is_perspective: bool) -> None:
     camera = make_camera(size=(1, 2), half_width=0.4, is_perspective=is_perspective)
-    sensor = described(make_scene(random(*SHAPE), camera=camera))["sensor_0"]
+    sensor = described(make_scene(random_values(*SHAPE), camera=camera))["sensor_0"]
     ours = cast_rays(camera)
     for ray, left in enumerate((0.5, -0.5)):
         if is_perspective:
@@ -68,17 +67,19 @@ def test_the_middle_of_a_films_edges_is_seen_along_our_rays(
         )
 
 
-def test_pixels_that_are_not_square_are_refused(make_scene, make_camera, random) -> None:
+def test_pixels_that_are_not_square_are_refused() -> None:
     with pytest.raises(
         SceneError, match=r"pixels are square, those of this camera 1\.1 times as high as wide"
     ):
-        described(make_scene(random(*SHAPE), camera=replace(make_camera(), pixel_aspect=1.1)))
+        described(
+            make_scene(random_values(*SHAPE), camera=replace(make_camera(), pixel_aspect=1.1))
+        )
 
 
 @pytest.mark.parametrize("sigma", [(0.5,), (0.5, 1.0, 2.0)])
-def test_constant_cross_sections(make_scene, random, sigma: tuple[float, ...]) -> None:
+def test_constant_cross_sections(sigma: tuple[float, ...]) -> None:
     scene = make_scene(
-        random(*SHAPE), sigma_a=sigma, sigma_s=tuple(3 * value for value in reversed(sigma))
+        random_values(*SHAPE), sigma_a=sigma, sigma_s=tuple(3 * value for value in reversed(sigma))
     )
     volume, medium = scene.volume, described(scene)["medium"]
     expected = (volume.sigma_a + volume.sigma_s).view(-1, 1, 1, 1) * volume.density
@@ -91,10 +92,10 @@ def test_constant_cross_sections(make_scene, random, sigma: tuple[float, ...]) -
 
 
 @pytest.mark.parametrize("absorbing", [(3, *SHAPE), (1, *SHAPE), (3, 1, 1, 1), (1, 1, 1, 1)])
-def test_cross_sections_per_cell(make_scene, random, absorbing: tuple[int, ...]) -> None:
-    sigma_a, scattering = random(*absorbing, seed=1), random(3, *SHAPE, seed=2)
+def test_cross_sections_per_cell(absorbing: tuple[int, ...]) -> None:
+    sigma_a, scattering = random_values(*absorbing, seed=1), random_values(3, *SHAPE, seed=2)
     constant = sigma_a.flatten() if absorbing[1:] == (1, 1, 1) else sigma_a
-    scene = make_scene(random(*SHAPE), sigma_a=constant, sigma_s=scattering)
+    scene = make_scene(random_values(*SHAPE), sigma_a=constant, sigma_s=scattering)
     medium = described(scene)["medium"]
     np.testing.assert_allclose(
         extinction(medium),
@@ -107,17 +108,21 @@ def test_cross_sections_per_cell(make_scene, random, absorbing: tuple[int, ...])
     )
 
 
-def test_nothing_scatters_where_nothing_is(make_scene, random) -> None:
+def test_nothing_scatters_where_nothing_is() -> None:
     fields = dict.fromkeys(("sigma_a", "sigma_s"), torch.zeros(1, *SHAPE, dtype=torch.float64))
-    assert not described(make_scene(random(*SHAPE), **fields))["medium"]["albedo"]["grid"].any()
+    assert not described(make_scene(random_values(*SHAPE), **fields))["medium"]["albedo"][
+        "grid"
+    ].any()
     assert (
-        described(make_scene(random(*SHAPE), sigma_a=(0.0,), sigma_s=(0.0,)))["medium"]["albedo"]
+        described(make_scene(random_values(*SHAPE), sigma_a=(0.0,), sigma_s=(0.0,)))["medium"][
+            "albedo"
+        ]
         == 0
     )
 
 
-def test_gray_is_told_through_rounding(make_scene, random) -> None:
-    density, albedo = random(*SHAPE), torch.tensor([0.95, 0.9, 0.8])
+def test_gray_is_told_through_rounding() -> None:
+    density, albedo = random_values(*SHAPE), torch.tensor([0.95, 0.9, 0.8])
     scene = make_scene(density.float(), sigma_a=12 * (1 - albedo), sigma_s=12 * albedo)
     assert is_gray(scene.volume) and extinction(described(scene)["medium"]).shape == (*SHAPE, 1)
     assert not is_gray(make_scene(density, sigma_a=12 * (1 - albedo), sigma_s=(9.0,)).volume)
@@ -136,8 +141,8 @@ def every_light(like: Tensor) -> list[Any]:
     ]
 
 
-def test_one_color_of_a_scene_is_that_color(make_scene, random) -> None:
-    scene = replace(make_scene(random(*SHAPE)), lights=every_light(random(1)))
+def test_one_color_of_a_scene_is_that_color() -> None:
+    scene = replace(make_scene(random_values(*SHAPE)), lights=every_light(random_values(1)))
     whole = described(scene)
     for color in range(3):
         one = described(pick_color(scene, color))
@@ -152,8 +157,8 @@ def test_one_color_of_a_scene_is_that_color(make_scene, random) -> None:
         )
 
 
-def test_ambient_light_is_part_of_an_environment_map(make_scene, random) -> None:
-    scene = replace(make_scene(random(*SHAPE)), lights=every_light(random(1)))
+def test_ambient_light_is_part_of_an_environment_map() -> None:
+    scene = replace(make_scene(random_values(*SHAPE)), lights=every_light(random_values(1)))
     np.testing.assert_allclose(
         described(scene)["around"]["bitmap"], np.broadcast_to([3.5, 6.5, 9.5], (2, 3, 3)), rtol=1e-6
     )
@@ -163,25 +168,27 @@ def test_ambient_light_is_part_of_an_environment_map(make_scene, random) -> None
     assert described(alone)["around"] == {"type": "constant", "radiance": (1.5, 2.5, 3.5)}
 
 
-def test_two_environment_maps_are_refused(make_scene, random) -> None:
-    lights = every_light(random(1))
+def test_two_environment_maps_are_refused() -> None:
+    lights = every_light(random_values(1))
     with pytest.raises(SceneError, match="2 environment maps"):
-        described(replace(make_scene(random(*SHAPE)), lights=[*lights, *lights]))
+        described(replace(make_scene(random_values(*SHAPE)), lights=[*lights, *lights]))
 
 
-def test_a_camera_inside_the_volume_is_in_its_medium(make_scene, make_camera, random) -> None:
+def test_a_camera_inside_the_volume_is_in_its_medium() -> None:
     inside, outside = ((0.1, 0.1, 0.2), (0.1, 0.1, 2.0))
     assert (
         "medium"
-        in described(make_scene(random(*SHAPE), camera=make_camera(eye=inside)))["sensor_0"]
+        in described(make_scene(random_values(*SHAPE), camera=make_camera(eye=inside)))["sensor_0"]
     )
     assert (
         "medium"
-        not in described(make_scene(random(*SHAPE), camera=make_camera(eye=outside)))["sensor_0"]
+        not in described(make_scene(random_values(*SHAPE), camera=make_camera(eye=outside)))[
+            "sensor_0"
+        ]
     )
 
 
-def test_rays_of_which_only_some_start_inside_are_refused(make_scene, make_camera, random) -> None:
+def test_rays_of_which_only_some_start_inside_are_refused() -> None:
     camera = make_camera(eye=(0.1, 0.1, 0.2), half_width=1.0, is_perspective=False)
     with pytest.raises(SceneError, match="view 'view'"):
-        described(make_scene(random(*SHAPE), camera=camera))
+        described(make_scene(random_values(*SHAPE), camera=camera))

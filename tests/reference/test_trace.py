@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.cameras import Camera, cast_rays, look_at
@@ -19,6 +20,8 @@ from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
+
+pytestmark = pytest.mark.slow
 
 pytest.importorskip("mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)")
 
@@ -52,9 +55,7 @@ def seen_from(
 
 
 @pytest.mark.parametrize("side", SIDES)
-def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(
-    make_scene, side: str
-) -> None:
+def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(side: str) -> None:
     density, sigma = torch.full((2, 3, 2), 1.5, dtype=torch.float64), np.array([0.5, 1.0, 2.0])
     grid = Grid.from_xyz((2, 3, 2), LOWER, UPPER)
     camera = seen_from(SIDES[side], 0.2, 4)
@@ -76,9 +77,7 @@ def test_an_absorbing_box_transmits_by_beer_and_lambert_in_every_color(
 
 @pytest.mark.parametrize("corner", [(0, 0, 0), (2, 0, 4), (2, 3, 0)])
 @pytest.mark.parametrize("side", SIDES)
-def test_a_voxel_darkens_the_place_it_has(
-    make_scene, side: str, corner: tuple[int, int, int]
-) -> None:
+def test_a_voxel_darkens_the_place_it_has(side: str, corner: tuple[int, int, int]) -> None:
     density = torch.zeros(3, 4, 5, dtype=torch.float64)
     density[corner] = 8.0
     grid = Grid.from_xyz((5, 4, 3), LOWER, UPPER)
@@ -133,9 +132,7 @@ LIGHTS: dict[str, Callable[[], list[Light]]] = {
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 @pytest.mark.parametrize("light", LIGHTS)
-def test_light_scattered_once_is_ours_to_4_percent(
-    make_scene, light: str, is_perspective: bool
-) -> None:
+def test_light_scattered_once_is_ours_to_4_percent(light: str, is_perspective: bool) -> None:
     grid, density = soft_ball(12)
     half_width = 0.25 if is_perspective else 0.5
     camera = seen_from((0.5, 0.3, 0.8), half_width, 16, is_perspective)
@@ -157,7 +154,7 @@ def test_light_scattered_once_is_ours_to_4_percent(
     assert ours.mean() == pytest.approx(traced.image.mean(), rel=0.03)
 
 
-def test_the_background_is_seen_where_we_see_it(make_scene) -> None:
+def test_the_background_is_seen_where_we_see_it() -> None:
     grid, density = soft_ball(8)
     camera = seen_from((0.5, 0.3, 0.8), 1.2, 16, True)
     scene = make_scene(
@@ -170,23 +167,23 @@ def test_the_background_is_seen_where_we_see_it(make_scene) -> None:
     assert traced.error(render(scene)[0].permute(1, 2, 0).numpy()) < 0.02
 
 
-def test_seeds(make_scene, random) -> None:
-    scene = make_scene(random(3, 4, 5))
+def test_seeds() -> None:
+    scene = make_scene(random_values(3, 4, 5))
     first, second = passes(scene, 2, 4)
     assert np.array_equal(first, passes(scene, 1, 4)[0]) and not np.array_equal(first, second)
 
 
-def test_nothing_and_nothing_that_shines(make_scene) -> None:
+def test_nothing_and_nothing_that_shines() -> None:
     empty = make_scene(torch.zeros(2, 2, 2, dtype=torch.float64), ambient=(0.5,))
     np.testing.assert_allclose(passes(empty, 1, 4)[0], 0.5, rtol=1e-6)
     assert not passes(replace(empty, lights=[]), 1, 4)[0].any()
 
 
-def test_an_off_center_camera_is_theirs(make_scene, make_camera, random) -> None:
+def test_an_off_center_camera_is_theirs() -> None:
     """Mitsuba's own rays through the corners of the film are ours."""
     mitsuba = load_mitsuba()
     camera = replace(make_camera(size=(4, 6), half_width=0.4), principal_point=(0.3, 0.65))
-    scene = make_scene(random(3, 4, 5), camera=camera)
+    scene = make_scene(random_values(3, 4, 5), camera=camera)
     sensor = mitsuba_scene(scene, scene.views)["sensor_0"]
     sensor["to_world"] = mitsuba.ScalarTransform4f(sensor["to_world"])
     theirs = mitsuba.load_dict(sensor)

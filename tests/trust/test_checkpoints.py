@@ -21,6 +21,8 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run import drive
 from ddrecon.run.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
 
+pytestmark = pytest.mark.slow
+
 Run = Callable[..., Result]
 OPTIMIZE = ["optimize", "scene.yaml", "-q", "-o", "out"]
 RESUME = [*OPTIMIZE, "--resume"]

@@ -21,6 +21,8 @@ from ddrecon.reconstruct.loop import optimize
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 
+pytestmark = pytest.mark.slow
+
 EQUAL = 1e-5
 """Relative difference that the number of threads may make."""
 SINGLE = 1e-4

@@ -31,6 +31,8 @@ from ddrecon.errors import FormatError, MissingExtraError
 from ddrecon.io.images.table import READERS, read_image
 from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
 
+pytestmark = pytest.mark.slow
+
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 VALUES = np.random.default_rng(0).random((4, 5, 6), np.float32)
 PICTURE = np.random.default_rng(1).random((6, 8, 3), np.float32)

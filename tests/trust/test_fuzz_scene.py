@@ -24,6 +24,8 @@ from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import write_field
 from ddrecon.scene_file.load import MAX_BYTES
 
+pytestmark = pytest.mark.slow
+
 CASES = settings(
     derandomize=True,
     database=None,
@@ -94,7 +96,7 @@ def trees(draw: Callable[..., Any]) -> str:
 
 @st.composite
 def texts(draw: Callable[..., Any]) -> bytes:
-    """The scene's text with characters replaced, removed or put in, or cut off; not always UTF-8."""
+    """The scene's text, cut off or with characters changed, removed or added; not always UTF-8."""
     data = bytearray(block(SCENE).encode())
     for _ in range(draw(st.integers(1, 4))):
         start = draw(st.integers(0, len(data)))
@@ -197,7 +199,7 @@ def test_empty_alternatives_are_missing(folder: Path, empty: str) -> None:
 
 
 def bomb(count: int) -> str:
-    """Each anchor is a list of nine of the one before: nine to the power of `count` entries in all."""
+    """Each anchor is a list of nine of the one before: 9 to the power of `count` entries in all."""
     return "a0: &a0 [x]\n" + "".join(
         f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, count)
     )

@@ -19,10 +19,16 @@ volume:
 lights:
   - {type: directional, direction: [-1, -2, -1], irradiance: 3}
 views:
-  - {name: front, image: front.npy, camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
-  - {name: side, image: side.npy, camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
-  - {name: test, image: side.npy, split: test,
-     camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1, resolution: [8, 6]}}
+  - name: front
+    image: front.npy
+    camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30}
+  - name: side
+    image: side.npy
+    camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30}
+  - name: test
+    image: side.npy
+    split: test
+    camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1}
 optimize:
   iterations: 10
   views_per_iteration: 1

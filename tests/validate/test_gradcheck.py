@@ -15,6 +15,8 @@ from ddrecon.numerics import interpolation as sampling
 from ddrecon.scene_file.build import load_scene
 from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
 
+pytestmark = pytest.mark.slow
+
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
 SMALL = [
     "volume.resolution=[6, 5, 4]",

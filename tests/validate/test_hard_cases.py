@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from media import make_camera, make_scene
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -89,7 +90,7 @@ each_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], id
 
 
 @pytest.fixture(scope="module")
-def rendered(make_scene, make_camera) -> Callable[[str, torch.dtype], tuple[Tensor, Tensor]]:
+def rendered() -> Callable[[str, torch.dtype], tuple[Tensor, Tensor]]:
     """The image of a case, and the gradient of its sum by density; each computed once."""
 
     @cache
@@ -140,7 +141,7 @@ def test_gradients_in_single_precision_follow_double(name: str, rendered):
 @pytest.mark.parametrize("density", [half_full, hot_voxel, checkerboard])
 @pytest.mark.parametrize(("sigma_a", "sigma_s"), [(10.0, 2.0), (0.5, 8.0), (0.0, 8.0)])
 def test_isotropic_light_is_never_negative_in_the_dark(
-    density: Callable[..., Tensor], sigma_a: float, sigma_s: float, make_scene
+    density: Callable[..., Tensor], sigma_a: float, sigma_s: float
 ):
     """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either
     sign, and L0 may dip below zero.
@@ -150,6 +151,6 @@ def test_isotropic_light_is_never_negative_in_the_dark(
     assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0
 
 
-def test_an_empty_volume_shows_the_background(make_scene):
+def test_an_empty_volume_shows_the_background():
     image = render(make_scene(empty(SHAPE), directional=(3.0,), ambient=(0.3, 0.4, 0.5), g=0.4))[0]
     assert torch.equal(image, image.new_tensor([0.3, 0.4, 0.5]).view(3, 1, 1).expand_as(image))

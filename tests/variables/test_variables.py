@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from media import make_scene, random_values
 
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
@@ -17,8 +16,8 @@ SHAPE = (4, 3, 5)
 
 
 @pytest.fixture
-def scene(make_scene: Callable[..., Scene], random: Callable[..., Tensor]) -> Scene:
-    return make_scene(random(*SHAPE), g=0.3, ambient=(0.2,))
+def scene() -> Scene:
+    return make_scene(random_values(*SHAPE), g=0.3, ambient=(0.2,))
 
 
 def test_every_name_has_a_value_and_putting_it_back_changes_nothing(scene: Scene) -> None:
@@ -60,10 +59,12 @@ def test_a_value_that_is_put_in_comes_out_and_the_scene_keeps_its_own(
 
 @pytest.mark.parametrize("is_field", [True, False])
 def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(
-    scene: Scene, random: Callable[..., Tensor], is_field: bool
+    scene: Scene, is_field: bool
 ) -> None:
     shape = (3, *SHAPE) if is_field else (3,)
-    changed = with_values(scene, {"sigma_a": random(*shape), "sigma_s": 5 * random(*shape, seed=1)})
+    changed = with_values(
+        scene, {"sigma_a": random_values(*shape), "sigma_s": 5 * random_values(*shape, seed=1)}
+    )
     values = {name: value_of(changed, name) for name in ("sigma_t", "albedo")}
     again = with_values(scene, values)
     for name in ("sigma_a", "sigma_s"):
@@ -72,8 +73,8 @@ def test_sigma_t_and_albedo_are_the_other_way_to_say_sigma_a_and_sigma_s(
         )
 
 
-def test_a_field_and_a_constant_mix(scene: Scene, random: Callable[..., Tensor]) -> None:
-    albedo, sigma_t = random(3, *SHAPE), torch.tensor([4.0, 5.0, 6.0], dtype=torch.float64)
+def test_a_field_and_a_constant_mix(scene: Scene) -> None:
+    albedo, sigma_t = random_values(3, *SHAPE), torch.tensor([4.0, 5.0, 6.0], dtype=torch.float64)
     changed = with_values(scene, {"albedo": albedo, "sigma_t": sigma_t})
     torch.testing.assert_close(changed.volume.sigma_s, albedo * sigma_t.view(3, 1, 1, 1))
     assert torch.isfinite(render(changed)).all()

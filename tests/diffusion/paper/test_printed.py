@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from media import box_grid, convergence_order, half_empty, make_scene, random_values
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -50,13 +51,13 @@ def solving(tolerance: float = 1e-14, memory: SolveMemory | None = None) -> Solv
 
 
 @pytest.fixture
-def make_printed(random) -> Callable[..., PrintedOperator]:
+def make_printed() -> Callable[..., PrintedOperator]:
     """The operator of a medium whose kappa varies by `contrast` from cell to cell, at random."""
 
     def make(grid: Grid, contrast: float = 2.0, colors: int = 2) -> PrintedOperator:
-        kappa = 0.1 * contrast ** random(colors, *grid.shape, seed=1)
+        kappa = 0.1 * contrast ** random_values(colors, *grid.shape, seed=1)
         stencils = Stencils.on(grid, kappa)
-        diagonal = 3 * random(colors, *grid.shape, seed=2) + kappa * sum(
+        diagonal = 3 * random_values(colors, *grid.shape, seed=2) + kappa * sum(
             2 / h**2 for h in grid.spacing
         )
         echo = Ghosts.of(kappa, Moments(torch.zeros_like(kappa)), DARK, stencils).echo
@@ -91,12 +92,12 @@ def matrix_by_loops(operator: PrintedOperator, kappa: Tensor, loss: Tensor) -> T
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_the_operator_is_the_matrix_written_with_loops(
-    shape: tuple[int, int, int], box, make_printed, random
-):
-    operator = make_printed(box(shape), contrast=30.0)
+def test_the_operator_is_the_matrix_written_with_loops(shape: tuple[int, int, int], make_printed):
+    operator = make_printed(box_grid(shape), contrast=30.0)
     expected = matrix_by_loops(
-        operator, 0.1 * 30.0 ** random(2, *shape, seed=1)[0], 3 * random(2, *shape, seed=2)[0]
+        operator,
+        0.1 * 30.0 ** random_values(2, *shape, seed=1)[0],
+        3 * random_values(2, *shape, seed=2)[0],
     )
     columns = (
         torch.eye(math.prod(shape), dtype=torch.float64)
@@ -111,12 +112,15 @@ def test_the_operator_is_the_matrix_written_with_loops(
     torch.testing.assert_close(transposed, expected.T, rtol=1e-12, atol=1e-12)
 
 
-def test_ghost_cells_hold_the_marshak_condition(box, random):
+def test_ghost_cells_hold_the_marshak_condition():
     """On every face of the box: D (-grad L0 + kappa_s Q1) . n = (L0 - outside) / 2, written with
     the values on its two sides.
     """
-    grid, outside = box((3, 2, 4)), torch.tensor([0.7, 0.2], dtype=torch.float64).view(2, 1, 1, 1)
-    kappa, u, *flux = (random(2, *grid.shape, seed=seed) for seed in range(5))
+    grid, outside = (
+        box_grid((3, 2, 4)),
+        torch.tensor([0.7, 0.2], dtype=torch.float64).view(2, 1, 1, 1),
+    )
+    kappa, u, *flux = (random_values(2, *grid.shape, seed=seed) for seed in range(5))
     ghosts = Ghosts.of(
         kappa, Moments(u, (flux[0], flux[1], flux[2])), outside, Stencils.on(grid, u)
     )
@@ -206,15 +210,15 @@ def errors_on(cells: int) -> tuple[float, float]:
     )
 
 
-def test_a_manufactured_solution_is_approached_at_second_order(order):
+def test_a_manufactured_solution_is_approached_at_second_order():
     counts = [12, 16, 24]
     means, fluxes = zip(*(errors_on(cells) for cells in counts), strict=True)
-    assert order([1 / cells for cells in counts], means) >= 1.75, means
-    assert order([1 / cells for cells in counts], fluxes) >= 1.4, fluxes
+    assert convergence_order([1 / cells for cells in counts], means) >= 1.75, means
+    assert convergence_order([1 / cells for cells in counts], fluxes) >= 1.4, fluxes
 
 
 @pytest.fixture
-def smooth_scene(make_scene) -> Callable[..., Scene]:
+def smooth_scene() -> Callable[..., Scene]:
     """A medium that varies slowly and touches its box, in beams and ambient light."""
 
     def make(cells: int = 6, **changes: Any) -> Scene:
@@ -242,7 +246,7 @@ def smooth_scene(make_scene) -> Callable[..., Scene]:
     ids=["ambient", "directional"],
 )
 def test_both_schemes_agree_as_the_grid_refines(
-    lights: dict[str, None], least: float, smooth_scene, order
+    lights: dict[str, None], least: float, smooth_scene
 ):
     """At second order; beams have layers at the faces they enter by, which these grids only begin
     to resolve.
@@ -258,11 +262,13 @@ def test_both_schemes_agree_as_the_grid_refines(
 
     counts = [6, 12, 18]
     apart = [disagreement(cells) for cells in counts]
-    assert order([1 / cells for cells in counts], apart) >= least and apart[-1] < 1e-3, apart
+    assert (
+        convergence_order([1 / cells for cells in counts], apart) >= least and apart[-1] < 1e-3
+    ), apart
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])
-def test_a_white_furnace_is_white(g: float, make_scene, half_empty):
+def test_a_white_furnace_is_white(g: float):
     scene = make_scene(
         half_empty(5, 4, 6),
         sigma_a=(0.0,),
@@ -298,15 +304,15 @@ def test_light_scales_with_its_source(smooth_scene):
 
 
 @pytest.fixture
-def inputs(box, make_printed, random) -> Callable[..., tuple[Stencils, list[Tensor]]]:
+def inputs(make_printed) -> Callable[..., tuple[Stencils, list[Tensor]]]:
     """Stencils, and source, diagonal, coefficients and echo of a small system of two colors, or of
     a gray one under a colored source.
     """
 
     def make(shape: tuple[int, int, int], colors: int = 2) -> tuple[Stencils, list[Tensor]]:
-        operator = make_printed(box(shape), colors=colors)
+        operator = make_printed(box_grid(shape), colors=colors)
         return operator.stencils, [
-            random(2, *shape) - 0.5,
+            random_values(2, *shape) - 0.5,
             operator.diagonal,
             operator.coefficients,
             operator.echo,
@@ -351,9 +357,9 @@ def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):
 
 
 @pytest.mark.parametrize("wanted", ["density", "sigma_s", "g", "irradiance"])
-def test_both_derivatives_of_an_image_agree_with_differences(wanted: str, make_scene, random):
+def test_both_derivatives_of_an_image_agree_with_differences(wanted: str):
     scene = make_scene(
-        1 + 0.5 * random(2, 2, 3),
+        1 + 0.5 * random_values(2, 2, 3),
         g=0.3,
         directional=(3.0, 2.0, 1.0),
         ambient=(0.3,),
@@ -392,11 +398,9 @@ def exact(operator: PrintedOperator, source: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("is_transposed", [False, True])
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-8, 1e-13])
-def test_the_tolerance_is_a_relative_residual(
-    tolerance: float, is_transposed: bool, box, make_printed, random
-):
-    operator = replace(make_printed(box((4, 5, 3))), is_transposed=is_transposed)
-    source = random(2, 4, 5, 3, seed=3) - 0.5
+def test_the_tolerance_is_a_relative_residual(tolerance: float, is_transposed: bool, make_printed):
+    operator = replace(make_printed(box_grid((4, 5, 3))), is_transposed=is_transposed)
+    source = random_values(2, 4, 5, 3, seed=3) - 0.5
     solution = jacobi(operator, source, None, tolerance)
     residual = (source - operator.apply(solution.value)) / operator.diagonal
     assert 0 < solution.residual <= tolerance
@@ -406,17 +410,17 @@ def test_the_tolerance_is_a_relative_residual(
     )
 
 
-def test_a_tolerance_below_rounding_ends_all_the_same(box, make_printed, random):
-    operator, source = make_printed(box((4, 5, 3))), random(2, 4, 5, 3, seed=3)
+def test_a_tolerance_below_rounding_ends_all_the_same(make_printed):
+    operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3, seed=3)
     solution = jacobi(operator, source, None, 1e-30)
     torch.testing.assert_close(solution.value, exact(operator, source), rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("has_guess", [False, True])
-def test_a_color_without_source_stays_dark(has_guess: bool, box, make_printed, random):
-    operator, source = make_printed(box((4, 5, 3))), random(2, 4, 5, 3, seed=3)
+def test_a_color_without_source_stays_dark(has_guess: bool, make_printed):
+    operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3, seed=3)
     source[0] = 0
-    value = jacobi(operator, source, random(2, 4, 5, 3) if has_guess else None, 1e-8).value
+    value = jacobi(operator, source, random_values(2, 4, 5, 3) if has_guess else None, 1e-8).value
     assert not value[0].any() and bool(value[1].any())
 
 
@@ -452,7 +456,7 @@ def test_a_warm_start_takes_fewer_iterations(smooth_scene):
 
 
 @pytest.fixture
-def ball(make_scene) -> Callable[..., Scene]:
+def ball() -> Callable[..., Scene]:
     """A ball of optical thickness 0.7 `sigma` in empty space, whose surface is `width` cells wide."""
 
     def make(sigma: float, width: float, floor: float = FLOOR) -> Scene:
@@ -515,23 +519,23 @@ def test_the_criterion_alone_is_no_error(ball):
     assert memory.records[0].residual <= 1e-4
 
 
-def test_divergence_that_the_criterion_does_not_explain_is_not_blamed_on_it(
-    box, make_printed, random
-):
-    operator = make_printed(box((4, 5, 3)))
+def test_divergence_that_the_criterion_does_not_explain_is_not_blamed_on_it(make_printed):
+    operator = make_printed(box_grid((4, 5, 3)))
     with pytest.raises(SolveError, match=r"diverged, although kappa changes by a factor [0-3]\."):
-        jacobi(replace(operator, diagonal=operator.diagonal / 3), random(2, 4, 5, 3), None, 1e-8)
+        jacobi(
+            replace(operator, diagonal=operator.diagonal / 3), random_values(2, 4, 5, 3), None, 1e-8
+        )
 
 
-def test_slow_convergence_ends_with_an_error(box, make_printed, random, monkeypatch):
+def test_slow_convergence_ends_with_an_error(make_printed, monkeypatch):
     monkeypatch.setattr(printed, "MAX_ITERATIONS", 4)
     with pytest.raises(SolveError, match="did not reach its tolerance after 4 iterations"):
-        jacobi(make_printed(box((4, 5, 3))), random(2, 4, 5, 3), None, 1e-8)
+        jacobi(make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3), None, 1e-8)
 
 
 @pytest.mark.parametrize("where", ["source", "diagonal", "coefficients"])
-def test_a_system_that_is_not_finite_is_an_error(where: str, box, make_printed, random):
-    operator, source = make_printed(box((4, 5, 3))), random(2, 4, 5, 3)
+def test_a_system_that_is_not_finite_is_an_error(where: str, make_printed):
+    operator, source = make_printed(box_grid((4, 5, 3))), random_values(2, 4, 5, 3)
     {"source": source, "diagonal": operator.diagonal, "coefficients": operator.coefficients}[where][
         0, 0, 0, 0
     ] = float("nan")

@@ -8,6 +8,7 @@ import itertools
 
 import pytest
 import torch
+from media import box_grid, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.paper.stencils import (
@@ -25,14 +26,14 @@ SHAPE = (3, 4, 2)
 
 
 @pytest.fixture
-def grid(box) -> Grid:
+def grid() -> Grid:
     """Cells that are not cubes."""
-    return box(SHAPE)
+    return box_grid(SHAPE)
 
 
 @pytest.fixture
-def extended(random) -> Tensor:
-    return random(2, *(n + 2 for n in SHAPE))
+def extended() -> Tensor:
+    return random_values(2, *(n + 2 for n in SHAPE))
 
 
 def padded_centers(grid: Grid) -> list[Tensor]:
@@ -114,8 +115,8 @@ def test_each_stencil_against_indices(grid: Grid, extended: Tensor):
         )
 
 
-def test_ghost_cells_repeat_their_neighbors(random):
-    u = random(2, *SHAPE)
+def test_ghost_cells_repeat_their_neighbors():
+    u = random_values(2, *SHAPE)
     extended = extend(u)
     assert torch.equal(inside(extended), u)
     for axis in (1, 2, 3):
@@ -123,8 +124,8 @@ def test_ghost_cells_repeat_their_neighbors(random):
             assert torch.equal(extended.select(axis, ghost), extended.select(axis, neighbor))
 
 
-def test_transposes(grid: Grid, extended: Tensor, random):
-    u, v = random(2, *SHAPE, seed=1), random(2, 4, *SHAPE, seed=2)
+def test_transposes(grid: Grid, extended: Tensor):
+    u, v = random_values(2, *SHAPE, seed=1), random_values(2, 4, *SHAPE, seed=2)
     kernels = Stencils.on(grid, u).terms
     torch.testing.assert_close(
         (fold(extended) * u).sum(), (extended * extend(u)).sum(), rtol=1e-13, atol=0
@@ -137,8 +138,8 @@ def test_transposes(grid: Grid, extended: Tensor, random):
     )
 
 
-def test_the_divergence_of_position_is_three_inside(box):
-    grid = box((3, 4, 5))
+def test_the_divergence_of_position_is_three_inside():
+    grid = box_grid((3, 4, 5))
     z, y, x = (
         c.expand(grid.shape)[None] for c in grid.centers(torch.zeros(1, dtype=torch.float64))
     )
@@ -148,8 +149,8 @@ def test_the_divergence_of_position_is_three_inside(box):
     torch.testing.assert_close(found, torch.full_like(found, 3), rtol=1e-13, atol=0)
 
 
-def test_normals_point_out_of_the_box(random):
-    normals = outward(random(1, *SHAPE))
+def test_normals_point_out_of_the_box():
+    normals = outward(random_values(1, *SHAPE))
     assert not inside(normals).any()
     for axis in range(3):
         faces = normals[axis].movedim(axis, 0)

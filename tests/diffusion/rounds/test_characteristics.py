@@ -11,6 +11,7 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from media import box_grid, half_empty, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Course, follow, radiance_along
@@ -38,8 +39,8 @@ def medium_of(
     )
 
 
-def random_light(random, grid: Grid, colors: int = 1) -> Moments:
-    mean, z, y, x = (random(colors, *grid.shape, seed=seed) for seed in range(4))
+def random_light(grid: Grid, colors: int = 1) -> Moments:
+    mean, z, y, x = (random_values(colors, *grid.shape, seed=seed) for seed in range(4))
     return Moments(1 + mean, (z - 0.5, y - 0.5, x - 0.5))
 
 
@@ -83,9 +84,9 @@ def by_cells(medium: Medium, scatters: Tensor, direction: tuple[float, float, fl
 
 
 @each_direction
-def test_slices_at_once_are_cells_one_by_one(random, box, direction):
-    grid = box((3, 4, 5))
-    medium, light = medium_of(4 * random(3, 4, 5), grid), random_light(random, grid)
+def test_slices_at_once_are_cells_one_by_one(direction):
+    grid = box_grid((3, 4, 5))
+    medium, light = medium_of(4 * random_values(3, 4, 5), grid), random_light(grid)
     scatters = light.along(tuple(torch.tensor(c, dtype=torch.float64) for c in direction))[0]
     torch.testing.assert_close(
         radiance_along(medium, light, None, direction)[0],
@@ -97,8 +98,8 @@ def test_slices_at_once_are_cells_one_by_one(random, box, direction):
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_along_an_axis_a_uniform_medium_follows_the_closed_form(box, axis: int, sign: int):
-    grid, albedo = box((4, 5, 6)), 0.9
+def test_along_an_axis_a_uniform_medium_follows_the_closed_form(axis: int, sign: int):
+    grid, albedo = box_grid((4, 5, 6)), 0.9
     medium = medium_of(torch.full((4, 5, 6), 0.7, dtype=torch.float64), grid, albedo)
     direction = tuple(float(sign * (a == axis)) for a in range(3))
     found = radiance_along(
@@ -117,8 +118,8 @@ def test_along_an_axis_a_uniform_medium_follows_the_closed_form(box, axis: int, 
 
 
 @each_direction
-def test_a_white_medium_in_a_white_room_stays_white(half_empty, box, direction):
-    grid = box((5, 4, 6))
+def test_a_white_medium_in_a_white_room_stays_white(direction):
+    grid = box_grid((5, 4, 6))
     medium = medium_of(30 * half_empty(5, 4, 6), grid, albedo=1.0, colors=3)
     room = torch.tensor([2.0, 3.0, 5.0], dtype=torch.float64).view(3, 1, 1, 1)
     found = radiance_along(medium, Moments(room.expand(3, *grid.shape)), room, direction)
@@ -126,35 +127,36 @@ def test_a_white_medium_in_a_white_room_stays_white(half_empty, box, direction):
 
 
 @each_direction
-def test_turning_grid_and_direction_around_turns_the_radiance(random, box, direction):
-    grid = box((4, 5, 3))
-    medium, light = medium_of(random(4, 5, 3), grid), random_light(random, grid)
+def test_turning_grid_and_direction_around_turns_the_radiance(direction):
+    grid = box_grid((4, 5, 3))
+    medium, light = medium_of(random_values(4, 5, 3), grid), random_light(grid)
     turned = replace(
         light, mean=light.mean.flip(1, 2, 3), flux=tuple(-part.flip(1, 2, 3) for part in light.flux)
     )
     opposite = tuple(-c for c in direction)
-    found = radiance_along(medium_of(random(4, 5, 3).flip(0, 1, 2), grid), turned, None, opposite)
+    found = radiance_along(
+        medium_of(random_values(4, 5, 3).flip(0, 1, 2), grid), turned, None, opposite
+    )
     torch.testing.assert_close(
         found.flip(1, 2, 3), radiance_along(medium, light, None, direction), rtol=1e-13, atol=0
     )
 
 
 @each_direction
-def test_radiance_is_never_negative_where_nothing_that_scatters_is(
-    random, half_empty, box, direction
-):
-    grid = box((6, 5, 4))
+def test_radiance_is_never_negative_where_nothing_that_scatters_is(direction):
+    grid = box_grid((6, 5, 4))
     for seed, thickness in enumerate((1e-6, 1.0, 1e3, 1e6)):
         medium = medium_of(thickness * half_empty(6, 5, 4, seed=seed), grid)
-        sharp = random(1, *grid.shape, seed=seed) ** 20
+        sharp = random_values(1, *grid.shape, seed=seed) ** 20
         assert bool((radiance_along(medium, Moments(sharp), None, direction) >= 0).all())
 
 
 @each_direction
-def test_following_backward_is_the_adjoint_of_following(random, box, direction):
-    course = Course.of(box((4, 5, 6)), direction)
+def test_following_backward_is_the_adjoint_of_following(direction):
+    course = Course.of(box_grid((4, 5, 6)), direction)
     laid = [
-        course.lay(random(colors, 4, 5, 6, seed=seed)) for seed, colors in ((0, 1), (1, 3), (2, 3))
+        course.lay(random_values(colors, 4, 5, 6, seed=seed))
+        for seed, colors in ((0, 1), (1, 3), (2, 3))
     ]
     passed, source, received = laid[0], laid[1].requires_grad_(), laid[2]
     found = follow(passed, source, course)
@@ -166,15 +168,13 @@ def test_following_backward_is_the_adjoint_of_following(random, box, direction):
 
 @each_direction
 @pytest.mark.parametrize("colors", [1, 3])
-def test_derivatives_agree_with_differences_in_both_modes(
-    random, half_empty, box, direction, colors: int
-):
-    grid = box((3, 2, 4))
+def test_derivatives_agree_with_differences_in_both_modes(direction, colors: int):
+    grid = box_grid((3, 2, 4))
     density = (5 * half_empty(3, 2, 4)).requires_grad_()
     inputs = [
-        random_light(random, grid, colors).mean,
-        *random_light(random, grid, colors).flux,
-        random(colors, 1, 1, 1),
+        random_light(grid, colors).mean,
+        *random_light(grid, colors).flux,
+        random_values(colors, 1, 1, 1),
     ]
     inputs = [tensor.clone().requires_grad_() for tensor in inputs]
     g = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)

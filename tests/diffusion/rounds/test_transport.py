@@ -10,6 +10,7 @@ from weakref import WeakSet
 
 import pytest
 import torch
+from media import half_empty, make_scene
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -39,7 +40,7 @@ def light_after(scene: Scene, rounds: int) -> Tensor:
     return solve_light(scene, SolveMemory()).outgoing.mean
 
 
-def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left(make_scene):
+def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_left():
     scene = make_scene(
         ball(),
         sigma_a=(0.0,),
@@ -59,7 +60,7 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
 
 @pytest.mark.parametrize("thickness", [1e-8, 1.0, 1e2, 1e4])
 @pytest.mark.parametrize("pattern", ["ball", "checkerboard"])
-def test_no_thickness_of_cells_lets_rounds_grow(make_scene, thickness: float, pattern: str):
+def test_no_thickness_of_cells_lets_rounds_grow(thickness: float, pattern: str):
     density = (
         ball(8)
         if pattern == "ball"
@@ -77,7 +78,7 @@ def test_no_thickness_of_cells_lets_rounds_grow(make_scene, thickness: float, pa
     assert float((later - light_after(scene, 11)).norm()) < 0.05 * float(later.norm())
 
 
-def test_in_the_limit_of_thick_cells_rounds_leave_diffusion_as_it_is(make_scene):
+def test_in_the_limit_of_thick_cells_rounds_leave_diffusion_as_it_is():
     def change(thickness: float) -> float:
         scene = make_scene(
             torch.ones(8, 8, 8),
@@ -94,7 +95,7 @@ def test_in_the_limit_of_thick_cells_rounds_leave_diffusion_as_it_is(make_scene)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.6, -0.5])
-def test_a_white_furnace_is_exact_after_any_rounds(make_scene, half_empty, g: float):
+def test_a_white_furnace_is_exact_after_any_rounds(g: float):
     density = half_empty(5, 6, 4)
     scene = make_scene(
         density,
@@ -109,7 +110,7 @@ def test_a_white_furnace_is_exact_after_any_rounds(make_scene, half_empty, g: fl
     torch.testing.assert_close(render(scene), torch.ones_like(render(scene)), rtol=0, atol=1e-9)
 
 
-def test_no_rounds_are_no_work(make_scene, monkeypatch):
+def test_no_rounds_are_no_work(monkeypatch):
     monkeypatch.setattr("ddrecon.diffusion.rounds.transport.sweep", None)
     memory = SolveMemory()
     render(make_scene(ball(6), directional=(3.0,)), memory=memory)
@@ -117,7 +118,7 @@ def test_no_rounds_are_no_work(make_scene, monkeypatch):
 
 
 @pytest.mark.parametrize("g", [1e-9, -1e-9])
-def test_light_without_direction_is_the_limit_of_light_with(make_scene, g: float):
+def test_light_without_direction_is_the_limit_of_light_with(g: float):
     plain, nearly = (
         make_scene(ball(8), g=value, directional=(3.0,), transport_rounds=2, tolerance=1e-11)
         for value in (0.0, g)
@@ -125,7 +126,7 @@ def test_light_without_direction_is_the_limit_of_light_with(make_scene, g: float
     torch.testing.assert_close(render(nearly), render(plain), rtol=1e-6, atol=0)
 
 
-def test_light_from_two_beams_is_the_sum_of_both(make_scene):
+def test_light_from_two_beams_is_the_sum_of_both():
     def lit(*lights: object) -> Tensor:
         return light_after(replace(scene, lights=list(lights)), 2)
 
@@ -135,7 +136,7 @@ def test_light_from_two_beams_is_the_sum_of_both(make_scene):
     )
 
 
-def test_directions_agree_the_better_the_more_there_are(make_scene):
+def test_directions_agree_the_better_the_more_there_are():
     scene = make_scene(ball(12), **WHITE, directional=(3.0,), transport_rounds=2, tolerance=1e-8)
     few, some, many = (
         render(replace(scene, diffusion=replace(scene.diffusion, transport_directions=count)))
@@ -146,7 +147,7 @@ def test_directions_agree_the_better_the_more_there_are(make_scene):
     )
 
 
-def test_memory_does_not_grow_with_directions(make_scene):
+def test_memory_does_not_grow_with_directions():
     """What is alive at once, of arrays of cells, while a sweep and its backward pass are made."""
 
     def peak(directions: int) -> int:
@@ -180,7 +181,7 @@ class ArrayCount(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("g", [0.0, 0.4])
-def test_tangent_adjoint_and_differences_agree_through_rounds(make_scene, half_empty, g: float):
+def test_tangent_adjoint_and_differences_agree_through_rounds(g: float):
     scene = make_scene(
         half_empty(4, 5, 6),
         g=g,

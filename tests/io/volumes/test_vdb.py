@@ -112,7 +112,7 @@ def test_grids_of_other_programs_share_the_box_of_what_is_active(tmp_path: Path)
 
 
 CATCH = """
-import sys; from pathlib import Path; from ddrecon.errors import FormatError; from ddrecon.io.volumes import read_field
+import sys; from pathlib import Path; from ddrecon.errors import FormatError; from ddrecon.io.volumes.table import read_field
 try: read_field(Path(sys.argv[1]), sys.argv[2])
 except FormatError as error: print(error.reason)
 """

@@ -17,12 +17,27 @@ import ddrecon
 from ddrecon.io.volumes.field import Field
 
 CANDIDATES = (sys.executable, "/usr/bin/python3")
-IMPORT = "import importlib.util as u, numpy; exit(not (u.find_spec('openvdb') or u.find_spec('pyopenvdb')))"
+IMPORT = """
+import importlib.util as u, numpy
+exit(not (u.find_spec('openvdb') or u.find_spec('pyopenvdb')))
+"""
 READ = """
-import sys; from pathlib import Path; import numpy as np; from ddrecon.io.volumes import field_names, read_field
-path = Path(sys.argv[1]); fields = {name: read_field(path, name) for name in field_names(path)}
-arrays = {f"{name}.{key}": getattr(field, key) for name, field in fields.items() for key in ("values", "bounds")}
+import sys
+from pathlib import Path
+import numpy as np
+from ddrecon.io.volumes.table import field_names, read_field
+path = Path(sys.argv[1])
+arrays = {}
+for name in field_names(path):
+    field = read_field(path, name)
+    arrays |= {f"{name}.values": field.values, f"{name}.bounds": field.bounds}
 np.savez(path.with_suffix(".found.npz"), **arrays)
+"""
+NAMES = """
+import json, sys
+try: import openvdb as vdb
+except ImportError: import pyopenvdb as vdb
+grids = {g.name: g for g in vdb.readAll(sys.argv[1])[0]}
 """
 
 
@@ -39,7 +54,7 @@ def require() -> str:
 
 
 def run(code: str, *arguments: object) -> str:
-    """What `code` prints there; raises AssertionError with its last line of stderr where it fails."""
+    """What `code` prints there; raises AssertionError with its stderr where it fails."""
     environment = {"PYTHONPATH": str(Path(ddrecon.__file__).parents[1])}
     done = subprocess.run(
         [require(), "-c", code, *map(str, arguments)],
@@ -60,13 +75,5 @@ def read_all(path: Path) -> dict[str, Field]:
 
 
 def described(code: str, path: Path) -> object:
-    """What the expression `code` about `grids`, the grids of the file at `path` by name, is, once
-    it has been JSON.
-    """
-    names = "try: import openvdb as vdb\nexcept ImportError: import pyopenvdb as vdb\n"
-    return json.loads(
-        run(
-            f"import json, sys\n{names}grids = {{g.name: g for g in vdb.readAll(sys.argv[1])[0]}}\nprint(json.dumps({code}))",
-            path,
-        )
-    )
+    """The value, by way of JSON, of the expression `code` about `grids`: those in `path` by name."""
+    return json.loads(run(f"{NAMES}print(json.dumps({code}))", path))

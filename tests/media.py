@@ -1,0 +1,130 @@
+"""Small random media, operators, cameras and scenes.
+
+Every test states what matters to it and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import Camera, look_at
+from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
+from ddrecon.grid import Grid
+from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.scene import Scene, View
+from ddrecon.settings import DiffusionSettings, RenderSettings
+
+LOWER, UPPER = (-0.5, -0.6, -0.4), (0.5, 0.6, 0.5)
+"""A box, in array order, whose cells are not cubes."""
+
+
+def random_values(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(
+        dtype
+    )
+
+
+def half_empty(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> Tensor:
+    return (2 * random_values(*shape, seed=seed, dtype=dtype) - 1).clamp(min=0)
+
+
+def box_grid(shape: tuple[int, int, int]) -> Grid:
+    return Grid(shape, LOWER, UPPER)
+
+
+def make_camera(
+    eye: tuple[float, float, float] = (0.2, 0.3, 2.5),
+    size: tuple[int, int] = (4, 5),
+    half_width: float = 0.3,
+    *,
+    is_perspective: bool = True,
+    **kind: Any,
+) -> Camera:
+    """A camera at `eye` (x, y, z) looking at the origin."""
+    origin = torch.tensor(eye, dtype=kind.get("dtype", torch.float64))
+    return Camera(
+        look_at(origin, torch.zeros_like(origin), origin.new_tensor([0.0, 1.0, 0.0])),
+        size,
+        half_width,
+        is_perspective,
+    )
+
+
+def make_scene(
+    density: Tensor,
+    *,
+    sigma_a: Any = (0.5, 1.0, 2.0),
+    sigma_s: Any = (8.0, 6.0, 4.0),
+    g: float = 0.0,
+    directional: tuple[float, ...] | None = (3.0,),
+    travel: tuple[float, float, float] = (-2.0, -2.0, -1.0),
+    ambient: tuple[float, ...] | None = None,
+    camera: Camera | None = None,
+    grid: Grid | None = None,
+    **diffusion: Any,
+) -> Scene:
+    """A scene in the precision of `density`, solved as closely as that precision allows; lights
+    that are None are left out.
+    """
+    grid = grid or box_grid((density.shape[0], density.shape[1], density.shape[2]))
+    tensor = density.new_tensor
+    sigma_a, sigma_s = (
+        sigma if isinstance(sigma, Tensor) else tensor(sigma) for sigma in (sigma_a, sigma_s)
+    )
+    lights: list[Any] = (
+        [DirectionalLight(tensor(travel), tensor(directional))] if directional else []
+    )
+    lights += [AmbientLight(tensor(ambient))] if ambient else []
+    camera = camera or make_camera(dtype=density.dtype)
+    diffusion = {"tolerance": 1e-13 if density.dtype == torch.float64 else 1e-6} | diffusion
+    return Scene(
+        Volume(grid, density, sigma_a, sigma_s, tensor(g)),
+        lights,
+        [View("view", camera)],
+        RenderSettings(),
+        DiffusionSettings(**diffusion),
+    )
+
+
+def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:
+    z, y, x = (conductance(diffusion, grid, axis) for axis in AXES)
+    return Operator((z, y, x), absorption + boundary_loss(diffusion, grid))
+
+
+def dense_matrix(operator: Operator) -> Tensor:
+    """The matrix `[C, n, n]` of `operator`, written with loops and flat indices: a slow twin that
+    shares no code with it.
+    """
+    colors, *shape = operator.loss.shape
+    strides = (shape[1] * shape[2], shape[2], 1)
+    matrix = torch.zeros(colors, math.prod(shape), math.prod(shape), dtype=operator.loss.dtype)
+    for cell in range(math.prod(shape)):
+        place = [cell // strides[0], cell // strides[1] % shape[1], cell % shape[2]]
+        matrix[:, cell, cell] += operator.loss[:, place[0], place[1], place[2]]
+        for axis in range(3):
+            if place[axis] + 1 == shape[axis]:
+                continue
+            conductance, neighbor = (
+                operator.conductances[axis][:, place[0], place[1], place[2]],
+                cell + strides[axis],
+            )
+            matrix[:, cell, cell] += conductance
+            matrix[:, neighbor, neighbor] += conductance
+            matrix[:, cell, neighbor] -= conductance
+            matrix[:, neighbor, cell] -= conductance
+    return matrix
+
+
+def convergence_order(steps: list[float], errors: list[float]) -> float:
+    """The slope of log error against log step: the order of convergence."""
+    x, y = (
+        torch.tensor(steps, dtype=torch.float64).log(),
+        torch.tensor(errors, dtype=torch.float64).log(),
+    )
+    x = x - x.mean()
+    return float((x * y).sum() / (x * x).sum())
