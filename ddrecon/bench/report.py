@@ -133,7 +133,7 @@ def write_bench_report(
     plot: bytes | None,
     environment: Mapping[str, Any],
 ) -> None:
-    """Writes `rows`, `remarks` on them, a `plot` (a PNG) if there is one, and versions as a page."""
+    """Writes `rows`, `remarks` on them, the `plot` (a PNG) if any, and versions as a page."""
     caption = "numbers are those of the legend; the line joins the best"
     drawn = [section("Error against time", picture(plot, caption, 1080))] if plot else []
     versions = [

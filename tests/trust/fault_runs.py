@@ -84,7 +84,7 @@ def ended(pid: int) -> int:
 
 
 def result_of(out: Path) -> dict[str, object]:
-    """What a run has come to, without the seconds it took: parameters, log, volumes and pictures."""
+    """What a run has come to, but for the seconds it took: parameters, log, volumes, pictures."""
     rows = [line.split(",") for line in (out / "loss.csv").read_text().splitlines()]
     seconds = rows[0].index("seconds")
     log = [row[:seconds] + row[seconds + 1 :] for row in rows]
