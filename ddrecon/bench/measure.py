@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
-from ddrecon.bench.variants import Variant, exactly, model_of
+from ddrecon.bench.variants import Variant, exact_scene, model_of
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.renderer import render_each
@@ -106,7 +106,7 @@ def exact_shots(variants: Sequence[Variant], scene: Scene, progress: Progress) -
     for variant in progress(variants, "exact solutions"):
         changed = variant.change(scene)
         if model_of(changed) not in known:
-            known[model_of(changed)] = shoot(exactly(changed), blocks)
+            known[model_of(changed)] = shoot(exact_scene(changed), blocks)
     return {variant.name: known[model_of(variant.change(scene))] for variant in variants}
 
 

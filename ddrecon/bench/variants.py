@@ -58,11 +58,11 @@ def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
     """The base, and every variant of `sweep` that differs from it."""
     return [
         Variant("base", "", lambda scene: scene),
-        *(item for item in _all(sweep) if not _is_same(item.change(scene), scene)),
+        *(item for item in _variants(sweep) if not _is_same(item.change(scene), scene)),
     ]
 
 
-def exactly(scene: Scene) -> Scene:
+def exact_scene(scene: Scene) -> Scene:
     """`scene` by the same model on the same grid, solved as exactly as its precision allows.
 
     It is marched in finer steps, ray by ray.
@@ -81,31 +81,31 @@ def model_of(scene: Scene) -> tuple[object, ...]:
     return scene.volume.grid.shape, _effective(replace(scene.diffusion, **EXACT))
 
 
-def _all(sweep: Sweep) -> Iterator[Variant]:
+def _variants(sweep: Sweep) -> Iterator[Variant]:
     for solver in SOLVERS:
-        yield _diffusing("solver", solver, solver=solver)
+        yield _vary_diffusion("solver", solver, solver=solver)
     for tolerance in sweep.tolerances:
-        yield _diffusing("tolerance", tolerance, tolerance=tolerance)
+        yield _vary_diffusion("tolerance", tolerance, tolerance=tolerance)
     for closure in CLOSURES:
-        yield _diffusing("closure", closure, closure=closure)
+        yield _vary_diffusion("closure", closure, closure=closure)
     for model in sweep.models:
-        yield _diffusing("model", model, model=model)
+        yield _vary_diffusion("model", model, model=model)
     for rounds, directions in sweep.rounds:
-        yield _diffusing(
+        yield _vary_diffusion(
             "rounds",
             f"{rounds}, {directions} directions",
             transport_rounds=rounds,
             transport_directions=directions,
         )
     for steps in sweep.steps:
-        yield _marching("steps", steps, steps_per_voxel=steps)
+        yield _vary_march("steps", steps, steps_per_voxel=steps)
     for tolerance in sweep.pixels:
-        yield _marching("pixels", tolerance, tolerance=tolerance)
+        yield _vary_march("pixels", tolerance, tolerance=tolerance)
     for factor in sweep.coarser:
-        yield Variant("grid", f"{factor} times coarser", functools.partial(_coarser, factor))
+        yield Variant("grid", f"{factor} times coarser", functools.partial(_coarsen, factor))
 
 
-def _diffusing(factor: str, value: object, **changes: Any) -> Variant:
+def _vary_diffusion(factor: str, value: object, **changes: Any) -> Variant:
     return Variant(
         factor,
         str(value),
@@ -113,13 +113,13 @@ def _diffusing(factor: str, value: object, **changes: Any) -> Variant:
     )
 
 
-def _marching(factor: str, value: object, **changes: Any) -> Variant:
+def _vary_march(factor: str, value: object, **changes: Any) -> Variant:
     return Variant(
         factor, str(value), lambda scene: replace(scene, render=replace(scene.render, **changes))
     )
 
 
-def _coarser(factor: int, scene: Scene) -> Scene:
+def _coarsen(factor: int, scene: Scene) -> Scene:
     return replace(scene_at_level(scene, factor), views=scene.views)
 
 

@@ -94,7 +94,7 @@ def render(
         raise click.UsageError("--mp4 is a movie of --ring N")
     if has_mp4:
         require_mp4()
-    loaded = session.relighting(lights).load(scene)
+    loaded = session.with_lights(lights).load(scene)
     views = session.pick_views(loaded, names)
     if lights or count is not None:
         loaded = remove_targets(loaded, views, count)
@@ -152,7 +152,7 @@ def optimize(
     if has_events:
         require_tensorboard()
     if iterations is not None:
-        session = session.overriding(f"optimize.iterations={iterations}")
+        session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
     with open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (

@@ -40,16 +40,16 @@ class Session:
     is_verbose: bool
     as_json: bool
 
-    def overriding(self, *overrides: str) -> Session:
+    def with_overrides(self, *overrides: str) -> Session:
         """The same session with more overrides of the scene file."""
         return replace(self, overrides=self.overrides + overrides)
 
-    def relighting(self, lights: tuple[str, ...]) -> Session:
+    def with_lights(self, lights: tuple[str, ...]) -> Session:
         """The same session with `lights`, as a scene file has them, instead of the scene's.
 
         Without any, the scene keeps its own.
         """
-        return self.overriding(f"lights=[{', '.join(lights)}]") if lights else self
+        return self.with_overrides(f"lights=[{', '.join(lights)}]") if lights else self
 
     def read(self, path: Path) -> SceneFile:
         """The scene file at `path`, or the result in the folder of a finished run, checked."""

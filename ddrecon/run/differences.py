@@ -40,7 +40,7 @@ def differences(old: Any, new: Any) -> list[str]:
     A text reads `key.path is A there, B now`.
     """
     return [
-        f"{key} is {_shown(before)} there, {_shown(after)} now"
+        f"{key} is {_shorten(before)} there, {_shorten(after)} now"
         for key, before, after in _changes("", old, new)
     ]
 
@@ -71,7 +71,7 @@ def _entries(value: Any) -> Mapping[Any, Any] | None:
     return None
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     if value is ABSENT:
         return "absent"
     text = json.dumps(value)

@@ -67,7 +67,7 @@ class Findings:
 def write_run_report(path: Path, findings: Findings) -> None:
     """Writes the report of `findings` to `path`."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
-    versions = [(key, _shown(value)) for key, value in findings.environment.items()]
+    versions = [(key, _format(value)) for key, value in findings.environment.items()]
     sections = [
         section("Loss", side_by_side(*_curves(findings.rows))),
         section("Views", *_comparisons(findings), _view_table(findings)),
@@ -192,5 +192,5 @@ def _timings(rows: Sequence[Row]) -> str:
     return table(TIMING_HEAD, lines)
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
