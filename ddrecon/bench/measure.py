@@ -7,11 +7,10 @@ precision; the whole error is against path tracing.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,13 +19,13 @@ from torch.nn.functional import adaptive_avg_pool3d
 from ddrecon.bench.variants import Variant, exact_scene, model_of
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
+from ddrecon.progress import Progress
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
 
 BLOCK = 4
 """Gradients are compared as sums over blocks of so many cells along each side."""
-Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from ddrecon.bench.measure import Progress, blocks_of, exact_shots, measure, shoot
+from ddrecon.bench.measure import blocks_of, exact_shots, measure, shoot
 from ddrecon.bench.path_tracing import PathTracer, Truth
 from ddrecon.bench.plot import draw
 from ddrecon.bench.plume import plume_scene
@@ -18,6 +18,7 @@ from ddrecon.bench.report import Row, rows_of, table, write_bench_report
 from ddrecon.bench.variants import QUICK, Sweep, variants_of
 from ddrecon.errors import MissingExtraError
 from ddrecon.io.files.json_file import write_json
+from ddrecon.progress import Progress
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 

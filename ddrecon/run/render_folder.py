@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -17,6 +16,7 @@ from ddrecon.extras import advice
 from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import psnr
+from ddrecon.progress import Progress
 from ddrecon.renderer import LightField, solve_light, view_components, view_image
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.scene import Scene, View
@@ -26,7 +26,6 @@ from ddrecon.variables.tangents import render_tangent, variation
 
 GRADIENT = "gradient"
 """Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""
-Progress = Callable[[list[View], str], Iterable[View]]
 
 
 def render_to_folder(

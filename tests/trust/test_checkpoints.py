@@ -81,9 +81,9 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_it(
     last.write_bytes(last.read_bytes()[:1000])
     result = run(*RESUME, "--iterations", "4")
     assert result.exit_code == 0
-    previous = last.with_name("previous.pt")
-    what = f"{last}: not a usable checkpoint; going on from {previous}"
-    assert result.stderr == f"warning: {what}\n"
+    assert result.stderr == (
+        f"warning: {last}: not a usable checkpoint; going on from {last.with_name('previous.pt')}\n"
+    )
     assert np.array_equal(density(), whole) and iterations() == [1, 2, 3, 4]
 
 
@@ -149,8 +149,11 @@ def test_the_seed_belongs_to_the_state(run: Run) -> None:
 def test_what_has_changed_is_named(run: Run, change: list[str], difference: str) -> None:
     run(*OPTIMIZE, "--iterations", "1")
     result = run(*RESUME, *change)
-    what = f"belongs to another scene: {difference}; use another output folder"
-    assert (result.exit_code, result.stderr) == (2, f"out/checkpoints/last.pt: {what}\n")
+    line = (
+        f"out/checkpoints/last.pt: belongs to another scene: {difference}; use another output "
+        "folder\n"
+    )
+    assert (result.exit_code, result.stderr) == (2, line)
 
 
 def test_a_changed_picture_is_named(run: Run, folder: Path) -> None:
