@@ -9,16 +9,16 @@ from ddrecon.scene import Scene
 from ddrecon.variables.kinds import pattern_of
 
 HASTE = 0.1
-"""Largest change of a density in one step; densities are usually of order 1."""
+"""Largest change of a density in one step, unless the scene says otherwise; densities are usually
+of order 1.
+"""
 THICKEST = 8
-"""Optical depth that one step may lay across the box.
-
-With more, the light is gone before the next step can mend it.
+"""Optical depth that one step may lay across the box; more, and the light is gone before the next
+step can mend it.
 """
 WARM_UP = 5
-"""Iterations over which learning rates rise to their value.
-
-Adam's first steps are all of full size, whatever the derivative.
+"""Iterations over which learning rates rise to their value: Adam's first steps are all of full
+size, whatever the derivative.
 """
 FINAL_RATE = 0.2
 """Learning rates fall exponentially over a run, to this part of their value."""
@@ -37,9 +37,8 @@ def rate_at(iteration: int, iterations: int) -> float:
 
 
 def default_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """The learning rate of the parameter `name` of `scene`, which starts from `start`.
-
-    It is the largest change in one step.
+    """The learning rate of the parameter `name` of `scene`, which starts from `start`: its largest
+    change in one step.
     """
     pattern, side = pattern_of(name), min(scene.volume.grid.extent)
     if pattern == "density":
@@ -55,6 +54,8 @@ def default_rate(scene: Scene, name: str, start: Tensor) -> float:
 
 
 def _density_rate(volume: Volume) -> float:
-    """HASTE, or less: at most THICKEST optical depths across the box's shortest side."""
+    """HASTE, or a density of THICKEST optical depths across the box's shortest side where that is
+    less.
+    """
     depth = float(volume.sigma_a.mean() + volume.sigma_s.mean()) * min(volume.grid.extent)
     return min(HASTE, THICKEST / depth) if depth > 0 else HASTE
