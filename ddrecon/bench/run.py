@@ -130,18 +130,18 @@ def describe(
     }
 
 
-def write_bench(folder: Path, rows: Sequence[Row], found: dict[str, Any]) -> str:
+def write_bench(folder: Path, rows: Sequence[Row], report: dict[str, Any]) -> str:
     """Where bench.json, report.html and, with matplotlib, bench.png were written, in words.
 
-    `found` are the `rows` as `describe` gives them.
+    `report` is what `describe` gives of the `rows`.
     """
-    write_json(folder / "bench.json", found)
-    plot, told = folder / "bench.png", f"written to {folder}"
+    write_json(folder / "bench.json", report)
+    plot, notice = folder / "bench.png", f"written to {folder}"
     try:
         draw(rows, plot)
     except MissingExtraError as error:
-        told = f"{told}, without a plot: {error}"
+        notice = f"{notice}, without a plot: {error}"
     png = plot.read_bytes() if plot.is_file() else None
     remarks = against_path_tracing(rows)
-    write_bench_report(folder / "report.html", rows, remarks, png, found["environment"])
-    return told
+    write_bench_report(folder / "report.html", rows, remarks, png, report["environment"])
+    return notice

@@ -111,12 +111,12 @@ def reference(
     tracer = open_tracer(loaded, views, threads=session.threads)
     with claim_folder(output, may_exist=overwrite):
         settings = output, samples, session.seed, session.progress
-        found = (
+        compared = (
             trace_to_folder(tracer, views, *settings)
             if is_only_traced
             else compare_to_folder(tracer, loaded, views, *settings)
         )
-        report = write_reference_report(output, found, session.environment())
+        report = write_reference_report(output, compared, session.environment())
     session.show(report, reference_lines(report, output))
 
 
@@ -184,11 +184,11 @@ def _bench_speed(
         click.echo(f"without path tracing: {error}", err=True)
     rows, truth = run_bench(scene, double, tracer, is_quick, session.progress)
     click.echo("\n".join(bench_lines(rows)))
-    found = describe(rows, truth, scene, session.environment())
+    measured = describe(rows, truth, scene, session.environment())
     if output is not None:
-        click.echo(write_bench(output, rows, found))
+        click.echo(write_bench(output, rows, measured))
     if report is not None:
-        write_json(report, found)
+        write_json(report, measured)
     return True
 
 

@@ -118,15 +118,15 @@ class Reconstruction:
         # See: which views this iteration compares.
         views = self._views()
         # Differentiate: the objective and its derivative by every parameter.
-        found = self._differentiate(views)
-        loss, gradients = add_penalties(found.loss, found.gradients, self.parameters, self.power)
+        objective = self._differentiate(views)
+        loss, gradients = add_penalties(objective, self.parameters, self.power)
         # Check: a derivative that is not finite would spoil the parameters for good.
         require_finite(self.parameters, gradients)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         self.before_step = None
         self.before_step = self.state() | {"solutions": solutions}
         # Step: every parameter against its derivative.
-        self.misfit = math.sqrt(float(found.loss) / self.power) if self.power else 1.0
+        self.misfit = math.sqrt(float(objective.loss) / self.power) if self.power else 1.0
         rate = rate_at(self.iteration, self.settings.iterations)
         for parameter in self.parameters:
             parameter.step(gradients[parameter.name], rate)
@@ -138,7 +138,7 @@ class Reconstruction:
             iteration=self.iteration + 1,
             seconds=self.total.seconds + perf_counter() - start,
             loss=float(loss),
-            psnr=mean_psnr(found.images, views),
+            psnr=mean_psnr(objective.images, views),
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),
             adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),

@@ -10,6 +10,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import image_loss, psnr
 from ddrecon.reconstruct.divergence import NotFiniteError
+from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
@@ -40,20 +41,20 @@ def loss_by_view(loss: str, views: Sequence[View]) -> Callable[[View, Tensor], T
 
 
 def add_penalties(
-    loss: Tensor, gradients: Mapping[str, Tensor], parameters: Sequence[Parameter], power: float
+    objective: Differentiated, parameters: Sequence[Parameter], power: float
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """`loss` and its `gradients` by name, with the penalties of `parameters` added.
+    """The loss of `objective` and its gradients by name, with the penalties of `parameters` added.
 
     `power` [radiance squared] is the mean square of the targets, the unit of penalties: brighter
     light or a wider frame change nothing.
     """
-    total = dict(gradients)
+    loss, gradients = objective.loss, dict(objective.gradients)
     for parameter in parameters:
         if parameter.tv or parameter.l1:
             penalty = power * parameter.penalty()
             loss = loss + penalty.detach()
-            total[parameter.name] += torch.autograd.grad(penalty, parameter.value)[0]
-    return loss, total
+            gradients[parameter.name] += torch.autograd.grad(penalty, parameter.value)[0]
+    return loss, gradients
 
 
 def mean_psnr(images: Sequence[Tensor], views: Sequence[View]) -> float:
