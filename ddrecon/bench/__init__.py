@@ -1,3 +1,4 @@
-"""`ddrecon bench`: speed against error, of every choice a scene leaves open, and of path tracing
-where Mitsuba 3 is installed.
+"""`ddrecon bench`: speed against error, of every choice a scene leaves open and of path tracing.
+
+Path tracing takes part where Mitsuba 3 is installed.
 """

@@ -1,41 +1,40 @@
-"""Time and error of each variant: its image and the gradient of the image's mean by density, in
-turns with all others.
+"""Time and error of each variant's image, and of the gradient of its mean by density.
 
-The numerical error is against the same model solved exactly, in double precision; the whole error
-is against path tracing.
+Variants take turns. The numerical error is against the same model solved exactly, in double
+precision; the whole error is against path tracing.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d
 
-from ddrecon.bench.variants import Variant, exactly, model_of
+from ddrecon.bench.variants import Variant, exact_scene, model_of
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
+from ddrecon.progress import Progress
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
+from ddrecon.variables.values import with_values
 
 BLOCK = 4
 """Gradients are compared as sums over blocks of so many cells along each side."""
-Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density,
-    summed over blocks [z, y, x].
+    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density.
 
-    `by_amount` is the gradient times density, summed likewise: what changes as all density there
-    grows by a factor. Empty cells, which path tracers do not see, have no part in it.
+    `gradient` is summed over blocks [z, y, x], and so is `by_amount`, the gradient times density:
+    what changes as all density there grows by a factor. Empty cells, which path tracers do not see,
+    have no part in it.
     """
 
     image: Tensor
@@ -48,38 +47,30 @@ class Shot:
 
 @dataclass
 class Timing:
-    """The shots of one variant; `seconds` are of the image, and of image and gradient together,
-    medians over the turns.
-    """
+    """The shots of one variant; `seconds` are medians over the turns."""
 
     shots: list[Shot] = field(default_factory=list)
 
     @property
     def seconds(self) -> tuple[float, float]:
         """Median seconds of an image, and of an image with its gradient."""
-        image, both = zip(
-            *(
-                (shot.image_seconds, shot.image_seconds + shot.gradient_seconds)
-                for shot in self.shots
-            ),
-            strict=True,
-        )
+        image = [shot.image_seconds for shot in self.shots]
+        both = [shot.image_seconds + shot.gradient_seconds for shot in self.shots]
         return statistics.median(image), statistics.median(both)
 
 
 def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
-    """Renders the first view of `scene` from nothing, and differentiates the mean of its image;
-    gradients are summed to `blocks`.
+    """An image of the first view of `scene`, rendered from nothing, with its gradient.
+
+    The gradient is that of the image's mean by density, summed to `blocks`.
     """
-    density = scene.volume.density
-    scene.volume.density = density.detach().clone().requires_grad_()
-    memory = SolveMemory()
+    density = scene.volume.density.detach().clone().requires_grad_()
+    varied, memory = with_values(scene, {"density": density}), SolveMemory()
     start = _now(density)
-    image = render_each(scene, scene.views[:1], memory)[0]
+    image = render_each(varied, varied.views[:1], memory)[0]
     middle = _now(density)
-    (gradient,) = torch.autograd.grad(image.mean(), scene.volume.density)
+    (gradient,) = torch.autograd.grad(image.mean(), density)
     end = _now(density)
-    scene.volume.density = density
     iterations = memory.records[0].iterations if memory.records else 0
     sums = block_sums(gradient, blocks), block_sums(gradient * density.detach(), blocks)
     return Shot(image.detach(), *sums, middle - start, end - middle, iterations)
@@ -88,10 +79,10 @@ def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
 def measure(
     contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress
 ) -> dict[str, Timing]:
-    """By name, the timings of all `contestants` that can be solved, each once in every turn, so
-    that what else runs slows all alike.
+    """The timings by name of all `contestants` that can be solved.
 
-    One is run once before, uncounted: the first work of a process takes longer.
+    Each runs once in every turn, so that what else runs slows all alike. One is run once before,
+    uncounted: the first work of a process takes longer.
     """
     timings = {name: Timing() for name in contestants}
     with suppress(SolveError):
@@ -106,14 +97,15 @@ def measure(
 
 
 def exact_shots(variants: Sequence[Variant], scene: Scene, progress: Progress) -> dict[str, Shot]:
-    """By name, what each variant of `scene` (in double precision) comes to when solved exactly;
-    alike models are solved once.
+    """The exact solution of each variant of `scene`, which is in double precision, by name.
+
+    Alike models are solved once.
     """
     blocks, known = blocks_of(scene), dict[tuple[object, ...], Shot]()
     for variant in progress(variants, "exact solutions"):
         changed = variant.change(scene)
         if model_of(changed) not in known:
-            known[model_of(changed)] = shoot(exactly(changed), blocks)
+            known[model_of(changed)] = shoot(exact_scene(changed), blocks)
     return {variant.name: known[model_of(variant.change(scene))] for variant in variants}
 
 
@@ -139,8 +131,9 @@ def correlation(one: Tensor, other: Tensor) -> float:
 
 
 def block_sums(gradient: Tensor, blocks: tuple[int, int, int]) -> Tensor:
-    """`gradient` [z, y, x] summed over `blocks`, whatever its own grid: the effect of scaling
-    density there.
+    """`gradient` [z, y, x] summed over `blocks`, whatever its own grid.
+
+    It is the effect of scaling density there.
     """
     mean = adaptive_avg_pool3d(gradient[None], blocks)[0]
     return mean * (gradient.numel() / mean.numel())

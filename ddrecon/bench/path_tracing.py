@@ -1,5 +1,4 @@
-"""The same scene by Mitsuba 3 (extra `reference`): the truth that errors are measured against, and
-a contestant at several sample counts.
+"""The same scene by Mitsuba 3: the truth, and a contestant at several sample counts.
 
 Gradients are those of path replay backpropagation (Vicini, Speierer and Jakob 2021,
 doi:10.1145/3450626.3459804), which needs the variant `llvm_ad_rgb`, and a medium of constant and
@@ -29,9 +28,7 @@ TRUTH_SEED = 1000
 
 @dataclass(frozen=True)
 class Truth:
-    """Path tracing: `image` [3, h, w] and `by_amount` [z, y, x] as of a `Shot`; None where there is
-    no path replay.
-    """
+    """Path tracing: `image` [3, h, w], and `by_amount` [z, y, x] where there is path replay."""
 
     image: Traced
     by_amount: Traced | None = None
@@ -53,8 +50,9 @@ class PathTracer:
         )
 
     def shoot(self, samples: int, seed: int = 0) -> Shot:
-        """An image by so many paths a pixel, and its gradient; without path replay a gradient of
-        zeros that took no time.
+        """An image by so many paths a pixel, and its gradient.
+
+        Without path replay that is zeros that took no time.
         """
         start = perf_counter()
         image = torch.from_numpy(self.tracer.trace(0, seed, samples)).movedim(-1, 0)
@@ -86,8 +84,9 @@ def _has_replay(tracer: Tracer, scene: Scene) -> bool:
 
 
 def _replay(tracer: Tracer, scene: Scene) -> Callable[[int, int], Tensor]:
-    """What makes the gradient [z, y, x] of the image's mean by density, from paths a pixel and
-    seed.
+    """A function that gives the gradient [z, y, x] by path replay, from paths a pixel and seed.
+
+    It is that of the image's mean by density.
     """
     import drjit
 

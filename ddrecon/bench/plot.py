@@ -15,34 +15,26 @@ FLOOR = 1e-8
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Writes a PNG: the time of an image against its error, and of an image with its gradient
-    against the gradient's numerical error.
+    """Writes a PNG of times against errors.
 
-    Raises MissingExtraError where matplotlib is not installed.
+    Left, the time of an image against its error; right, that of an image with its gradient against
+    the gradient's numerical error. Raises MissingExtraError where matplotlib is not installed.
     """
     load_extra("matplotlib", "a plot").use("Agg")
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
-    truth = (
-        "path tracing"
-        if any(row.image_error is not None for row in rows)
-        else "the same model solved exactly"
-    )
+    has_truth = any(row.image_error is not None for row in rows)
+    truth = "path tracing" if has_truth else "the same model solved exactly"
     kinds = list(dict.fromkeys(_kind(row) for row in rows))
     dots = [
-        Dot(index + 1, row.name, f"C{kinds.index(_kind(row)) % 10}")
-        for index, row in enumerate(rows)
+        Dot(number, row.name, f"C{kinds.index(_kind(row)) % 10}")
+        for number, row in enumerate(rows, 1)
     ]
-    _scatter(
-        left, [(dot, row.image_seconds, error_of(row)) for dot, row in zip(dots, rows, strict=True)]
-    )
-    gradients = [
-        (dot, row.both_seconds, row.gradient_numerical) for dot, row in zip(dots, rows, strict=True)
-    ]
-    _scatter(
-        right, [(dot, seconds, error) for dot, seconds, error in gradients if error is not None]
-    )
+    pairs = list(zip(dots, rows, strict=True))
+    _scatter(left, [(dot, row.image_seconds, error_of(row)) for dot, row in pairs])
+    gradients = [(dot, row.both_seconds, row.gradient_numerical) for dot, row in pairs]
+    _scatter(right, [(dot, time, error) for dot, time, error in gradients if error is not None])
     front = sorted((row.image_seconds, max(error_of(row), FLOOR)) for row in rows if row.is_best)
     left.step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
     left.set(
@@ -61,7 +53,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 @dataclass(frozen=True)
 class Dot:
-    """How a row is drawn: a numbered dot; the `number` stands beside its name in the legend."""
+    """How a row is drawn: a dot with a `number`, which stands beside its name in the legend."""
 
     number: int
     name: str
@@ -69,8 +61,9 @@ class Dot:
 
 
 def _scatter(axis: Any, points: Sequence[tuple[Dot, float, float]]) -> None:
-    """Draws dots at (seconds, error); numbers go around them in turn, so that those of close dots
-    stay apart.
+    """Draws dots at (seconds, error).
+
+    Numbers go around the dots in turn, so that those of close dots stay apart.
     """
     for index, (dot, x, y) in enumerate(sorted(points, key=lambda point: point[1])):
         height = max(y, FLOOR)

@@ -1,4 +1,4 @@
-"""The scene that is measured where none is given: a smoke plume of our own under one light, gray."""
+"""The scene that is measured where none is given: a gray smoke plume under one light."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.devic
 
 
 def _plume(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """Density at places from -0.5 to 0.5: a rising, widening, swaying and ragged column, denser
-    below.
-    """
+    """Density at places from -0.5 to 0.5: a rising, widening, swaying and ragged column."""
     rise = y + 0.5
     across = (
         (x - 0.1 * rise * torch.sin(7 * rise)) ** 2 + (z - 0.1 * rise * torch.cos(6 * rise)) ** 2

@@ -18,14 +18,13 @@ from ddrecon.report.page import paragraph, picture, section, write_page
 
 @dataclass(frozen=True)
 class Row:
-    """One variant, or path tracing. Seconds are medians, `both_seconds` of image and gradient;
-    errors are relative RMS.
+    """One variant, or path tracing; errors are relative RMS, None where nothing is to compare with.
 
-    `image_numerical` and `gradient_numerical` are against the same model solved exactly;
-    `image_error` is against path tracing, its noise subtracted in quadrature,
-    `gradient_correlation` with path replay's gradient times density. None where there is nothing to
-    compare with. `iterations` are the first solve's, or samples a pixel. `is_best`: no other row is
-    faster and closer to the truth.
+    Seconds are medians, `both_seconds` of image and gradient. `image_numerical` and
+    `gradient_numerical` are against the same model solved exactly. `image_error` is against path
+    tracing, its noise subtracted in quadrature; `gradient_correlation` is with path replay's
+    gradient times density. `iterations` are the first solve's, or samples a pixel. `is_best`: no
+    other row is faster and closer to the truth.
     """
 
     name: str
@@ -42,9 +41,7 @@ class Row:
 def rows_of(
     timings: Mapping[str, Timing], exact: Mapping[str, Shot], truth: Truth | None
 ) -> list[Row]:
-    """A row for every contestant that was measured; `exact` are the exact solutions of those that
-    have one.
-    """
+    """A row for every contestant that was measured; `exact` holds the exact solutions, if any."""
     return with_best(
         [_row(name, timing, exact.get(name), truth) for name, timing in timings.items()]
     )
@@ -63,9 +60,7 @@ def with_best(rows: Sequence[Row]) -> list[Row]:
 
 
 def error_of(row: Row) -> float:
-    """Against path tracing, or where there is none against the exact solution; infinite without
-    either.
-    """
+    """The error against path tracing, or else against the exact solution; or else infinity."""
     return next(
         (error for error in (row.image_error, row.image_numerical) if error is not None), math.inf
     )
@@ -75,20 +70,16 @@ def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> 
     shot = timing.shots[0]
     row = Row(name, *timing.seconds, shot.iterations)
     if exact is not None:
-        errors = (
-            relative_error(shot.image, exact.image),
-            relative_error(shot.gradient, exact.gradient),
+        row = replace(
+            row,
+            image_numerical=relative_error(shot.image, exact.image),
+            gradient_numerical=relative_error(shot.gradient, exact.gradient),
         )
-        row = replace(row, image_numerical=errors[0], gradient_numerical=errors[1])
     if truth is not None:
         row = replace(row, image_error=truth.image.error(shot.image.numpy()))
         if truth.by_amount is not None:
-            row = replace(
-                row,
-                gradient_correlation=correlation(
-                    shot.by_amount, torch.from_numpy(truth.by_amount.image)
-                ),
-            )
+            expected = torch.from_numpy(truth.by_amount.image)
+            row = replace(row, gradient_correlation=correlation(shot.by_amount, expected))
     return row
 
 
@@ -142,19 +133,9 @@ def write_bench_report(
     plot: bytes | None,
     environment: Mapping[str, Any],
 ) -> None:
-    """Writes the rows, `remarks` on them, the `plot` (a PNG) where there is one, and the versions
-    as a page.
-    """
-    drawn = (
-        [
-            section(
-                "Error against time",
-                picture(plot, "numbers are those of the legend; the line joins the best", 1080),
-            )
-        ]
-        if plot
-        else []
-    )
+    """Writes `rows`, `remarks` on them, the `plot` (a PNG) if any, and versions as a page."""
+    caption = "numbers are those of the legend; the line joins the best"
+    drawn = [section("Error against time", picture(plot, caption, 1080))] if plot else []
     versions = [
         (key, " ".join(map(str, value)) if isinstance(value, list) else value)
         for key, value in environment.items()
@@ -164,9 +145,5 @@ def write_bench_report(
         section("Variants", page.table(HEAD, cells(rows)), *map(paragraph, remarks)),
         section("Versions", page.table(["", ""], versions)),
     ]
-    write_page(
-        path,
-        "ddrecon bench",
-        "Speed against error: medians of whole renders, in one run.",
-        sections,
-    )
+    lead = "Speed against error: medians of whole renders, in one run."
+    write_page(path, "ddrecon bench", lead, sections)

@@ -16,7 +16,9 @@ from ddrecon.settings import DiffusionSettings
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is tried: tolerances of solves, models, transport rounds with directions, steps a voxel,
+    """What is tried.
+
+    These are tolerances of solves, models, transport rounds with directions, steps a voxel,
     tolerances of interpolated pixels, and factors by which the grid is made coarser.
     """
 
@@ -31,8 +33,9 @@ class Sweep:
 QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (0, 0.05), (2,))
 EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
 EXACT_LIMITED = 1e-5
-"""The tolerance in place of that for `flux_limited`, whose damped iteration gains a digit in many
-minutes.
+"""The tolerance in place of that for `flux_limited`.
+
+Its damped iteration gains a digit in many minutes.
 """
 EXACT_STEPS = 3
 
@@ -55,13 +58,14 @@ def variants_of(scene: Scene, sweep: Sweep) -> list[Variant]:
     """The base, and every variant of `sweep` that differs from it."""
     return [
         Variant("base", "", lambda scene: scene),
-        *(item for item in _all(sweep) if not _is_same(item.change(scene), scene)),
+        *(item for item in _variants(sweep) if not _is_same(item.change(scene), scene)),
     ]
 
 
-def exactly(scene: Scene) -> Scene:
-    """`scene` by the same model on the same grid, solved as exactly as its precision allows and
-    marched in finer steps, ray by ray.
+def exact_scene(scene: Scene) -> Scene:
+    """`scene` by the same model on the same grid, solved as exactly as its precision allows.
+
+    It is marched in finer steps, ray by ray.
     """
     render = replace(
         scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel), tolerance=0.0
@@ -73,35 +77,35 @@ def exactly(scene: Scene) -> Scene:
 
 
 def model_of(scene: Scene) -> tuple[object, ...]:
-    """What `exactly` keeps of a scene: scenes for which this is the same have the same exact image."""
+    """What two scenes must share for their exact images to be the same."""
     return scene.volume.grid.shape, _effective(replace(scene.diffusion, **EXACT))
 
 
-def _all(sweep: Sweep) -> Iterator[Variant]:
+def _variants(sweep: Sweep) -> Iterator[Variant]:
     for solver in SOLVERS:
-        yield _diffusing("solver", solver, solver=solver)
+        yield _vary_diffusion("solver", solver, solver=solver)
     for tolerance in sweep.tolerances:
-        yield _diffusing("tolerance", tolerance, tolerance=tolerance)
+        yield _vary_diffusion("tolerance", tolerance, tolerance=tolerance)
     for closure in CLOSURES:
-        yield _diffusing("closure", closure, closure=closure)
+        yield _vary_diffusion("closure", closure, closure=closure)
     for model in sweep.models:
-        yield _diffusing("model", model, model=model)
+        yield _vary_diffusion("model", model, model=model)
     for rounds, directions in sweep.rounds:
-        yield _diffusing(
+        yield _vary_diffusion(
             "rounds",
             f"{rounds}, {directions} directions",
             transport_rounds=rounds,
             transport_directions=directions,
         )
     for steps in sweep.steps:
-        yield _marching("steps", steps, steps_per_voxel=steps)
+        yield _vary_march("steps", steps, steps_per_voxel=steps)
     for tolerance in sweep.pixels:
-        yield _marching("pixels", tolerance, tolerance=tolerance)
+        yield _vary_march("pixels", tolerance, tolerance=tolerance)
     for factor in sweep.coarser:
-        yield Variant("grid", f"{factor} times coarser", functools.partial(_coarser, factor))
+        yield Variant("grid", f"{factor} times coarser", functools.partial(_coarsen, factor))
 
 
-def _diffusing(factor: str, value: object, **changes: Any) -> Variant:
+def _vary_diffusion(factor: str, value: object, **changes: Any) -> Variant:
     return Variant(
         factor,
         str(value),
@@ -109,13 +113,13 @@ def _diffusing(factor: str, value: object, **changes: Any) -> Variant:
     )
 
 
-def _marching(factor: str, value: object, **changes: Any) -> Variant:
+def _vary_march(factor: str, value: object, **changes: Any) -> Variant:
     return Variant(
         factor, str(value), lambda scene: replace(scene, render=replace(scene.render, **changes))
     )
 
 
-def _coarser(factor: int, scene: Scene) -> Scene:
+def _coarsen(factor: int, scene: Scene) -> Scene:
     return replace(scene_at_level(scene, factor), views=scene.views)
 
 

@@ -13,8 +13,9 @@ from ddrecon.variables.values import with_values
 
 
 def memory_estimate(scene: Scene) -> int:
-    """Bytes that rendering all views of `scene` takes at its peak, with derivatives where it is to
-    be optimized, without torch itself.
+    """Bytes that rendering all views of `scene` takes at its peak, without torch itself.
+
+    Derivatives are counted where the scene is to be optimized.
     """
     volume, grid = scene.volume, scene.volume.grid
     fields = [start for start in scene.starts.values() if tuple(start.shape[-3:]) == grid.shape]
@@ -34,21 +35,21 @@ def memory_estimate(scene: Scene) -> int:
 
 
 def describe(scene: Scene) -> dict[str, Any]:
-    """What `ddrecon check` reports of `scene`: grid, views, physics and memory, where what it
-    optimizes starts.
+    """What `ddrecon check` reports of `scene`: grid, views, physics, parameters and memory.
+
+    Its parameters are where they start.
     """
     scene = with_values(scene, scene.starts)
     grid = scene.volume.grid
     low, high = grid.bounds_xyz
+    parameters = scene.optimize.parameters if scene.optimize else {}
     return {
         "resolution": list(reversed(grid.shape)),
         "bounds": [list(low), list(high)],
         "voxel": list(reversed(grid.spacing)),
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
-        "optimizes": {name: scene.starts[name].numel() for name in scene.optimize.parameters}
-        if scene.optimize
-        else {},
+        "optimizes": {name: scene.starts[name].numel() for name in parameters},
         "memory_bytes": memory_estimate(scene),
     }
 
@@ -56,22 +57,26 @@ def describe(scene: Scene) -> dict[str, Any]:
 def lines(report: dict[str, Any]) -> list[str]:
     """The report of `describe` as lines of text."""
     low, high = report["bounds"]
-    views = [
-        f"  {v['name']}: {v['camera']}, {v['width']} x {v['height']} pixels, {v['split']}{', with image' * v['has_image']}"
-        for v in report["views"]
-    ]
+    sizes = f"{_by(report['resolution'])} cells of {_by(report['voxel'])} u"
+    parameters = [_count_entries(*item) for item in report["optimizes"].items()]
     return [
-        f"grid: {_by(report['resolution'])} cells of {_by(report['voxel'])} u, from {low} to {high}",
-        f"views: {len(views)}",
-        *views,
+        f"grid: {sizes}, from {low} to {high}",
+        f"views: {len(report['views'])}",
+        *(f"  {_view_line(view)}" for view in report["views"]),
         "physics:",
         *(f"  {term}" for term in report["physics"]),
-        f"optimizes: {', '.join(_counted_entries(*item) for item in report['optimizes'].items()) or 'nothing'}",
+        f"optimizes: {', '.join(parameters) or 'nothing'}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
 
 
-def _counted_entries(name: str, count: int) -> str:
+def _view_line(view: dict[str, Any]) -> str:
+    size = f"{view['width']} x {view['height']} pixels"
+    image = ", with image" if view["has_image"] else ""
+    return f"{view['name']}: {view['camera']}, {size}, {view['split']}{image}"
+
+
+def _count_entries(name: str, count: int) -> str:
     return f"{name} ({count:,} number{'s' if count > 1 else ''})"
 
 

@@ -1,6 +1,4 @@
-"""What all commands share: options, the session they run in, and how errors and warnings reach the
-user.
-"""
+"""What all commands share: options, a session, and how errors and warnings reach the user."""
 
 from __future__ import annotations
 
@@ -40,8 +38,9 @@ COMMON = (
     click.option("--debug", is_flag=True, help="Show the traceback of an error."),
 )
 THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
-"""Waiting threads spin for a moment, then sleep: 1.5 times faster than sleeping at once, without
-the stalls of endless spinning.
+"""Waiting threads spin for a moment, then sleep.
+
+That is 1.5 times faster than sleeping at once, without the stalls of endless spinning.
 """
 DTYPE = click.option(
     "--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
@@ -62,8 +61,9 @@ OVERWRITE = click.option("--overwrite", is_flag=True, help="Write into a folder 
 
 
 def in_session(command: Callable[..., None]) -> Callable[..., None]:
-    """Adds the common options, handed on as one `Session`; an error of the user's becomes one line
-    and an exit code.
+    """`command` with the common options, handed on to it as one `Session`.
+
+    An error of the user's becomes one line and an exit code.
     """
 
     @functools.wraps(command)
@@ -82,17 +82,10 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
         try:
             from ddrecon.cli.session import open_session
 
-            printing = {
-                "dtype": others.pop("dtype", "float64"),
-                "as_json": others.pop("as_json", False),
-            }
+            dtype, as_json = others.pop("dtype", "float64"), others.pop("as_json", False)
+            common = overrides, device, threads, seed, quiet, verbose
             with show_warnings():
-                command(
-                    session=open_session(
-                        overrides, device, threads, seed, quiet, verbose, **printing
-                    ),
-                    **others,
-                )
+                command(session=open_session(*common, dtype, as_json), **others)
         except DdreconError as error:
             if debug:
                 raise
@@ -104,10 +97,10 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             if debug or not is_shortage(error):
                 raise
             reason = str(error).partition("\n")[0] or "no more is given"
-            click.echo(
-                f"out of memory: {reason}; make volume.resolution or the images smaller; --resume takes up an interrupted run",
-                err=True,
+            advice = (
+                "make volume.resolution or the images smaller; --resume takes up an interrupted run"
             )
+            click.echo(f"out of memory: {reason}; {advice}", err=True)
             sys.exit(2)
         except KeyboardInterrupt as error:
             click.echo(f"interrupted {error}".strip(), err=True)
@@ -128,9 +121,7 @@ def require_folder_of(report: Path | None) -> None:
 
 @contextmanager
 def show_warnings() -> Iterator[None]:
-    """Warnings about data become lines on stderr; those of libraries are for developers and stay
-    unseen.
-    """
+    """Warnings about data become lines on stderr; those of libraries stay unseen."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", DataWarning)
@@ -147,6 +138,7 @@ def show_version(context: click.Context, parameter: click.Parameter, is_asked: b
 
         device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
         click.echo(
-            f"ddrecon {__version__}, Python {platform.python_version()}, torch {torch.__version__}, device {device}"
+            f"ddrecon {__version__}, Python {platform.python_version()}, "
+            f"torch {torch.__version__}, device {device}"
         )
         context.exit()

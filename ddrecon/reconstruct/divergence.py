@@ -1,17 +1,65 @@
-"""Where a reconstruction went wrong: the parameter and the voxel, in words."""
+"""Why a reconstruction cannot go on: the parameter and the voxel that are to blame, in words."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from ddrecon.errors import DivergenceError, SolveError
+from ddrecon.reconstruct.parameters import Parameter
+
+
+class NotFiniteError(Exception):
+    """A number of the iteration being made is not finite; the text says which."""
+
+
+def require_finite(parameters: Sequence[Parameter], gradients: Mapping[str, Tensor]) -> None:
+    """Raises NotFiniteError where the derivative by one of the `parameters` is not finite."""
+    for parameter in parameters:
+        place = describe_flaw(parameter.name, gradients[parameter.name], parameter.is_field)
+        if place is not None:
+            raise NotFiniteError(
+                f"the derivative of the loss with respect to {place} is not finite"
+            )
+
+
+def explain_divergence(
+    iteration: int, parameters: Sequence[Parameter], error: SolveError | NotFiniteError
+) -> DivergenceError:
+    """What is raised where `iteration`, counted from 1, failed by `error`.
+
+    It names the largest value of each of the `parameters`, and advises to lower their rates.
+    """
+    what, residual, advice = str(error), math.nan, ""
+    if isinstance(error, SolveError):
+        residual = error.residual
+        if math.isfinite(residual):
+            what, advice = what.partition(";")[0], f"{error.advice}, or "
+        else:
+            what = "the light is not finite"
+    largest = "; ".join(
+        describe_largest(parameter.name, parameter.value, parameter.is_field)
+        for parameter in parameters
+    )
+    rates = " and ".join(
+        f"optimize.parameters.{parameter.name}.lr (now {parameter.rate:.3g})"
+        for parameter in parameters
+    )
+    return DivergenceError(
+        iteration, f"{what}; at most, {largest}", residual, f"{advice}lower {rates}"
+    )
+
 
 def describe_flaw(name: str, values: Tensor, is_field: bool) -> str | None:
-    """The first entry of `values`, of the parameter `name`, that is not finite: `density at voxel
-    [x, y, z]`; None if there is none.
+    """The first entry of `values` that is not finite, as `density at voxel [x, y, z]`, or None.
+
+    `values` belong to the parameter `name`.
     """
     flaws = torch.nonzero(~torch.isfinite(values.detach()))
-    return _named(name, flaws[0].tolist(), is_field) if len(flaws) else None
+    return _name_entry(name, flaws[0].tolist(), is_field) if len(flaws) else None
 
 
 def describe_largest(name: str, values: Tensor, is_field: bool) -> str:
@@ -19,20 +67,21 @@ def describe_largest(name: str, values: Tensor, is_field: bool) -> str:
     values = values.detach()
     flat = int(values.abs().flatten().argmax())
     index = [int(i) for i in torch.unravel_index(torch.tensor(flat), values.shape)]
-    return f"{_named(name, index, is_field)} is {float(values.flatten()[flat]):.4g}"
+    return f"{_name_entry(name, index, is_field)} is {float(values.flatten()[flat]):.4g}"
 
 
-def _named(name: str, index: list[int], is_field: bool) -> str:
-    """`index` into the array of the parameter `name` in world order: the last three of a field, the
-    last two of a map.
+def _name_entry(name: str, index: list[int], is_field: bool) -> str:
+    """An entry of the parameter `name` in words, its `index` in world order.
+
+    Places are the last three numbers of the index into a field, the last two of that into a map.
     """
     if is_field:
         *color, z, y, x = index
-        return f"{name} at voxel [{x}, {y}, {z}]{_color(color)}"
+        return f"{name} at voxel [{x}, {y}, {z}]{_name_color(color)}"
     if len(index) == 3:
-        return f"{name} at pixel [{index[2]}, {index[1]}]{_color(index[:1])}"
+        return f"{name} at pixel [{index[2]}, {index[1]}]{_name_color(index[:1])}"
     return f"{name}, entry {index}" if index else name
 
 
-def _color(index: list[int]) -> str:
+def _name_color(index: list[int]) -> str:
     return f", color {index[0]}" if index else ""

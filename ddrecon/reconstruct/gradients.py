@@ -1,4 +1,4 @@
-"""The derivative of the image loss with respect to everything that is optimized, view by view.
+"""The derivative of the image loss by everything that is optimized, view by view.
 
 The light inside the volume is solved once and held as if it were given; each view's derivative goes
 back to it at once and is added up there, and the sum goes back through the solve. So memory does
@@ -23,9 +23,7 @@ from ddrecon.variables.values import with_values
 
 @dataclass(frozen=True)
 class Differentiated:
-    """Rendered `images` [3, h, w] of the views, the `loss`, and its derivative with respect to each
-    value, by name.
-    """
+    """Rendered `images` [3, h, w] of the views, their `loss`, and its derivatives by name."""
 
     images: list[Tensor]
     loss: Tensor
@@ -39,39 +37,36 @@ def differentiate(
     loss_of: Callable[[View, Tensor], Tensor],
     memory: SolveMemory,
 ) -> Differentiated:
-    """The sum over the views called `names` of `loss_of(view, image)`, and its derivatives with
-    respect to the leaves `values`.
+    """The sum of `loss_of(view, image)` over the views called `names`, and its derivatives.
+
+    They are those by the leaves `values`, which stand in `scene` for the variables of their names.
     """
     derivatives = scene.optimize.derivatives if scene.optimize else "all"
-    light_field = solve_light(with_values(scene, values), memory)
-    held = _Held()
-    given = held.hold(light_field)
+    # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
+    cut = _Cut()
+    light_field = cut.cut(solve_light(with_values(scene, values), memory))
+    # Each view's derivative, by the values and by the leaves, added up at once.
     outside = {name: value for name, value in values.items() if name not in VOLUME}
-    images, loss = (
-        [],
-        torch.zeros((), dtype=scene.volume.density.dtype, device=scene.volume.density.device),
-    )
-    leaves = [*values.values(), *held.leaves]
-    totals: list[Tensor | None] = [None] * len(leaves)
+    inputs = [*values.values(), *cut.leaves]
+    sums: list[Tensor | None] = [None] * len(inputs)
+    images, loss = list[Tensor](), scene.volume.density.new_zeros(())
     for name in names:
-        world = with_values(scene, outside)
-        view = world.view(name)
-        image = view_image(given, world, view.camera, derivatives)
-        part = loss_of(view, image)
-        if part.requires_grad:
-            totals = _add(totals, torch.autograd.grad(part, leaves, allow_unused=True))
+        lit = with_values(scene, outside)
+        view = lit.view(name)
+        image = view_image(light_field, lit, view.camera, derivatives)
+        view_loss = loss_of(view, image)
+        if view_loss.requires_grad:
+            sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))
         images.append(image.detach())
-        loss = loss + part.detach()
-    direct, bars = totals[: len(values)], totals[len(values) :]
-    reached = [
-        (tensor, bar) for tensor, bar in zip(held.tensors, bars, strict=True) if bar is not None
-    ]
+        loss = loss + view_loss.detach()
+    direct, leaf_bars = sums[: len(values)], sums[len(values) :]
+    # What reached the leaves goes back through the light field, and so through the solve (E9).
+    reached = [pair for pair in zip(cut.tensors, leaf_bars, strict=True) if pair[1] is not None]
     if reached:
-        tensors, given_bars = zip(*reached, strict=True)
-        direct = _add(
-            direct,
-            torch.autograd.grad(tensors, list(values.values()), given_bars, allow_unused=True),
-        )
+        tensors, bars = zip(*reached, strict=True)
+        through_light = torch.autograd.grad(tensors, inputs[: len(values)], bars, allow_unused=True)
+        # The derivative is the sum of both ways.
+        direct = _add(direct, through_light)
     gradients = {
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
@@ -79,33 +74,30 @@ def differentiate(
     return Differentiated(images, loss, gradients)
 
 
-def _add(totals: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
+def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """Entry by entry; None is zero."""
     return [
         one if other is None else other if one is None else one + other
-        for one, other in zip(totals, more, strict=True)
+        for one, other in zip(sums, more, strict=True)
     ]
 
 
-class _Held:
-    """Records rebuilt with leaves in place of the tensors that depend on something: `tensors`, and
-    the `leaves` that stand for them.
-    """
+class _Cut:
+    """Where a graph is cut: the `tensors` before it, and the `leaves` that stand for them."""
 
     def __init__(self) -> None:
         self.tensors: list[Tensor] = []
         self.leaves: list[Tensor] = []
 
-    def hold(self, record: Any) -> Any:
+    def cut(self, record: Any) -> Any:
         """`record` with leaves inside; a tensor that occurs twice becomes one leaf."""
         if isinstance(record, Tensor):
             return self._leaf(record) if record.requires_grad else record
         if isinstance(record, tuple):
-            return tuple(self.hold(entry) for entry in record)
+            return tuple(self.cut(entry) for entry in record)
         if is_dataclass(record) and not isinstance(record, type):
-            return replace(
-                record,
-                **{field.name: self.hold(getattr(record, field.name)) for field in fields(record)},
-            )
+            parts = {part.name: self.cut(getattr(record, part.name)) for part in fields(record)}
+            return replace(record, **parts)
         return record
 
     def _leaf(self, tensor: Tensor) -> Tensor:

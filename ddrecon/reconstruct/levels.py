@@ -1,6 +1,4 @@
-"""Coarse to fine: the same scene with fewer cells and pixels, and fields carried from one
-resolution to the next.
-"""
+"""Coarse to fine: a scene with fewer cells and pixels, and fields carried between resolutions."""
 
 from __future__ import annotations
 
@@ -19,28 +17,25 @@ FEWEST_PIXELS = 16
 
 
 def factors(scene: Scene, refine_at: tuple[float, ...]) -> list[int]:
-    """The coarsening factor of each stage, the last of them 1; stages too coarse for the scene's
-    grid take the coarsest that fits.
+    """The coarsening factor of each stage, the last of them 1.
+
+    Stages too coarse for the scene's grid take the coarsest factor that fits.
     """
     longest = max(scene.volume.grid.shape)
-    fits = [
-        factor
-        for factor in (2**k for k in range(len(refine_at), -1, -1))
-        if longest // factor >= FEWEST_CELLS or factor == 1
-    ]
-    return [max(fits[0], 1)] * (len(refine_at) + 1 - len(fits)) + fits
+    powers = (2**k for k in range(len(refine_at), -1, -1))
+    fits = [power for power in powers if longest // power >= FEWEST_CELLS or power == 1]
+    return [fits[0]] * (len(refine_at) + 1 - len(fits)) + fits
 
 
 def stage_of(iteration: int, iterations: int, refine_at: tuple[float, ...]) -> int:
-    """The stage that `iteration` of `iterations` belongs to: how many fractions of `refine_at` it
-    has passed.
-    """
+    """The stage of `iteration`: how many fractions of `refine_at` have passed by then."""
     return sum(iteration >= round(fraction * iterations) for fraction in refine_at)
 
 
 def scene_at_level(scene: Scene, factor: int) -> Scene:
-    """`scene` with about `factor` times fewer cells and pixels along each side; targets are
-    averaged over the larger pixels.
+    """`scene` with about `factor` times fewer cells and pixels along each side.
+
+    Targets are averaged over the larger pixels.
     """
     if factor == 1:
         return scene
@@ -55,17 +50,18 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:
-    """`field` [..., z, y, x] on `grid` over the same box: averaged where `grid` is coarser,
-    trilinearly interpolated where finer.
+    """`field` [..., z, y, x] on `grid`, which spans the same box.
+
+    It is averaged where `grid` is coarser, trilinearly interpolated where it is finer.
     """
     if tuple(field.shape[-3:]) == grid.shape:
         return field
     colors = field.reshape(1, -1, *field.shape[-3:])
     if colors[0, 0].numel() > grid.cells:
-        changed = adaptive_avg_pool3d(colors, grid.shape)
+        resampled = adaptive_avg_pool3d(colors, grid.shape)
     else:
-        changed = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
-    return changed.view(*field.shape[:-3], *grid.shape)
+        resampled = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
+    return resampled.view(*field.shape[:-3], *grid.shape)
 
 
 def _resample_cross_section(sigma: Tensor, grid: Grid) -> Tensor:
@@ -73,19 +69,12 @@ def _resample_cross_section(sigma: Tensor, grid: Grid) -> Tensor:
 
 
 def _view_at_level(view: View, factor: int) -> View:
-    factor = max(
-        [
-            f
-            for f in (2**k for k in range(factor.bit_length()))
-            if f <= factor and min(view.camera.size) // f >= FEWEST_PIXELS
-        ],
-        default=1,
-    )
-    camera = view.camera.resize(factor)
-    image = adaptive_avg_pool2d(view.image, camera.size) if view.image is not None else None
-    mask = (
-        (adaptive_avg_pool2d(view.mask[None], camera.size)[0] > 0.5).to(view.mask.dtype)
-        if view.mask is not None
-        else None
-    )
+    """`view` with up to `factor` times fewer pixels, a power of two, along each side."""
+    powers = (2**k for k in range(factor.bit_length()))
+    fits = [power for power in powers if min(view.camera.size) // power >= FEWEST_PIXELS]
+    camera, image, mask = view.camera.resize(max(fits, default=1)), view.image, view.mask
+    if image is not None:
+        image = adaptive_avg_pool2d(image, camera.size)
+    if mask is not None:
+        mask = (adaptive_avg_pool2d(mask[None], camera.size)[0] > 0.5).to(mask.dtype)
     return replace(view, camera=camera, image=image, mask=mask)

@@ -1,6 +1,4 @@
-"""What is optimized: a value with its bounds and regularizers, its Adam state, and its way through
-the resolutions.
-"""
+"""What is optimized: a value with its bounds and penalties, its Adam state and its resolution."""
 
 from __future__ import annotations
 
@@ -8,7 +6,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.optim.adam import adam
 
 from ddrecon.grid import Grid
 from ddrecon.losses import total_variation
@@ -17,21 +14,22 @@ from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 
 BETAS = (0.9, 0.99)
-"""Decay of Adam's first and second moments; the second forgets sooner than customary, since runs
-are short.
+"""How much Adam's first and second moments keep of themselves in a step.
+
+The second forgets sooner than customary, since runs are short.
 """
-TINY = 1e-15
-"""Adam's epsilon: derivatives of a mean over pixels with respect to one cell are far smaller than
-the customary 1e-8.
+EPSILON = 1e-15
+"""Adam's bound on the size of a derivative.
+
+That of a mean over pixels with respect to one cell is far smaller than the customary 1e-8.
 """
 
 
 class Parameter:
-    """The value of one variable and the optimizer that moves it (Adam: Kingma and Ba 2015,
-    arXiv:1412.6980), within its bounds.
+    """The value of one variable, and the optimizer that moves it within its bounds.
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
-    every resolution.
+    every resolution. The optimizer is Adam (Kingma and Ba 2015, arXiv:1412.6980).
     """
 
     def __init__(
@@ -50,8 +48,9 @@ class Parameter:
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
     def penalty(self) -> Tensor:
-        """What its regularizers add to the loss, in units of the targets' mean square; see
-        `ParameterSettings`.
+        """What its regularizers add to the loss, in units of the targets' mean square.
+
+        See `ParameterSettings` for the weights.
         """
         total = self.value.new_zeros(())
         if self.tv:
@@ -59,51 +58,50 @@ class Parameter:
         return total + self.l1 * self.value.abs().mean() if self.l1 else total
 
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Moves the value against `gradient` by `rate` times its learning rate, and back within its
-        bounds.
+        """Moves the value against `gradient`, and back within its bounds.
+
+        `rate` is the part of its learning rate that counts now. With m and v the running means of
+        the derivative and of its square, each divided by the part of 1 that their weights sum to,
+        Adam moves the value by -rate m / (sqrt(v) + epsilon).
         """
         length = self.value.detach().norm()
         first, second = self.moments
         with torch.no_grad():
-            adam(
-                [self.value],
-                [gradient],
-                [first],
-                [second],
-                [],
-                [self.steps],
-                amsgrad=False,
-                beta1=BETAS[0],
-                beta2=BETAS[1],
-                lr=rate * self.rate,
-                weight_decay=0.0,
-                eps=TINY,
-                maximize=False,
-            )
+            self.steps += 1
+            weights = [1 - beta ** float(self.steps) for beta in BETAS]
+            first.lerp_(gradient, 1 - BETAS[0])
+            second.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
+            size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
+            self.value.addcdiv_(first, size, value=-(rate * self.rate / weights[0]))
             self.value.clamp_(self.low, self.high)
             if self.is_direction:
                 self.value.mul_(length / self.value.norm())
 
+    def value_on(self, grid: Grid) -> Tensor:
+        """A copy of its value, on `grid` where it is a field."""
+        value = self.value.detach()
+        return (resample(value, grid) if self.is_field else value).clone()
+
     def refine(self, grid: Grid) -> None:
-        """Carries field and moments to `grid`; a derivative with respect to a cell shrinks with the
-        cell's volume.
+        """Carries field and moments to `grid`.
+
+        A derivative with respect to a cell shrinks with the cell's volume.
         """
-        share = self.grid.cells / grid.cells
+        volume_ratio = self.grid.cells / grid.cells
         self.grid = grid
         if not self.is_field:
             return
-        self.value = resample(self.value.detach(), grid).clone().requires_grad_()
+        self.value = self.value_on(grid).requires_grad_()
         first, second = (resample(moment, grid) for moment in self.moments)
-        self.moments = first * share, second * share**2
+        self.moments = first * volume_ratio, second * volume_ratio**2
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it, untouched by further steps."""
-        moments = [moment.clone() for moment in self.moments]
         return {
             "value": self.value.detach().clone(),
             "shape": list(self.grid.shape),
             "steps": self.steps.clone(),
-            "moments": moments,
+            "moments": [moment.clone() for moment in self.moments],
         }
 
     def restore(self, state: dict[str, Any]) -> None:

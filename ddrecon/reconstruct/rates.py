@@ -1,6 +1,4 @@
-"""How fast parameters move: learning rates where a scene gives none, and how they change over a
-run.
-"""
+"""How fast parameters move: learning rates where a scene gives none, and their way over a run."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ FINAL_RATE = 0.2
 
 
 def rate_at(iteration: int, iterations: int) -> float:
-    """The part of their value that learning rates have in `iteration` of `iterations`, in (0, 1]."""
+    """The part of their value that learning rates have in an iteration, in (0, 1]."""
     warm_up: float = min(1.0, (iteration + 1) / WARM_UP)
     fall: float = FINAL_RATE ** (iteration / iterations)
     return warm_up * fall

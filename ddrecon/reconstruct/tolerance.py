@@ -13,7 +13,8 @@ GRADIENT_ERROR = 0.01
 
 
 def solve_tolerances(misfit: float) -> dict[str, float]:
-    """By kind of solve, the tolerance [relative residual] that is enough at `misfit` >= 0, of the
-    last images that were compared.
+    """The relative residual at which each kind of solve may stop, by kind.
+
+    `misfit` >= 0 is that of the last images that were compared.
     """
     return {"forward": GRADIENT_ERROR * min(misfit, 1.0), "adjoint": GRADIENT_ERROR}

@@ -6,17 +6,21 @@ import torch
 
 
 def pick_views(count: int, wanted: int, iteration: int, seed: int) -> list[int]:
-    """Which of `count` views `iteration` looks at: `wanted` of them (0: all), every view once
-    before any comes again, ordered by `seed`.
+    """The numbers of the views, of `count`, that `iteration` compares.
+
+    They are `wanted` views (0: all). Every view comes once before any comes again, in an order that
+    `seed` decides.
     """
     if not 0 < wanted < count:
         return list(range(count))
-    seed, places = seed % 2**32, range(iteration * wanted, (iteration + 1) * wanted)
-    rounds = {place // count for place in places}
-    orders = {
-        turn: torch.randperm(
-            count, generator=torch.Generator().manual_seed(seed * 1_000_003 + turn)
-        ).tolist()
-        for turn in rounds
-    }
+    # Over a run, views are taken from shuffled passes over all of them, one after another.
+    places = range(iteration * wanted, (iteration + 1) * wanted)
+    orders = {number: _shuffle(count, seed, number) for number in {i // count for i in places}}
     return [orders[place // count][place % count] for place in places]
+
+
+def _shuffle(count: int, seed: int, number: int) -> list[int]:
+    """The order of `count` views in pass `number` over them."""
+    generator = torch.Generator().manual_seed(seed % 2**32 * 1_000_003 + number)
+    order: list[int] = torch.randperm(count, generator=generator).tolist()
+    return order

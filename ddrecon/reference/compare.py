@@ -156,3 +156,23 @@ def _write(stem: Path, ours: Tensor, theirs: Tensor) -> list[Path]:
         for path in write_picture(Path(f"{stem}.{kind}"), array, preview)
     ]
     return [*written, beside]
+
+
+def reference_lines(report: dict[str, Any], folder: Path) -> list[str]:
+    """What `reference` prints of its `report`: how far ours is from theirs, and how long both took.
+
+    An error below a third of the reference's noise cannot be told from none.
+    """
+    lines = []
+    for name, view in report["views"].items():
+        noise, notes = view["noise"], [f"noise {view['noise']:.3f}"]
+        if "error" in view:
+            error = f"{view['error']:.3f}" if view["error"] >= noise / 3 else f"< {noise / 3:.3f}"
+            distance = f"with the reference's noise, {noise:.3f}: {view['distance']:.3f}"
+            notes = [f"relative RMS error {error} ({distance})", f"PSNR {view['psnr']:.1f} dB"]
+            if view["brightness"] is not None:
+                notes.append(f"brightness {view['brightness']:.3f} of the reference's")
+        times = ", ".join(f"{who} {seconds:.2f} s" for who, seconds in view["seconds"].items())
+        lines.append(f"{name}: {', '.join(notes)} ({times})")
+    samples, mitsuba = report["settings"]["samples_per_pixel"], report["environment"]["mitsuba"]
+    return [*lines, f"{samples} paths a pixel, Mitsuba {mitsuba}", f"written to {folder}"]

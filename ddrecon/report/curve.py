@@ -1,5 +1,6 @@
-"""Curves as SVG within a page. (matplotlib is an extra and takes seconds to start; a report is
-written after every run.)
+"""Curves as SVG within a page.
+
+matplotlib is an extra and takes seconds to start; a report is written after every run.
 """
 
 from __future__ import annotations
@@ -21,56 +22,44 @@ MOST = 500
 def draw_curve(
     title: str, series: Mapping[str, Sequence[Point]], across: str, is_logarithmic: bool = False
 ) -> str:
-    """The `series` of points (x, y) as lines, with a legend; `across` says what x is.
-    `is_logarithmic`: y by its logarithm, if > 0.
+    """The `series` of points (x, y) as lines of an SVG with a legend; `across` says what x is.
 
-    There must be at least one point; those that are not finite are left out.
+    With `is_logarithmic`, y > 0 is drawn by its logarithm. There must be at least one point; those
+    that are not finite are left out.
     """
-    drawn = {
-        name: _thin([p for p in points if _is_shown(p[1], is_logarithmic)])
-        for name, points in series.items()
-    }
+    # What is drawn: thinned, and by its logarithm where asked for.
+    drawn = {name: _thin(_drawable(points, is_logarithmic)) for name, points in series.items()}
     drawn = {name: points for name, points in drawn.items() if points}
     xs = [x for points in drawn.values() for x, _ in points] or [0.0]
-    ys = [
-        math.log10(y) if is_logarithmic else y for points in drawn.values() for _, y in points
-    ] or [0.0]
-    horizontal, vertical = (
-        _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT),
-        _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP),
-    )
+    ys = [y for points in drawn.values() for _, y in points] or [0.0]
+    horizontal = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT)
+    vertical = _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP)
     parts = [_text(LEFT, 16, title, "start", bold=True)]
+    # A line across for every round value of y, a number below for every one of x.
     for value in (logarithmic_ticks if is_logarithmic else ticks)(vertical.low, vertical.high):
-        y = vertical.place(value)
-        parts += [
-            _line(LEFT, y, WIDTH - RIGHT, y, 0.2),
-            _text(LEFT - 6, y + 4, f"{10**value if is_logarithmic else value:.4g}", "end"),
-        ]
+        y, label = vertical.place(value), f"{10**value if is_logarithmic else value:.4g}"
+        parts.append(_line(LEFT, y, WIDTH - RIGHT, y, 0.2))
+        parts.append(_text(LEFT - 6, y + 4, label, "end"))
     for value in ticks(horizontal.low, horizontal.high):
         parts.append(_text(horizontal.place(value), HEIGHT - BOTTOM + 17, f"{value:.6g}", "middle"))
-    parts += [
-        _line(LEFT, HEIGHT - BOTTOM, WIDTH - RIGHT, HEIGHT - BOTTOM, 0.7),
-        _text(WIDTH - RIGHT, HEIGHT - 6, across, "end"),
-    ]
+    parts.append(_line(LEFT, HEIGHT - BOTTOM, WIDTH - RIGHT, HEIGHT - BOTTOM, 0.7))
+    parts.append(_text(WIDTH - RIGHT, HEIGHT - 6, across, "end"))
+    # The curves, and their names in the legend.
     for index, (name, points) in enumerate(drawn.items()):
         color = COLORS[index % len(COLORS)]
-        placed = [
-            (horizontal.place(x), vertical.place(math.log10(y) if is_logarithmic else y))
-            for x, y in points
-        ]
-        parts.append(_path(placed, color))
+        parts.append(_path([(horizontal.place(x), vertical.place(y)) for x, y in points], color))
         parts.append(_text(WIDTH - RIGHT - LEGEND * index, 16, name, "end", color=color))
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">{"".join(parts)}</svg>'
+    label = f'role="img" aria-label="{escape(title)}"'
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" {label}>{"".join(parts)}</svg>'
 
 
 class _Axis:
     """Values from `low` to `high` at places from `first` to `last`."""
 
     def __init__(self, low: float, high: float, first: float, last: float):
-        middle, half = (
-            (low + high) / 2,
-            max((high - low) / 2, 1e-9 * max(abs(low), abs(high), 1e-3)),
-        )
+        # A range of one value is widened, so that it has a middle and ticks.
+        middle = (low + high) / 2
+        half = max((high - low) / 2, 1e-9 * max(abs(low), abs(high), 1e-3))
         self.low, self.high, self.first, self.last = middle - half, middle + half, first, last
 
     def place(self, value: float) -> float:
@@ -88,19 +77,22 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def logarithmic_ticks(low: float, high: float) -> list[float]:
-    """The decimal logarithms of some round values in [10^`low`, 10^`high`], `low` < `high`: 1, 2,
-    5, 10, ..., or powers of ten.
+    """The decimal logarithms of round values in [10^`low`, 10^`high`], `low` < `high`.
+
+    They are 1, 2, 5, 10, ..., or powers of ten.
     """
     decades = range(math.floor(low), math.ceil(high) + 1)
     factors = (1, 2, 5) if high - low < 2 else (1,)
     every = -(-len(decades) // 6)
-    found = [decade + math.log10(factor) for decade in decades[::every] for factor in factors]
-    inside = [value for value in found if low - 1e-9 <= value <= high + 1e-9]
+    values = [decade + math.log10(factor) for decade in decades[::every] for factor in factors]
+    inside = [value for value in values if low - 1e-9 <= value <= high + 1e-9]
     return inside or ticks(low, high)
 
 
-def _is_shown(y: float, is_logarithmic: bool) -> bool:
-    return math.isfinite(y) and (y > 0 or not is_logarithmic)
+def _drawable(points: Sequence[Point], is_logarithmic: bool) -> list[Point]:
+    """Those of `points` that are finite, and if `is_logarithmic` log10 of their y > 0."""
+    finite = [(x, y) for x, y in points if math.isfinite(y)]
+    return [(x, math.log10(y)) for x, y in finite if y > 0] if is_logarithmic else finite
 
 
 def _thin(points: Sequence[Point]) -> list[Point]:
@@ -118,11 +110,13 @@ def _path(places: Sequence[Point], color: str) -> str:
 
 
 def _line(x1: float, y1: float, x2: float, y2: float, opacity: float) -> str:
-    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="currentColor" stroke-opacity="{opacity}"/>'
+    ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
+    return f'<line {ends} stroke="currentColor" stroke-opacity="{opacity}"/>'
 
 
 def _text(
     x: float, y: float, text: str, anchor: str, color: str = "currentColor", bold: bool = False
 ) -> str:
     weight = ' font-weight="600"' if bold else ""
-    return f'<text x="{x:.1f}" y="{y:.1f}" font-size="12.5" text-anchor="{anchor}" fill="{color}"{weight}>{escape(text)}</text>'
+    style = f'font-size="12.5" text-anchor="{anchor}" fill="{color}"{weight}'
+    return f'<text x="{x:.1f}" y="{y:.1f}" {style}>{escape(text)}</text>'

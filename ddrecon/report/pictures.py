@@ -1,5 +1,6 @@
-"""Pictures of a run: targets beside renders beside differences, and slices of the volume. Arrays
-here are numpy, [h, w, 3].
+"""Pictures of a run: targets, renders and differences side by side, and slices of volumes.
+
+Arrays here are numpy, [h, w, 3].
 """
 
 from __future__ import annotations
@@ -25,31 +26,34 @@ def pixels(image: Tensor) -> np.ndarray:
 
 
 def find_white(image: np.ndarray) -> float:
-    """The radiance that is shown as white: that of the brightest pixels of `image` [h, w, 3], but
-    for one in a thousand.
+    """The radiance that is shown as white in `image` [h, w, 3].
+
+    It is that of the brightest pixels, but for one in a thousand.
     """
     return max(float(np.quantile(image.max(-1), 0.999)), 1e-6)
 
 
 def comparison(target: Tensor, image: Tensor) -> np.ndarray:
-    """Target, render and enlarged difference side by side; brightness scaled so that the target's
-    brightest pixels are just white.
+    """Target, render and enlarged difference side by side.
+
+    Brightness is scaled so that the target's brightest pixels are just white.
     """
-    wanted, got = pixels(target), pixels(image)
-    white = find_white(wanted)
-    difference = np.clip(0.5 + ENLARGED * (got - wanted) / (2 * white), 0, 1) ** 2.2
-    return place_beside([wanted / white, got / white, difference])
+    expected, rendered = pixels(target), pixels(image)
+    white = find_white(expected)
+    # Previews encode by a gamma of about 2.2, so that no difference is mid-gray.
+    difference = np.clip(0.5 + ENLARGED * (rendered - expected) / (2 * white), 0, 1) ** 2.2
+    return place_beside([expected / white, rendered / white, difference])
 
 
 def slices(field: Tensor) -> np.ndarray:
-    """The middle slices of `field` [z, y, x] or [C, z, y, x] across z, x and y, with y (or z)
-    upwards; the largest value is white.
+    """The middle slices of `field` [z, y, x] or [C, z, y, x] across z, x and y.
+
+    y (or z) is up; the largest value is white.
     """
     array = _cells_of(field)
     z, y, x = (size // 2 for size in array.shape[:3])
-    return _three_sides(
-        [array[z], array[:, :, x], array[:, y]], max(float(np.quantile(array, 0.999)), 1e-6)
-    )
+    white = max(float(np.quantile(array, 0.999)), 1e-6)
+    return _three_sides([array[z], array[:, :, x], array[:, y]], white)
 
 
 def projections(field: Tensor) -> np.ndarray:
@@ -62,31 +66,33 @@ def projections(field: Tensor) -> np.ndarray:
 def _cells_of(field: Tensor) -> np.ndarray:
     """`field` as float32 [z, y, x, 3]."""
     colors = field if field.ndim == 4 else field[None]
-    array: np.ndarray = (
-        colors.detach().expand(3, -1, -1, -1).permute(1, 2, 3, 0).float().cpu().numpy()
-    )
+    cells = colors.detach().expand(3, -1, -1, -1).permute(1, 2, 3, 0)
+    array: np.ndarray = cells.float().cpu().numpy()
     return array
 
 
 def _three_sides(sides: list[np.ndarray], white: float) -> np.ndarray:
-    """Sides [y, x], [z, y] and [z, x], each with colors, as pictures in a row: y to the top, or z
-    where there is no y.
+    """Sides [y, x], [z, y] and [z, x], each with colors, as pictures in a row.
+
+    y is up, or z where there is no y.
     """
     across_z, across_x, across_y = (side / white for side in sides)
     return place_beside([across_z[::-1], across_x[:, ::-1].transpose(1, 0, 2), across_y[::-1]])
 
 
 def shrink(image: Tensor, most: int) -> Tensor:
-    """`image` [3, h, w] with so many fewer pixels, means of squares of them, that neither side has
-    more than `most`.
+    """`image` [3, h, w], so much smaller that neither side has more than `most` pixels.
+
+    Pixels are the means of squares of pixels.
     """
     factor = -(-max(image.shape[1:]) // most)
     return image if factor == 1 else avg_pool2d(image, factor, ceil_mode=True)
 
 
 def diverging(image: Tensor) -> tuple[np.ndarray, float]:
-    """Signed `image` [3, h, w], averaged over colors, in blue (negative), white (zero) and red; and
-    the value of full red.
+    """Signed `image` [3, h, w], its colors averaged, as a picture; and the value of full red.
+
+    Negative is blue, zero white.
     """
     values = pixels(image).mean(-1)
     full = max(float(np.quantile(np.abs(values), 0.999)), float(np.finfo(np.float32).tiny))

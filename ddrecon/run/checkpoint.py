@@ -1,6 +1,4 @@
-"""Checkpoints: the state of a run in one file of tensors and plain values, never a pickle of
-anything else. The last two are kept.
-"""
+"""Checkpoints: files of tensors and plain values that hold the state of a run; two are kept."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from typing import Any
 
 import torch
 
-from ddrecon.errors import DataWarning, FormatError, SceneError
+from ddrecon.errors import DataWarning, FormatError, UsageError
 from ddrecon.io.files.atomic import replace_file_durably
 from ddrecon.run.differences import differences
 
@@ -20,12 +18,13 @@ FORMAT = 3
 """What a checkpoint holds; counts up when that changes."""
 LAST, PREVIOUS = "last.pt", "previous.pt"
 """The names of the last checkpoint and of the one before it."""
+ANEW = "start anew with --overwrite"
+UNUSABLE = f"not a usable checkpoint; {ANEW}"
+"""What is wrong with a damaged checkpoint, and what to do."""
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any]) -> None:
-    """Writes `state`, and a description of the `scene` it belongs to, as the last checkpoint in
-    `folder`.
-    """
+    """Writes `state` as the last checkpoint in `folder`, with what describes its `scene`."""
     with (
         replace_file_durably(folder / LAST, kept_as=folder / PREVIOUS) as temporary,
         temporary.open("wb") as stream,
@@ -37,15 +36,14 @@ def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any
 
 
 def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
-    """The state in the last checkpoint in `folder`, or in the one before it where that is damaged,
-    with a warning; and its file.
+    """The state in the last checkpoint in `folder`, and its file.
 
-    Raises FormatError if neither can be used, SceneError if there is none, or it is not of this
-    `scene`.
+    Where that is damaged, it is the one before it, with a warning. Raises FormatError if neither
+    can be used, UsageError if there is none or it is not of this `scene`.
     """
     last, previous = folder / LAST, folder / PREVIOUS
     if not last.exists() and not previous.exists():
-        raise SceneError(f"{last}: there is no checkpoint to resume from; run without --resume")
+        raise UsageError(f"{last}: there is no checkpoint to resume from; run without --resume")
     try:
         return _check(last, _load(last), scene), last
     except FormatError as error:
@@ -67,19 +65,19 @@ def forget_checkpoints(folder: Path) -> None:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    """What is in the file at `path`: torch itself does not notice changed bytes, but they are in a
-    zip archive with checksums.
-    """
+    """What is in the file at `path`; raises FormatError where it cannot be used."""
     if not path.is_file():
-        raise FormatError(path, "is missing; start anew with --overwrite")
+        raise FormatError(path, f"is missing; {ANEW}")
     try:
+        # torch itself does not notice changed bytes, but they are in a zip archive with checksums.
         with zipfile.ZipFile(path) as archive:
             is_whole = archive.testzip() is None
+        # Tensors and plain values alone: any other pickle could run code.
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever its reader stumbles on
-        raise FormatError(path, "not a usable checkpoint; start anew with --overwrite") from error
+        raise FormatError(path, UNUSABLE) from error
     if not is_whole or not isinstance(content, dict):
-        raise FormatError(path, "not a usable checkpoint; start anew with --overwrite")
+        raise FormatError(path, UNUSABLE)
     return content
 
 
@@ -87,11 +85,10 @@ def _check(path: Path, content: dict[str, Any], scene: Mapping[str, Any]) -> dic
     if content.get("format") != FORMAT:
         written = content.get("format")
         raise FormatError(
-            path,
-            f"a checkpoint of format {written}; this version reads {FORMAT}; start anew with --overwrite",
+            path, f"a checkpoint of format {written}; this version reads {FORMAT}; {ANEW}"
         )
     if changes := differences(content["scene"], scene):
-        raise SceneError(
+        raise UsageError(
             [
                 f"{path}: belongs to another scene: {change}; use another output folder"
                 for change in changes

@@ -1,4 +1,4 @@
-"""What a run's result depends on, described in plain values, and how two such descriptions differ."""
+"""What a run's result depends on, in plain values, and how two such descriptions differ."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
 
 
 def differences(old: Any, new: Any) -> list[str]:
-    """One text a difference between two trees of mappings, lists and plain values: `key.path is A
-    there, B now`.
+    """The differences between two trees of mappings, lists and plain values, a text for each.
+
+    A text reads `key.path is A there, B now`.
     """
     return [
-        f"{key} is {_shown(before)} there, {_shown(after)} now"
+        f"{key} is {_shorten(before)} there, {_shorten(after)} now"
         for key, before, after in _changes("", old, new)
     ]
 
@@ -59,8 +60,9 @@ def _changes(key: str, old: Any, new: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _entries(value: Any) -> Mapping[Any, Any] | None:
-    """The children of `value` by name or number; None if it has none, or is a list of numbers,
-    which is shown whole.
+    """The children of `value` by name or number; None if it has none.
+
+    A list of numbers counts as one value, and is shown whole.
     """
     if isinstance(value, Mapping):
         return value
@@ -69,7 +71,7 @@ def _entries(value: Any) -> Mapping[Any, Any] | None:
     return None
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     if value is ABSENT:
         return "absent"
     text = json.dumps(value)

@@ -1,6 +1,4 @@
-"""Driving a reconstruction to its end: one progress line, the log, previews, and nothing lost on
-the way.
-"""
+"""A reconstruction driven to its end: progress, the log, previews, and nothing lost on the way."""
 
 from __future__ import annotations
 
@@ -14,11 +12,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ddrecon.errors import DivergenceError, FormatError, SceneError
+from ddrecon.errors import DivergenceError, FormatError, SceneError, UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
-from ddrecon.reconstruct.loop import Reconstruction, Row
-from ddrecon.run.checkpoint import LAST, load_checkpoint
+from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
@@ -37,11 +36,11 @@ def open_run(
     may_exist: bool,
     resume: bool,
 ) -> Iterator[tuple[Reconstruction, RunFolder]]:
-    """A run of `scene` and its folder `path`, this process's alone until the block ends, with the
-    resolved scene and environment in it.
+    """A run of `scene` and its folder `path`, this process's alone until the block ends.
 
-    Raises SceneError for a folder that another process writes to or that is not empty, unless it
-    may be or the run goes on from the checkpoint in it.
+    The resolved scene and the `environment` are written there. Raises UsageError for a folder that
+    another process writes to or that is not empty, unless it may be or the run goes on from the
+    checkpoint in it; SceneError for a scene that cannot be reconstructed.
     """
     try:
         run = Reconstruction(scene)
@@ -66,10 +65,11 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     try:
         run.restore(state)
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        raise FormatError(loaded, "not a usable checkpoint; start anew with --overwrite") from error
+        raise FormatError(loaded, UNUSABLE) from error
     if run.iteration > run.settings.iterations:
-        raise SceneError(
-            f"{path}: {run.iteration} iterations are made already; ask for more than that, in all, with --iterations"
+        raise UsageError(
+            f"{path}: {run.iteration} iterations are made already; "
+            "ask for more than that, in all, with --iterations"
         )
     return loaded
 
@@ -81,9 +81,9 @@ def drive_run(
     is_quiet: bool,
     has_events: bool = False,
 ) -> dict[str, Any]:
-    """Advances `run` until it is done, writing to `folder`, with `has_events` for TensorBoard as
-    well; returns the summary.
+    """The summary of `run`, advanced until it is done, its results in `folder`.
 
+    `preview_every` counts iterations between pictures; `has_events` logs for TensorBoard as well.
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
     before it is passed on. So does a divergence; any other failure leaves the checkpoints written
     so far.
@@ -118,17 +118,18 @@ def drive_run(
                     )
     except DivergenceError as error:
         folder.save(run)
-        kept = folder.checkpoints / LAST
         raise error.with_advice(
-            f"the state after {run.iteration} iterations is kept in {kept}: go on from it with --resume"
+            f"the state after {run.iteration} iterations is kept in {folder.checkpoints / LAST}: "
+            "go on from it with --resume"
         ) from error
     return folder.finish(run)
 
 
 @contextmanager
 def defer_interrupt() -> Iterator[list[int]]:
-    """A list that fills when the process is asked to stop, so that an iteration is never torn;
-    asked twice, it stops at once.
+    """A list that fills when the process is asked to stop, so that no iteration is torn.
+
+    Asked twice, it stops at once.
     """
     asked: list[int] = []
 
@@ -146,8 +147,18 @@ def defer_interrupt() -> Iterator[list[int]]:
 
 
 def progress_text(total: Row, row: Row) -> str:
-    """Loss, PSNR of training and (last known) test views, and solver iterations, for the progress
-    line.
-    """
+    """The progress line: loss, PSNR of training and (last known) test views, solver iterations."""
     test = "" if total.test_psnr is None else f"/{total.test_psnr:.1f}"
-    return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {row.forward_iterations}+{row.adjoint_iterations}"
+    solves = f"{row.forward_iterations}+{row.adjoint_iterations}"
+    return f"loss {row.loss:.3g}, PSNR {row.psnr:.1f}{test} dB, solver {solves}"
+
+
+def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
+    """The `summary` of a run that is done, in `folder`, as lines."""
+    line = (
+        f"{summary['iterations']} iterations in {summary['seconds']:.1f} s: "
+        f"loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
+    )
+    if summary["test_psnr"] is not None:
+        line += f", test PSNR {summary['test_psnr']:.2f} dB"
+    return [line, f"density and all else written to {folder}"]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.extras import load_extra
-from ddrecon.reconstruct.loop import Row
+from ddrecon.reconstruct.log import Row
 
 FOLDER = "tensorboard"
 """Where a run's folder keeps its events."""
@@ -20,9 +20,7 @@ def require_tensorboard() -> None:
 
 
 class EventLog:
-    """Every number of the loss log as a scalar, by the name of its column; `writer` is
-    TensorBoard's.
-    """
+    """Every number of the loss log as a scalar, named as its column; `writer` is TensorBoard's."""
 
     def __init__(self, writer: Any):
         self.writer = writer
@@ -36,8 +34,9 @@ class EventLog:
 
 @contextmanager
 def event_log(folder: Path, made: int) -> Iterator[EventLog]:
-    """A log of events in the run's `folder`; those after iteration `made`, where a resumed run goes
-    on, are no longer shown.
+    """A log of events in the run's `folder`.
+
+    Those after iteration `made`, from which a resumed run goes on, are no longer shown.
     """
     from torch.utils.tensorboard import SummaryWriter
 

@@ -11,24 +11,27 @@ from typing import Any
 
 from ddrecon.errors import DataWarning
 from ddrecon.io.files.atomic import flush, refusals, replace_file
-from ddrecon.reconstruct.loop import Row
+from ddrecon.reconstruct.log import Row
 
 COLUMNS = [field.name for field in fields(Row)]
-KINDS: list[Callable[[str], Any]] = [
-    int,
-    float,
-    float,
-    float,
-    lambda text: float(text) if text else None,
-    int,
-    int,
-    int,
-]
-"""What the cells of a row are."""
+READERS: dict[str, Callable[[str], Any]] = {
+    "iteration": int,
+    "seconds": float,
+    "loss": float,
+    "psnr": float,
+    "test_psnr": lambda text: float(text) if text else None,
+    "forward_iterations": int,
+    "adjoint_iterations": int,
+    "cells": int,
+}
+"""What reads the text of a cell, by column."""
 
 
 class LossLog:
-    """The log in the file at `path`. Whatever writes raises FormatError where the system refuses."""
+    """The log in the file at `path`.
+
+    Whatever writes raises FormatError where the system refuses.
+    """
 
     def __init__(self, path: Path):
         self.path = path
@@ -38,8 +41,9 @@ class LossLog:
         self._write([])
 
     def cut(self, iteration: int) -> None:
-        """Takes rows after `iteration` away, where a resumed run goes on; warns where some before
-        it are missing.
+        """Removes the rows after `iteration`, where a resumed run goes on.
+
+        Warns where some before it are missing.
         """
         rows = self._read()[:iteration]
         if len(rows) < iteration:
@@ -60,7 +64,7 @@ class LossLog:
     def rows(self) -> list[Row]:
         """What was written."""
         return [
-            Row(*(kind(cell) for kind, cell in zip(KINDS, row, strict=True)))
+            Row(*(READERS[name](cell) for name, cell in zip(COLUMNS, row, strict=True)))
             for row in self._read()
         ]
 

@@ -1,10 +1,8 @@
-"""Rendered views as files: linear pixels, previews, derivative images, and a report of what it
-took.
-"""
+"""Rendered views as files: linear pixels, previews, derivative images, and a report of all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,25 +11,27 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import SceneError
+from ddrecon.errors import UsageError
+from ddrecon.extras import advice
 from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import psnr
+from ddrecon.progress import Progress
 from ddrecon.renderer import LightField, solve_light, view_components, view_image
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
+from ddrecon.turntable import place_turntable
 from ddrecon.variables.tangents import render_tangent, variation
 
 GRADIENT = "gradient"
 """Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""
-Progress = Callable[[list[View], str], Iterable[View]]
 
 
 def render_to_folder(
     scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Progress
 ) -> dict[str, Any]:
-    """Renders `views` of `scene` into `folder` and returns a report of it."""
+    """The report of rendering `views` of `scene`, with their components if wanted, to `folder`."""
     memory, files, seconds, quality = SolveMemory(), {}, {}, {}
     with torch.no_grad():
         start = perf_counter()
@@ -61,8 +61,9 @@ def render_gradient_to_folder(
     parameter: str,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Renders `views` of `scene` and their derivatives with respect to `parameter`, which
-    `require_variation` allows, into `folder`.
+    """As `render_to_folder`, with the images' derivatives with respect to `parameter`.
+
+    `require_variation` must allow it.
     """
     memory, scales = SolveMemory(), {}
     seconds: dict[str, Any] = {"views": {}}
@@ -97,9 +98,7 @@ def render_gradient_to_folder(
 
 
 def write_ring(views: list[View], folder: Path, has_mp4: bool) -> dict[str, Any]:
-    """Writes the images of `views` in `folder` as one movie, `ring.png` and where asked for
-    `ring.mp4`; what the report says of it.
-    """
+    """What the report says of the movie `ring.png`, and `ring.mp4`, of all `views` in `folder`."""
     images = [read_image(folder / f"{view.name}.npy").pixels for view in views]
     white = max(map(find_white, images))
     frames, written = encode_frames(images, white), ["ring.png"]
@@ -110,12 +109,37 @@ def write_ring(views: list[View], folder: Path, has_mp4: bool) -> dict[str, Any]
     return {"files": written, "white": white}
 
 
+def remove_targets(scene: Scene, views: list[View], count: int | None) -> Scene:
+    """`scene` with `views` alone, and without their target images.
+
+    With `count`, so many views around the volume from the first of `views` take their place.
+    """
+    if count is not None:
+        return replace(scene, views=place_turntable(scene, views[0], count))
+    return replace(scene, views=[View(view.name, view.camera) for view in views])
+
+
 def require_variation(scene: Scene, parameter: str) -> None:
-    """Raises SceneError unless `parameter` names a number of `scene` or a component of one."""
+    """Raises UsageError unless `parameter` names a number of `scene` or a component of one."""
     try:
         variation(scene, parameter)
     except KeyError as error:
-        raise SceneError(f"--gradient {parameter}: {error.args[0]}") from None
+        raise UsageError(f"--gradient {parameter}: {error.args[0]}") from None
+
+
+def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
+    """What `render` prints of its `report`: files, quality and time of each view."""
+    lines = []
+    for name, files in report["files"].items():
+        notes = [f"{report['seconds']['views'][name]:.2f} s"]
+        notes += [f"PSNR {report['psnr'][name]:.1f} dB"] if name in report["psnr"] else []
+        lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
+    if any(file.endswith(".tif") for files in report["files"].values() for file in files):
+        lines.append(f"float .tif instead of .exr: EXR {advice('OpenEXR')}")
+    if "ring" in report:
+        files, white = ", ".join(report["ring"]["files"]), report["ring"]["white"]
+        lines.append(f"around: {files} (radiance {white:.3g} is white)")
+    return [*lines, f"written to {folder}"]
 
 
 def _report(

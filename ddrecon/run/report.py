@@ -1,4 +1,4 @@
-"""The report of a finished reconstruction: `report.html`, curves, pictures and tables in one file."""
+"""The report of a finished reconstruction, `report.html`: curves, pictures and tables."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ddrecon.io.images.movies import animation_of, encode_frames
 from ddrecon.io.images.table import png_of
-from ddrecon.reconstruct.loop import Row
+from ddrecon.reconstruct.log import Row
 from ddrecon.renderer import LightField, view_image
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
@@ -40,12 +40,20 @@ LARGEST = 256
 FRAMES, FRAME = 12, 96
 """Pictures of the turntable, and pixels along their longer side, at most."""
 
+TIMING_HEAD = [
+    "cells",
+    "iterations",
+    "seconds each (median)",
+    "seconds",
+    "forward solve, iterations",
+    "adjoint solve, iterations",
+]
+"""The columns of the table of timings."""
+
 
 @dataclass(frozen=True)
 class Findings:
-    """What a report is made of: the `scene` as found, its `images` and PSNR of views with a target,
-    the log, and plain values.
-    """
+    """What a report is made of: the `scene` as found, `images` and PSNR by view, and the log."""
 
     scene: Scene
     light_field: LightField
@@ -57,74 +65,61 @@ class Findings:
     settings: str
 
 
-def write_run_report(path: Path, found: Findings) -> None:
-    """Writes the report of what was `found` to `path`."""
-    grid = found.scene.volume.grid
-    cells = " x ".join(str(count) for count in reversed(grid.shape))
-    test = (
-        ""
-        if found.summary["test_psnr"] is None
-        else f", {found.summary['test_psnr']:.2f} dB of those held out"
-    )
-    lead = (
-        f"{cells} cells, {found.summary['iterations']} iterations in {found.summary['seconds']:.1f} s. "
-        f"PSNR {found.summary['psnr']:.2f} dB of the views seen last{test}."
-    )
+def write_run_report(path: Path, findings: Findings) -> None:
+    """Writes the report of `findings` to `path`."""
+    scene, needs = findings.scene, "What this scene needed, and so was computed:"
+    versions = [(key, _format(value)) for key, value in findings.environment.items()]
     sections = [
-        section("Loss", side_by_side(*_curves(found.rows))),
-        section("Views", *_compare(found), _view_table(found)),
-        section("Volumes", *_volumes(found.scene)),
-        section("Turntable", _turntable(found)),
-        section("Timings", _timings(found.rows)),
-        section(
-            "Physics",
-            paragraph("What this scene needed, and so was computed:"),
-            items(needed_terms(found.scene)),
-        ),
-        section("Settings", fold("scene.yaml, all defaults filled in", found.settings)),
-        section(
-            "Versions",
-            table(["", ""], [(key, _shown(value)) for key, value in found.environment.items()]),
-        ),
+        section("Loss", side_by_side(*_curves(findings.rows))),
+        section("Views", *_comparisons(findings), _view_table(findings)),
+        section("Volumes", *_volumes(scene)),
+        section("Turntable", _turntable(findings)),
+        section("Timings", _timings(findings.rows)),
+        section("Physics", paragraph(needs), items(needed_terms(scene))),
+        section("Settings", fold("scene.yaml, all defaults filled in", findings.settings)),
+        section("Versions", table(["", ""], versions)),
     ]
-    write_page(path, f"ddrecon: {path.absolute().parent.name}", lead, sections)
+    write_page(path, f"ddrecon: {path.absolute().parent.name}", _lead(findings), sections)
+
+
+def _lead(findings: Findings) -> str:
+    """The sentence below the title."""
+    cells = " x ".join(str(count) for count in reversed(findings.scene.volume.grid.shape))
+    summary, test = findings.summary, ""
+    if summary["test_psnr"] is not None:
+        test = f", {summary['test_psnr']:.2f} dB of those held out"
+    return (
+        f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
+        f"PSNR {summary['psnr']:.2f} dB of the views seen last{test}."
+    )
 
 
 def _curves(rows: Sequence[Row]) -> list[str]:
     """Loss and PSNR by iteration."""
+    losses = {"": [(float(row.iteration), row.loss) for row in rows]}
     quality = {"seen": [(float(row.iteration), row.psnr) for row in rows]}
     tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
-    loss = draw_curve(
-        "loss",
-        {"": [(float(row.iteration), row.loss) for row in rows]},
-        "iteration",
-        is_logarithmic=True,
-    )
+    if tests:
+        quality["held out"] = tests
     return [
-        loss,
-        draw_curve("PSNR [dB]", quality | ({"held out": tests} if tests else {}), "iteration"),
+        draw_curve("loss", losses, "iteration", is_logarithmic=True),
+        draw_curve("PSNR [dB]", quality, "iteration"),
     ]
 
 
-def _compare(found: Findings) -> list[str]:
+def _comparisons(findings: Findings) -> list[str]:
     """Target, render and difference of the first views, those held out before the others."""
-    views = sorted(
-        (view for view in found.scene.views if view.name in found.images),
-        key=lambda view: not view.is_test,
+    views = [view for view in findings.scene.views if view.name in findings.images]
+    views.sort(key=lambda view: not view.is_test)
+    caption = (
+        "Target, render, and their difference four times enlarged around gray; "
+        "the target's brightest pixels are just white."
     )
-    parts = [
-        paragraph(
-            "Target, render, and their difference four times enlarged around gray; the target's brightest pixels are just white."
-        )
+    pictures = [
+        _comparison(view, findings.images[view.name], findings.quality[view.name])
+        for view in views[:SHOWN]
     ]
-    parts.append(
-        side_by_side(
-            *(
-                _comparison(view, found.images[view.name], found.quality[view.name])
-                for view in views[:SHOWN]
-            )
-        )
-    )
+    parts = [paragraph(caption), side_by_side(*pictures)]
     if len(views) > SHOWN:
         parts.append(paragraph(f"{len(views) - SHOWN} more views are in previews/."))
     return parts
@@ -136,21 +131,14 @@ def _comparison(view: View, image: Tensor, quality: Mapping[str, Any]) -> str:
     return picture(png_of(shown), f"{view.name} ({quality['split']}): {quality['psnr']:.2f} dB")
 
 
-def _view_table(found: Findings) -> str:
+def _view_table(findings: Findings) -> str:
     rows = []
-    for view in found.scene.views:
+    for view in findings.scene.views:
         height, width = view.camera.size
-        quality = found.quality.get(view.name, {})
+        split = "test" if view.is_test else "train"
+        quality = findings.quality.get(view.name)
         decibels = f"{quality['psnr']:.2f}" if quality else ""
-        rows.append(
-            (
-                view.name,
-                "test" if view.is_test else "train",
-                f"{width} x {height}",
-                f"{view.weight:g}",
-                decibels,
-            )
-        )
+        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", decibels))
     return table(["view", "split", "pixels", "weight", "PSNR [dB]"], rows)
 
 
@@ -164,32 +152,28 @@ def _volumes(scene: Scene) -> list[str]:
     for name in VOLUME:
         value = value_of(scene, name)
         if value.ndim >= 3:
-            top = float(value.max())
-            shown = [("middle slices", slices(value)), ("means along the axes", projections(value))]
-            captions = [
-                f"{name}, {what} (the largest value of a cell is {top:.4g})" for what, _ in shown
-            ]
-            parts.append(
-                side_by_side(
-                    *(
-                        picture(png_of(array), caption)
-                        for caption, (_, array) in zip(captions, shown, strict=True)
-                    )
-                )
-            )
+            largest = f"(the largest value of a cell is {float(value.max()):.4g})"
+            cut = picture(png_of(slices(value)), f"{name}, middle slices {largest}")
+            means = picture(png_of(projections(value)), f"{name}, means along the axes {largest}")
+            parts.append(side_by_side(cut, means))
     return parts
 
 
-def _turntable(found: Findings) -> str:
-    first = found.scene.views[0]
+def _turntable(findings: Findings) -> str:
+    """A movie of FRAMES pictures once around the volume, from the first view."""
+    first = findings.scene.views[0]
     small = View(first.name, first.camera.resize(-(-max(first.camera.size) // FRAME)))
     with torch.no_grad():
-        views = place_turntable(found.scene, small, FRAMES)
-        images = [pixels(view_image(found.light_field, found.scene, view.camera)) for view in views]
+        images = [
+            pixels(view_image(findings.light_field, findings.scene, view.camera))
+            for view in place_turntable(findings.scene, small, FRAMES)
+        ]
     white = max(map(find_white, images))
-    animation = animation_of(encode_frames(images, white))
-    caption = f"Once around the upright axis, from {first.name}; radiance {white:.3g} is white. Larger: ddrecon render RUN --ring 60"
-    return picture(animation, caption, 300)
+    caption = (
+        f"Once around the upright axis, from {first.name}; radiance {white:.3g} is white. "
+        "Larger: ddrecon render RUN --ring 60"
+    )
+    return picture(animation_of(encode_frames(images, white)), caption, 300)
 
 
 def _timings(rows: Sequence[Row]) -> str:
@@ -199,32 +183,15 @@ def _timings(rows: Sequence[Row]) -> str:
         stages.setdefault(row.cells, []).append((row, row.seconds - before))
     lines = []
     for cells, timed in stages.items():
-        solves = [
-            mean(getattr(row, name) for row, _ in timed)
-            for name in ("forward_iterations", "adjoint_iterations")
-        ]
         seconds = [taken for _, taken in timed]
-        lines.append(
-            (
-                f"{cells:,}",
-                len(timed),
-                f"{median(seconds):.3f}",
-                f"{sum(seconds):.1f}",
-                *(f"{count:.1f}" for count in solves),
-            )
-        )
-    return table(
-        [
-            "cells",
-            "iterations",
-            "seconds each (median)",
-            "seconds",
-            "forward solve, iterations",
-            "adjoint solve, iterations",
-        ],
-        lines,
-    )
+        solves = [
+            mean(row.forward_iterations for row, _ in timed),
+            mean(row.adjoint_iterations for row, _ in timed),
+        ]
+        times = f"{median(seconds):.3f}", f"{sum(seconds):.1f}"
+        lines.append((f"{cells:,}", len(timed), *times, *(f"{count:.1f}" for count in solves)))
+    return table(TIMING_HEAD, lines)
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,6 +1,4 @@
-"""The folder a reconstruction writes: its log, volumes, pictures, checkpoint and summary (names as
-documented in the README).
-"""
+"""The folder a reconstruction writes: log, volumes, pictures, checkpoints, summary and report."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.report import Findings, write_run_report
-from ddrecon.run.result import RESULT, describe_result, found_names
+from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
@@ -42,8 +40,9 @@ CHECKPOINT_SHARE = 0.05
 
 
 class RunFolder:
-    """The output folder `path` of one run of `scene_file` in an `environment`; `result_of` is what
-    the run's result depends on.
+    """The output folder `path` of one run of `scene_file` in an `environment`.
+
+    `result_of` describes what the run's result depends on.
     """
 
     def __init__(
@@ -53,12 +52,8 @@ class RunFolder:
         result_of: Mapping[str, Any],
         environment: Mapping[str, Any],
     ):
-        self.path, self.scene_file, self.result_of, self.environment = (
-            path,
-            scene_file,
-            result_of,
-            environment,
-        )
+        self.path, self.scene_file = path, scene_file
+        self.result_of, self.environment = result_of, environment
         with refusals(path):
             for name in ("volumes", "previews", CHECKPOINTS):
                 (path / name).mkdir(exist_ok=True)
@@ -68,17 +63,16 @@ class RunFolder:
         self.saved, self.next_save = -1, 0.0
 
     def start(self, run: Reconstruction) -> None:
-        """Begins the log and the checkpoints of a new run; those of a run made here before are
-        gone.
-        """
+        """Begins the log and the checkpoints of a new run; those of an earlier run are removed."""
         with refusals(self.checkpoints):
             forget_checkpoints(self.checkpoints)
         self.log.start()
         self.save(run)
 
     def resume(self, run: Reconstruction, loaded: Path) -> None:
-        """Goes on with `run` from the checkpoint `loaded`: the log ends where it does, and a
-        damaged one after it is gone.
+        """Goes on with `run` from the checkpoint `loaded`.
+
+        The log is cut to end where it does, and a damaged checkpoint after it is replaced.
         """
         with refusals(loaded):
             os.replace(loaded, self.checkpoints / LAST)
@@ -86,8 +80,9 @@ class RunFolder:
         self._note_saved(run, 0.0)
 
     def save(self, run: Reconstruction) -> None:
-        """Writes a checkpoint, unless the last is of this very iteration; the log has all rows
-        before it, whatever happens.
+        """Writes a checkpoint, unless the last is of this very iteration.
+
+        The log goes to the disk first, so that it never lacks rows that a checkpoint counts.
         """
         if self.saved != run.iteration:
             start = monotonic()
@@ -101,113 +96,83 @@ class RunFolder:
             self.save(run)
 
     def _note_saved(self, run: Reconstruction, seconds: float) -> None:
-        self.saved, self.next_save = (
-            run.iteration,
-            monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE),
-        )
+        self.saved = run.iteration
+        self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
         scene = run.current_scene()
-        self._pictures(scene, _images(scene, _light(scene)), f"_{run.iteration:06d}")
+        self._pictures(scene, _render(scene, _solve(scene)), f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
-        """Writes checkpoint, volumes, parameters, result, pictures, summary and report, and returns
-        what the summary says.
-        """
+        """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
         self.save(run)
         scene = run.current_scene()
-        names = dict.fromkeys(
-            ["density", *found_names([parameter.name for parameter in run.parameters])]
-        )
-        found = {name: self._stored(scene, name) for name in names}
-        write_described(describe_result(self.scene_file, scene, found), self.path / RESULT)
-        write_json(self.path / "parameters.json", self._parameters(scene, found))
-        light_field = _light(scene)
-        images = _images(scene, light_field)
+        names = result_names([parameter.name for parameter in run.parameters])
+        values = {name: self._store(scene, name) for name in dict.fromkeys(["density", *names])}
+        write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
+        write_json(self.path / "parameters.json", self._parameters(scene, values))
+        light_field = _solve(scene)
+        images = _render(scene, light_field)
         quality = self._pictures(scene, images, "")
         summary = _summary(run) | {"views": quality}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
+        log, environment = self.log.rows(), self.environment
         findings = Findings(
-            scene,
-            light_field,
-            images,
-            quality,
-            self.log.rows(),
-            summary,
-            self.environment,
-            settings,
+            scene, light_field, images, quality, log, summary, environment, settings
         )
         write_run_report(self.path / "report.html", findings)
         return summary
 
-    def _stored(self, scene: Scene, name: str) -> Any:
-        """The value of a variable as plain numbers, or where a file of this folder holds it, which
-        is written here.
-        """
+    def _store(self, scene: Scene, name: str) -> Any:
+        """The value of a variable as plain numbers, or where its file is, which is written here."""
         value = value_of(scene, name)
-        if name not in VOLUME and value.ndim == 3:
-            return self._write_map(name, value)
         if value.ndim < 3:
             return _plain(value)
+        if name not in VOLUME and value.ndim == 3:
+            return self._write_map(name, value)
         array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
-        file = Path("volumes", f"{name}.npz")
-        write_field(
-            self.path / file,
-            name,
-            array.float().cpu().numpy(),
-            np.array(scene.volume.grid.bounds_xyz),
-        )
+        file, box = Path("volumes", f"{name}.npz"), np.array(scene.volume.grid.bounds_xyz)
+        write_field(self.path / file, name, array.float().cpu().numpy(), box)
         return {"file": str(file)}
 
     def _parameters(self, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
-        """Everything of `scene` that is not a volume, as plain values; maps become files of their
-        own, but for those that are `stored`.
+        """Everything of `scene` that is not a field, as plain values.
+
+        Maps become files of their own, but for those that are `stored`.
         """
-        volume = {
-            name: value.tolist()
-            for name in ("sigma_a", "sigma_s", "g")
-            if (value := value_of(scene, name)).ndim < 2
-        }
-        lights: dict[str, Any] = {}
+        parameters: dict[str, Any] = {}
+        for name in ("sigma_a", "sigma_s", "g"):
+            if (value := value_of(scene, name)).ndim < 2:
+                parameters[name] = value.tolist()
         for name in variable_names(scene):
             if name.startswith("lights."):
-                value = value_of(scene, name)
-                lights[name] = (
-                    value.tolist()
-                    if value.ndim < 3
-                    else stored[name]
-                    if name in stored
-                    else self._stored(scene, name)
-                )
-        cameras = {
-            f"views.{view.name}.camera": {"matrix": [*view.camera.pose.tolist(), [0, 0, 0, 1]]}
-            for view in scene.views
-        }
-        return volume | lights | cameras
+                if (value := value_of(scene, name)).ndim < 3:
+                    parameters[name] = value.tolist()
+                else:
+                    parameters[name] = stored.get(name) or self._store(scene, name)
+        for view in scene.views:
+            matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
+            parameters[f"views.{view.name}.camera"] = {"matrix": matrix}
+        return parameters
 
     def _write_map(self, name: str, radiance: Tensor) -> str:
-        """Writes a map of radiance [C, h, w]; returns its file's name."""
-        write_linear(
-            self.path / name, radiance.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy()
-        )
+        """Writes a map of radiance [C, h, w]; the name of its file."""
+        colors = radiance.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy()
+        write_linear(self.path / name, colors)
         return f"{name}.npy"
 
     def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> dict[str, Any]:
-        """Writes slices of every field of `scene`, and `images` beside their targets; returns how
-        good each is.
-        """
+        """The split and PSNR of each view with a target; writes pictures of views and fields."""
+        folder, quality = self.path / "previews", {}
         for name in VOLUME:
             if (value := value_of(scene, name)).ndim >= 3:
-                write_preview(self.path / "previews" / f"{name}.slices{mark}.png", slices(value))
-        quality = {}
+                write_preview(folder / f"{name}.slices{mark}.png", slices(value))
         for view in scene.views:
             if view.image is not None:
                 image = images[view.name]
-                write_preview(
-                    self.path / "previews" / f"{view.name}{mark}.png", comparison(view.image, image)
-                )
+                write_preview(folder / f"{view.name}{mark}.png", comparison(view.image, image))
                 quality[view.name] = {
                     "split": "test" if view.is_test else "train",
                     "psnr": psnr(image, view.image, view.mask),
@@ -215,13 +180,13 @@ class RunFolder:
         return quality
 
 
-def _light(scene: Scene) -> LightField:
+def _solve(scene: Scene) -> LightField:
     with torch.no_grad():
         return solve_light(scene, SolveMemory())
 
 
-def _images(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
-    """The images of the views that have a target."""
+def _render(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
+    """The images of the views that have a target, by name."""
     with torch.no_grad():
         return {
             view.name: view_image(light_field, scene, view.camera)

@@ -6,7 +6,7 @@ lose no light and have no radiance below zero.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
+from ddrecon.progress import Progress
 from ddrecon.renderer import render
 from ddrecon.validate.balance import Balance, balance_of
 from ddrecon.validate.hard_cases import CASES, TOLERANCE, HardCase
@@ -26,8 +27,6 @@ ROUNDINGS = 8
 ENERGY = {torch.float32: 1e-4, torch.float64: 1e-10}
 NEGATIVE = 1e-7
 """How far below zero radiance may be, as a part of the brightest pixel."""
-
-Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,11 @@ lights:
   - {type: directional, direction: [-1, -2, -1], irradiance: 3}
   - {type: ambient, radiance: 0.1}
 views:
-  - {name: front, image: front.npy, camera: {type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
+  - {name: front, image: front.npy, camera: {type: perspective, fov: 30,
+     origin: [0, 0, 2.5], target: [0, 0, 0], resolution: [8, 6]}}
   - {name: side, image: side.npy, split: test,
-     camera: {type: perspective, origin: [2.5, 0, 0], target: [0, 0, 0], fov: 30, resolution: [8, 6]}}
+     camera: {type: perspective, fov: 30,
+     origin: [2.5, 0, 0], target: [0, 0, 0], resolution: [8, 6]}}
 optimize:
   iterations: 4
   parameters: {density: {init: 0}}

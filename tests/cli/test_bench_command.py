@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
+from ddrecon.errors import MissingExtraError
+from ddrecon.scene import Scene
 from ddrecon.validate import hard
 from ddrecon.validate.hard_cases import CASES, HardCase, empty, full
 
@@ -67,9 +69,12 @@ def test_what_cannot_be_done_is_refused(
 
 
 def test_a_scene_is_measured_by_every_variant(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ddrecon.bench.run._tracer", lambda scene, has_gradient: None)
+    def refuse(scene: Scene, has_gradient: bool) -> None:
+        raise MissingExtraError("no Mitsuba here")
+
+    monkeypatch.setattr("ddrecon.bench.path_tracing.PathTracer", refuse)
     result = run("bench", "scene.yaml", "--quick", "-q", "-o", "out", "--json", "report.json")
-    assert (result.exit_code, result.stderr) == (0, "")
+    assert (result.exit_code, result.stderr) == (0, "without path tracing: no Mitsuba here\n")
     report = json.loads(Path("report.json").read_text())
     assert report == json.loads(Path("out/bench.json").read_text())
     rows = {row["name"]: row for row in report["rows"]}

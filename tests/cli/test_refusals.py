@@ -60,7 +60,8 @@ EDITS = {
         "resolution: [6, 5, 4]\n  density: 0.2",
         "resolution: [4, 5, 6]\n  density: {file: density.npz}",
         [
-            "volume.density.file: has 6 x 5 x 4 cells in x, y, z, but volume.resolution has 4 x 5 x 6"
+            "volume.density.file: has 6 x 5 x 4 cells in x, y, z, "
+            "but volume.resolution has 4 x 5 x 6"
         ],
     ),
 }
@@ -298,7 +299,8 @@ def test_a_solve_that_diverges(run: Callable[..., Result], folder: Path, command
     (line,) = result.stderr.splitlines()
     assert (result.exit_code, result.stdout) == (4, "")
     assert re.search(
-        r"kappa changes by a factor \d+\.\d between neighbors at cell \(\d, \d, \d\).*diffusion\.scheme=conservative",
+        r"kappa changes by a factor \d+\.\d between neighbors at cell \(\d, \d, \d\)"
+        r".*diffusion\.scheme=conservative",
         line,
     )
 

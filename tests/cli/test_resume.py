@@ -15,7 +15,7 @@ import pytest
 import torch
 from click.testing import Result
 
-from ddrecon.reconstruct import loop
+from ddrecon.reconstruct import loop, objective
 from ddrecon.reconstruct.parameters import Parameter
 
 Run = Callable[..., Result]
@@ -121,7 +121,7 @@ def test_overwriting_discards_the_old_checkpoint(
         raise MemoryError
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "render_each", killed)
+        patch.setattr(objective, "render_each", killed)
         assert (
             run(
                 "optimize", "scene.yaml", "-q", "--iterations", "3", "-o", "out", "--overwrite"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ddrecon.errors import FormatError, SceneError, SolveError
+from ddrecon.errors import FormatError, SceneError, SolveError, UsageError
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.run.checkpoint import load_checkpoint, save_checkpoint
@@ -99,7 +99,7 @@ def test_resuming_gives_the_same_bits_as_not_stopping(
 
 def test_a_checkpoint_of_another_scene_is_refused(ball_scene: Scene, tmp_path: Path) -> None:
     save_checkpoint(tmp_path, Reconstruction(ball_scene).state(), {"volume": {"g": 0.1}})
-    with pytest.raises(SceneError, match=r"volume\.g is 0\.1 there, 0\.2 now"):
+    with pytest.raises(UsageError, match=r"volume\.g is 0\.1 there, 0\.2 now"):
         load_checkpoint(tmp_path, {"volume": {"g": 0.2}})
 
 

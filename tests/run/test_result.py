@@ -38,8 +38,12 @@ lights:
   - {{type: environment, file: sky.npy, scale: 0.5, rotation: 20, directions: 6}}
   - {{type: point, position: [0.9, 0.8, 0.3], intensity: 1}}
 views:
-  - {{name: front, image: front.npy, camera: {{type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30}}}}
-  - {{name: side, camera: {{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1, resolution: [5, 4]}}}}
+  - name: front
+    image: front.npy
+    camera: {{type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30}}
+  - name: side
+    camera: {{type: orthographic, origin: [2.5, 0, 0], target: [0, 0, 0], width: 1,
+      resolution: [5, 4]}}
 optimize: {{iterations: 2, refine_at: [], parameters: {{{parameters}}}}}
 """
 VARIED = [
@@ -48,7 +52,8 @@ VARIED = [
     ("albedo: {init: 0.8, field: true}, density: {}", ["density", "albedo"]),
     ("sigma_t: {}, g: {}", []),
     (
-        "lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}, lights.2.position: {}, lights.2.intensity: {}",
+        "lights.0.irradiance: {init: [3, 2, 1]}, lights.0.direction: {}, "
+        "lights.2.position: {}, lights.2.intensity: {}",
         [],
     ),
     ("lights.1.radiance: {}, lights.1.scale: {}, lights.1.rotation: {}", []),

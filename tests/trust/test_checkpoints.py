@@ -16,8 +16,8 @@ import torch
 from click.testing import Result
 
 from ddrecon.errors import DataWarning
-from ddrecon.reconstruct import loop
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run import drive
 from ddrecon.run.checkpoint import LAST, PREVIOUS, load_checkpoint, save_checkpoint
 
@@ -114,7 +114,7 @@ def test_a_second_ctrl_c_saves_no_torn_state(run: Run, monkeypatch: pytest.Monke
 
     before = Path("out/checkpoints/last.pt").read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(loop.Parameter, "step", interrupted)
+        patch.setattr(Parameter, "step", interrupted)
         assert run(*RESUME, "--iterations", "5").exit_code == 130
     assert Path("out/checkpoints/last.pt").read_bytes() == before
 

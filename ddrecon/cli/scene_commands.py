@@ -1,0 +1,163 @@
+"""Commands that take a scene: check, render, optimize.
+
+torch is imported inside the commands, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ddrecon.cli.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, SCENE, in_session
+
+if TYPE_CHECKING:
+    from ddrecon.cli.session import Session
+
+
+@click.command()
+@SCENE
+@DTYPE
+@AS_JSON
+@in_session
+def check(session: Session, scene: Path) -> None:
+    """Validate SCENE and print its grid, views, memory and the physics it needs."""
+    from ddrecon.cli.check import describe, lines
+
+    report = describe(session.load(scene))
+    session.show(report, lines(report))
+
+
+@click.command()
+@SCENE
+@OUTPUT
+@OVERWRITE
+@click.option(
+    "--view", "names", multiple=True, metavar="NAME", help="Render only this view; repeatable."
+)
+@click.option(
+    "--components",
+    is_flag=True,
+    help="Also write reduced, single and multiple radiance, which sum to the image.",
+)
+@click.option(
+    "--gradient",
+    "parameter",
+    metavar="PARAM",
+    help="Also write each image's derivative: density, g, lights.0.direction.x, ...",
+)
+@click.option(
+    "--light",
+    "lights",
+    multiple=True,
+    metavar="LIGHT",
+    help="Light it by '{type: directional, ...}' instead; repeatable.",
+)
+@click.option(
+    "--ring",
+    "count",
+    type=click.IntRange(min=2),
+    metavar="N",
+    help="N views around the volume instead, and ring.png of them.",
+)
+@click.option("--mp4", "has_mp4", is_flag=True, help="With --ring, also write ring.mp4.")
+@DTYPE
+@AS_JSON
+@in_session
+def render(
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    names: tuple[str, ...],
+    components: bool,
+    parameter: str | None,
+    lights: tuple[str, ...],
+    count: int | None,
+    has_mp4: bool,
+) -> None:
+    """Render the views of SCENE, a scene file or the folder of a finished run."""
+    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.io.files.json_file import write_json
+    from ddrecon.io.images.movies import require_mp4
+    from ddrecon.run.render_folder import (
+        remove_targets,
+        render_gradient_to_folder,
+        render_lines,
+        render_to_folder,
+        require_variation,
+        write_ring,
+    )
+
+    if count is None and has_mp4:
+        raise click.UsageError("--mp4 is a movie of --ring N")
+    if has_mp4:
+        require_mp4()
+    loaded = session.with_lights(lights).load(scene)
+    views = session.pick_views(loaded, names)
+    if lights or count is not None:
+        loaded = remove_targets(loaded, views, count)
+        views = list(loaded.views)
+    if parameter is not None:
+        require_variation(loaded, parameter)
+    with claim_folder(output, may_exist=overwrite):
+        settings = views, output, components
+        if parameter is None:
+            report = render_to_folder(loaded, *settings, session.progress)
+        else:
+            report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
+        if count is not None:
+            report["ring"] = write_ring(views, output, has_mp4)
+        write_json(output / "render.json", report)
+    session.show(report, render_lines(report, output))
+
+
+@click.command()
+@SCENE
+@OUTPUT
+@OVERWRITE
+@click.option(
+    "--iterations",
+    type=click.IntRange(min=1),
+    help="Total number of iterations, also after --resume.",
+)
+@click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
+@click.option(
+    "--preview-every",
+    type=click.IntRange(min=1),
+    metavar="K",
+    help="Write pictures every K iterations.",
+)
+@click.option(
+    "--tensorboard", "has_events", is_flag=True, help="Also write the loss log for TensorBoard."
+)
+@DTYPE
+@AS_JSON
+@in_session
+def optimize(
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    iterations: int | None,
+    resume: bool,
+    preview_every: int | None,
+    has_events: bool,
+) -> None:
+    """Reconstruct what SCENE asks for from its views' images."""
+    from ddrecon.run.drive import drive_run, open_run, summary_lines
+    from ddrecon.run.events import require_tensorboard
+
+    if has_events:
+        require_tensorboard()
+    if iterations is not None:
+        session = session.with_overrides(f"optimize.iterations={iterations}")
+    scene_file = session.read(scene)
+    built, environment = session.build(scene_file), session.environment()
+    with open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
+        run,
+        folder,
+    ):
+        summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
+    session.show(summary, summary_lines(summary, output))

@@ -1,0 +1,205 @@
+"""Commands that tell how far to trust the others: gradcheck, reference, bench.
+
+torch is imported inside the commands, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ddrecon.cli.command import (
+    AS_JSON,
+    DTYPE,
+    OUTPUT,
+    OVERWRITE,
+    REPORT,
+    SCENE,
+    in_session,
+    require_folder_of,
+)
+
+if TYPE_CHECKING:
+    from ddrecon.cli.session import Session
+
+
+@click.command()
+@SCENE
+@click.option(
+    "--parameter",
+    "names",
+    multiple=True,
+    metavar="NAME",
+    help="Check only this parameter; repeatable.",
+)
+@click.option(
+    "--samples",
+    type=click.IntRange(min=2),
+    default=8,
+    show_default=True,
+    help="Cells checked one by one.",
+)
+@REPORT
+@in_session
+def gradcheck(
+    session: Session, scene: Path, names: tuple[str, ...], samples: int, report: Path | None
+) -> None:
+    """Check tangent against adjoint against finite differences of the program, in float64."""
+    from ddrecon.io.files.json_file import write_json
+    from ddrecon.validate.gradcheck import check_parameters, describe
+
+    require_folder_of(report)
+    checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
+    click.echo("\n".join(line for check in checks for line in check.lines()))
+    if report is not None:
+        write_json(report, describe(checks))
+    if not all(check.has_passed for check in checks):
+        sys.exit(1)
+
+
+@click.command()
+@SCENE
+@OUTPUT
+@OVERWRITE
+@click.option(
+    "--view", "names", multiple=True, metavar="NAME", help="Trace only this view; repeatable."
+)
+@click.option(
+    "--spp",
+    "samples",
+    type=click.IntRange(min=4),
+    default=256,
+    show_default=True,
+    metavar="N",
+    help="Paths a pixel.",
+)
+@click.option(
+    "--views",
+    "is_only_traced",
+    is_flag=True,
+    help="Write the path-traced images alone, as NAME.*: targets for experiments.",
+)
+@DTYPE
+@AS_JSON
+@in_session
+def reference(
+    session: Session,
+    scene: Path,
+    output: Path,
+    overwrite: bool,
+    names: tuple[str, ...],
+    samples: int,
+    is_only_traced: bool,
+) -> None:
+    """Path-trace the views of SCENE by Mitsuba 3, and tell how far ours are from them."""
+    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.reference.compare import (
+        compare_to_folder,
+        reference_lines,
+        trace_to_folder,
+        write_reference_report,
+    )
+    from ddrecon.reference.trace import open_tracer
+
+    loaded = session.load(scene)
+    views = session.pick_views(loaded, names)
+    tracer = open_tracer(loaded, views, threads=session.threads)
+    with claim_folder(output, may_exist=overwrite):
+        settings = output, samples, session.seed, session.progress
+        compared = (
+            trace_to_folder(tracer, views, *settings)
+            if is_only_traced
+            else compare_to_folder(tracer, loaded, views, *settings)
+        )
+        report = write_reference_report(output, compared, session.environment())
+    session.show(report, reference_lines(report, output))
+
+
+@click.command()
+@click.argument("scene", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "--quick", "is_quick", is_flag=True, help="A small scene, or SCENE made coarser, measured once."
+)
+@click.option(
+    "--hard",
+    "is_hard",
+    is_flag=True,
+    help="Instead: numerical stability on hard cases, in float32 against float64.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="Folder for the results: bench.json, bench.png and report.html, or hard.json.",
+)
+@OVERWRITE
+@REPORT
+@in_session
+def bench(
+    session: Session,
+    scene: Path | None,
+    is_quick: bool,
+    is_hard: bool,
+    output: Path | None,
+    overwrite: bool,
+    report: Path | None,
+) -> None:
+    """Measure speed against error on SCENE, or on a plume of ddrecon's own."""
+    if session.overrides and scene is None:
+        raise click.UsageError("-D changes a scene file; name one")
+    if is_hard and (scene is not None or is_quick):
+        raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
+    require_folder_of(report)
+    from ddrecon.io.files.folders import claim_folder
+
+    with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
+        if is_hard:
+            has_passed = _bench_hard(session, output, report)
+        else:
+            has_passed = _bench_speed(session, scene, is_quick, output, report)
+    if not has_passed:
+        sys.exit(1)
+
+
+def _bench_speed(
+    session: Session, path: Path | None, is_quick: bool, output: Path | None, report: Path | None
+) -> bool:
+    """Measures the scene at `path`, or the plume, and writes what was asked for; True."""
+    from ddrecon.bench.path_tracing import PathTracer
+    from ddrecon.bench.run import bench_lines, describe, load_pair, run_bench, write_bench
+    from ddrecon.errors import MissingExtraError, SceneError
+    from ddrecon.io.files.json_file import write_json
+
+    load = None if path is None else lambda dtype: replace(session, dtype=dtype).load(path)
+    scene, double = load_pair(load, session.device, is_quick)
+    tracer = None
+    try:
+        tracer = PathTracer(scene, has_gradient=not is_quick)
+    except (MissingExtraError, SceneError) as error:
+        click.echo(f"without path tracing: {error}", err=True)
+    rows, truth = run_bench(scene, double, tracer, is_quick, session.progress)
+    click.echo("\n".join(bench_lines(rows)))
+    measured = describe(rows, truth, scene, session.environment())
+    if output is not None:
+        click.echo(write_bench(output, rows, measured))
+    if report is not None:
+        write_json(report, measured)
+    return True
+
+
+def _bench_hard(session: Session, output: Path | None, report: Path | None) -> bool:
+    """Runs the hard cases, writes their table where asked for, and says whether all have passed."""
+    from ddrecon.io.files.json_file import write_json
+    from ddrecon.validate.hard import describe, run_cases, table
+
+    results = run_cases(session.device, session.progress)
+    click.echo("\n".join(table(results)))
+    for file in (output / "hard.json" if output else None, report):
+        if file is not None:
+            write_json(file, describe(results))
+    return not any(result.failures() for result in results)

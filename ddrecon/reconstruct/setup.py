@@ -1,0 +1,73 @@
+"""What a reconstruction starts from: its views, its parameters, and whether they are of use."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from ddrecon.errors import SceneError
+from ddrecon.reconstruct.divergence import describe_flaw
+from ddrecon.reconstruct.objective import target_of
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.rates import default_rate
+from ddrecon.scene import Scene
+from ddrecon.settings import OptimizeSettings
+from ddrecon.variables.values import value_of, variable_names
+
+
+def require_settings(scene: Scene, iterations: int | None) -> OptimizeSettings:
+    """What `scene` asks for, with `iterations` in place of its own where given.
+
+    Raises SceneError where it asks for nothing.
+    """
+    if scene.optimize is None:
+        raise SceneError(
+            "optimize: missing section; say what to reconstruct, such as parameters: {density: {}}"
+        )
+    return scene.optimize if iterations is None else replace(scene.optimize, iterations=iterations)
+
+
+def select_views(scene: Scene, is_test: bool) -> Scene:
+    """`scene` with a volume of its own and those test, or training, views that have an image."""
+    views = [view for view in scene.views if view.image is not None and view.is_test == is_test]
+    return replace(scene, views=views, volume=replace(scene.volume))
+
+
+def require_usable(train: Scene, settings: OptimizeSettings) -> None:
+    """Raises SceneError where `settings` cannot be reconstructed from the views of `train`.
+
+    That is where there are none, a parameter does not touch them, or a target is not finite.
+    """
+    if not train.views:
+        raise SceneError(
+            "views: none has split: train and an image; there is nothing to reconstruct from"
+        )
+    known = variable_names(train)
+    problems = [
+        f"optimize.parameters.{name}: there is no training view of this name with an image"
+        for name in settings.parameters
+        if name not in known
+    ]
+    for view in train.views:
+        place = describe_flaw("the image", target_of(view), is_field=False)
+        if place is not None:
+            problems.append(f"views.{view.name}: {place} is not finite")
+    if problems:
+        raise SceneError(problems)
+
+
+def mean_power(train: Scene) -> float:
+    """The mean square of the targets of `train` [radiance squared]."""
+    return float(torch.stack([target_of(view).square().mean() for view in train.views]).mean())
+
+
+def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter]:
+    """The parameters that `settings` name, at the values from which `scene` starts them."""
+    parameters = []
+    for name, wanted in settings.parameters.items():
+        start = scene.starts.get(name)
+        start = value_of(scene, name) if start is None else start
+        rate = wanted.lr or default_rate(scene, name, start)
+        parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid))
+    return parameters
