@@ -75,5 +75,5 @@ def read_all(path: Path) -> dict[str, Field]:
 
 
 def described(code: str, path: Path) -> object:
-    """The value, by way of JSON, of the expression `code` about `grids`: those in `path` by name."""
+    """The value, by JSON, of the expression `code` about `grids`: those in `path` by name."""
     return json.loads(run(f"{NAMES}print(json.dumps({code}))", path))

@@ -95,7 +95,8 @@ def _replay(tracer: Tracer, scene: Scene) -> Callable[[int, int], Tensor]:
         {"type": "prbvolpath", "max_depth": LONGEST, "rr_depth": 2 * LONGEST}
     )
     parameters = tracer.module.traverse(loaded)
-    (name,) = (key for key in parameters.keys() if key.endswith(DENSITY))  # noqa: SIM118 - Mitsuba's own mapping
+    keys = parameters.keys()  # of Mitsuba's own mapping
+    (name,) = (key for key in keys if key.endswith(DENSITY))
 
     def gradient(samples: int, seed: int) -> Tensor:
         drjit.enable_grad(parameters[name])

@@ -31,7 +31,8 @@ def read_camera(frame: Node, entries: Entries, rule: Rule) -> PerspectiveSection
     if "transform_matrix" not in entries:
         raise frame.refused("missing key 'transform_matrix'")
     matrix = read_matrix(entries["transform_matrix"], Rule(Matrix, {}, rule.folder))
-    camera = PerspectiveSection(matrix=matrix, **_intrinsics(frame, entries, rule))  # type: ignore[arg-type]
+    lens = _intrinsics(frame, entries, rule)
+    camera = PerspectiveSection(matrix=matrix, **lens)  # type: ignore[arg-type]
     for _, what in camera.problems():
         raise entries["transform_matrix"].refused(what)
     return camera

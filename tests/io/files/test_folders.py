@@ -1,4 +1,4 @@
-"""Files are written where nothing is, unless it may be replaced, and only into folders that exist."""
+"""Files are written where nothing is, unless it may be replaced, and only into existing folders."""
 
 from __future__ import annotations
 
