@@ -45,8 +45,8 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
     Raises SceneError with everything wrong in it.
     """
     entries = _mapping(node)
-    known = fields(kind)  # type: ignore[arg-type]
-    declared: dict[str, Field[Any]] = {field.name: field for field in known}
+    all_fields = fields(kind)  # type: ignore[arg-type]
+    declared: dict[str, Field[Any]] = {field.name: field for field in all_fields}
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
     hints, problems, values = get_type_hints(kind), Problems(), {}
     for what in _absences(kind, declared, entries):
