@@ -31,7 +31,7 @@ class Equidistant:
         self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
 
     def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Equidistant]]:
-        """All of `rays`, `count` or more at a time: their indices, and what they meet."""
+        """All of `rays`, `count` at a time, in large volumes more: indices, and what they meet."""
         size = max(count, self.fields[0].numel() // (CELLS_PER_NODE * self.nodes))
         indices = torch.arange(len(rays.direction), device=rays.direction.device)
         return [(chunk, self) for chunk in indices.split(size)]
