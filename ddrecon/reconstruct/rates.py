@@ -8,8 +8,9 @@ from ddrecon.scene import Scene
 from ddrecon.variables.kinds import kind_of
 
 WARM_UP = 5
-"""Iterations over which learning rates rise to their value: Adam's first steps are all of full
-size, whatever the derivative.
+"""Iterations over which learning rates rise to their value.
+
+Adam's first steps are all of full size, whatever the derivative.
 """
 FINAL_RATE = 0.2
 """Learning rates fall exponentially over a run, to this part of their value."""
@@ -23,7 +24,8 @@ def rate_at(iteration: int, iterations: int) -> float:
 
 
 def default_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """The learning rate of the parameter `name` of `scene`, which starts from `start`: its largest
-    change in one step.
+    """The learning rate of the parameter `name` of `scene`, which starts from `start`.
+
+    It is the largest change in one step.
     """
     return kind_of(name).rate(scene.volume, start)

@@ -7,7 +7,7 @@ all of them at once.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
 from ddrecon.errors import UsageError
+from ddrecon.progress import Progress
 from ddrecon.scene import Scene
 from ddrecon.scene_file.problems import suggestion
 from ddrecon.validate.point import (
@@ -38,7 +39,6 @@ TOGETHER = "all at once"
 """What the check of all parameters together is called."""
 
 Loss = Callable[[Mapping[str, Tensor]], Tensor]
-Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 
 
 @dataclass(frozen=True)
