@@ -16,8 +16,9 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.march.emission import Channels
-from ddrecon.march.lattice import Lattice, across
+from ddrecon.march.lattice import Lattice
 from ddrecon.march.slices import Slices
+from ddrecon.numerics.slicing import across
 from ddrecon.numerics.third_order import subdivide
 
 BAND = 4

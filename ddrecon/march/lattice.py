@@ -19,6 +19,7 @@ from torch.nn.functional import max_pool2d, normalize
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
 from ddrecon.numerics.interpolation import sample_slices
+from ddrecon.numerics.slicing import across
 from ddrecon.numerics.third_order import ThirdOrder, second_difference
 
 MARGIN = 2
@@ -82,12 +83,6 @@ class Lattice:
         if self.eye is None:
             return line + apart * (self.direction[axis] / self.direction[self.axis])
         return line + apart / (self.middle - self.eye[self.axis]) * (line - self.eye[axis])
-
-
-def across(axis: int) -> tuple[int, int]:
-    """The two axes of a slice across `axis`: those of its rows and of its columns."""
-    row, column = (other for other in range(3) if other != axis)
-    return row, column
 
 
 def choose_lattice(grid: Grid, axis: int, hitting: Rays) -> Lattice | None:

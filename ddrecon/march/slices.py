@@ -12,9 +12,10 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
-from ddrecon.march.lattice import Lattice, across
+from ddrecon.march.lattice import Lattice
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.numerics.separable import Weights, sample_lattice
+from ddrecon.numerics.slicing import across
 from ddrecon.numerics.third_order import ThirdOrder
 
 

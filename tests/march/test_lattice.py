@@ -16,9 +16,10 @@ from ddrecon.march import integral as march_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.emission import Channels
 from ddrecon.march.integral import march
-from ddrecon.march.lattice import Lattice, across, choose_lattice
+from ddrecon.march.lattice import Lattice, choose_lattice
 from ddrecon.march.samplers import choose_sampler
 from ddrecon.march.slices import Slices
+from ddrecon.numerics.slicing import across
 from ddrecon.renderer import _emission, render, solve_light
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
