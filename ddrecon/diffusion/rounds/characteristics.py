@@ -24,6 +24,7 @@ from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.numerics.autodiff import keep
 from ddrecon.numerics.decay import decayed_line
+from ddrecon.numerics.slicing import Slicing, across
 
 SLICES, ROWS, COLUMNS = 0, 2, 3
 """Dimensions of arrays laid out for a course: [slices, C, rows, columns]."""
@@ -53,12 +54,11 @@ class Course:
         speed = [
             component / spacing for component, spacing in zip(direction, grid.spacing, strict=True)
         ]
-        axis = max(range(3), key=lambda a: abs(speed[a]))
-        rows, columns = (a for a in range(3) if a != axis)
-        drifts = (speed[rows] / abs(speed[axis]), speed[columns] / abs(speed[axis]))
-        drift = tuple(round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
-        forward, step = (1 if speed[axis] > 0 else -1), 1 / abs(speed[axis])
-        return Course((1 + axis, 0, 1 + rows, 1 + columns), forward, (drift[0], drift[1]), step)
+        slicing = Slicing.of(speed)
+        fastest = abs(speed[slicing.axis])
+        drifts = (speed[other] / fastest for other in across(slicing.axis))
+        row, column = (round(d) if abs(d - round(d)) < NEARLY else d for d in drifts)
+        return Course(slicing.order, -1 if slicing.is_reversed else 1, (row, column), 1 / fastest)
 
     def lay(self, field: Tensor) -> Tensor:
         """`field` [C, z, y, x] as [slices, C, rows, columns]."""
