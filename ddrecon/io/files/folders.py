@@ -1,6 +1,4 @@
-"""Output folders: nothing that is there is ever overwritten without being asked to, and only one
-process writes.
-"""
+"""Output files and folders: only one process writes, and nothing is overwritten unasked."""
 
 from __future__ import annotations
 
