@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -15,6 +15,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_picture, write_preview
 from ddrecon.losses import psnr
+from ddrecon.progress import Progress
 from ddrecon.reference.mitsuba_scene import LONGEST
 from ddrecon.reference.trace import Traced, Tracer
 from ddrecon.renderer import solve_light, view_image
@@ -25,8 +26,6 @@ PASSES = 8
 """Passes an image is traced in, whose scatter says how noisy it is; no more than paths a pixel."""
 SEEDS = 2**30
 """Seeds that Mitsuba takes."""
-Progress = Callable[[Sequence[int], str], Iterable[int]]
-"""Hands on the numbers of passes while it shows how far, under this name, they are."""
 
 
 def trace_to_folder(

@@ -1,5 +1,6 @@
-"""Every command line of the README and the documentation runs, in the order in which it stands
-there, on fewer cells, paths and samples.
+"""Every command line of the README and the documentation runs.
+
+In the order in which it stands there, on fewer cells, paths and samples.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from click.testing import CliRunner
 
 from ddrecon.bench import run as bench_run
 from ddrecon.cli.commands import main
+from ddrecon.errors import MissingExtraError
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.validate.hard_cases import CASES
@@ -60,8 +62,12 @@ def quick(command: str) -> list[str]:
     return [name, *rest, *(added[name]() if name in added else []), "-q"]
 
 
-def coarse(load: Callable[..., Scene]) -> Callable[..., Scene]:
-    return lambda *arguments: scene_at_level(load(*arguments), 4)
+def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene]]:
+    return lambda *arguments: [scene_at_level(scene, 4) for scene in load(*arguments)]
+
+
+def refuse(scene: Scene, has_gradient: bool) -> None:
+    raise MissingExtraError("no path tracing in this test")
 
 
 @pytest.fixture
@@ -74,8 +80,8 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / name).symlink_to(ROOT / name)
     for name in list(CASES)[2:]:
         monkeypatch.delitem(CASES, name)
-    monkeypatch.setattr(bench_run, "_scene", coarse(bench_run._scene))
-    monkeypatch.setattr(bench_run, "_tracer", lambda scene, has_gradient: None)
+    monkeypatch.setattr(bench_run, "load_pair", coarse(bench_run.load_pair))
+    monkeypatch.setattr("ddrecon.bench.path_tracing.PathTracer", refuse)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
