@@ -40,10 +40,14 @@ class Beam:
         forward peak of depth `peak` [N, C, R] at the nodes (E13) it changes along the ray: then the
         integral holds it, and the factor is 1.
         """
-        cosine = -(nodes.direction @ self.direction)
+        cosine = self.cosine(nodes.direction)
         if peak is None:
             return nodes.integral(scattering), henyey_greenstein(cosine, g)
         return nodes.integral(scattering * peaked_phase_along(peak, cosine, g)), 1.0
+
+    def cosine(self, direction: Tensor) -> Tensor:
+        """Cosine [R] between the light and what leaves along view rays of `direction` [R, 3]."""
+        return -(direction @ self.direction)
 
 
 def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:

@@ -58,10 +58,7 @@ class PointBeam:
 
         Arguments as of `Beam.scattered`. Scattering times p is linear between nodes.
         """
-        # The light's offset from a view ray: `along` it from each node, and squared, across it.
-        offset = nodes.origin - self.position
-        foot = (offset * nodes.direction).sum(-1)
-        across = _bounded_square(offset - foot[:, None] * nodes.direction, self.least_square)
+        foot, across = self.passing(nodes.origin, nodes.direction)
         along = foot + nodes.distance
 
         # The phase function at the nodes, of the angle between light and view ray.
@@ -73,6 +70,16 @@ class PointBeam:
         distance = across.sqrt()
         angle = torch.atan2(distance * nodes.lengths, across + along[1:] * along[:-1])
         return nodes.integral(scattering * phase, angle / distance), 1.0
+
+    def passing(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """How view rays pass the light: from `origin` [R, 3] along unit `direction` [R, 3].
+
+        The way [R] [u] from where a ray is nearest to its origin, and the square [R] [u^2] of its
+        distance there, bounded as all squared distances are.
+        """
+        offset = origin - self.position
+        foot = (offset * direction).sum(-1)
+        return foot, _bounded_square(offset - foot[:, None] * direction, self.least_square)
 
 
 def follow_point_light(

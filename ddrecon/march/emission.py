@@ -82,14 +82,14 @@ class Sampled:
         scattering = next(fields) if self._has_own_scattering else extinction
         peak = self.peak
         if peak is not None:
-            peak = next(fields) if _is_field(peak) else peak.view(-1, 1)
+            peak = next(fields) if is_field(peak) else peak.view(-1, 1)
         return Sampled(extinction, diffuse, masses, scattering, peak)
 
     def _fields(self) -> list[Tensor]:
         fields = [self.extinction, self.diffuse, *self.masses]
         if self._has_own_scattering:
             fields.append(self.scattering)
-        if self.peak is not None and _is_field(self.peak):
+        if self.peak is not None and is_field(self.peak):
             fields.append(self.peak)
         return fields
 
@@ -98,7 +98,7 @@ class Sampled:
         return self.scattering is not self.extinction
 
 
-def _is_field(peak: Tensor) -> bool:
+def is_field(peak: Tensor) -> bool:
     """Whether a medium's `peak` differs from cell to cell."""
     return peak.shape[1:].numel() > 1
 

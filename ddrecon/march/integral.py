@@ -8,12 +8,13 @@ that first.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
+from ddrecon.engine import current_engine
 from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing, cross_box, intersect_box
 from ddrecon.march.emission import Emission, Sampled, pack_channels
@@ -45,6 +46,7 @@ def march(
     order. A pixel that this might change by more than `settings.tolerance` of the image's root
     mean square, with light no brighter than `behind` seen through the volume, keeps its own ray.
     """
+    march_rays, march_lattice = _pick_engine()
     grid, crossing = emission.grid, cross_box(emission.grid, rays)
     if crossing.hit.numel() == 0:
         return _assemble(emission, rays, [])
@@ -53,14 +55,23 @@ def march(
     if settings.tolerance > 0 and isinstance(sampler, Bands):
         lattice = choose_lattice(grid, sampler.slices.axis, rays.select(crossing.hit))
         if lattice is not None:
-            values = _march_lattice(emission, sampler, lattice)
+            values = march_lattice(emission, sampler, lattice)
             places = lattice.places(rays.select(crossing.hit))
             parts = [(crossing.hit, interpolate_between(values, places))]
             rough = crossing.select(_needs_own_ray(values, places, settings.tolerance, behind))
             if len(rough.hit):
-                parts.append(_march_rays(emission, sampler, rays, rough))
+                parts.append(march_rays(emission, sampler, rays, rough))
             return _assemble(emission, rays, parts)
-    return _assemble(emission, rays, [_march_rays(emission, sampler, rays, crossing)])
+    return _assemble(emission, rays, [march_rays(emission, sampler, rays, crossing)])
+
+
+def _pick_engine() -> tuple[Callable[..., Part], Callable[..., Tensor]]:
+    """How rays and lattices of rays are marched by the engine in use."""
+    if current_engine() == "warp":
+        from ddrecon.march.fused import march as fused
+
+        return fused.march_rays, fused.march_lattice
+    return _march_rays, _march_lattice
 
 
 def _needs_own_ray(values: Tensor, places: Tensor, tolerance: float, behind: float) -> Tensor:

@@ -54,11 +54,16 @@ def peaked_phase_along(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
     Exact at depth 0; elsewhere off by at most 0.007 up to g = 0.95, relative to the function's
     value or to 1 where that is less.
     """
+    return evaluate_positive(fit_peaked_phase(cosine, g), depth)
+
+
+def fit_peaked_phase(cosine: Tensor, g: Tensor) -> Tensor:
+    """The polynomials [COEFFICIENTS, R] that stand for `peaked_phase` at each `cosine` [R]."""
 
     def along_depth(depths: Tensor) -> Tensor:
         return _signed_peaked_phase(depths, cosine.double(), g.double())
 
-    return evaluate_positive(fit_chebyshev(along_depth, depth), depth)
+    return fit_chebyshev(along_depth, cosine)
 
 
 def _signed_peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:

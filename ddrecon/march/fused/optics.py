@@ -1,0 +1,151 @@
+"""Formulas of the view-ray integral for single numbers, inside fused kernels.
+
+They are those of `numerics.decay`, `numerics.chebyshev` and `medium.phase` for tensors. The files
+of kernels have no postponed annotations: Warp reads the types of their arguments.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ddrecon.numerics.chebyshev import COEFFICIENTS, SCALE
+
+SERIES_BELOW = 0.5
+"""Differences of depth below this take psi from its series."""
+TERMS = {wp.float32: 7, wp.float64: 13}
+"""Terms of that series, by precision: the last is beyond the last digit."""
+
+
+@functools.cache
+def optics(scalar: Any, role: str) -> SimpleNamespace:
+    """The functions below for `scalar`, wp.float32 or wp.float64.
+
+    `role` tells apart those that kernels call ("value") from those that they differentiate by
+    `wp.grad` ("derivative"): Warp 1.19 makes no derivative of a function that is called as well.
+    """
+    F = scalar
+    count = TERMS[scalar]
+    inverses = wp.types.vector(length=count, dtype=F)(*(1.0 / (k + 2) for k in range(count, 0, -1)))
+    Triple = wp.types.vector(length=3, dtype=F)
+
+    def named(function: Any) -> Any:
+        return wp.func(function, name=f"{function.__name__}_{role}")
+
+    @named
+    def psi_series(depth: F) -> F:
+        """psi = 1/2 - depth / 6 + depth^2 / 24 - ... (`numerics.decay`)."""
+        series = F(1.0)
+        for k in range(wp.static(count)):
+            series = F(1.0) - depth * series * wp.static(inverses)[k]
+        return F(0.5) * series
+
+    @named
+    def mean_decay(begin: F, end: F, decay_begin: F, decay_end: F) -> F:
+        """The mean of exp(-depth) while depth goes linearly from `begin` to `end`.
+
+        `decay_begin` and `decay_end` are exp(-depth) there.
+        """
+        apart = wp.abs(end - begin)
+        if apart >= F(wp.static(SERIES_BELOW)):
+            return wp.abs(decay_begin - decay_end) / apart
+        return wp.max(decay_begin, decay_end) * (F(1.0) - apart * psi_series(apart))
+
+    @named
+    def mean_decay_slopes(begin: F, end: F, decay_begin: F, decay_end: F) -> Triple:
+        """That mean, and its derivatives by `begin` and by `end`."""
+        apart = wp.abs(end - begin)
+        most = wp.max(decay_begin, decay_end)
+        # By the smaller depth: -exp(-depth) psi, where psi = (1 - phi) / apart.
+        if apart >= F(wp.static(SERIES_BELOW)):
+            mean = wp.abs(decay_begin - decay_end) / apart
+            by_lower = (mean - most) / apart
+        else:
+            psi = psi_series(apart)
+            mean = most * (F(1.0) - apart * psi)
+            by_lower = -most * psi
+        # Both derivatives together are minus the mean.
+        if begin <= end:
+            return Triple(mean, by_lower, -mean - by_lower)
+        return Triple(mean, -mean - by_lower, by_lower)
+
+    @named
+    def henyey_greenstein(depth: F, cosine: F, g: F) -> F:
+        """p of E2, which has no peak: `depth` does not matter."""
+        square = F(1.0) + g * g - F(2.0) * g * cosine
+        return (F(1.0) - g * g) / (square * wp.sqrt(square))
+
+    @named
+    def phi(depth: F) -> F:
+        """(1 - exp(-depth)) / depth."""
+        if depth >= F(wp.static(SERIES_BELOW)):
+            return (F(1.0) - wp.exp(-depth)) / depth
+        return F(1.0) - depth * psi_series(depth)
+
+    @named
+    def peaked_phase(depth: F, cosine: F, g: F) -> F:
+        """p of E13 on a way of peak `depth` (E15, E16); at least 0."""
+        unscattered = phi(depth)
+        h = g * wp.exp((g - F(1.0)) * depth) * phi(g * depth) / unscattered
+        away = h - F(2.0) * cosine
+        root = wp.sqrt(F(1.0) + h * away)
+        above = F(1.0) + root * (F(2.0) + root * (F(3.0) + F(1.5) * root))
+        curved = above / (root * root * root * (root + F(1.0)) * (root + F(1.0)))
+        linear = F(3.0) * cosine - F(1.5) + F(1.5) * h * away
+        peak = linear + (F(1.0) - h * h) * away * away * curved
+        rest = (F(1.0) - g * g) * (F(1.0) + F(3.0) * g / (F(1.0) + g) * cosine)
+        return wp.max(rest + g * g * unscattered * peak, F(0.0))
+
+    @named
+    def place_of(depth: F) -> F:
+        """The variable of the polynomials that stand for E13 along a ray."""
+        return F(1.0) - F(wp.static(2.0 * SCALE)) / (depth + F(wp.static(SCALE)))
+
+    @named
+    def polynomial(coefficients: wp.array2d(dtype=F), first: int, ray: int, place: F) -> F:
+        """The polynomial of a ray at `place`: its coefficients are rows from `first` on."""
+        value = coefficients[first + wp.static(COEFFICIENTS - 1), ray]
+        for k in range(wp.static(COEFFICIENTS - 1)):
+            value = coefficients[first + wp.static(COEFFICIENTS - 2) - k, ray] + value * place
+        return value
+
+    @named
+    def polynomial_slope(coefficients: wp.array2d(dtype=F), first: int, ray: int, place: F) -> F:
+        """Its derivative by depth: d place / d depth = (1 - place)^2 / (2 s)."""
+        slope = (
+            F(wp.static(float(COEFFICIENTS - 1)))
+            * coefficients[first + wp.static(COEFFICIENTS - 1), ray]
+        )
+        for k in range(wp.static(COEFFICIENTS - 2)):
+            power = wp.static(COEFFICIENTS - 2) - k
+            slope = F(power) * coefficients[first + power, ray] + slope * place
+        away = F(1.0) - place
+        return slope * away * away * F(wp.static(0.5 / SCALE))
+
+    @named
+    def point_cosine(foot: F, across: F, t: F) -> F:
+        """Cosine between light from a point and a ray at distance `t`.
+
+        The point's foot is at distance -`foot` on the ray, and `across` the square of its distance.
+        """
+        along = foot + t
+        return -along / wp.sqrt(across + along * along)
+
+    @named
+    def subtended(foot: F, across: F, t0: F, t1: F) -> F:
+        """The integral of 1 / r^2 from `t0` to `t1`: the angle it subtends over the distance."""
+        apart = wp.sqrt(across)
+        return wp.atan2(apart * (t1 - t0), across + (foot + t0) * (foot + t1)) / apart
+
+    return SimpleNamespace(
+        mean_decay=mean_decay,
+        mean_decay_slopes=mean_decay_slopes,
+        henyey_greenstein=henyey_greenstein,
+        peaked_phase=peaked_phase,
+        place_of=place_of,
+        polynomial=polynomial,
+        polynomial_slope=polynomial_slope,
+        point_cosine=point_cosine,
+        subtended=subtended,
+    )

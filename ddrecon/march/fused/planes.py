@@ -1,0 +1,158 @@
+"""Interpolation in one slice of cells, inside fused kernels.
+
+Linear values, the third-order corrections of beams' masses (a (1 - a) / 2 second differences along
+each axis), the slopes of both, and their adjoint.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.lines import lines
+from ddrecon.march.fused.rays import vectors
+
+
+@functools.cache
+def planes(layout: Layout) -> SimpleNamespace:
+    """Functions of cells [n, h, w, channels], the slice n, and places along h and w."""
+    types = vectors(layout)
+    F, Node, Bent = types.F, types.Node, types.Bent
+    Place, Pair = lines(F).Place, wp.types.vector(length=2, dtype=F)
+    channels, first = layout.channels, layout.first_mass
+    last = first + layout.masses
+
+    @wp.func
+    def linear(f: wp.array4d(dtype=F), n: int, y: Place, x: Place) -> Node:
+        v = Node()
+        w00 = (F(1.0) - y.a) * (F(1.0) - x.a)
+        w01 = (F(1.0) - y.a) * x.a
+        w10 = y.a * (F(1.0) - x.a)
+        w11 = y.a * x.a
+        for c in range(wp.static(channels)):
+            v[c] = (
+                w00 * f[n, y.i, x.i, c]
+                + w01 * f[n, y.i, x.j, c]
+                + w10 * f[n, y.j, x.i, c]
+                + w11 * f[n, y.j, x.j, c]
+            )
+        return v
+
+    @wp.func
+    def linear_slope(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, along_y: bool) -> Node:
+        v = Node()
+        for c in range(wp.static(channels)):
+            if along_y:
+                v[c] = y.live * (
+                    (F(1.0) - x.a) * (f[n, y.j, x.i, c] - f[n, y.i, x.i, c])
+                    + x.a * (f[n, y.j, x.j, c] - f[n, y.i, x.j, c])
+                )
+            else:
+                v[c] = x.live * (
+                    (F(1.0) - y.a) * (f[n, y.i, x.j, c] - f[n, y.i, x.i, c])
+                    + y.a * (f[n, y.j, x.j, c] - f[n, y.j, x.i, c])
+                )
+        return v
+
+    @wp.func
+    def weights(x: Place) -> Pair:
+        """Those of linear interpolation between the cells i and j."""
+        return Pair(F(1.0) - x.a, x.a)
+
+    @wp.func
+    def bends_along_y(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, v: Pair, w: Pair) -> Bent:
+        """Second differences of masses along y in cells i and j of both lines, weighted v and w."""
+        out = Bent()
+        for k in range(wp.static(layout.masses)):
+            c = wp.static(first) + k
+            f00 = f[n, y.i, x.i, c]
+            f01 = f[n, y.i, x.j, c]
+            f10 = f[n, y.j, x.i, c]
+            f11 = f[n, y.j, x.j, c]
+            before = w[0] * (f[n, y.m, x.i, c] - F(2.0) * f00 + f10)
+            before += w[1] * (f[n, y.m, x.j, c] - F(2.0) * f01 + f11)
+            behind = w[0] * (f00 - F(2.0) * f10 + f[n, y.p, x.i, c])
+            behind += w[1] * (f01 - F(2.0) * f11 + f[n, y.p, x.j, c])
+            out[k] = v[0] * before + v[1] * behind
+        return out
+
+    @wp.func
+    def bends_along_x(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, v: Pair, w: Pair) -> Bent:
+        """The same along x."""
+        out = Bent()
+        for k in range(wp.static(layout.masses)):
+            c = wp.static(first) + k
+            f00 = f[n, y.i, x.i, c]
+            f01 = f[n, y.i, x.j, c]
+            f10 = f[n, y.j, x.i, c]
+            f11 = f[n, y.j, x.j, c]
+            before = v[0] * (f[n, y.i, x.m, c] - F(2.0) * f00 + f01)
+            before += v[1] * (f[n, y.j, x.m, c] - F(2.0) * f10 + f11)
+            behind = v[0] * (f00 - F(2.0) * f01 + f[n, y.i, x.p, c])
+            behind += v[1] * (f10 - F(2.0) * f11 + f[n, y.j, x.p, c])
+            out[k] = w[0] * before + w[1] * behind
+        return out
+
+    @wp.func
+    def correction(f: wp.array4d(dtype=F), n: int, y: Place, x: Place) -> Bent:
+        """What linear interpolation is off by: a (1 - a) / 2 second differences an axis."""
+        v = weights(y)
+        w = weights(x)
+        along_y = bends_along_y(f, n, y, x, v, w)
+        return y.excess * along_y + x.excess * bends_along_x(f, n, y, x, v, w)
+
+    @wp.func
+    def correction_slope(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, along_y: bool) -> Bent:
+        """Its derivative along y, or x: of the excess there, and of the weights."""
+        v = weights(y)
+        w = weights(x)
+        step = Pair(F(-1.0), F(1.0))
+        if along_y:
+            by_excess = y.excess_slope * bends_along_y(f, n, y, x, v, w)
+            by_weights = y.excess * bends_along_y(f, n, y, x, step, w)
+            return y.live * (by_excess + by_weights + x.excess * bends_along_x(f, n, y, x, step, w))
+        by_excess = x.excess_slope * bends_along_x(f, n, y, x, v, w)
+        by_weights = x.excess * bends_along_x(f, n, y, x, v, step)
+        return x.live * (by_excess + by_weights + y.excess * bends_along_y(f, n, y, x, v, step))
+
+    @wp.func
+    def scatter(g: wp.array4d(dtype=F), n: int, y: Place, x: Place, bar: Node, t: Bent):
+        """Adds what `bar` of linear values and `t` of corrections mean for the cells."""
+        w00 = (F(1.0) - y.a) * (F(1.0) - x.a)
+        w01 = (F(1.0) - y.a) * x.a
+        w10 = y.a * (F(1.0) - x.a)
+        w11 = y.a * x.a
+        for c in range(wp.static(channels)):
+            g00 = w00 * bar[c]
+            g01 = w01 * bar[c]
+            g10 = w10 * bar[c]
+            g11 = w11 * bar[c]
+            if wp.static(layout.masses > 0):  # noqa: SIM102 - static conditions stand alone
+                if c >= wp.static(first) and c < wp.static(last):
+                    ty = y.excess * t[c - wp.static(first)]
+                    tx = x.excess * t[c - wp.static(first)]
+                    wp.atomic_add(g, n, y.m, x.i, c, ty * w00)
+                    wp.atomic_add(g, n, y.m, x.j, c, ty * w01)
+                    wp.atomic_add(g, n, y.p, x.i, c, ty * w10)
+                    wp.atomic_add(g, n, y.p, x.j, c, ty * w11)
+                    wp.atomic_add(g, n, y.i, x.m, c, tx * w00)
+                    wp.atomic_add(g, n, y.j, x.m, c, tx * w10)
+                    wp.atomic_add(g, n, y.i, x.p, c, tx * w01)
+                    wp.atomic_add(g, n, y.j, x.p, c, tx * w11)
+                    g00 += ty * (w10 - F(2.0) * w00) + tx * (w01 - F(2.0) * w00)
+                    g01 += ty * (w11 - F(2.0) * w01) + tx * (w00 - F(2.0) * w01)
+                    g10 += ty * (w00 - F(2.0) * w10) + tx * (w11 - F(2.0) * w10)
+                    g11 += ty * (w01 - F(2.0) * w11) + tx * (w10 - F(2.0) * w11)
+            wp.atomic_add(g, n, y.i, x.i, c, g00)
+            wp.atomic_add(g, n, y.i, x.j, c, g01)
+            wp.atomic_add(g, n, y.j, x.i, c, g10)
+            wp.atomic_add(g, n, y.j, x.j, c, g11)
+
+    return SimpleNamespace(
+        linear=linear,
+        linear_slope=linear_slope,
+        correction=correction,
+        correction_slope=correction_slope,
+        scatter=scatter,
+    )

@@ -1,0 +1,175 @@
+"""The fused kernels of the view-ray integral compute what PyTorch's operations compute.
+
+Values, derivatives in reverse and in forward mode, for all that an emission can hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward
+from media import half_empty, make_camera, make_scene, random_values
+from torch import Tensor
+
+import ddrecon.engine
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import use_engine
+from ddrecon.light.lights import PointLight
+from ddrecon.renderer import render_each
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, with_values
+
+pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+pytestmark = pytest.mark.slow
+
+SHAPE = (7, 9, 8)
+OUTSIDE, INSIDE = {"half_width": 0.4}, {"eye": (0.1, 0.12, 0.05), "half_width": 0.6}
+LIGHT = ["density", "g", "lights.0.irradiance", "lights.0.direction"]
+POINT = ["lights.1.position", "lights.1.intensity"]
+POSE = ["views.view.camera"]
+
+
+@pytest.fixture(autouse=True)
+def _engine_as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(ddrecon.engine, "_engine", "torch")
+    yield
+
+
+def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: int = 9) -> Scene:
+    """A scene with a directional light, `kind` of medium and lights, seen by one camera."""
+    density = half_empty(*SHAPE, dtype=dtype)
+    camera = make_camera(size=(size, size + 1), dtype=dtype, **view)
+    if kind == "gray":
+        return make_scene(density, sigma_a=(1.0,), sigma_s=(6.0,), camera=camera)
+    if kind == "backward":
+        return make_scene(density, g=-0.4, ambient=(0.2, 0.1, 0.3), camera=camera)
+    if kind == "peaked":
+        return make_scene(density, g=0.5, camera=camera)
+    fields = {
+        name: factor * (0.5 + random_values(3, *SHAPE, seed=seed, dtype=dtype))
+        for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
+    }
+    scene = make_scene(density, g=0.5, camera=camera, **fields)
+    outside = PointLight(density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5]))
+    inside = PointLight(density.new_tensor([0.1, 0.05, -0.1]), density.new_tensor([0.3]))
+    scene.lights += [outside, inside]
+    return scene
+
+
+def images(scene: Scene, values: dict[str, Tensor], engine: str) -> list[Tensor]:
+    use_engine(engine)
+    changed = with_values(scene, values)
+    return render_each(changed, changed.views, SolveMemory())
+
+
+def gradients(scene: Scene, names: list[str], engine: str) -> tuple[Tensor, list[Tensor]]:
+    """The first image, and the derivatives of a random functional of all of them."""
+    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
+    rendered = images(scene, leaves, engine)
+    weights = [random_values(*image.shape, seed=3).to(image) for image in rendered]
+    loss = sum((image * weight).sum() for image, weight in zip(rendered, weights, strict=True))
+    return rendered[0].detach(), list(torch.autograd.grad(loss, list(leaves.values())))
+
+
+def tangent(scene: Scene, name: str, engine: str) -> Tensor:
+    value = value_of(scene, name).detach()
+    with forward.dual_level():
+        dual = forward.make_dual(value, random_values(*value.shape, seed=5).to(value))
+        return forward.unpack_dual(images(scene, {name: dual}, engine)[0]).tangent
+
+
+def assert_near(found: Tensor, known: Tensor, error: float) -> None:
+    assert float((found - known).abs().max()) <= error * float(known.abs().max())
+
+
+CASES = [
+    ("gray", OUTSIDE, [*LIGHT, "sigma_t", *POSE]),
+    ("backward", OUTSIDE, [*LIGHT, "albedo"]),
+    ("peaked", OUTSIDE, [*LIGHT, "sigma_s", *POSE]),
+    ("fields", OUTSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
+    ("fields", INSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
+]
+each_case = pytest.mark.parametrize(
+    ("kind", "view", "names"),
+    CASES,
+    ids=[f"{kind}-{'inside' if view is INSIDE else 'outside'}" for kind, view, _ in CASES],
+)
+
+
+@each_case
+def test_images_and_gradients_are_those_of_torch(kind: str, view: dict, names: list[str]):
+    scene = scene_of(kind, view)
+    known, by_torch = gradients(scene, names, "torch")
+    image, by_warp = gradients(scene, names, "warp")
+    assert_near(image, known, 1e-12)
+    for name, one, other in zip(names, by_warp, by_torch, strict=True):
+        assert float(other.abs().max()) > 0, name
+        assert_near(one, other, 1e-11)
+
+
+@each_case
+def test_tangents_are_those_of_torch(kind: str, view: dict, names: list[str]):
+    scene = scene_of(kind, view)
+    for name in names:
+        assert_near(tangent(scene, name, "warp"), tangent(scene, name, "torch"), 1e-11)
+
+
+@pytest.mark.parametrize("settings", [{"steps_per_voxel": 3}, {"samples_per_pixel": 4}], ids=str)
+def test_settings_of_the_march_mean_the_same(settings: dict):
+    scene = scene_of("peaked", OUTSIDE)
+    scene.render = replace(scene.render, **settings)
+    for one, other in zip(*(gradients(scene, LIGHT, e)[1] for e in ("warp", "torch")), strict=True):
+        assert_near(one, other, 1e-11)
+
+
+def test_lattices_of_rays_are_marched_as_well():
+    """As many pixels as make the renderer interpolate most of them."""
+    scene = scene_of("peaked", OUTSIDE, size=64)
+    (image, one), (known, other) = (gradients(scene, ["density"], e) for e in ("warp", "torch"))
+    assert_near(image, known, 1e-12)
+    assert_near(one[0], other[0], 1e-11)
+
+
+def test_single_precision():
+    scene = scene_of("peaked", OUTSIDE, torch.float32)
+    (image, one), (known, other) = (gradients(scene, LIGHT, e) for e in ("warp", "torch"))
+    assert_near(image, known, 1e-5)
+    for found, expected in zip(one, other, strict=True):
+        assert_near(found, expected, 2e-5)
+
+
+def test_tangent_and_adjoint_are_transposes_of_each_other():
+    """To rounding, by the kernels' own derivatives: <J v, w> = <v, J^T w>."""
+    scene = scene_of("fields", OUTSIDE)
+    for name in ("density", "g", "lights.1.position", "views.view.camera"):
+        value = value_of(scene, name).detach()
+        along = float(tangent(scene, name, "warp").mul(random_values(3, 9, 10, seed=3)).sum())
+        (gradient,) = gradients(scene, [name], "warp")[1]
+        back = float((gradient * random_values(*value.shape, seed=5)).sum())
+        assert along == pytest.approx(back, rel=1e-10), name
+
+
+def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
+    scene, threads = scene_of("peaked", OUTSIDE), torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        first, again = (gradients(scene, LIGHT, "warp")[1] for _ in range(2))
+        torch.set_num_threads(1)
+        alone = gradients(scene, LIGHT, "warp")[1]
+    finally:
+        torch.set_num_threads(threads)
+    for one, same, other in zip(first, again, alone, strict=True):
+        assert torch.equal(one, same)
+        assert_near(one, other, 1e-12)
+
+
+def test_empty_space_and_rays_that_miss():
+    """Nothing is seen, and derivatives by the density of empty cells are finite and not zero."""
+    scene = scene_of("gray", {"half_width": 0.7})
+    scene.volume.density = torch.zeros_like(scene.volume.density)
+    (image, one), (_, other) = (gradients(scene, ["density"], e) for e in ("warp", "torch"))
+    assert not image.any() and bool(torch.isfinite(one[0]).all()) and bool(one[0].any())
+    assert_near(one[0], other[0], 1e-11)
