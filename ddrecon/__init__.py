@@ -16,6 +16,7 @@ _HOMES = {
     "optimize": "ddrecon.reconstruct.loop",
     "Result": "ddrecon.reconstruct.loop",
     "Scene": "ddrecon.scene",
+    "use_engine": "ddrecon.engine",
     "DdreconError": "ddrecon.errors",
     "SceneError": "ddrecon.errors",
     "UsageError": "ddrecon.errors",

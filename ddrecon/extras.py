@@ -18,6 +18,7 @@ EXTRAS = {
     "mitsuba": "reference",
     "imageio_ffmpeg": "mp4",
     "tensorboard": "tensorboard",
+    "warp": "fast",
 }
 """Which extra of ddrecon brings which package."""
 

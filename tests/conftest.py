@@ -1,4 +1,7 @@
-"""What every test has: a seed of its own, one thread, and commands that run in this process."""
+"""What every test has: a seed of its own, one thread, and commands that run in this process.
+
+The torch engine runs unless a test, or the environment, asks for another.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,14 @@ from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import FORMATS
 
 os.environ["OMP_NUM_THREADS"] = "1"
+os.environ.setdefault("DDRECON_ENGINE", "torch")  # compiles nothing
 torch.set_num_threads(1)  # tests run side by side, one a core
+
+
+@pytest.fixture(autouse=True)
+def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test depends on the engine that those before it used."""
+    monkeypatch.setattr("ddrecon.engine._engine", None)
 
 
 @pytest.fixture(autouse=True)

@@ -16,13 +16,16 @@ from ddrecon.extras import EXTRAS, load_extra, load_for_file
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
     "optional-dependencies"
 ]
+PROJECTS = {"warp": "warp-lang"}
+"""What pip calls a package, where that is another name than it is imported by."""
 
 
 def test_every_extra_brings_its_package_and_all_brings_every_extra() -> None:
     extras = {name: needs for name, needs in PROJECT.items() if name not in ("all", "dev", "docs")}
     assert set(extras) == set(EXTRAS.values())
     for package, name in EXTRAS.items():
-        assert any(need.startswith(f"{package.replace('_', '-')}>=") for need in extras[name])
+        project = PROJECTS.get(package, package.replace("_", "-"))
+        assert any(need.startswith(f"{project}>=") for need in extras[name])
     assert PROJECT["all"] == [f"ddrecon[{','.join(extras)}]"]
 
 

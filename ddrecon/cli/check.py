@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from ddrecon.engine import engine_of_parts
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
@@ -35,7 +36,7 @@ def memory_estimate(scene: Scene) -> int:
 
 
 def describe(scene: Scene) -> dict[str, Any]:
-    """What `ddrecon check` reports of `scene`: grid, views, physics, parameters and memory.
+    """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
     Its parameters are where they start.
     """
@@ -50,6 +51,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
+        "engine": engine_of_parts(),
         "memory_bytes": memory_estimate(scene),
     }
 
@@ -66,6 +68,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(parameters) or 'nothing'}",
+        f"engine: {_name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
 
@@ -74,6 +77,15 @@ def _view_line(view: dict[str, Any]) -> str:
     size = f"{view['width']} x {view['height']} pixels"
     image = ", with image" if view["has_image"] else ""
     return f"{view['name']}: {view['camera']}, {size}, {view['split']}{image}"
+
+
+def _name_engines(engines: dict[str, str]) -> str:
+    """The engine, and with warp what it runs and what it leaves to torch."""
+    fused = [part for part, engine in engines.items() if engine == "warp"]
+    others = [part for part, engine in engines.items() if engine == "torch"]
+    if not fused:
+        return "torch"
+    return f"warp ({', '.join(fused)}); {' and '.join(others)} run in torch"
 
 
 def _count_entries(name: str, count: int) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from ddrecon import __version__
+from ddrecon.engine import CHOICES
 from ddrecon.errors import DataWarning, DdreconError
 
 COMMON = (
@@ -26,6 +27,11 @@ COMMON = (
     ),
     click.option(
         "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
+    ),
+    click.option(
+        "--engine",
+        type=click.Choice(CHOICES),
+        help="Kernels; auto: warp where it is installed. DDRECON_ENGINE or auto unless given.",
     ),
     click.option(
         "--threads",
@@ -70,6 +76,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     def wrapped(
         overrides: tuple[str, ...],
         device: str,
+        engine: str | None,
         threads: int | None,
         seed: int,
         quiet: bool,
@@ -80,11 +87,11 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
         for name, value in THREADING.items():
             os.environ.setdefault(name, value)
         try:
-            from ddrecon.cli.session import open_session
+            from ddrecon.cli.session import open_session, show_compilations
 
             dtype, as_json = others.pop("dtype", "float64"), others.pop("as_json", False)
-            common = overrides, device, threads, seed, quiet, verbose
-            with show_warnings():
+            common = overrides, device, engine, threads, seed, quiet, verbose
+            with show_warnings(), show_compilations(quiet):
                 command(session=open_session(*common, dtype, as_json), **others)
         except DdreconError as error:
             if debug:
@@ -136,9 +143,17 @@ def show_version(context: click.Context, parameter: click.Parameter, is_asked: b
 
         import torch
 
+        from ddrecon.engine import engine_versions
+
+        try:
+            engine, *packages = engine_versions().items()
+        except DdreconError as error:
+            click.echo(str(error), err=True)
+            context.exit(error.exit_code)
+        brought = "".join(f" ({name} {version})" for name, version in packages)
         device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
         click.echo(
             f"ddrecon {__version__}, Python {platform.python_version()}, "
-            f"torch {torch.__version__}, device {device}"
+            f"torch {torch.__version__}, engine {engine[1]}{brought}, device {device}"
         )
         context.exit()

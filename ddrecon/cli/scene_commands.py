@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @AS_JSON
 @in_session
 def check(session: Session, scene: Path) -> None:
-    """Validate SCENE and print its grid, views, memory and the physics it needs."""
+    """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     from ddrecon.cli.check import describe, lines
 
     report = describe(session.load(scene))

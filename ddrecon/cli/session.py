@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import platform
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ import torch
 from tqdm import tqdm
 
 from ddrecon import __version__
+from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
 from ddrecon.run.result import RESULT
 from ddrecon.scene import Scene, View
@@ -87,6 +90,7 @@ class Session:
             "ddrecon": __version__,
             "python": platform.python_version(),
             "torch": torch.__version__,
+            **engine_versions(),
             "numpy": np.__version__,
             "platform": platform.platform(),
             "device": torch.cuda.get_device_name(self.device)
@@ -117,6 +121,7 @@ def result_in(folder: Path) -> Path:
 def open_session(
     overrides: tuple[str, ...],
     device: str,
+    engine: str | None,
     threads: int | None,
     seed: int,
     is_quiet: bool,
@@ -124,16 +129,41 @@ def open_session(
     dtype: str,
     as_json: bool,
 ) -> Session:
-    """Sets torch up as the options say; raises UsageError for a device that is not there."""
+    """Sets torch and the engine up as the options say.
+
+    Raises UsageError for a device that is not there, MissingExtraError for such an engine.
+    """
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError(
             "--device cuda: torch sees no CUDA device here; "
             "leave --device out, or install a CUDA build of torch"
         )
     place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+    use_engine(engine or current_engine())
     threads = threads or (
         torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else os.cpu_count() or 1
     )
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     return Session(overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json)
+
+
+class _LinesAboveBars(logging.Handler):
+    """Prints each message as a line on stderr, above the progress bar that may be there."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        tqdm.write(record.getMessage(), file=sys.stderr)
+
+
+@contextmanager
+def show_compilations(is_quiet: bool) -> Iterator[None]:
+    """What the engine logs, that it compiles kernels, becomes lines on stderr, unless quiet."""
+    log, handler = logging.getLogger(LOG), _LinesAboveBars()
+    level = log.level
+    log.setLevel(logging.WARNING if is_quiet else logging.INFO)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)

@@ -18,7 +18,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "cli.md").read_text()
 PROGRAM = [sys.executable, "-c", "from ddrecon.cli import main; main()"]
 
 
-HEAVY = {"torch", "numpy", "yaml", "imageio", "tqdm"}
+HEAVY = {"torch", "warp", "numpy", "yaml", "imageio", "tqdm"}
 
 
 @pytest.mark.parametrize(
@@ -42,11 +42,12 @@ def test_a_command_says_what_it_does(command: str) -> None:
     assert "-D KEY.PATH=VALUE" in result.stdout
 
 
-def test_version() -> None:
+def test_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DDRECON_ENGINE", "torch")
     python = ".".join(map(str, sys.version_info[:3]))
     (line,) = CliRunner().invoke(main, ["--version"]).stdout.splitlines()
     assert line.startswith(
-        f"ddrecon {__version__}, Python {python}, torch {torch.__version__}, device "
+        f"ddrecon {__version__}, Python {python}, torch {torch.__version__}, engine torch, device "
     )
     assert line.endswith(" cpu") or torch.cuda.is_available()
 

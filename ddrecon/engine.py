@@ -1,0 +1,79 @@
+"""Which kernels run: PyTorch's, or fused ones in NVIDIA Warp.
+
+An engine is an implementation of the inner loops. `torch` is the readable definition and has them
+all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
+same formulas, so their numbers agree to rounding. Today warp has the view-ray integral; light and
+diffusion run in torch with either.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+
+from ddrecon.errors import MissingExtraError, UsageError
+from ddrecon.extras import advice
+
+ENGINES = ("torch", "warp")
+"""The engines there are."""
+CHOICES = ("auto", *ENGINES)
+"""What can be asked for; `auto` is warp where it is installed, else torch."""
+PARTS = {"view rays": ENGINES, "light": ("torch",), "diffusion": ("torch",)}
+"""Which engines have which part of the renderer."""
+VARIABLE = "DDRECON_ENGINE"
+"""The environment variable that chooses where `use_engine` was not called; `auto` without it."""
+LOG = "ddrecon.engine"
+"""The logger that is told when kernels are compiled, which happens once."""
+
+_engine: str | None = None
+"""The engine of this process, once it is known."""
+
+
+def use_engine(name: str) -> None:
+    """Chooses the engine of this process: `auto`, `torch` or `warp`.
+
+    `auto` takes warp where it is installed, else torch. Raises MissingExtraError for `warp` where
+    it is not installed; UsageError for another name.
+    """
+    global _engine
+    _engine = _resolve(name, f"engine {name}")
+
+
+def current_engine() -> str:
+    """The engine of this process, `torch` or `warp`.
+
+    Where `use_engine` was not called, the environment variable DDRECON_ENGINE chooses it. Raises
+    what `use_engine` raises.
+    """
+    global _engine
+    if _engine is None:
+        name = os.environ.get(VARIABLE) or "auto"
+        _engine = _resolve(name, f"{VARIABLE}={name}")
+    return _engine
+
+
+def engine_of_parts() -> dict[str, str]:
+    """The engine that runs each part of the renderer: the current one where it has the part."""
+    engine = current_engine()
+    return {part: engine if engine in engines else "torch" for part, engines in PARTS.items()}
+
+
+def engine_versions() -> dict[str, str]:
+    """The current `engine`, and the version of `warp-lang` where that is warp."""
+    from importlib.metadata import version  # here, so that help answers at once
+
+    engine = current_engine()
+    return {"engine": engine} | ({"warp-lang": version("warp-lang")} if engine == "warp" else {})
+
+
+def _resolve(name: str, asked: str) -> str:
+    """The engine that `name` stands for; `asked` begins the message of an error."""
+    if name not in CHOICES:
+        raise UsageError(f"{asked}: no such engine; known: {', '.join(CHOICES)}")
+    if name == "torch":
+        return name
+    # Looked for, not imported: that takes a third of a second.
+    is_installed = find_spec("warp") is not None
+    if name == "warp" and not is_installed:
+        raise MissingExtraError(f"{asked} {advice('warp')}")
+    return "warp" if is_installed else "torch"

@@ -1,0 +1,102 @@
+"""`--engine` reaches what a command records, and compilations are announced."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+
+from ddrecon import engine
+from ddrecon.cli import check
+from ddrecon.cli.session import open_session, show_compilations
+
+Run = Callable[..., Result]
+Refuse = Callable[..., list[str]]
+LOG = logging.getLogger("ddrecon.engine")
+COMPILING = "compiling kernels, once: 2.5 s"
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """warp-lang 9.8.7 is installed, and taken unless another engine is asked for."""
+    monkeypatch.setattr(engine, "find_spec", {"warp": "found"}.get)
+    monkeypatch.setattr(metadata, "version", {"warp-lang": "9.8.7"}.get)
+    monkeypatch.setenv("DDRECON_ENGINE", "auto")
+
+
+def test_a_run_records_its_engine(succeed: Run) -> None:
+    succeed("optimize", "scene.yaml", "-o", "out", "-q", "--engine", "torch", "--iterations", "1")
+    environment = json.loads(Path("out/environment.json").read_text())
+    assert environment["engine"] == "torch" and "warp-lang" not in environment
+    assert "<td>engine</td><td>torch</td>" in Path("out/report.html").read_text()
+
+
+def test_the_environment_has_the_version_of_warp() -> None:
+    session = open_session((), "cpu", "warp", 1, 0, True, False, "float32", False)
+    named = {"engine": "warp", "warp-lang": "9.8.7"}
+    assert named.items() <= session.environment().items()
+
+
+def test_version_names_the_engine(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ", engine warp (warp-lang 9.8.7), device " in run("--version").stdout
+    monkeypatch.setattr(engine, "_engine", None)
+    monkeypatch.setenv("DDRECON_ENGINE", "cuda")
+    result = run("--version")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("DDRECON_ENGINE=cuda: no such engine; known: ")
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("warp", "engine: warp (view rays); light and diffusion run in torch"),
+        ("auto", "engine: warp (view rays); light and diffusion run in torch"),
+        ("torch", "engine: torch"),
+    ],
+)
+def test_check_names_it(succeed: Run, name: str, line: str) -> None:
+    assert line in succeed("check", "scene.yaml", "--engine", name).stdout.splitlines()
+    report = json.loads(succeed("check", "scene.yaml", "--engine", name, "--json").stdout)
+    rays = "torch" if name == "torch" else "warp"
+    assert report["engine"] == {"view rays": rays, "light": "torch", "diffusion": "torch"}
+
+
+def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "find_spec", {}.get)
+    command = "optimize", "scene.yaml", "-o", "out", "--engine"
+    (line,) = refuse(3, *command, "warp")
+    assert line == 'engine warp needs warp: pip install "ddrecon[fast]"'
+    assert "'cuda' is not one of 'auto', 'torch', 'warp'" in refuse(2, *command, "cuda")[-1]
+    monkeypatch.setenv("DDRECON_ENGINE", "cuda")
+    assert refuse(2, *command[:-1]) == [
+        "DDRECON_ENGINE=cuda: no such engine; known: auto, torch, warp"
+    ]
+
+
+@pytest.mark.parametrize(("quiet", "expected"), [((), [COMPILING]), (("-q",), [])])
+def test_a_compilation_is_announced_once(
+    succeed: Run, monkeypatch: pytest.MonkeyPatch, quiet: tuple[str, ...], expected: list[str]
+) -> None:
+    describe = check.describe
+
+    def compile_and_describe(scene: object) -> object:
+        LOG.info("compiling kernels, once: %.1f s", 2.5)
+        return describe(scene)
+
+    monkeypatch.setattr(check, "describe", compile_and_describe)
+    for _ in range(2):
+        result = succeed("check", "scene.yaml", *quiet)
+        assert result.stderr.splitlines() == expected
+
+
+def test_no_handler_stays() -> None:
+    before = LOG.level, list(LOG.handlers)
+    with pytest.raises(KeyError), show_compilations(is_quiet=False):
+        assert len(LOG.handlers) == len(before[1]) + 1
+        raise KeyError
+    assert (LOG.level, LOG.handlers) == before

@@ -1,0 +1,114 @@
+"""The engine is chosen by name, by the environment, or by what is installed."""
+
+from __future__ import annotations
+
+import sys
+from importlib import metadata
+
+import pytest
+
+import ddrecon
+from ddrecon import engine
+from ddrecon.engine import ENGINES, PARTS, current_engine, engine_of_parts, engine_versions
+from ddrecon.errors import MissingExtraError, UsageError
+
+ADVICE = 'needs warp: pip install "ddrecon[fast]"'
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """warp-lang 9.8.7 is installed."""
+    monkeypatch.setattr(engine, "find_spec", {"warp": "found"}.get)
+    monkeypatch.setattr(metadata, "version", {"warp-lang": "9.8.7"}.get)
+
+
+@pytest.fixture
+def missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """warp-lang is not installed."""
+    monkeypatch.setattr(engine, "find_spec", {}.get)
+
+
+def test_it_is_public() -> None:
+    assert ddrecon.use_engine is engine.use_engine
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_an_engine_is_used_until_another_is(installed: None, name: str) -> None:
+    ddrecon.use_engine(name)
+    assert current_engine() == current_engine() == name
+    ddrecon.use_engine("torch")
+    assert current_engine() == "torch"
+
+
+def test_auto_takes_warp_where_it_is_installed(installed: None) -> None:
+    ddrecon.use_engine("auto")
+    assert current_engine() == "warp"
+
+
+def test_auto_takes_torch_elsewhere(missing: None) -> None:
+    ddrecon.use_engine("auto")
+    assert current_engine() == "torch"
+
+
+def test_an_unknown_engine_is_refused() -> None:
+    ddrecon.use_engine("torch")
+    with pytest.raises(UsageError, match=r"^engine wrap: no such engine; known: auto, torch, warp"):
+        ddrecon.use_engine("wrap")
+    assert current_engine() == "torch"
+
+
+def test_warp_that_is_missing_is_refused(missing: None) -> None:
+    ddrecon.use_engine("torch")
+    with pytest.raises(MissingExtraError) as caught:
+        ddrecon.use_engine("warp")
+    assert str(caught.value) == f"engine warp {ADVICE}"
+    assert current_engine() == "torch"
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"), [("torch", "torch"), ("warp", "warp"), ("auto", "warp"), ("", "warp")]
+)
+def test_the_environment_chooses(
+    installed: None, monkeypatch: pytest.MonkeyPatch, value: str, expected: str
+) -> None:
+    monkeypatch.setenv("DDRECON_ENGINE", value)
+    assert current_engine() == expected
+    ddrecon.use_engine("torch")
+    assert current_engine() == "torch"
+
+
+def test_without_a_word_it_is_auto(installed: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DDRECON_ENGINE", raising=False)
+    assert current_engine() == "warp"
+
+
+def test_an_environment_that_cannot_be_is_named(
+    missing: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DDRECON_ENGINE", "cuda")
+    with pytest.raises(UsageError, match=r"^DDRECON_ENGINE=cuda: no such engine; known: auto, "):
+        current_engine()
+    monkeypatch.setenv("DDRECON_ENGINE", "warp")
+    with pytest.raises(MissingExtraError) as caught:
+        current_engine()
+    assert str(caught.value) == f"DDRECON_ENGINE=warp {ADVICE}"
+
+
+def test_torch_has_every_part_and_runs_what_warp_has_not(installed: None) -> None:
+    ddrecon.use_engine("torch")
+    assert engine_of_parts() == dict.fromkeys(PARTS, "torch")
+    ddrecon.use_engine("warp")
+    assert engine_of_parts() == dict.fromkeys(PARTS, "torch") | {"view rays": "warp"}
+
+
+def test_versions(installed: None) -> None:
+    ddrecon.use_engine("torch")
+    assert engine_versions() == {"engine": "torch"}
+    ddrecon.use_engine("warp")
+    assert engine_versions() == {"engine": "warp", "warp-lang": "9.8.7"}
+
+
+def test_to_choose_imports_no_warp(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "warp", raising=False)
+    ddrecon.use_engine("auto")
+    assert "warp" not in sys.modules
