@@ -5,7 +5,6 @@ Values, derivatives in reverse and in forward mode, for all that an emission can
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -14,7 +13,6 @@ import torch.autograd.forward_ad as forward
 from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
-import ddrecon.engine
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import PointLight
@@ -30,12 +28,6 @@ OUTSIDE, INSIDE = {"half_width": 0.4}, {"eye": (0.1, 0.12, 0.05), "half_width": 
 LIGHT = ["density", "g", "lights.0.irradiance", "lights.0.direction"]
 POINT = ["lights.1.position", "lights.1.intensity"]
 POSE = ["views.view.camera"]
-
-
-@pytest.fixture(autouse=True)
-def _engine_as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(ddrecon.engine, "_engine", "torch")
-    yield
 
 
 def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: int = 9) -> Scene:

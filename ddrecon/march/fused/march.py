@@ -49,7 +49,9 @@ def _integrate(
     bundle = torch.cat([origin, direction, near[:, None], far[:, None]], 1)
     feet, squares, coefficients, factors = _beams(emission, rays)
     scale = emission.extinction.scale.view(-1).expand(layout.colors)
-    peak = emission.peak.view(-1).expand(layout.colors) if layout.peak == 0 else 0 * scale
+    peak = 0 * scale
+    if emission.peak is not None and not is_field(emission.peak):
+        peak = emission.peak.view(-1).expand(layout.colors)
     numbers = torch.cat([scale, peak, emission.g.view(1), bound])
     out, masses = Integrate.apply(
         layout, is_sliced, planes, cells, bundle, torch.cat([feet, squares]), coefficients, numbers
