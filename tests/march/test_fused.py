@@ -6,6 +6,7 @@ Values, derivatives in reverse and in forward mode, for all that an emission can
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +21,11 @@ from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
 
-pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.march.fused.adjoint import adjoint_kernel  # noqa: E402
+from ddrecon.march.fused.layout import Layout  # noqa: E402
+from ddrecon.march.fused.walks import integral_kernel, tangent_kernel  # noqa: E402
+
 pytestmark = pytest.mark.slow
 
 SHAPE = (7, 9, 8)
@@ -156,6 +161,17 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
     for one, same, other in zip(first, again, alone, strict=True):
         assert torch.equal(one, same)
         assert_near(one, other, 1e-12)
+
+
+@pytest.mark.parametrize("architecture", [80, 90])
+def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
+    """For those that are not here as well."""
+    layout = Layout(3, 1, 3, (False, True), 0, 0, 32)
+    kernels = [integral_kernel(layout, True), tangent_kernel(layout, True)]
+    kernels += [adjoint_kernel(layout, is_sliced, True) for is_sliced in (True, False)]
+    for kernel in kernels:
+        wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)
 
 
 def test_empty_space_and_rays_that_miss():
