@@ -19,6 +19,8 @@ from ddrecon.engine import use_engine
 from ddrecon.light.lights import PointLight
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
+from ddrecon.validate.hard import run_case
+from ddrecon.validate.hard_cases import CASES
 from ddrecon.variables.values import value_of, with_values
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
@@ -82,7 +84,7 @@ def assert_near(found: Tensor, known: Tensor, error: float) -> None:
     assert float((found - known).abs().max()) <= error * float(known.abs().max())
 
 
-CASES = [
+EMISSIONS = [
     ("gray", OUTSIDE, [*LIGHT, "sigma_t", *POSE]),
     ("backward", OUTSIDE, [*LIGHT, "albedo"]),
     ("peaked", OUTSIDE, [*LIGHT, "sigma_s", *POSE]),
@@ -91,8 +93,8 @@ CASES = [
 ]
 each_case = pytest.mark.parametrize(
     ("kind", "view", "names"),
-    CASES,
-    ids=[f"{kind}-{'inside' if view is INSIDE else 'outside'}" for kind, view, _ in CASES],
+    EMISSIONS,
+    ids=[f"{kind}-{'inside' if view is INSIDE else 'outside'}" for kind, view, _ in EMISSIONS],
 )
 
 
@@ -136,6 +138,13 @@ def test_single_precision():
     assert_near(image, known, 1e-5)
     for found, expected in zip(one, other, strict=True):
         assert_near(found, expected, 2e-5)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hard_cases_are_passed(name: str):
+    """Where cells are opaque, little mass is left of much on the walk back."""
+    use_engine("warp")
+    assert run_case(name, CASES[name], torch.device("cpu")).failures() == []
 
 
 def test_tangent_and_adjoint_are_transposes_of_each_other():

@@ -28,7 +28,8 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
     F: Any = types.F
     Node, Mass, Out, Bent, Triple = types.Node, types.Mass, types.Out, types.Bent, types.Triple
     Bundle, Ray = records.Bundle, records.Ray
-    load_ray, place, hold, add_mass = step.load_ray, step.place, step.hold, step.add_mass
+    Total, load_ray, place, hold = types.Total, step.load_ray, step.place, step.hold
+    add_mass, mass_of = step.add_mass, step.mass_of
     subtract_corrections, decays = step.subtract_corrections, step.decays
     sample, correct, spread = cells.sample, cells.correct, cells.spread
     slope, correct_slope = cells.slope, cells.correct_slope
@@ -105,7 +106,7 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
     def transpose(
         first: int,
         given: Bundle,
-        masses: wp.array2d(dtype=F),
+        masses: wp.array2d(dtype=wp.float64),
         out_bar: wp.array2d(dtype=F),
         masses_bar: wp.array2d(dtype=F),
         bars: Bundle,
@@ -115,7 +116,7 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
         ray = load_ray(given, r)
         ray_bar = Ray()
         ray_bar.index = r
-        bar, m1, m_bar = Out(), Mass(), Mass()
+        bar, m1, m_bar = Out(), Total(), Mass()
         for i in range(wp.static(layout.outputs)):
             bar[i] = out_bar[i, r]
         for k in range(wp.static(K)):
@@ -143,7 +144,7 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
                 t0 = hold(ray, s0)
                 if step > 0:
                     m0 = add_mass(m1, v0, v1, t0 - t1)
-                w0, u0, p0 = emit(ray, v0, m0, t0, given.coefficients)
+                w0, u0, p0 = emit(ray, v0, mass_of(m0), t0, given.coefficients)
                 x0 = decays(u0)
             if step > 0:
                 if n >= 0:
@@ -159,7 +160,7 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
                 e_v, e_m, e_t, ray_bar = emit_adjoint(
                     ray,
                     v1,
-                    m1,
+                    mass_of(m1),
                     t1,
                     given.coefficients,
                     p1,

@@ -28,9 +28,10 @@ COMPILED = 0.5
 
 
 class Integrate(torch.autograd.Function):
-    """Outputs [outputs, R] of rays and masses [K, R] behind them; arguments as `rays.Bundle` has.
+    """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `rays.Bundle` has.
 
-    Differentiable in both modes with respect to all tensors but `planes`.
+    The masses come once more in double precision, for the walk back. Differentiable in both modes
+    with respect to all tensors but `planes`.
     """
 
     @staticmethod
@@ -43,21 +44,22 @@ class Integrate(torch.autograd.Function):
         angles: Tensor,
         coefficients: Tensor,
         numbers: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         given = _bundle(layout, planes, cells, rays, angles, coefficients, numbers)
         out = cells.new_empty(layout.outputs, len(rays))
-        masses = cells.new_empty(layout.extinction, len(rays))
+        masses = cells.new_empty(layout.extinction, len(rays), dtype=torch.float64)
         arguments = [given, _array(out), _array(masses)]
         _launch(integral_kernel(layout, is_sliced), rays, lambda _: arguments)
-        return out, masses
+        return out, masses.to(cells.dtype, copy=True), masses
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.layout, ctx.is_sliced = inputs[:2]
-        keep(ctx, *inputs[2:], output[1])
+        ctx.mark_non_differentiable(output[2])
+        keep(ctx, *inputs[2:], output[2])
 
     @staticmethod
-    def backward(ctx: Any, out_bar: Tensor, masses_bar: Tensor) -> tuple[Any, ...]:
+    def backward(ctx: Any, out_bar: Tensor, masses_bar: Tensor, _: None) -> tuple[Any, ...]:
         *inputs, masses = ctx.saved_tensors
         planes, cells, rays, angles, coefficients, numbers = inputs
         varies_rays = any(ctx.needs_input_grad[4:7])
@@ -75,19 +77,19 @@ class Integrate(torch.autograd.Function):
         return None, None, None, cells_bar, *found, numbers_bar.sum(1)
 
     @staticmethod
-    def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor]:
+    def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
         *inputs, masses = ctx.saved_tensors
         planes, *varied = inputs
         d_varied = [
             torch.zeros_like(tensor) if change is None else change
             for tensor, change in zip(varied, changes[3:], strict=True)
         ]
-        d_out = masses.new_empty(ctx.layout.outputs, masses.shape[1])
-        d_masses = torch.empty_like(masses)
+        d_out = varied[0].new_empty(ctx.layout.outputs, masses.shape[1])
+        d_masses = varied[0].new_empty(masses.shape)
         bundles = _bundle(ctx.layout, *inputs), _bundle(ctx.layout, planes, *d_varied)
         arguments = [*bundles, _array(d_out), _array(d_masses)]
         _launch(tangent_kernel(ctx.layout, ctx.is_sliced), varied[1], lambda _: arguments)
-        return d_out, d_masses
+        return d_out, d_masses, None
 
 
 @functools.cache

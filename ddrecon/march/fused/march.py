@@ -53,7 +53,7 @@ def _integrate(
     if emission.peak is not None and not is_field(emission.peak):
         peak = emission.peak.view(-1).expand(layout.colors)
     numbers = torch.cat([scale, peak, emission.g.view(1), bound])
-    out, masses = Integrate.apply(
+    out, masses, _ = Integrate.apply(
         layout, is_sliced, planes, cells, bundle, torch.cat([feet, squares]), coefficients, numbers
     )
     # What does not change along a ray is multiplied in here: irradiance, and p where there is no

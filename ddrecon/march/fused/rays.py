@@ -29,6 +29,7 @@ def vectors(layout: Layout) -> SimpleNamespace:
         PerBeam=vector(len(layout.beams)),
         Bent=vector(layout.masses),
         Triple=vector(3),
+        Total=wp.types.vector(length=layout.extinction, dtype=wp.float64),
     )
 
 
@@ -79,6 +80,7 @@ def steps(layout: Layout, is_sliced: bool) -> SimpleNamespace:
     """The functions below for rays of `layout`, whose nodes lie in slices or at equal steps."""
     types, records = vectors(layout), ray_types(layout)
     F, Node, Mass, Out, Bent = types.F, types.Node, types.Mass, types.Out, types.Bent
+    Total = types.Total
     Bundle, Ray = records.Bundle, records.Ray
     C, K, BEAMS, FIRST, MASSES = (
         layout.colors,
@@ -130,10 +132,22 @@ def steps(layout: Layout, is_sliced: bool) -> SimpleNamespace:
         return v
 
     @wp.func
-    def add_mass(m: Mass, v0: Node, v1: Node, length: F) -> Mass:
-        """The mass `m` with that of a segment, in which extinction is linear."""
+    def add_mass(total: Total, v0: Node, v1: Node, length: F) -> Total:
+        """The mass `total` with that of a segment, in which extinction is linear.
+
+        Masses are added up in double precision: on the walk back they are subtracted again, and in
+        front of an opaque volume little is left of much.
+        """
         for k in range(wp.static(K)):
-            m[k] = m[k] + F(0.5) * (v0[k] + v1[k]) * length
+            total[k] = total[k] + wp.float64(F(0.5) * (v0[k] + v1[k]) * length)
+        return total
+
+    @wp.func
+    def mass_of(total: Total) -> Mass:
+        """The same in the precision of all else."""
+        m = Mass()
+        for k in range(wp.static(K)):
+            m[k] = F(total[k])
         return m
 
     @wp.func
@@ -150,5 +164,6 @@ def steps(layout: Layout, is_sliced: bool) -> SimpleNamespace:
         hold=hold,
         subtract_corrections=subtract_corrections,
         add_mass=add_mass,
+        mass_of=mass_of,
         decays=decays,
     )

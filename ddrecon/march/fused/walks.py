@@ -17,21 +17,27 @@ from ddrecon.march.fused.segments import segments
 
 @functools.cache
 def integral_kernel(layout: Layout, is_sliced: bool) -> Any:
-    """The kernel of E1 to E3 along rays: outputs [outputs, R] and masses [K, R] behind each."""
+    """The kernel of E1 to E3 along rays: outputs [outputs, R], and masses [K, R] of whole rays."""
     types, records, step = vectors(layout), ray_types(layout), steps(layout, is_sliced)
     cells = sampling(layout, is_sliced)
     F: Any = types.F
-    Node, Mass, Out, Bundle = types.Node, types.Mass, types.Out, records.Bundle
-    load_ray, place, hold, add_mass = step.load_ray, step.place, step.hold, step.add_mass
+    Node, Total, Out, Bundle = types.Node, types.Total, types.Out, records.Bundle
+    load_ray, place, hold = step.load_ray, step.place, step.hold
+    add_mass, mass_of = step.add_mass, step.mass_of
     subtract_corrections, decays = step.subtract_corrections, step.decays
     sample, correct = cells.sample, cells.correct
     emit, arrive = nodes(layout).emit, segments(layout).arrive
 
     @wp.kernel(enable_backward=False, module="unique")
-    def integrate(first: int, given: Bundle, out: wp.array2d(dtype=F), masses: wp.array2d(dtype=F)):
+    def integrate(
+        first: int,
+        given: Bundle,
+        out: wp.array2d(dtype=F),
+        masses: wp.array2d(dtype=wp.float64),
+    ):
         r = first + wp.tid()
         ray = load_ray(given, r)
-        total, m, v0, t0 = Out(), Mass(), Node(), F(0.0)
+        total, m, v0, t0 = Out(), Total(), Node(), F(0.0)
         w0, u0, x0 = Out(), Out(), Out()
         for n in range(given.planes.shape[0]):
             # The next node: its values, and its distance within the box.
@@ -44,7 +50,7 @@ def integral_kernel(layout: Layout, is_sliced: bool) -> Any:
             # The mass passed on the way to it, and what it emits behind that.
             if n > 0:
                 m = add_mass(m, v0, v1, t1 - t0)
-            w1, u1, _ = emit(ray, v1, m, t1, given.coefficients)
+            w1, u1, _ = emit(ray, v1, mass_of(m), t1, given.coefficients)
             x1 = decays(u1)
             # E2, E3: what arrives from the segment between both.
             if n > 0:
@@ -68,9 +74,11 @@ def tangent_kernel(layout: Layout, is_sliced: bool) -> Any:
     types, records, step = vectors(layout), ray_types(layout), steps(layout, is_sliced)
     cells, node, segment = sampling(layout, is_sliced), nodes(layout), segments(layout)
     F: Any = types.F
-    Node, Mass, Out, Bent = types.Node, types.Mass, types.Out, types.Bent
+    Node, Mass, Total = types.Node, types.Mass, types.Total
+    Out, Bent = types.Out, types.Bent
     Bundle, Ray = records.Bundle, records.Ray
-    load_ray, place, hold, add_mass = step.load_ray, step.place, step.hold, step.add_mass
+    load_ray, place, hold = step.load_ray, step.place, step.hold
+    add_mass, mass_of = step.add_mass, step.mass_of
     subtract_corrections, decays = step.subtract_corrections, step.decays
     sample, correct, slope, correct_slope = (
         cells.sample,
@@ -118,7 +126,7 @@ def tangent_kernel(layout: Layout, is_sliced: bool) -> Any:
         r = first + wp.tid()
         ray = load_ray(given, r)
         d_ray = load_ray(d_given, r)
-        total, m, v0, t0 = Out(), Mass(), Node(), F(0.0)
+        total, whole, v0, t0 = Out(), Total(), Node(), F(0.0)
         w0, u0, x0 = Out(), Out(), Out()
         d_m, d_v0, d_t0, d_w0, d_u0 = Mass(), Node(), F(0.0), Out(), Out()
         for n in range(given.planes.shape[0]):
@@ -147,7 +155,8 @@ def tangent_kernel(layout: Layout, is_sliced: bool) -> Any:
                 for k in range(wp.static(layout.extinction)):
                     longer = (v0[k] + v1[k]) * (d_t1 - d_t0)
                     d_m[k] = d_m[k] + F(0.5) * ((d_v0[k] + d_v1[k]) * (t1 - t0) + longer)
-                m = add_mass(m, v0, v1, t1 - t0)
+                whole = add_mass(whole, v0, v1, t1 - t0)
+            m = mass_of(whole)
             w1, u1, p1 = emit(ray, v1, m, t1, given.coefficients)
             d_w1, d_u1 = emit_tangent(
                 ray, v1, m, t1, given.coefficients, p1, d_ray, d_v1, d_m, d_t1, d_given.coefficients
