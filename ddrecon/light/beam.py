@@ -30,7 +30,7 @@ class Beam:
     direction: Tensor
     irradiance: Tensor
 
-    def scattered(
+    def scatter(
         self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
         """The integral of `scattering` over each segment of view rays, and the phase function p.

@@ -51,12 +51,12 @@ class PointBeam:
     irradiance: Tensor
     least_square: float
 
-    def scattered(
+    def scatter(
         self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
         """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`, and 1.
 
-        Arguments as of `Beam.scattered`. Scattering times p is linear between nodes.
+        Arguments as of `Beam.scatter`. Scattering times p is linear between nodes.
         """
         foot, across = self.passing(nodes.origin, nodes.direction)
         along = foot + nodes.distance

@@ -147,7 +147,7 @@ def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> Tensor:
         # E13: the depth of the forward peak, from where the light enters to the camera.
         depth = None if at_nodes.peak is None else at_nodes.peak * (passed + to_light)
         # E2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
-        weight, phase = beam.scattered(at_nodes.scattering, nodes, emission.g, depth)
+        weight, phase = beam.scatter(at_nodes.scattering, nodes, emission.g, depth)
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
         scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
     # E1: what comes from the volume, and 1 - tau of what is behind it.
