@@ -95,3 +95,12 @@ def test_the_commands_of_a_page_run(page: Path, surroundings: None) -> None:
 
 def test_there_are_commands() -> None:
     assert sum(len(commands(page)) for page in PAGES) >= 15
+
+
+def test_the_python_of_its_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Block after block, as somebody would paste them."""
+    monkeypatch.chdir(ROOT)
+    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert blocks
+    exec("\n".join(blocks), {})

@@ -116,6 +116,19 @@ def test_tangents_are_those_of_torch(kind: str, view: dict, names: list[str]):
         assert_near(tangent(scene, name, "warp"), tangent(scene, name, "torch"), 1e-11)
 
 
+def test_forward_mode_of_torch_func():
+    scene = scene_of("peaked", OUTSIDE)
+    density, change = scene.volume.density, random_values(*SHAPE, seed=5)
+
+    def differentiate(engine: str) -> Tensor:
+        def image(values: Tensor) -> Tensor:
+            return images(scene, {"density": values}, engine)[0]
+
+        return torch.func.jvp(image, (density,), (change,))[1]
+
+    assert_near(differentiate("warp"), differentiate("torch"), 1e-11)
+
+
 @pytest.mark.parametrize("settings", [{"steps_per_voxel": 3}, {"samples_per_pixel": 4}], ids=str)
 def test_settings_of_the_march_mean_the_same(settings: dict):
     scene = scene_of("peaked", OUTSIDE)

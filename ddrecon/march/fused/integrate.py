@@ -15,6 +15,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ddrecon import engine
 from ddrecon.march.fused.adjoint import adjoint_kernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.rays import ray_types
@@ -22,7 +23,7 @@ from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
 from ddrecon.numerics.autodiff import keep
 
 wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
-LOG = logging.getLogger("ddrecon.engine")
+LOG = logging.getLogger(engine.LOG)
 COMPILED = 0.5
 """A kernel that takes longer to load [s] was compiled; others come from Warp's cache."""
 
@@ -78,18 +79,34 @@ class Integrate(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
-        *inputs, masses = ctx.saved_tensors
-        planes, *varied = inputs
+        planes, *varied, _ = ctx.saved_tensors
         d_varied = [
             torch.zeros_like(tensor) if change is None else change
             for tensor, change in zip(varied, changes[3:], strict=True)
         ]
-        d_out = varied[0].new_empty(ctx.layout.outputs, masses.shape[1])
-        d_masses = varied[0].new_empty(masses.shape)
-        bundles = _bundle(ctx.layout, *inputs), _bundle(ctx.layout, planes, *d_varied)
-        arguments = [*bundles, _array(d_out), _array(d_masses)]
-        _launch(tangent_kernel(ctx.layout, ctx.is_sliced), varied[1], lambda _: arguments)
+        d_out, d_masses = _Tangent.apply(ctx.layout, ctx.is_sliced, planes, *varied, *d_varied)
         return d_out, d_masses, None
+
+
+class _Tangent(torch.autograd.Function):
+    """The changes of outputs and masses with those of all tensors but `planes`.
+
+    A function of its own, so that torch.func hands it plain tensors, which kernels need.
+    """
+
+    @staticmethod
+    def forward(layout: Layout, is_sliced: bool, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        planes, cells, rays = tensors[:3]
+        bundles = [_bundle(layout, planes, *part) for part in (tensors[1:6], tensors[6:])]
+        d_out = cells.new_empty(layout.outputs, len(rays))
+        d_masses = cells.new_empty(layout.extinction, len(rays))
+        arguments = [*bundles, _array(d_out), _array(d_masses)]
+        _launch(tangent_kernel(layout, is_sliced), rays, lambda _: arguments)
+        return d_out, d_masses
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output)
 
 
 @functools.cache
