@@ -1,0 +1,101 @@
+"""Launching fused kernels on torch's tensors: in as many threads as torch has, or on a GPU.
+
+Every kernel takes `first: int` before all else, and thread `wp.tid()` of a launch does item
+`first + wp.tid()`: so the items of a launch can be shared among threads of a processor.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from time import perf_counter
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ddrecon import engine
+
+wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
+LOG = logging.getLogger(engine.LOG)
+COMPILED = 0.5
+"""A kernel that takes longer to load [s] was compiled; others come from Warp's cache."""
+
+
+def array(tensor: Tensor) -> Any:
+    """`tensor` as Warp's array, contiguous: in the same memory where it is so already."""
+    _start()
+    return wp.from_torch(tensor.detach().contiguous(), requires_grad=False)
+
+
+def thread_count(like: Tensor) -> int:
+    """In how many threads kernels on tensors `like` this run: on a GPU one."""
+    return 1 if like.is_cuda else torch.get_num_threads()
+
+
+def launch(
+    kernel: Any,
+    count: int,
+    arguments: Sequence[Any] | Callable[[int], Sequence[Any]],
+    like: Tensor,
+    threads: int | None = None,
+) -> None:
+    """Runs `kernel` for `count` items where tensor `like` lies.
+
+    On a processor that is in so many `threads` (None: as many as torch has), each with its share of
+    the items; a function of the thread's number gives it `arguments` of its own. Handing a share to
+    a thread takes about 50 microseconds: what takes less is better done in one.
+    """
+    _start()
+    threads = thread_count(like) if threads is None else threads
+    device = wp.device_from_torch(like.device)
+    _load(kernel, device.alias)
+    bounds = [i * count // threads for i in range(threads + 1)]
+    stream = wp.stream_from_torch(torch.cuda.current_stream()) if like.is_cuda else None
+
+    def run(i: int) -> None:
+        given = arguments(i) if callable(arguments) else arguments
+        size = bounds[i + 1] - bounds[i]
+        wp.launch(kernel, size, [bounds[i], *given], device=device, stream=stream)
+
+    # The thread that asks takes the first share itself.
+    others = [_pool(threads).submit(run, i) for i in range(1, threads)]
+    run(0)
+    for other in others:
+        other.result()
+
+
+@functools.cache
+def _start() -> None:
+    """Starts Warp; what it writes of a missing CUDA driver then is kept from the user's sight.
+
+    It does so past Python, to the process's error stream, on every machine without a GPU.
+    """
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        wp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+@functools.cache
+def _load(kernel: Any, device: str) -> None:
+    """Has `kernel` ready, compiled where Warp's cache has it not."""
+    start = perf_counter()
+    wp.load_module(kernel.module, device=device)
+    if (seconds := perf_counter() - start) > COMPILED:
+        LOG.info("compiling kernels, once: %.1f s", seconds)
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "kernels")

@@ -1,0 +1,97 @@
+"""C++ for the inner loops of fused kernels: what a processor's vector units are used by.
+
+Warp's own language makes scalar code of a thread. A loop over many numbers beside each other in
+memory is therefore written in C++, which Warp compiles for processors (where it becomes vector
+instructions) and for GPUs (where a thread does one turn of it):
+
+    def _kernel(bits):
+        F = number_type(bits)
+
+        @wp.func_native(program(bits, "for (int i = first; i < last; ++i) y.data[i] = ..."))
+        def scale_row(y: wp.array(dtype=F), first: int, last: int): ...
+
+In the text `F` is the type of numbers, and there are the functions below.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+_TYPES = """
+typedef {number} F;
+typedef {integer} Bits;
+"""
+# exp(-depth): 2^n e^r with n whole and |r| < log(2) / 2. Adding and taking away `SHIFT` rounds to a
+# whole number, whose digits are then those at the end of the sum. libm's exp is no vector code.
+_DECAY = """
+auto decay = [](F depth) -> F {{
+#if defined(__CUDA_ARCH__)
+    return {exp}(-depth);
+#else
+    const F x = depth < F({most}) ? (depth > F(-{most}) ? -depth : F({most})) : F(-{most});
+    const F shifted = x * F(1.4426950408889634074) + F({shift});
+    const F n = shifted - F({shift});
+    const F r = (x - n * F({log2_high})) - n * F({log2_low});
+    F p = F({first});
+    {horner}
+    return __builtin_bit_cast(
+        F, (Bits)(__builtin_bit_cast(Bits, p) + (__builtin_bit_cast(Bits, shifted) << {digits})));
+#endif
+}};
+"""
+# psi = 1/2 - depth / 6 + depth^2 / 24 - ... = (1 - phi) / depth (`numerics.decay`), depth >= 0
+_PSI = """
+auto psi_series = [](F depth) -> F {{
+    F series = F(1);
+    {series}
+    return F(0.5) * series;
+}};
+"""
+
+
+def _polynomial(degree: int) -> dict[str, str]:
+    """exp's, of its Taylor series: the first coefficient and Horner's lines."""
+    inverse, coefficients = 1.0, [1.0]
+    for k in range(1, degree + 1):
+        inverse /= k
+        coefficients.append(inverse)
+    lines = [f"p = p * r + F({c!r});" for c in reversed(coefficients[:-1])]
+    return {"first": repr(coefficients[-1]), "horner": " ".join(lines)}
+
+
+def _series(terms: int) -> str:
+    return " ".join(
+        f"series = F(1) - depth * series * F({1 / (k + 2)!r});" for k in range(terms, 0, -1)
+    )
+
+
+_TEXT = {
+    32: (_TYPES + _DECAY + _PSI).format(
+        number="float", integer="int", exp="expf", most="87.0", shift="12582912.0", digits=23,
+        log2_high="0.693145751953125", log2_low="1.42860682030941723212e-6",
+        **_polynomial(7), series=_series(7),
+    ),
+    64: (_TYPES + _DECAY + _PSI).format(
+        number="double", integer="long long", exp="exp", most="700.0",
+        shift="6755399441055744.0", digits=52,
+        log2_high="0.693147180369123816490", log2_low="1.90821492927058770002e-10",
+        **_polynomial(13), series=_series(13),
+    ),
+}  # fmt: skip
+
+
+def number_type(bits: int) -> Any:
+    """Warp's type of numbers of 32 or 64 `bits`."""
+    return wp.float64 if bits == 64 else wp.float32
+
+
+def program(bits: int, body: str) -> str:
+    """C++ for `wp.func_native`: `body` behind the definitions of `F`, `decay` and `psi_series`.
+
+    `decay(depth)` is exp(-depth), of depths from about -87 to any size, exact to the last digit but
+    one; where it is below about 1e-38 (1e-304 in 64 `bits`) it is that. `psi_series(depth)` is
+    (1 - (1 - exp(-depth)) / depth) / depth for depth from 0 to 1/2.
+    """
+    return _TEXT[bits] + body
