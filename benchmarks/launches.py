@@ -1,0 +1,240 @@
+"""What an iteration of a reconstruction asks of the machine: calls, launches, waits.
+
+    python benchmarks/launches.py [--views 3] [--device cpu]
+
+Prints two tables in Markdown: of each engine without and with a transport round, and where in
+ddrecon the calls come from. The iteration is one of `configs/plume.yaml` at full resolution.
+
+A call is an operation of torch, views of tensors not counted; on a GPU each costs at least 5
+microseconds. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
+depends on them, to Python: there the processor waits for a GPU. A write makes a tensor of Python's
+numbers, for which it waits as well. All are counted alike on a machine without a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import ddrecon
+from ddrecon.engine import ENGINES, use_engine
+from ddrecon.io.volumes.table import read_field
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = Path(ddrecon.__file__).parent
+HELPERS = "kernels", "numerics"
+"""Rooms whose calls count for whoever asked."""
+READS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_dim"}
+"""Operations of torch whose result a processor waits for."""
+METHODS = {Tensor.tolist: "read", Tensor.numpy: "read", Tensor.__array__: "read"}
+FACTORIES = {Tensor.new_tensor: "write", torch.tensor: "write", torch.as_tensor: "write"}
+"""The same by functions that reach no operation of torch."""
+WARM_UP = 2
+"""Iterations before the one that is counted."""
+FEWEST = 10
+"""Modules with fewer calls and launches than this, and no reads, stand in one line."""
+
+
+@dataclass
+class Counts:
+    """How many of each kind come from each module: `call`, `launch`, `read`, `write`."""
+
+    of: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+    def add(self, kind: str) -> None:
+        self.of[kind, origin()] += 1
+
+    def total(self, *kinds: str, module: str | None = None) -> int:
+        return sum(
+            count
+            for (kind, place), count in self.of.items()
+            if kind in kinds and module in (None, place)
+        )
+
+
+class Operations(TorchDispatchMode):
+    """Counts operations of torch, and those of them that a processor waits for."""
+
+    def __init__(self, counts: Counts):
+        super().__init__()
+        self.counts = counts
+
+    def __torch_dispatch__(
+        self, function: Any, types: Any, arguments: Any = (), options: Any = None
+    ) -> Any:
+        if not is_view(function):
+            self.counts.add("call")
+        if is_read(function, arguments):
+            self.counts.add("read")
+        return function(*arguments, **(options or {}))
+
+
+class Conversions(TorchFunctionMode):
+    """Counts tensors that become Python's numbers, and numbers that become tensors."""
+
+    def __init__(self, counts: Counts):
+        super().__init__()
+        self.counts = counts
+
+    def __torch_function__(
+        self, function: Any, types: Any, arguments: Any = (), options: Any = None
+    ) -> Any:
+        kind = METHODS.get(function)
+        if function in FACTORIES and not isinstance(arguments[-1], Tensor):
+            kind = FACTORIES[function]
+        if kind is not None:
+            self.counts.add(kind)
+        return function(*arguments, **(options or {}))
+
+
+def is_view(function: Any) -> bool:
+    """Whether an operation only looks at memory that is there."""
+    marks = [result.alias_info for result in function._schema.returns]
+    is_alias = any(mark is not None and not mark.is_write for mark in marks)
+    return is_alias or function._schema.name == "aten::_unsafe_view"
+
+
+def is_read(function: Any, arguments: Sequence[Any]) -> bool:
+    """Whether an operation's result, or its size, is needed by the processor."""
+    name = function._schema.name.removeprefix("aten::")
+    if name in ("index", "index_put", "index_put_", "_index_put_impl_"):
+        masks = (torch.bool, torch.uint8)
+        return any(isinstance(part, Tensor) and part.dtype in masks for part in arguments[1])
+    return name in READS
+
+
+def origin() -> str:
+    """The module of ddrecon that is at work; in a backward pass that whose derivative it is."""
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        # Derivatives that torch takes itself remember where their function was called.
+        if frame.f_code.co_name == "_engine_run_backward":
+            node = torch._C._current_autograd_node()
+            lines = node.metadata.get("traceback_", []) if node is not None else []
+            files = [line.split('"')[1] for line in reversed(lines) if line.count('"') > 1]
+            return next(filter(None, map(module_of, files)), "torch")
+        if name := module_of(frame.f_code.co_filename):
+            return name
+        frame = frame.f_back
+    return "torch"
+
+
+def module_of(file: str) -> str | None:
+    """A file's place in ddrecon; None for one elsewhere, and for helpers."""
+    if not file.startswith(f"{PACKAGE}/"):
+        return None
+    name = file.removeprefix(f"{PACKAGE}/")
+    return None if name.split("/")[0] in HELPERS else name
+
+
+@contextmanager
+def launches_counted(counts: Counts) -> Iterator[None]:
+    """Counts launches of fused kernels, where there are any."""
+    try:
+        import warp as wp
+    except ImportError:
+        yield
+        return
+    launch, launch_again = wp.launch, wp.Launch.launch
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        if not options.get("record_cmd"):
+            counts.add("launch")
+        return launch(*arguments, **options)
+
+    def counted_again(*arguments: Any, **options: Any) -> Any:
+        counts.add("launch")
+        return launch_again(*arguments, **options)
+
+    with patch.object(wp, "launch", counted), patch.object(wp.Launch, "launch", counted_again):
+        yield
+
+
+def load(views: int, rounds: int, device: str) -> Scene:
+    """The plume at full resolution, from half its density."""
+    overrides = [f"diffusion.transport_rounds={rounds}", "optimize.refine_at=[]"]
+    scene = load_scene(ROOT / "configs" / "plume.yaml", overrides=overrides, device=device)
+    density = torch.tensor(read_field(ROOT / "data" / "plume" / "density.npz", "density").values)
+    start = 0.5 * density.to(scene.volume.density)
+    seen = [view for view in scene.views if not view.is_test][:views]
+    return replace(scene, views=seen, starts={"density": start})
+
+
+def count(scene: Scene) -> Counts:
+    """What one iteration asks, once all is warm."""
+    run, counts = Reconstruction(scene), Counts()
+    for _ in range(WARM_UP):
+        run.step()
+    remembered = torch.autograd.set_detect_anomaly(True, check_nan=False)
+    with remembered, launches_counted(counts), Conversions(counts), Operations(counts):
+        run.step()
+    return counts
+
+
+def print_totals(found: dict[tuple[str, int], Counts]) -> None:
+    print("| engine | transport rounds | calls | launches | both | reads | writes |")
+    print("|---|---|---|---|---|---|---|")
+    for (engine, rounds), counts in found.items():
+        kinds = ("call",), ("launch",), ("call", "launch"), ("read",), ("write",)
+        numbers = [str(counts.total(*kind)) for kind in kinds]
+        print(f"| {engine} | {rounds} | {' | '.join(numbers)} |")
+
+
+def print_modules(found: dict[tuple[str, int], Counts]) -> None:
+    last = list(found.values())[-1]
+    modules = {module for counts in found.values() for _, module in counts.of}
+
+    def weight(module: str) -> int:
+        return last.total("call", "launch", module=module)
+
+    def cell(counts: Counts, chosen: Sequence[str]) -> str:
+        calls, reads = (
+            sum(counts.total(*kinds, module=module) for module in chosen)
+            for kinds in (("call", "launch"), ("read",))
+        )
+        return f"{calls}, {reads}" if reads else f"{calls}"
+
+    few = [m for m in modules if weight(m) < FEWEST and not last.total("read", module=m)]
+    rows = [(f"`{module}`", [module]) for module in sorted(modules - set(few), key=weight)[::-1]]
+    print(f"\n| calls and launches, reads | {' | '.join(f'{e}, {r}' for e, r in found)} |")
+    print("|---|" + "---|" * len(found))
+    for name, chosen in [*rows, ("others", few)]:
+        print(f"| {name} | {' | '.join(cell(counts, chosen) for counts in found.values())} |")
+
+
+def main() -> None:
+    """Prints the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--views", type=int, default=3)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--engines", nargs="+", default=ENGINES, choices=ENGINES)
+    parser.add_argument("--rounds", nargs="+", type=int, default=(0, 1))
+    options = parser.parse_args()
+    torch.set_num_threads(1)  # so that a kernel is one launch, as on a GPU
+    found = {}
+    for engine in options.engines:
+        use_engine(engine)
+        for rounds in options.rounds:
+            found[engine, rounds] = count(load(options.views, rounds, options.device))
+    print_totals(found)
+    print_modules(found)
+
+
+if __name__ == "__main__":
+    main()
