@@ -25,7 +25,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.march.bands import Bands
 from ddrecon.march.box import cross_box
 from ddrecon.march.emission import Channels
-from ddrecon.march.samplers import choose_sampler
+from ddrecon.march.samplers import choose_way, make_sampler
 from ddrecon.numerics.interpolation import sample_slices
 from ddrecon.renderer import LightField, solve_light, view_image
 from ddrecon.scene import Scene
@@ -60,7 +60,7 @@ class Case:
         grid, bundle = self.scene.volume.grid, cast_rays(self.camera)
         crossing = cross_box(grid, bundle)
         fields = torch.cat([leaf.detach() for leaf in self.leaves])
-        sampler = choose_sampler(Channels(fields), grid, bundle, crossing, 1)
+        sampler = make_sampler(Channels(fields), grid, choose_way(grid, bundle, crossing), 1)
         if not isinstance(sampler, Bands):
             raise SystemExit("the view is not one by slices")
         whole = sampler.slices

@@ -62,12 +62,12 @@ class Arrays:
 RENDER = Arrays(
     cell={"once": 17, "color": 21, "flux": 3, "rounds": 16, "limited": 7},
     node={"once": 6, "color": 2},
-    pixel=3,
+    pixel=12,  # what rays meet, renders
 )
 OPTIMIZE = Arrays(
     cell={"once": 50, "varied": 15, "color": 7, "flux": 13, "rounds": 34, "limited": 32},
     node={"color": 12, "varied": 4},
-    pixel=9,  # targets, those of a coarser level, renders
+    pixel=18,  # targets, those of a coarser level, what rays meet, renders
 )
 """Fitted to what `benchmarks/memory.py` measures."""
 

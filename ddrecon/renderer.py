@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
+from ddrecon.cameras import Camera, Rays
 from ddrecon.diffusion.closures import CLOSURES, smooth
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import solve_flux_limited
@@ -33,6 +33,7 @@ from ddrecon.light.sky import Sky, decompose_lights
 from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
+from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.scene import Scene, View
@@ -181,8 +182,8 @@ def view_image(
     is seen unscattered) or `diffusion` (E3, with the ambient light in it). The image is the same.
     """
     if derivatives == "all":
-        emission = _emission(light_field, cast_rays(camera))
-        return _image(emission, scene, camera)
+        sight = look_through(camera, scene.volume.grid, scene.render)
+        return _image(_emission(light_field, sight.rays), scene, sight).unflatten(-1, camera.size)
     nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
     single = replace(light_field, outgoing=nothing), scene
     diffusion = replace(light_field, beams=(), skies=()), _without_background(scene)
@@ -210,14 +211,15 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     return Components(reduced, single, image - reduced - single)
 
 
-def _image(emission: Emission, scene: Scene, camera: Camera) -> Tensor:
-    """Radiance [3, h, w]: E1, averaged over the rays of each pixel."""
-    offsets = subpixel_offsets(scene.render.samples_per_pixel)
-    bundle = Rays.join([cast_rays(camera, offset) for offset in offsets])
-    behind = _background(scene.lights if scene.render.background else [], bundle)
-    scattered, clear = march(emission, bundle, scene.render, float(behind.detach().max()))
-    radiance = (scattered + clear * behind).unflatten(-1, (len(offsets), -1)).mean(-2)
-    return radiance.expand(3, -1).unflatten(-1, camera.size)
+def _image(emission: Emission, scene: Scene, sight: Sight) -> Tensor:
+    """Radiance [3, pixels]: E1, averaged over the rays of each pixel."""
+    behind = _background(scene.lights, sight.rays) if scene.render.background else None
+    radiance, clear = march(emission, sight, scene.render, behind)
+    if behind is not None:
+        radiance = radiance + clear * behind
+    if scene.render.samples_per_pixel > 1:
+        radiance = radiance.unflatten(-1, (scene.render.samples_per_pixel, -1)).mean(-2)
+    return radiance.expand(3, -1)
 
 
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
@@ -238,10 +240,15 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
     )
 
 
-def _background(lights: Sequence[Light], bundle: Rays) -> Tensor:
-    """The radiance [C, R] of ambient light and environment maps along `bundle`, unattenuated."""
+def _background(lights: Sequence[Light], bundle: Rays) -> Tensor | None:
+    """The radiance [C, R] of ambient light and environment maps along `bundle`, unattenuated.
+
+    None where there is no such light.
+    """
+    environments = [light for light in lights if isinstance(light, EnvironmentLight)]
+    if not environments and not any(isinstance(light, AmbientLight) for light in lights):
+        return None
     total = ambient_radiance(lights, bundle.direction).view(-1, 1)
-    for light in lights:
-        if isinstance(light, EnvironmentLight):
-            total = total + environment_radiance(light, bundle.direction)
+    for light in environments:
+        total = total + environment_radiance(light, bundle.direction)
     return total

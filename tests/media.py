@@ -11,10 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, look_at
+from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductance
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.march.emission import Emission
+from ddrecon.march.integral import march
+from ddrecon.march.sight import look_along
 from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings, RenderSettings
@@ -89,6 +92,13 @@ def make_scene(
         RenderSettings(),
         DiffusionSettings(**diffusion),
     )
+
+
+def march_rays(
+    emission: Emission, rays: Rays, settings: RenderSettings, behind: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Radiance and transmittance [C, R] along `rays`, a camera's or any others."""
+    return march(emission, look_along(emission.grid, rays, settings), settings, behind)
 
 
 def make_operator(grid: Grid, diffusion: Tensor, absorption: Tensor) -> Operator:

@@ -23,9 +23,9 @@ class Crossing:
     near: Tensor
     far: Tensor
 
-    def select(self, is_chosen: Tensor) -> Crossing:
-        """Some of the rays that hit."""
-        return Crossing(self.hit[is_chosen], self.near[is_chosen], self.far[is_chosen])
+    def select(self, index: Tensor) -> Crossing:
+        """Those of the rays that hit which are at `index` among them."""
+        return Crossing(self.hit[index], self.near[index], self.far[index])
 
 
 def cross_box(grid: Grid, rays: Rays) -> Crossing:

@@ -16,11 +16,12 @@ from torch import Tensor
 from ddrecon.cameras import Rays
 from ddrecon.engine import current_engine
 from ddrecon.march.bands import Bands
-from ddrecon.march.box import Crossing, cross_box, intersect_box
+from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.march.emission import Emission, Sampled, pack_channels
 from ddrecon.march.equidistant import Equidistant
-from ddrecon.march.lattice import Lattice, choose_lattice, interpolate_between, is_rough
-from ddrecon.march.samplers import choose_sampler
+from ddrecon.march.lattice import Lattice, interpolate_between, is_rough
+from ddrecon.march.samplers import make_sampler
+from ddrecon.march.sight import Sight
 from ddrecon.march.slices import Slices
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.decay import decayed_sum
@@ -37,32 +38,31 @@ Part = tuple[Tensor, Tensor]
 
 
 def march(
-    emission: Emission, rays: Rays, settings: RenderSettings, behind: float = 0.0
+    emission: Emission, sight: Sight, settings: RenderSettings, behind: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Radiance [C, R] scattered towards the camera along `rays`, and transmittance [C, R] (E1).
+    """Radiance [C, R] scattered towards the camera along its rays, and transmittance [C, R] (E1).
 
     Every ray through the box is marched itself. Where pixels are closer together than the volume
     can tell, rays of a lattice are marched instead, and pixels interpolated between them to third
     order. A pixel that this might change by more than `settings.tolerance` of the image's root
-    mean square, with light no brighter than `behind` seen through the volume, keeps its own ray.
+    mean square, with the light `behind` [C, R] seen through the volume, keeps its own ray.
     """
+    if sight.way is None:
+        return _assemble(emission, sight, [])
     march_rays, march_lattice = _pick_engine()
-    grid, crossing = emission.grid, cross_box(emission.grid, rays)
-    if crossing.hit.numel() == 0:
-        return _assemble(emission, rays, [])
     channels = pack_channels(emission)
-    sampler = choose_sampler(channels, grid, rays, crossing, settings.steps_per_voxel)
-    if settings.tolerance > 0 and isinstance(sampler, Bands):
-        lattice = choose_lattice(grid, sampler.slices.axis, rays.select(crossing.hit))
-        if lattice is not None:
-            values = march_lattice(emission, sampler, lattice)
-            places = lattice.places(rays.select(crossing.hit))
-            parts = [(crossing.hit, interpolate_between(values, places))]
-            rough = crossing.select(_needs_own_ray(values, places, settings.tolerance, behind))
-            if len(rough.hit):
-                parts.append(march_rays(emission, sampler, rays, rough))
-            return _assemble(emission, rays, parts)
-    return _assemble(emission, rays, [march_rays(emission, sampler, rays, crossing)])
+    sampler = make_sampler(channels, emission.grid, sight.way, settings.steps_per_voxel)
+    if sight.lattice is None or sight.places is None:
+        return _assemble(
+            emission, sight, [march_rays(emission, sampler, sight.rays, sight.crossing)]
+        )
+    values = march_lattice(emission, sampler, sight.lattice)
+    parts = [(sight.crossing.hit, interpolate_between(values, sight.places))]
+    is_rough = _needs_own_ray(values, sight.places, settings.tolerance, behind)
+    rough = sight.crossing.select(is_rough.nonzero()[:, 0])
+    if len(rough.hit):
+        parts.append(march_rays(emission, sampler, sight.rays, rough))
+    return _assemble(emission, sight, parts)
 
 
 def _pick_engine() -> tuple[Callable[..., Part], Callable[..., Tensor]]:
@@ -74,23 +74,30 @@ def _pick_engine() -> tuple[Callable[..., Part], Callable[..., Tensor]]:
     return _march_rays, _march_lattice
 
 
-def _needs_own_ray(values: Tensor, places: Tensor, tolerance: float, behind: float) -> Tensor:
+def _needs_own_ray(
+    values: Tensor, places: Tensor, tolerance: float, behind: Tensor | None
+) -> Tensor:
     """Which pixels, at `places` [P, 2] of a lattice, are not to be interpolated: bool [P].
 
     Those where the `values` [2 C, r, c] of the lattice say that this may change the image by more
     than `tolerance` of its root mean square.
     """
     scattered, opacity = values.detach().chunk(2)
-    brightness = float((scattered + behind * (1 - opacity)).square().mean().sqrt())
-    return is_rough(torch.cat([scattered, behind * opacity]), tolerance * brightness, places)
+    brightest = scattered.new_zeros(()) if behind is None else behind.detach().max()
+    brightness = (scattered + brightest * (1 - opacity)).square().mean().sqrt()
+    bound = (tolerance * brightness.double()).to(values.dtype)
+    return is_rough(torch.cat([scattered, brightest * opacity]), bound, places)
 
 
-def _assemble(emission: Emission, rays: Rays, parts: Sequence[Part]) -> tuple[Tensor, Tensor]:
-    """Radiance and transmittance [C, R] along `rays`: those of `parts`, and 0 and 1 elsewhere.
+def _assemble(emission: Emission, sight: Sight, parts: Sequence[Part]) -> tuple[Tensor, Tensor]:
+    """Radiance and transmittance [C, R] along all rays: those of `parts`, and 0 and 1 elsewhere.
 
     Where a ray is in several parts the last of them counts.
     """
-    values = emission.diffuse.new_zeros(2 * emission.colors, len(rays.direction))
+    if sight.is_whole and parts and parts[0][0] is sight.crossing.hit:
+        (_, values), *parts = parts
+    else:
+        values = emission.diffuse.new_zeros(2 * emission.colors, len(sight.rays.direction))
     for index, along in parts:
         values = values.index_copy(1, index, along)
     scattered, opacity = values.split(emission.colors)

@@ -123,7 +123,7 @@ def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
     return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0].clamp(min=0)
 
 
-def is_rough(values: Tensor, tolerance: float, places: Tensor) -> Tensor:
+def is_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:
     """At which of `places` [P, 2] interpolation may be off by more than `tolerance`: bool [P].
 
     That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:

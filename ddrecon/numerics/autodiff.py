@@ -32,6 +32,14 @@ def is_forward() -> bool:
     return forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
 
 
+def version_of(tensor: Tensor) -> int:
+    """How often the numbers of `tensor` were changed in place; -1 where nobody counts.
+
+    That is in inference mode.
+    """
+    return -1 if tensor.is_inference() else tensor._version
+
+
 def keep(ctx: Any, *tensors: Tensor) -> None:
     """Saves `tensors` in the context of a custom function, for both modes.
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, convergence_order, half_empty, make_camera, make_scene
+from media import box_grid, convergence_order, half_empty, make_camera, make_scene, march_rays
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
@@ -18,7 +18,6 @@ from ddrecon.light.lights import DirectionalLight, PointLight
 from ddrecon.light.point_light import follow_point_light
 from ddrecon.light.reduced import reduced_light
 from ddrecon.march.emission import Emission
-from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
@@ -144,7 +143,7 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
     emission = Emission(
         grid, medium.extinction, medium.scattering, beams, dark, medium.g, medium.peak
     )
-    radiance = march(emission, bundle, RenderSettings())[0][0]
+    radiance = march_rays(emission, bundle, RenderSettings())[0][0]
     light = array_order(torch.tensor(position, dtype=torch.float64))
     low, high = (light.new_tensor(corner) for corner in (grid.lower, grid.upper))
     one, other = ((corner - bundle.origin) / bundle.direction for corner in (low, high))

@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, make_camera, make_scene, random_values
+from media import box_grid, make_camera, make_scene, march_rays, random_values
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
 from ddrecon.march import integral as march_module
+from ddrecon.march import sight as sight_module
 from ddrecon.march.box import cross_box
 from ddrecon.march.emission import Channels
-from ddrecon.march.integral import march
 from ddrecon.march.lattice import Lattice, choose_lattice
-from ddrecon.march.samplers import choose_sampler
+from ddrecon.march.samplers import choose_way, make_sampler
 from ddrecon.march.slices import Slices
 from ddrecon.numerics.slicing import across
 from ddrecon.renderer import _emission, render, solve_light
@@ -59,7 +59,8 @@ def scene_of():
 def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
     bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
-    slices = choose_sampler(Channels(scene.volume.density[None]), grid, bundle, crossing, 1).slices
+    way = choose_way(grid, bundle, crossing)
+    slices = make_sampler(Channels(scene.volume.density[None]), grid, way, 1).slices
     return choose_lattice(grid, slices.axis, bundle.select(crossing.hit)), slices
 
 
@@ -104,8 +105,11 @@ def test_a_lattice_ray_is_a_ray(view: dict, scene_of, monkeypatch):
     lattice, _ = lattice_of(scene)
     bundle = lattice.rays(lattice.rows, 3.0)
     emission = _emission(solve_light(scene, SolveMemory()), bundle)
-    monkeypatch.setattr(march_module, "choose_lattice", lambda *_: lattice)
-    interpolated, own = march(emission, bundle, INTERPOLATED, 1.0), march(emission, bundle, OWN)
+    monkeypatch.setattr(sight_module, "choose_lattice", lambda *_: lattice)
+    interpolated, own = (
+        march_rays(emission, bundle, INTERPOLATED, torch.ones(())),
+        march_rays(emission, bundle, OWN),
+    )
     for one, other in zip(interpolated, own, strict=True):
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9 * float(other.max()))
 

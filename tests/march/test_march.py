@@ -7,7 +7,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from media import box_grid, convergence_order, half_empty, make_camera, make_scene, random_values
+from media import (
+    box_grid,
+    convergence_order,
+    half_empty,
+    make_camera,
+    make_scene,
+    march_rays,
+    random_values,
+)
 from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays, cast_rays
@@ -17,7 +25,6 @@ from ddrecon.light.reduced import reduced_light
 from ddrecon.march import bands, samplers
 from ddrecon.march import integral as march_module
 from ddrecon.march.emission import Emission
-from ddrecon.march.integral import march
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.numerics.nodes import Nodes
@@ -96,7 +103,7 @@ def chords(grid: Grid, bundle: Rays) -> Tensor:
 def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
     grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera(size=(7, 6), **view))
     emission = emission_of(grid, torch.full(grid.shape, 0.7, dtype=torch.float64))
-    transmittance = march(emission, bundle, every_ray(steps))[1]
+    transmittance = march_rays(emission, bundle, every_ray(steps))[1]
     lengths = chords(grid, bundle)
     assert bool((lengths > 0).any())
     extinction = emission.extinction.value[:, 0, 0, 0]
@@ -109,7 +116,7 @@ def test_a_homogeneous_box_attenuates_by_its_chord(view: dict, steps: int):
 def test_rays_that_miss_the_box_see_nothing(view: dict):
     grid = box_grid((3, 5, 4))
     bundle = cast_rays(make_camera(size=(7, 6), **(view | {"half_width": 5.0})))
-    scattered, transmittance = march(
+    scattered, transmittance = march_rays(
         emission_of(grid, random_values(*grid.shape)), bundle, every_ray(1)
     )
     is_miss = chords(grid, bundle) == 0
@@ -121,7 +128,7 @@ def test_rays_that_miss_the_box_see_nothing(view: dict):
 def test_a_box_behind_the_camera_is_not_seen():
     grid, bundle = box_grid((3, 5, 4)), cast_rays(make_camera())
     away = Rays(bundle.origin, -bundle.direction, bundle.eye)
-    scattered, transmittance = march(
+    scattered, transmittance = march_rays(
         emission_of(grid, random_values(*grid.shape)), away, every_ray(1)
     )
     assert not scattered.any() and bool((transmittance == 1).all())
@@ -134,7 +141,7 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
     bundle = cast_rays(make_camera(size=(7, 6), **view))
 
     def marched() -> list[Tensor]:
-        seen = march(emission_of(box_grid((9, 11, 10)), density), bundle, every_ray(2))
+        seen = march_rays(emission_of(box_grid((9, 11, 10)), density), bundle, every_ray(2))
         return [*seen, *torch.autograd.grad((seen[0] - seen[1]).square().sum(), density)]
 
     whole = marched()
@@ -168,7 +175,7 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, monkeypat
     seen, counts = [], []
     for emission in emissions:
         nodes.clear()
-        seen.append(march(emission, bundle, every_ray(1)))
+        seen.append(march_rays(emission, bundle, every_ray(1)))
         counts.append(sum(nodes))
     for one, other in zip(*seen, strict=True):
         torch.testing.assert_close(one, other.detach(), rtol=1e-12, atol=1e-15)
@@ -185,9 +192,9 @@ def test_slices_and_equal_steps_agree_in_the_limit(view: str, monkeypatch):
         emission_of(box_grid((3, 5, 4)), random_values(3, 5, 4)),
         cast_rays(make_camera(size=(7, 6), **CAMERAS[view])),
     )
-    sliced = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
+    sliced = [march_rays(emission, bundle, every_ray(steps)) for steps in (1, 16)]
     monkeypatch.setattr(samplers, "STEEPEST", 1.0)
-    equal = [march(emission, bundle, every_ray(steps)) for steps in (1, 16)]
+    equal = [march_rays(emission, bundle, every_ray(steps)) for steps in (1, 16)]
     for field in (0, 1):
         coarse, fine = (
             float((a[field] - b[field]).norm() / a[field].norm())
@@ -201,7 +208,7 @@ def test_radiance_and_transmittance_have_both_derivatives(view: dict):
     grid, bundle = box_grid((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
     density = half_empty(*grid.shape, seed=3).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda d: march(emission_of(grid, d), bundle, every_ray(1)),
+        lambda d: march_rays(emission_of(grid, d), bundle, every_ray(1)),
         density,
         atol=1e-8,
         check_forward_ad=True,
@@ -236,7 +243,7 @@ def test_a_cross_section_may_be_a_field(has_fields: str, g: float):
             medium.g,
             medium.peak,
         )
-        results.append(torch.cat(march(emission, cast_rays(camera), every_ray(1))))
+        results.append(torch.cat(march_rays(emission, cast_rays(camera), every_ray(1))))
     torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=0)
 
 

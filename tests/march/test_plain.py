@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from media import convergence_order, make_camera, make_scene, random_values
+from media import convergence_order, make_camera, make_scene, march_rays, random_values
 from torch import Tensor
 
 from ddrecon.cameras import Rays, cast_rays
@@ -20,9 +20,8 @@ from ddrecon.light import beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.march.box import cross_box
 from ddrecon.march.emission import Channels, Emission
-from ddrecon.march.integral import march
 from ddrecon.march.plain import march_plainly
-from ddrecon.march.samplers import choose_sampler
+from ddrecon.march.samplers import choose_way, make_sampler
 from ddrecon.medium.phase import peaked_phase
 from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.renderer import _emission, solve_light
@@ -93,7 +92,7 @@ def emit(scene: Scene) -> tuple[Emission, Rays]:
 
 
 def march_fast(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
-    return march(emission, rays, RenderSettings(steps_per_voxel=steps, tolerance=0.0))
+    return march_rays(emission, rays, RenderSettings(steps_per_voxel=steps, tolerance=0.0))
 
 
 def march_twin(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
@@ -166,7 +165,8 @@ def test_where_both_sample_alike_transmittance_is_the_same():
     emission, rays = emit(lit_scene(LIGHTS["two beams"], VIEWS["inside"]))
     crossing = cross_box(emission.grid, rays)
     channels = Channels(emission.extinction.field)
-    count = choose_sampler(channels, emission.grid, rays, crossing, 1).nodes - 1
+    way = choose_way(emission.grid, rays, crossing)
+    count = make_sampler(channels, emission.grid, way, 1).nodes - 1
     torch.testing.assert_close(
         march_fast(emission, rays, 1)[1],
         march_plainly(emission, rays, count)[1],

@@ -1,0 +1,108 @@
+"""What a camera's rays meet is found once, anew where anything changed, and goes with it."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import replace
+
+import pytest
+import torch
+from media import box_grid, make_camera, make_scene, random_values
+
+from ddrecon.cameras import Camera
+from ddrecon.march import sight as sight_module
+from ddrecon.march.sight import look_through
+from ddrecon.renderer import render
+from ddrecon.scene import Scene
+from ddrecon.settings import RenderSettings
+from ddrecon.variables.values import value_of, with_values
+
+GRID, SETTINGS = box_grid((5, 6, 7)), RenderSettings()
+
+
+def camera_of(**kind) -> Camera:
+    return make_camera(size=(6, 7), **kind)
+
+
+def scene_of(camera: Camera) -> Scene:
+    return make_scene(random_values(*GRID.shape), camera=camera, ambient=(0.3,))
+
+
+def test_a_sight_is_found_once():
+    camera = camera_of()
+    assert look_through(camera, GRID, SETTINGS) is look_through(camera, GRID, SETTINGS)
+
+
+def shift(camera: Camera) -> None:
+    camera.pose[:, 3] += 0.1
+
+
+def narrow(camera: Camera) -> None:
+    camera.half_width *= 0.5
+
+
+def enlarge(camera: Camera) -> None:
+    camera.size = (9, 8)
+
+
+def turn(camera: Camera) -> None:
+    camera.pose = make_camera(eye=(1.0, 0.5, 2.0)).pose
+
+
+@pytest.mark.parametrize("change", [shift, narrow, enlarge, turn])
+def test_a_camera_that_changed_sees_what_a_new_one_sees(change):
+    camera = camera_of()
+    render(scene_of(camera))
+    change(camera)
+    assert torch.equal(render(scene_of(camera)), render(scene_of(replace(camera))))
+
+
+@pytest.mark.parametrize(
+    ("grid", "settings"),
+    [
+        (box_grid((7, 6, 5)), SETTINGS),
+        (GRID, replace(SETTINGS, samples_per_pixel=4)),
+        (GRID, replace(SETTINGS, tolerance=0.0)),
+    ],
+)
+def test_another_grid_or_other_settings_are_another_sight(grid, settings):
+    camera = camera_of()
+    first = look_through(camera, GRID, SETTINGS)
+    assert look_through(camera, grid, settings) is not first
+
+
+def test_nothing_is_kept_of_a_camera_that_is_gone_or_varied(monkeypatch):
+    kept = type(sight_module._KEPT)()
+    monkeypatch.setattr(sight_module, "_KEPT", kept)
+    camera = camera_of()
+    scene = scene_of(camera)
+    twist = value_of(scene, "views.view.camera").requires_grad_()
+    (bar,) = torch.autograd.grad(
+        render(with_values(scene, {"views.view.camera": twist})).sum(), twist
+    )
+    assert bool((bar != 0).any()) and not kept
+    render(scene)
+    assert list(kept) == [camera]
+    del camera, scene
+    gc.collect()
+    assert not kept
+
+
+def test_no_more_is_kept_than_the_limit(monkeypatch):
+    kept = type(sight_module._KEPT)()
+    monkeypatch.setattr(sight_module, "_KEPT", kept)
+    cameras = [camera_of(eye=(0.1 * number, 0.2, 2.5)) for number in range(4)]
+    monkeypatch.setattr(sight_module, "LIMIT", 2 * look_through(cameras[0], GRID, SETTINGS).bytes)
+    for camera in cameras:
+        look_through(camera, GRID, SETTINGS)
+    assert len(kept) == 2
+
+
+def test_what_was_found_in_inference_mode_serves_derivatives():
+    camera = camera_of()
+    scene = scene_of(camera)
+    with torch.inference_mode():
+        render(scene)
+    density = scene.volume.density.clone().requires_grad_()
+    render(with_values(scene, {"density": density})).sum().backward()
+    assert bool(density.grad.isfinite().all())
