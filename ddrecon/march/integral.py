@@ -8,7 +8,7 @@ that first.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from ddrecon.march.lattice import Lattice, interpolate_between, is_rough
 from ddrecon.march.samplers import make_sampler
 from ddrecon.march.sight import Sight
 from ddrecon.march.slices import Slices
-from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.running_sum import running_sum
@@ -48,21 +48,21 @@ def march(
     mean square, with the light `behind` [C, R] seen through the volume, keeps its own ray.
     """
     if sight.way is None:
-        return _assemble(emission, sight, [])
+        nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
+        return nothing, 1 - nothing
     march_rays, march_lattice = _pick_engine()
     channels = pack_channels(emission)
     sampler = make_sampler(channels, emission.grid, sight.way, settings.steps_per_voxel)
     if sight.lattice is None or sight.places is None:
-        return _assemble(
-            emission, sight, [march_rays(emission, sampler, sight.rays, sight.crossing)]
-        )
-    values = march_lattice(emission, sampler, sight.lattice)
-    parts = [(sight.crossing.hit, interpolate_between(values, sight.places))]
-    is_rough = _needs_own_ray(values, sight.places, settings.tolerance, behind)
-    rough = sight.crossing.select(is_rough.nonzero()[:, 0])
-    if len(rough.hit):
-        parts.append(march_rays(emission, sampler, sight.rays, rough))
-    return _assemble(emission, sight, parts)
+        values = _spread(march_rays(emission, sampler, sight.rays, sight.crossing), sight)
+    else:
+        of_lattice = march_lattice(emission, sampler, sight.lattice)
+        values, is_rough = _interpolate(of_lattice, sight, sight.places, settings, behind)
+        rough = sight.crossing.select(is_rough.nonzero()[:, 0])
+        if len(rough.hit):
+            values = values.index_copy(1, *march_rays(emission, sampler, sight.rays, rough))
+    scattered, opacity = values.split(emission.colors)
+    return scattered, 1 - opacity
 
 
 def _pick_engine() -> tuple[Callable[..., Part], Callable[..., Tensor]]:
@@ -74,34 +74,43 @@ def _pick_engine() -> tuple[Callable[..., Part], Callable[..., Tensor]]:
     return _march_rays, _march_lattice
 
 
-def _needs_own_ray(
-    values: Tensor, places: Tensor, tolerance: float, behind: Tensor | None
-) -> Tensor:
+def _interpolate(
+    values: Tensor, sight: Sight, places: Tensor, settings: RenderSettings, behind: Tensor | None
+) -> Part:
+    """`values` [2 C, r, c] of a lattice at the `places` of pixels, [2 C, R] along all rays.
+
+    And which of those that meet the box are not to be interpolated, bool [P].
+    """
+    brightest = values.new_zeros(1) if behind is None else behind.detach().max().view(1)
+    if current_engine() == "warp" and not is_varied(places):
+        from ddrecon.march.fused.between import interpolate_pixels
+
+        count = len(sight.rays.direction)
+        return interpolate_pixels(
+            values, places, sight.crossing.hit, count, brightest, settings.tolerance
+        )
+    own = _needs_own_ray(values, places, settings.tolerance, brightest)
+    return _spread((sight.crossing.hit, interpolate_between(values, places)), sight), own
+
+
+def _needs_own_ray(values: Tensor, places: Tensor, tolerance: float, behind: Tensor) -> Tensor:
     """Which pixels, at `places` [P, 2] of a lattice, are not to be interpolated: bool [P].
 
     Those where the `values` [2 C, r, c] of the lattice say that this may change the image by more
     than `tolerance` of its root mean square.
     """
     scattered, opacity = values.detach().chunk(2)
-    brightest = scattered.new_zeros(()) if behind is None else behind.detach().max()
-    brightness = (scattered + brightest * (1 - opacity)).square().mean().sqrt()
+    brightness = (scattered + behind * (1 - opacity)).square().mean().sqrt()
     bound = (tolerance * brightness.double()).to(values.dtype)
-    return is_rough(torch.cat([scattered, brightest * opacity]), bound, places)
+    return is_rough(torch.cat([scattered, behind * opacity]), bound, places)
 
 
-def _assemble(emission: Emission, sight: Sight, parts: Sequence[Part]) -> tuple[Tensor, Tensor]:
-    """Radiance and transmittance [C, R] along all rays: those of `parts`, and 0 and 1 elsewhere.
-
-    Where a ray is in several parts the last of them counts.
-    """
-    if sight.is_whole and parts and parts[0][0] is sight.crossing.hit:
-        (_, values), *parts = parts
-    else:
-        values = emission.diffuse.new_zeros(2 * emission.colors, len(sight.rays.direction))
-    for index, along in parts:
-        values = values.index_copy(1, index, along)
-    scattered, opacity = values.split(emission.colors)
-    return scattered, 1 - opacity
+def _spread(part: Part, sight: Sight) -> Tensor:
+    """Radiance and opacity [2 C, R] along all rays: those of `part`, and 0 elsewhere."""
+    index, along = part
+    if sight.is_whole and index is sight.crossing.hit:
+        return along
+    return along.new_zeros(len(along), len(sight.rays.direction)).index_copy(1, index, along)
 
 
 def _march_rays(

@@ -118,9 +118,14 @@ def interpolate_between(values: Tensor, places: Tensor) -> Tensor:
 
     They are interpolated to third order, and held at zero.
     """
+    return interpolate(values, places).clamp(min=0)
+
+
+def interpolate(values: Tensor, places: Tensor) -> Tensor:
+    """The same, not held."""
     sizes = places.new_tensor(values.shape[1:])
     points = ((2 * places + 1) / sizes - 1).flip(-1)
-    return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0].clamp(min=0)
+    return sample_slices(values[None], points[None], ThirdOrder(0, values.shape[0]))[0]
 
 
 def is_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:

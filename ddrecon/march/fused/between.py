@@ -1,0 +1,92 @@
+"""Pixels between the rays of a lattice, by fused kernels: one function of the lattice's values."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.march.fused.pixels import interpolation_kernel, judge_kernel, spread_kernel
+from ddrecon.march.lattice import DOUBT, interpolate
+from ddrecon.numerics.autodiff import keep
+
+LENGTH = 256
+"""Pixels that an item of a launch does on a processor."""
+FEW = 1 << 14
+"""So many numbers of pixels are not worth a second thread."""
+
+
+def interpolate_pixels(
+    values: Tensor, places: Tensor, hit: Tensor, count: int, behind: Tensor, tolerance: float
+) -> tuple[Tensor, Tensor]:
+    """Radiance and opacity [2 C, `count`] of all pixels, and which of those in `hit` are rough.
+
+    `values` [2 C, r, c] of lattice rays are interpolated at `places` [P, 2] to pixels `hit` [P];
+    others stay 0. Rough [P] are those that `lattice.is_rough` names for `tolerance` of what is
+    seen, with light `behind` [1].
+    """
+    out, is_rough = _Interpolate.apply(values, places, hit, count, behind, tolerance)
+    return out, is_rough
+
+
+class _Interpolate(torch.autograd.Function):
+    """Differentiable in both modes with respect to the values; places are those of a camera that
+    is not varied.
+    """
+
+    @staticmethod
+    def forward(
+        values: Tensor, places: Tensor, hit: Tensor, count: int, behind: Tensor, tolerance: float
+    ) -> tuple[Tensor, Tensor]:
+        bits, (channels, rows, columns) = torch.finfo(values.dtype).bits, values.shape
+        uneven = values.new_empty(rows, columns)
+        squares = values.new_empty(rows, dtype=torch.float64)
+        judged = [array(x) for x in (values, behind, uneven, squares)]
+        launch(judge_kernel(bits), rows, judged, values, _threads(values))
+        brightness = (squares.sum() / (channels // 2 * rows * columns)).sqrt()
+        bound = (tolerance / DOUBT * brightness).to(values.dtype).view(1)
+        out = values.new_zeros(channels, count)
+        is_rough = torch.empty_like(hit, dtype=torch.bool)
+        arguments = [array(x) for x in (values, places, hit, uneven, bound, out, is_rough)]
+        items, length = _shares(places)
+        threads = _threads(places, channels)
+        launch(interpolation_kernel(bits), items, [length, *arguments], values, threads)
+        return out, is_rough
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(output[1])
+        keep(ctx, *inputs[:3])
+        ctx.count = inputs[3]
+
+    @staticmethod
+    def backward(ctx: Any, out_bar: Tensor, _: None) -> tuple[Tensor | None, ...]:
+        values, places, hit = ctx.saved_tensors
+        bits, threads = torch.finfo(values.dtype).bits, _threads(places, len(values))
+        shares = [torch.zeros_like(values) for _ in range(threads)]
+        items, length = _shares(places)
+        fixed = [length, *(array(x) for x in (values, places, hit, out_bar))]
+        given = [[*fixed, array(share)] for share in shares]
+        launch(spread_kernel(bits), items, given.__getitem__, values, threads)
+        return functools.reduce(Tensor.add_, shares), None, None, None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, d_values: Tensor, *_: None) -> tuple[Tensor, None]:
+        values, places, hit = ctx.saved_tensors
+        moves = interpolate(values, places) >= 0
+        along = torch.where(moves, interpolate(d_values, places), 0)
+        d_out = values.new_zeros(len(values), ctx.count)
+        return d_out.index_copy(1, hit, along), None
+
+
+def _threads(pixels: Tensor, channels: int = 1) -> int:
+    return 1 if pixels.numel() * channels < FEW else thread_count(pixels)
+
+
+def _shares(places: Tensor) -> tuple[int, int]:
+    """Items of a launch, and how many pixels each of them does."""
+    length = 1 if places.is_cuda else LENGTH
+    return -(-len(places) // length), length

@@ -1,0 +1,129 @@
+"""Pixels between lattice rays by fused kernels are those by PyTorch's operations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward
+from media import random_values
+from torch import Tensor
+
+from ddrecon.march.lattice import interpolate_between, is_rough
+
+wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.march.fused.between import interpolate_pixels  # noqa: E402
+from ddrecon.march.fused.pixels import (  # noqa: E402
+    interpolation_kernel,
+    judge_kernel,
+    spread_kernel,
+)
+
+pytestmark = pytest.mark.slow
+
+SHAPES = [(2, 9, 7), (6, 8, 11)]
+EXACT = {torch.float64: 1e-13, torch.float32: 1e-5}
+each_shape = pytest.mark.parametrize("shape", SHAPES)
+each_type = pytest.mark.parametrize("dtype", EXACT)
+
+
+def case(shape: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, int]:
+    """A lattice's values, some below zero, with a jump and an empty corner; places, and pixels."""
+    values = 2 * random_values(*shape, dtype=dtype) - 0.4
+    values[:, 5:, :3] = 0
+    values[:, 4:, 4:] += 3
+    count = 900
+    hit = torch.randperm(count, generator=torch.Generator().manual_seed(1))[:700].sort().values
+    size = values.new_tensor(shape[1:]) - 1
+    places = random_values(len(hit), 2, seed=2, dtype=dtype) * size
+    places[:8] = places[:8].floor()  # on rays of the lattice
+    return values, places, hit, count
+
+
+def known(values: Tensor, places: Tensor, hit: Tensor, count: int) -> Tensor:
+    zeros = values.new_zeros(len(values), count)
+    return zeros.index_copy(1, hit, interpolate_between(values, places))
+
+
+def fused(values: Tensor, places: Tensor, hit: Tensor, count: int) -> Tensor:
+    return interpolate_pixels(values, places, hit, count, values.new_zeros(1), 0.1)[0]
+
+
+@each_type
+@each_shape
+def test_values_and_gradients_agree(shape, dtype):
+    values, *pixels = case(shape, dtype)
+    weight = random_values(len(values), pixels[2], seed=3, dtype=dtype)
+    found = []
+    for function in (known, fused):
+        leaf = values.clone().requires_grad_()
+        image = function(leaf, *pixels)
+        found.append((image.detach(), torch.autograd.grad((image * weight).sum(), leaf)[0]))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(other, one, rtol=0, atol=EXACT[dtype] * float(one.abs().max()))
+
+
+@each_shape
+def test_tangents_agree_and_are_the_adjoint(shape):
+    values, *pixels = case(shape, torch.float64)
+    change = random_values(*shape, seed=4) - 0.5
+    tangents = []
+    for function in (known, fused):
+        with forward.dual_level():
+            image = function(forward.make_dual(values, change), *pixels)
+            tangents.append(forward.unpack_dual(image).tangent)
+    torch.testing.assert_close(tangents[1], tangents[0], rtol=0, atol=1e-12)
+    by_func = torch.func.jvp(lambda v: fused(v, *pixels), (values,), (change,))[1]
+    torch.testing.assert_close(by_func, tangents[0], rtol=0, atol=1e-12)
+    weight, leaf = random_values(*tangents[0].shape, seed=5), values.clone().requires_grad_()
+    (bar,) = torch.autograd.grad((fused(leaf, *pixels) * weight).sum(), leaf)
+    torch.testing.assert_close(
+        (bar * change).sum(), (tangents[1] * weight).sum(), rtol=1e-10, atol=0
+    )
+
+
+@each_shape
+@pytest.mark.parametrize("light", [0.0, 2.0])
+@pytest.mark.parametrize("tolerance", [0.05, 0.3, 1.0])
+def test_the_same_pixels_are_rough(shape, light, tolerance):
+    values, places, hit, count = case(shape, torch.float64)
+    behind = values.new_tensor([light])
+    scattered, opacity = values.chunk(2)
+    brightness = (scattered + light * (1 - opacity)).square().mean().sqrt()
+    expected = is_rough(torch.cat([scattered, light * opacity]), tolerance * brightness, places)
+    found = interpolate_pixels(values, places, hit, count, behind, tolerance)[1]
+    assert torch.equal(found, expected)
+
+
+def test_nothing_passes_derivatives_to_every_ray_of_the_lattice():
+    values, *pixels = case(SHAPES[0], torch.float64)
+    leaf = torch.zeros_like(values).requires_grad_()
+    (bar,) = torch.autograd.grad(fused(leaf, *pixels).sum(), leaf)
+    assert bool((bar[:, 2:-2, 2:-2] != 0).all())
+
+
+def test_two_threads_find_the_same_and_always_the_same_bits(monkeypatch):
+    from ddrecon.march.fused import between
+
+    values, *pixels = case(SHAPES[1], torch.float32)
+    monkeypatch.setattr(between, "FEW", 0)
+    monkeypatch.setattr(between, "LENGTH", 64)
+    bars = []
+    for threads in (1, 2, 2):
+        torch.set_num_threads(threads)
+        try:
+            leaf = values.clone().requires_grad_()
+            bars.append(torch.autograd.grad(fused(leaf, *pixels).square().sum(), leaf)[0])
+        finally:
+            torch.set_num_threads(1)
+    assert torch.equal(bars[1], bars[2])
+    torch.testing.assert_close(bars[0], bars[1], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("arch", [80, 90])
+def test_kernels_compile_for_graphics_cards(arch: int, tmp_path: Path):
+    for make in (judge_kernel, interpolation_kernel, spread_kernel):
+        module = make(32).module
+        wp.compile_aot_module(module, arch=arch, use_ptx=True, module_dir=tmp_path / make.__name__)
+        assert list((tmp_path / make.__name__).glob("*.ptx"))
