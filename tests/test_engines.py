@@ -1,0 +1,193 @@
+"""Both engines compute the same images and the same derivatives, whatever the scene.
+
+Of every scene in configs/, with fewer cells and pixels, and of scenes drawn at random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as some
+from media import half_empty, make_camera, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import ENGINES, use_engine
+from ddrecon.light.lights import EnvironmentLight, PointLight
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.renderer import render_each
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
+from ddrecon.settings import DiffusionSettings, RenderSettings
+from ddrecon.variables.values import value_of, variable_names, with_values
+
+pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
+CLOSE = {torch.float32: 1e-5, torch.float64: 1e-11}
+SOLVED = {torch.float32: 1e-7, torch.float64: 1e-14}
+"""Both solve as closely as numbers allow: what is compared is no solver's stopping."""
+MOST_CELLS = 12
+each_type = pytest.mark.parametrize("dtype", CLOSE, ids=lambda dtype: str(dtype)[6:])
+
+
+def variables_of(scene: Scene) -> list[str]:
+    """All but those that others are made of."""
+    return [name for name in variable_names(scene) if name not in ("sigma_t", "albedo")]
+
+
+def outcome(scene: Scene, names: Sequence[str], engine: str) -> list[Tensor]:
+    """The images, and the derivatives by `names` of a sum of their pixels, each by its weight."""
+    use_engine(engine)
+    values = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
+    changed = with_values(scene, values)
+    images = render_each(changed, changed.views, SolveMemory())
+    total = sum(
+        (image * random_values(*image.shape, seed=seed, dtype=image.dtype)).sum()
+        for seed, image in enumerate(images)
+    )
+    bars = torch.autograd.grad(total, list(values.values()), allow_unused=True)
+    zeros = (torch.zeros_like(value) for value in values.values())
+    pairs = zip(bars, zeros, strict=True)
+    return [*(image.detach() for image in images), *(z if bar is None else bar for bar, z in pairs)]
+
+
+def assert_engines_agree(scene: Scene, names: Sequence[str]) -> None:
+    """To `CLOSE`; where numbers of 32 bits do not tell so much, to what they do tell.
+
+    That is how far the known result is from the same scene's in 64 bits.
+    """
+    known, found = (outcome(scene, names, engine) for engine in ENGINES)
+    labels = [*(view.name for view in scene.views), *names]
+    close = CLOSE[scene.volume.density.dtype]
+    for index, (label, one, other) in enumerate(zip(labels, known, found, strict=True)):
+        apart, size = float((one - other).norm()), float(one.norm())
+        if apart > close * size and one.dtype == torch.float32:
+            exact = outcome(in_double(scene), names, "torch")[index]
+            size += 2 * float((exact - one).norm()) / close
+        assert apart <= close * size, f"{label}: {apart:.2e} of {size:.2e}"
+
+
+def in_double(record: Any) -> Any:
+    """The same scene in 64 bits."""
+    if isinstance(record, Tensor):
+        return record.double()
+    if isinstance(record, (list, tuple)):
+        return type(record)(in_double(entry) for entry in record)
+    if not is_dataclass(record):
+        return record
+    changes = {part.name: in_double(getattr(record, part.name)) for part in fields(record)}
+    if isinstance(record, DiffusionSettings):
+        changes["tolerance"] = SOLVED[torch.float64]
+    return replace(record, **changes)
+
+
+@each_type
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
+def test_engines_agree_on_every_config(config: Path, dtype: torch.dtype) -> None:
+    scene = load_scene(config, dtype=dtype)
+    factor = -(-max(scene.volume.grid.shape) // MOST_CELLS)
+    scene = scene_at_level(replace(scene, views=scene.views[:2]), factor)
+    volume = replace(scene.volume, density=half_empty(*scene.volume.grid.shape, dtype=dtype))
+    diffusion = replace(scene.diffusion, tolerance=SOLVED[dtype])
+    scene = replace(scene, volume=volume, diffusion=diffusion)
+    assert_engines_agree(scene, variables_of(scene))
+
+
+MEDIA = {
+    "gray": {"sigma_a": (1.0,), "sigma_s": (6.0,)},
+    "colored": {},
+    "cellwise": {},
+    "black": {"sigma_s": (0.0,), "model": "none"},
+}
+"""Kinds of media; fused kernels are compiled for each, and for each kind of lights."""
+LIGHTS = {
+    "beam": {},
+    "gray beam": {"directional": (2.0,)},
+    "ambient": {"directional": None, "ambient": (0.4, 0.3, 0.2)},
+    "points": {"ambient": (0.3,)},
+    "sky": {"directional": None},
+}
+KINDS = [
+    ("gray", "gray beam"),
+    ("colored", "beam"),
+    ("colored", "sky"),
+    ("cellwise", "points"),
+    ("cellwise", "ambient"),
+    ("black", "points"),
+]
+VIEWS = {
+    "far": {"eye": (0.3, 0.4, 3.0), "half_width": 0.25},
+    "near": {"eye": (1.1, 0.5, 0.9), "half_width": 0.9},
+    "inside": {"eye": (0.1, 0.12, 0.05), "half_width": 0.6},
+    "parallel": {"eye": (0.7, -0.4, 2.5), "half_width": 0.8, "is_perspective": False},
+}
+
+
+@some.composite
+def scenes(draw: Any, dtype: torch.dtype) -> Scene:
+    """A small scene; its numbers come from seeds, its kind and settings one by one."""
+    kind, lit = draw(some.sampled_from(KINDS))
+    shape = tuple(draw(some.integers(2, 9)) for _ in range(3))
+    seed = draw(some.integers(0, 99))
+    density = draw(some.sampled_from([0.0, 0.3, 2.0])) * half_empty(*shape, seed=seed, dtype=dtype)
+    size = (draw(some.integers(2, 24)), draw(some.integers(2, 24)))
+    view = VIEWS[draw(some.sampled_from(sorted(VIEWS)))]
+    # Flux-limited diffusion is solved as closely in 64 bits only.
+    models = ["p1"] if dtype == torch.float32 else ["p1", "p1", "flux_limited"]
+    model = draw(some.sampled_from(models))
+    changes = {"model": model, **MEDIA[kind], **LIGHTS[lit]}
+    if changes["model"] == "p1":
+        changes["transport_rounds"] = draw(some.integers(0, 2))
+        changes["closure"] = draw(some.sampled_from(["geometric", "smooth"]))
+    if kind == "cellwise":
+        for step, (name, most) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1):
+            changes[name] = most * random_values(3, *shape, seed=seed + step, dtype=dtype)
+    scene = make_scene(
+        density,
+        g=draw(some.sampled_from([0.0, 0.4, 0.85, -0.3])),
+        camera=make_camera(size=size, dtype=dtype, **view),
+        tolerance=SOLVED[dtype],
+        **changes,
+    )
+    tensor = density.new_tensor
+    if lit == "points":
+        scene.lights += [
+            PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
+            PointLight(tensor([0.1, 0.05, -0.1]), tensor([0.3])),
+        ]
+    if lit == "sky":
+        sky = random_values(3, 4, 8, seed=seed + 3, dtype=dtype)
+        scene.lights.append(EnvironmentLight(sky, tensor(0.5), tensor(20.0), 6))
+    render = RenderSettings(
+        samples_per_pixel=draw(some.sampled_from([1, 2])),
+        steps_per_voxel=draw(some.sampled_from([1, 2])),
+        tolerance=draw(some.sampled_from([0.0, 1.0])),
+    )
+    return replace(scene, render=render)
+
+
+@each_type
+def test_engines_agree_on_scenes_drawn_at_random(dtype: torch.dtype) -> None:
+    @settings(
+        max_examples=12,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        phases=[Phase.generate],
+    )
+    @given(scene=scenes(dtype), has_moved=some.booleans())
+    def check(scene: Scene, has_moved: bool) -> None:
+        names = variables_of(scene)
+        still = [name for name in names if not name.endswith("camera")]
+        assert_engines_agree(scene, names if has_moved else still)
+
+    check()
