@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -62,19 +63,48 @@ LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
 }
 
 
+@dataclass(frozen=True)
+class Target:
+    """What images are compared with: `image` [3, h, w] (linear radiance), and its measures.
+
+    `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: of
+    numbers that do; `scale`: the root of their mean square; `peak`: the largest value squared.
+    """
+
+    image: Tensor
+    seen: Tensor | None
+    count: Tensor
+    scale: Tensor
+    peak: Tensor
+
+    @staticmethod
+    def of(image: Tensor, mask: Tensor | None) -> Target:
+        """The target `image`, of which `mask` [h, w] is seen; None is all of it."""
+        tiny = torch.finfo(image.dtype).tiny
+        if mask is None:
+            count, square = image.new_full((), image[0].numel() * 3), image.square()
+        else:
+            count, square = (3 * mask.sum()).clamp(min=1), image.square() * mask
+        scale = (square.sum() / count).sqrt().clamp(min=tiny**0.25)
+        return Target(image, mask, count, scale, image.max().clamp(min=tiny) ** 2)
+
+    def loss_of(self, loss: str, image: Tensor) -> Tensor:
+        """The mean of `loss` over the pixels and colors of `image` [3, h, w]."""
+        error = LOSSES[loss](image - self.image, self.image, self.scale)
+        return (error if self.seen is None else error * self.seen).sum() / self.count
+
+    def psnr_of(self, square: Tensor) -> Tensor:
+        """The peak signal-to-noise ratio [dB] of a mean `square` of errors."""
+        tiny = torch.finfo(square.dtype).tiny
+        return 10 * torch.log10(self.peak / square.clamp(min=tiny))
+
+
 def image_loss(loss: str, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """The mean of `loss` over the pixels and colors of `image` [3, h, w] against `target`.
 
     Pixels where `mask` [h, w] is 0 do not count; None counts all.
     """
-    seen = torch.ones_like(image[0]) if mask is None else mask
-    count = (3 * seen.sum()).clamp(min=1)
-    scale = (
-        ((target.square() * seen).sum() / count)
-        .sqrt()
-        .clamp(min=torch.finfo(target.dtype).tiny ** 0.25)
-    )
-    return (LOSSES[loss](image - target, target, scale) * seen).sum() / count
+    return Target.of(target, mask).loss_of(loss, image)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
@@ -82,9 +112,8 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
 
     The peak is the largest value of the target. Pixels where `mask` [h, w] is 0 do not count.
     """
-    error = image_loss("l2", image.detach(), target, mask)
-    tiny = torch.finfo(target.dtype).tiny
-    return float(10 * torch.log10(target.max().clamp(min=tiny) ** 2 / error.clamp(min=tiny)))
+    known = Target.of(target, mask)
+    return float(known.psnr_of(known.loss_of("l2", image.detach())))
 
 
 def total_variation(field: Tensor, grid: Grid) -> Tensor:

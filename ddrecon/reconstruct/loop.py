@@ -17,12 +17,19 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
+from ddrecon.losses import Target
 from ddrecon.reconstruct import setup
-from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence, require_finite
+from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.levels import factors, resample, scene_at_level, stage_of
 from ddrecon.reconstruct.log import NO_ROWS, Row, sum_rows
-from ddrecon.reconstruct.objective import add_penalties, loss_by_view, mean_psnr, render_psnr
+from ddrecon.reconstruct.objective import (
+    Comparison,
+    add_penalties,
+    read_numbers,
+    render_psnr,
+    target_of,
+)
 from ddrecon.reconstruct.rates import rate_at
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
@@ -118,15 +125,16 @@ class Reconstruction:
         # See: which views this iteration compares.
         views = self._views()
         # Differentiate: the objective and its derivative by every parameter.
-        objective = self._differentiate(views)
+        compared = Comparison(self.settings.loss, views, self.targets)
+        objective = self._differentiate(views, compared)
         loss, gradients = add_penalties(objective, self.parameters, self.power)
         # Check: a derivative that is not finite would spoil the parameters for good.
-        require_finite(self.parameters, gradients)
+        numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         self.before_step = None
         self.before_step = self.state() | {"solutions": solutions}
         # Step: every parameter against its derivative.
-        self.misfit = math.sqrt(float(objective.loss) / self.power) if self.power else 1.0
+        self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
         rate = rate_at(self.iteration, self.settings.iterations)
         for parameter in self.parameters:
             parameter.step(gradients[parameter.name], rate)
@@ -137,8 +145,8 @@ class Reconstruction:
         row = Row(
             iteration=self.iteration + 1,
             seconds=self.total.seconds + perf_counter() - start,
-            loss=float(loss),
-            psnr=mean_psnr(objective.images, views),
+            loss=numbers.loss,
+            psnr=numbers.psnr,
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),
             adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
@@ -182,6 +190,9 @@ class Reconstruction:
         self.train_level, self.test_level = (
             scene_at_level(scene, self.factors[stage]) for scene in (self.train, self.test)
         )
+        self.targets = {
+            view.name: Target.of(target_of(view), view.mask) for view in self.train_level.views
+        }
         grid = self.train_level.volume.grid
         for parameter in self.parameters:
             if parameter.grid != grid:
@@ -195,13 +206,17 @@ class Reconstruction:
     def _values(self) -> dict[str, Tensor]:
         return {parameter.name: parameter.value for parameter in self.parameters}
 
-    def _differentiate(self, views: list[View]) -> Differentiated:
+    def _differentiate(self, views: list[View], compared: Comparison) -> Differentiated:
         """The loss of `views` and its derivatives, solved no more exactly than the misfit asks."""
         self.memory.records.clear()
         self.memory.tolerance_floor = solve_tolerances(self.misfit)
-        names, loss_of = [view.name for view in views], loss_by_view(self.settings.loss, views)
+        names = [view.name for view in views]
         try:
-            return differentiate(self.train_level, names, self._values(), loss_of, self.memory)
+            return differentiate(self.train_level, names, self._values(), compared, self.memory)
+        except SolveError:
+            # The adjoint cannot be solved for a loss that is not finite.
+            compared.require_finite()
+            raise
         finally:
             self.memory.tolerance_floor = {}
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.losses import image_loss, psnr
-from ddrecon.reconstruct.divergence import NotFiniteError
+from ddrecon.losses import Target, psnr
+from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each
@@ -24,20 +26,66 @@ def target_of(view: View) -> Tensor:
     return view.image
 
 
-def loss_by_view(loss: str, views: Sequence[View]) -> Callable[[View, Tensor], Tensor]:
-    """A function of one of `views` and its rendered image: what it adds to the objective.
+@dataclass
+class Comparison:
+    """Compares images of `views` with their `targets` by name, each once, by the loss `kind`.
 
-    That is its share, by weight, of their mean `loss`; where it is not finite, NotFiniteError.
+    `losses` and `psnrs` [dB] are those compared so far, in their order.
     """
-    weights = sum(view.weight for view in views)
 
-    def loss_of(view: View, image: Tensor) -> Tensor:
-        value = view.weight / weights * image_loss(loss, image, target_of(view), view.mask)
-        if not bool(torch.isfinite(value)):
-            raise NotFiniteError(f"the loss of view {view.name} is not finite")
+    kind: str
+    views: Sequence[View]
+    targets: Mapping[str, Target]
+    losses: list[Tensor] = field(default_factory=list)
+    psnrs: list[Tensor] = field(default_factory=list)
+
+    def __call__(self, view: View, image: Tensor) -> Tensor:
+        """What `view` and its rendered `image` add to the objective.
+
+        That is its share, by weight, of the views' mean loss.
+        """
+        target = self.targets[view.name]
+        loss = target.loss_of(self.kind, image)
+        square = loss if self.kind == "l2" else target.loss_of("l2", image.detach())
+        self.psnrs.append(target.psnr_of(square.detach()))
+        value = view.weight / sum(view.weight for view in self.views) * loss
+        self.losses.append(value.detach())
         return value
 
-    return loss_of
+    def require_finite(self) -> None:
+        """Raises NotFiniteError where a loss is not finite."""
+        for view, loss in zip(self.views, self.losses, strict=False):
+            if not math.isfinite(loss):
+                raise NotFiniteError(f"the loss of view {view.name} is not finite")
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What Python knows of an iteration: the `loss`, its part of the images, their mean `psnr`."""
+
+    loss: float
+    of_images: float
+    psnr: float
+
+
+def read_numbers(
+    compared: Comparison,
+    objective: Differentiated,
+    loss: Tensor,
+    gradients: Mapping[str, Tensor],
+    parameters: Sequence[Parameter],
+) -> Numbers:
+    """The numbers of an iteration, all read at once, with `loss` and `gradients` of all there is.
+
+    Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
+    """
+    extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
+    psnr, image_losses = compared.psnrs, compared.losses
+    read = torch.stack([loss, objective.loss, *psnr, *image_losses, *extremes]).tolist()
+    if not all(math.isfinite(number) for number in read[2 + len(psnr) :]):
+        compared.require_finite()
+        require_finite(parameters, gradients)
+    return Numbers(read[0], read[1], sum(read[2 : 2 + len(psnr)]) / len(psnr))
 
 
 def add_penalties(
@@ -57,17 +105,11 @@ def add_penalties(
     return loss, gradients
 
 
-def mean_psnr(images: Sequence[Tensor], views: Sequence[View]) -> float:
-    """The mean over `views` of the PSNR [dB] of their rendered `images` [3, h, w]."""
-    values = [
-        psnr(image, target_of(view), view.mask) for image, view in zip(images, views, strict=True)
-    ]
-    return sum(values) / len(values)
-
-
 def render_psnr(scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory) -> float:
     """The mean PSNR [dB] of the views of `scene`, rendered with those `values` that it has."""
-    known = variable_names(scene)
+    known, views = variable_names(scene), scene.views
     with torch.no_grad():
         rendered = with_values(scene, {name: values[name] for name in values if name in known})
-        return mean_psnr(render_each(rendered, rendered.views, memory), rendered.views)
+        images = render_each(rendered, rendered.views, memory)
+    pairs = zip(images, views, strict=True)
+    return sum(psnr(image, target_of(view), view.mask) for image, view in pairs) / len(views)

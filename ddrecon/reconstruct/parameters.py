@@ -44,7 +44,7 @@ class Parameter:
         self.tv = (kind.tv if settings.tv is None else settings.tv) if self.is_field else 0.0
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
-        self.steps = value.new_zeros(())
+        self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
     def penalty(self) -> Tensor:
@@ -64,18 +64,18 @@ class Parameter:
         the derivative and of its square, each divided by the part of 1 that their weights sum to,
         Adam moves the value by -rate m / (sqrt(v) + epsilon).
         """
-        length = self.value.detach().norm()
-        first, second = self.moments
-        with torch.no_grad():
-            self.steps += 1
-            weights = [1 - beta ** float(self.steps) for beta in BETAS]
-            first.lerp_(gradient, 1 - BETAS[0])
-            second.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-            size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
-            self.value.addcdiv_(first, size, value=-(rate * self.rate / weights[0]))
-            self.value.clamp_(self.low, self.high)
-            if self.is_direction:
-                self.value.mul_(length / self.value.norm())
+        self.steps += 1
+        weights = [1 - beta ** float(self.steps) for beta in BETAS]
+        # All are new tensors: the old ones are the state before the step.
+        before, (first, second) = self.value.detach(), self.moments
+        first = first.lerp(gradient, 1 - BETAS[0])
+        second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
+        size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
+        value = before.addcdiv(first, size, value=-(rate * self.rate / weights[0]))
+        value.clamp_(self.low, self.high)
+        if self.is_direction:
+            value.mul_(before.norm() / value.norm())
+        self.value, self.moments = value.requires_grad_(), (first, second)
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""
@@ -96,18 +96,18 @@ class Parameter:
         self.moments = first * volume_ratio, second * volume_ratio**2
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps of it, untouched by further steps."""
+        """What a checkpoint keeps of it; further steps make new tensors."""
         return {
-            "value": self.value.detach().clone(),
+            "value": self.value.detach(),
             "shape": list(self.grid.shape),
-            "steps": self.steps.clone(),
-            "moments": [moment.clone() for moment in self.moments],
+            "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
+            "moments": list(self.moments),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
         self.value = state["value"].to(self.value).clone().requires_grad_()
-        self.steps = state["steps"].to(self.value).clone()
-        first, second = (moment.to(self.value).clone() for moment in state["moments"])
+        self.steps = int(state["steps"])
+        first, second = (moment.to(self.value) for moment in state["moments"])
         self.moments = first, second
