@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.losses import total_variation
 from ddrecon.reconstruct.levels import resample
@@ -54,7 +55,10 @@ class Parameter:
         """
         total = self.value.new_zeros(())
         if self.tv:
-            total = total + self.tv * total_variation(self.value, self.grid)
+            variation = total_variation
+            if current_engine() == "warp":
+                from ddrecon.reconstruct.fused.passes import total_variation as variation
+            total = total + self.tv * variation(self.value, self.grid)
         return total + self.l1 * self.value.abs().mean() if self.l1 else total
 
     def step(self, gradient: Tensor, rate: float) -> None:
@@ -65,17 +69,31 @@ class Parameter:
         Adam moves the value by -rate m / (sqrt(v) + epsilon).
         """
         self.steps += 1
-        weights = [1 - beta ** float(self.steps) for beta in BETAS]
         # All are new tensors: the old ones are the state before the step.
-        before, (first, second) = self.value.detach(), self.moments
+        before = self.value.detach()
+        value, self.moments = self._step(before, gradient, rate * self.rate)
+        if self.is_direction:
+            value.mul_(before.norm() / value.norm())
+        self.value = value.requires_grad_()
+
+    def _step(
+        self, before: Tensor, gradient: Tensor, rate: float
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """The value within its bounds, and the moments, after the step from `before`."""
+        if current_engine() == "warp":
+            from ddrecon.reconstruct.fused.passes import step_adam
+
+            bounds = self.low, self.high
+            return step_adam(
+                before, gradient, self.moments, BETAS, self.steps, rate, EPSILON, bounds
+            )
+        first, second = self.moments
+        weights = [1 - beta ** float(self.steps) for beta in BETAS]
         first = first.lerp(gradient, 1 - BETAS[0])
         second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
         size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
-        value = before.addcdiv(first, size, value=-(rate * self.rate / weights[0]))
-        value.clamp_(self.low, self.high)
-        if self.is_direction:
-            value.mul_(before.norm() / value.norm())
-        self.value, self.moments = value.requires_grad_(), (first, second)
+        value = before.addcdiv(first, size, value=-(rate / weights[0]))
+        return value.clamp_(self.low, self.high), (first, second)
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""

@@ -1,0 +1,83 @@
+"""Adam's step and total variation as functions of tensors, by fused kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.losses import ROUNDING
+from ddrecon.reconstruct.fused.kernels import step_kernel, variation_kernel
+
+LENGTH = 4096
+"""Numbers that an item of a launch steps on a processor."""
+PART = 32
+"""Cells of a row that a thread does on a GPU."""
+FEW = 1 << 15
+"""So many numbers are not worth a second thread."""
+
+
+def step_adam(
+    value: Tensor,
+    gradient: Tensor,
+    moments: tuple[Tensor, Tensor],
+    betas: tuple[float, float],
+    steps: int,
+    rate: float,
+    epsilon: float,
+    bounds: tuple[float, float],
+) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """The new value, within its bounds, and the new moments, after `steps` with this one."""
+    new = [torch.empty_like(value) for _ in range(3)]
+    weights = [1 - beta**steps for beta in betas]
+    arrays = [array(tensor.contiguous().view(-1)) for tensor in (value, gradient, *moments)]
+    arrays += [array(tensor.view(-1)) for tensor in new]
+    length = 1 if value.is_cuda else LENGTH
+    forget = [1 - beta for beta in betas]
+    numbers = [*forget, weights[1] ** -0.5, epsilon, rate / weights[0], *bounds]
+    kernel = step_kernel(torch.finfo(value.dtype).bits)
+    items = -(-value.numel() // length)
+    launch(kernel, items, [length, *arrays, *numbers], value, _threads(value))
+    return new[0], (new[1], new[2])
+
+
+def total_variation(field: Tensor, grid: Grid) -> Tensor:
+    """What `losses.total_variation` is of `field` [..., z, y, x], differentiable once."""
+    total: Tensor
+    total, _ = _Variation.apply(field, grid)
+    return total
+
+
+class _Variation(torch.autograd.Function):
+    """The derivative is found with the value: it is what a penalty is for."""
+
+    @staticmethod
+    def forward(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+        side, columns = min(grid.extent), field.shape[-1]
+        cells = field.reshape(-1, *field.shape[-3:]).contiguous()
+        slope = torch.empty_like(cells)
+        length = PART if field.is_cuda else columns
+        items = field.numel() // columns * -(-columns // length)
+        totals = field.new_empty(items, dtype=torch.float64)
+        arguments = [length, *map(array, (cells, slope, totals))]
+        factors = [side / spacing for spacing in grid.spacing]
+        kernel = variation_kernel(torch.finfo(field.dtype).bits)
+        launch(kernel, items, [*arguments, *factors, ROUNDING], field, _threads(field))
+        return (totals.sum() / field.numel()).to(field.dtype), slope.view(field.shape)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1])
+
+    @staticmethod
+    def backward(ctx: Any, total_bar: Tensor, _: None) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        return (total_bar / slope.numel()) * slope, None
+
+
+def _threads(numbers: Tensor) -> int:
+    return 1 if numbers.numel() < FEW else thread_count(numbers)
