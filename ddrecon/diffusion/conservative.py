@@ -23,7 +23,7 @@ from ddrecon.diffusion.operator import (
 )
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.autodiff import is_fused, recompute
 
 Closure = Callable[[Tensor], Tensor]
 
@@ -52,6 +52,13 @@ class DiffusionProblem:
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E7."""
+        if is_fused():
+            from ddrecon.diffusion.fused.system import assemble_system
+
+            z, y, x, loss, right = assemble_system(
+                self.medium, self.diffusion, self.source, self.outside
+            )
+            return Operator((z, y, x), loss), right
         flux_along = self._source_flux()
         z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
         loss, right = recompute(
@@ -66,6 +73,10 @@ class DiffusionProblem:
         """L1 of L0 = `mean`; None where light's direction does not matter."""
         if not self.has_flux:
             return None
+        if is_fused():
+            from ddrecon.diffusion.fused.flux import find_flux
+
+            return find_flux(self.medium, self.diffusion, self.source.flux, self.outside, mean)
         along = self._source_flux().items()
         z, y, x = (
             recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)

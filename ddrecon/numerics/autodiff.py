@@ -13,6 +13,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.graph import saved_tensors_hooks
 
+from ddrecon.engine import current_engine
+
 T = TypeVar("T")
 _GRID_SAMPLE_BACKWARD = {
     4: torch.ops.aten.grid_sampler_2d_backward,
@@ -30,6 +32,14 @@ def is_varied(tensor: Tensor) -> bool:
 def is_forward() -> bool:
     """Whether forward mode, or one of the transforms of `torch.func`, is on."""
     return forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
+
+
+def is_fused() -> bool:
+    """Whether kernels that have a backward pass only may stand for torch's operations.
+
+    Not in forward mode, whose derivatives are those of the operations.
+    """
+    return current_engine() == "warp" and not is_forward()
 
 
 def keep(ctx: Any, *tensors: Tensor) -> None:
