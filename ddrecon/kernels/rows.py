@@ -1,7 +1,8 @@
 """Kernels that go through a grid's cells row by row, each a text in C++.
 
-An item is a part of a row along x: a whole row on a processor, whose vector units take many cells
-at a time, and one cell on a GPU.
+An item is a part of a row along x, in one color: a whole row on a processor, whose vector units
+take many cells at a time, and one cell on a GPU. Colors come one after the other: all at once are
+more streams from memory than a processor looks ahead in.
 """
 
 import functools
@@ -25,13 +26,14 @@ _ROW = """
 #endif
 const int nz = cells.nz, ny = cells.ny, nx = cells.nx;
 const F hz = cells.hz, hy = cells.hy, hx = cells.hx;
-const int row = item / cells.parts;
+const int rows = nz * ny, c = item / (rows * cells.parts);
+const int row = item / cells.parts - c * rows;
 const int begin = (item % cells.parts) * cells.width;
 const int end = begin + cells.width < nx ? begin + cells.width : nx;
 const int z = row / ny, y = row % ny;
 const long long plane = (long long)ny * nx, size = plane * nz, start = (long long)row * nx;
-// The offset in an array of `colors` colors, each of `entries`, of color c: 0 if there is but one.
-auto color = [=](int colors, int c, long long entries) -> long long {
+// The offset of the item's color in an array of `colors` colors, each of `entries`; 0 if of one.
+auto color = [=](int colors, long long entries) -> long long {
     return colors > 1 ? c * entries : 0;
 };
 """
@@ -41,8 +43,9 @@ auto color = [=](int colors, int c, long long entries) -> long long {
 def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") -> Any:
     """The kernel `name` that does `text` for each part of a row.
 
-    The text has the cells `begin` to `end` of row `z`, `y`, which lie `start` behind the first of
-    a color's `size`; pointers called as the `arrays`; whole `numbers`; and what `program` has.
+    The text has the color `c`; the cells `begin` to `end` of row `z`, `y`, which lie `start` behind
+    the first of a color's `size`; pointers called as the `arrays`; whole `numbers`; and what
+    `program` has.
     """
     F = number_type(bits)
     fields = dict.fromkeys((*_NUMBERS, *numbers.split()), int) | dict.fromkeys(_STEPS, F)
@@ -64,9 +67,12 @@ def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") 
 
 
 def launch_rows(
-    kernel: Callable[[int], Any], grid: Grid, like: Tensor, **values: Tensor | int
+    kernel: Callable[[int], Any], grid: Grid, colors: int, like: Tensor, **values: Tensor | int
 ) -> None:
-    """Runs `kernel` of as many bits as `like` on all cells of `grid`; `values` by their names."""
+    """Runs `kernel` of as many bits as `like` on all cells of `grid` in `colors` colors.
+
+    `values` are its arrays and numbers, by their names.
+    """
     made = kernel(8 * like.element_size())
     cells = made.Cells()
     cells.nz, cells.ny, cells.nx = grid.shape
@@ -78,4 +84,4 @@ def launch_rows(
     values |= {name: value.data_ptr() for name, value in held.items()}
     for name, value in values.items():
         setattr(cells, name, value)
-    launch(made, grid.shape[0] * grid.shape[1] * cells.parts, [cells], like)
+    launch(made, colors * grid.shape[0] * grid.shape[1] * cells.parts, [cells], like)

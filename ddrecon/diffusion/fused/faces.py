@@ -14,13 +14,15 @@ auto share = [](F a, F b, F h, bool inside) INLINE -> F {
 auto driven = [](F p, F beyond, F h, bool inside) INLINE -> F {
     return F(0.5) * (inside ? p + beyond : h * p);
 };
-// All cells of the part; those at the ends of a row lack a neighbor along x.
+// All cells of the part, with whether and where there are neighbors along x. Beside the ends of a
+// row lie other rows, which may be read for nothing, but for the first row and the last.
 auto each = [&](auto&& cell) INLINE {
-    int i = begin;
-    if (i == 0) { cell(0, false, nx > 1); i = 1; }
-    const int last = end < nx - 1 ? end : nx - 1;
+    if (row > 0 && row < nz * ny - 1) {
 #pragma clang loop vectorize(assume_safety)
-    for (int k = i; k < last; ++k) cell(k, true, true);
-    if (end == nx && i < nx) cell(nx - 1, true, false);
+        for (int i = begin; i < end; ++i) cell(i, i > 0, i < nx - 1, -1, 1);
+    } else {
+        for (int i = begin; i < end; ++i)
+            cell(i, i > 0, i < nx - 1, i > 0 ? -1 : 0, i < nx - 1 ? 1 : 0);
+    }
 };
 """

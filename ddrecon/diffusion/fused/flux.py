@@ -17,6 +17,7 @@ from ddrecon.diffusion.fused.colors import (
     name_flux,
     per_color,
     remaining_scale,
+    sum_colors,
     total,
 )
 from ddrecon.diffusion.fused.flux_kernels import flux_adjoint_kernel, flux_kernel
@@ -46,9 +47,8 @@ class _Flux(torch.autograd.Function):
         mean, is_directed = tensors[4], len(tensors) > 5
         light = tuple(torch.empty_like(mean) for _ in _NAMES)
         kernel = functools.partial(flux_kernel, is_directed)
-        launch_rows(
-            kernel, grid, mean, **_given(*tensors), **dict(zip(_NAMES, light, strict=True))
-        )
+        values = dict(zip(_NAMES, light, strict=True)) | _given(*tensors)
+        launch_rows(kernel, grid, len(mean), mean, **values)
         return light
 
     @staticmethod
@@ -61,21 +61,24 @@ class _Flux(torch.autograd.Function):
         diffusion, scale, field, outside, mean, *flux = ctx.saved_tensors
         _, needs_scale, _, needs_outside = ctx.needs_input_grad[1:5]
         scattering = FieldBar(scale, field, len(mean), needs_scale)
-        found = empty_bars(diffusion=diffusion, mean=mean, **name_flux(flux))
+        found = empty_bars(len(mean), diffusion=diffusion, mean=mean, **name_flux(flux))
         launch_rows(
             functools.partial(flux_adjoint_kernel, bool(flux)),
             ctx.grid,
+            len(mean),
             mean,
             **_given(*ctx.saved_tensors),
             **{f"{name}_bar": bar for name, bar in zip(_NAMES, bars, strict=True)},
             scattering_factor=scattering.factor,
-            field_colors=len(scattering.bar),
             field_bar=scattering.bar,
             **found,
         )
         scattering_bars = scattering.split() if flux else (None, None)
         outside_bar = _inflow_bar(bars, diffusion, ctx.grid, outside) if needs_outside else None
-        diffusion_bar, *mean_bars = found.values()
+        diffusion_bar, *mean_bars = (
+            sum_colors(bar, like)
+            for bar, like in zip(found.values(), (diffusion, mean, *flux), strict=True)
+        )
         return None, diffusion_bar, *scattering_bars, outside_bar, *mean_bars
 
 
@@ -96,7 +99,6 @@ def _given(
 ) -> dict[str, Any]:
     """What both kernels are given, by its names."""
     return {
-        "colors": len(mean),
         "own": len(diffusion),
         "scattering_fields": len(field),
         "sources": len(flux[0]) if flux else 1,

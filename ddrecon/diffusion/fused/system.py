@@ -17,6 +17,7 @@ from ddrecon.diffusion.fused.colors import (
     name_flux,
     per_color,
     remaining_scale,
+    sum_colors,
     total,
 )
 from ddrecon.diffusion.fused.system_kernels import system_adjoint_kernel, system_kernel
@@ -60,11 +61,11 @@ class _System(torch.autograd.Function):
         nz, ny, nx = grid.shape
         shapes = (nz - 1, ny, nx), (nz, ny - 1, nx), (nz, ny, nx - 1)
         conductances = [diffusion.new_empty(len(diffusion), *shape) for shape in shapes]
-        given = _given(*tensors)
-        right = diffusion.new_empty(given["colors"], *grid.shape)
+        right = diffusion.new_empty(_colors(*tensors), *grid.shape)
         made = *conductances, torch.empty_like(diffusion), right
         kernel = functools.partial(system_kernel, is_directed)
-        launch_rows(kernel, grid, right, **given, **dict(zip(_NAMES, made, strict=True)))
+        values = dict(zip(_NAMES, made, strict=True)) | _given(len(right), *tensors)
+        launch_rows(kernel, grid, len(right), right, **values)
         return made
 
     @staticmethod
@@ -77,19 +78,20 @@ class _System(torch.autograd.Function):
         diffusion, a_scale, a_field, s_scale, s_field, outside, mean, *flux = ctx.saved_tensors
         needs_a_scale, needs_a_field, needs_s_scale, _, needs_outside = ctx.needs_input_grad[3:8]
         loss_bar, right_bar = bars[3:]
-        given = _given(*ctx.saved_tensors)
-        scattering = FieldBar(s_scale, s_field, given["colors"], needs_s_scale)
+        colors = len(right_bar)
+        given = _given(colors, *ctx.saved_tensors)
+        scattering = FieldBar(s_scale, s_field, colors, needs_s_scale)
         is_one = ctx.is_shared and not needs_a_scale and not needs_s_scale
-        found = empty_bars(diffusion=diffusion, mean=mean, **name_flux(flux))
+        found = empty_bars(colors, diffusion=diffusion, mean=mean, **name_flux(flux))
         launch_rows(
             functools.partial(system_adjoint_kernel, bool(flux)),
             ctx.grid,
+            colors,
             right_bar,
             **given,
             **{f"{name}_bar": bar for name, bar in zip(_NAMES, bars, strict=True)},
             scattering_factor=scattering.factor,
             absorption_factor=given["absorption_scale"] * float(is_one),
-            field_colors=len(scattering.bar),
             field_bar=scattering.bar,
             **found,
         )
@@ -97,10 +99,13 @@ class _System(torch.autograd.Function):
         if needs_a_scale:
             a_scale_bar = total(a_field * loss_bar, a_scale)
         if needs_a_field and not is_one:
-            a_field_bar = (a_scale * loss_bar).sum_to_size(a_field.shape)
+            a_field_bar = sum_colors(a_scale * loss_bar, a_field)
         if needs_outside:
             outside_bar = total(boundary_loss(diffusion, ctx.grid) * right_bar, outside)
-        diffusion_bar, *source_bars = found.values()
+        diffusion_bar, *source_bars = (
+            sum_colors(bar, like)
+            for bar, like in zip(found.values(), (diffusion, mean, *flux), strict=True)
+        )
         absorption_bars = a_scale_bar, a_field_bar
         return (
             *(None, None, diffusion_bar, *absorption_bars, *scattering.split()),
@@ -108,7 +113,14 @@ class _System(torch.autograd.Function):
         )
 
 
+def _colors(*tensors: Tensor) -> int:
+    """How many colors the right side has."""
+    diffusion, *_, outside, mean = tensors[:7]
+    return max(map(len, (diffusion, outside, mean)))
+
+
 def _given(
+    colors: int,
     diffusion: Tensor,
     absorption_scale: Tensor,
     absorption: Tensor,
@@ -119,9 +131,7 @@ def _given(
     *flux: Tensor,
 ) -> dict[str, Any]:
     """What both kernels are given, by its names."""
-    colors = max(map(len, (diffusion, outside, mean)))
     return {
-        "colors": colors,
         "own": len(diffusion),
         "absorption_fields": len(absorption),
         "scattering_fields": len(scattering),
