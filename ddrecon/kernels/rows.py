@@ -17,7 +17,7 @@ from ddrecon.kernels.launch import launch
 from ddrecon.kernels.native import number_type, program
 
 _NUMBERS = "nz", "ny", "nx", "width", "parts"
-_STEPS = "hz", "hy", "hx"
+_LENGTHS = "hz", "hy", "hx", "lz", "ly", "lx"
 _ROW = """
 #if defined(__CUDA_ARCH__)
 #define INLINE
@@ -25,7 +25,8 @@ _ROW = """
 #define INLINE __attribute__((always_inline))
 #endif
 const int nz = cells.nz, ny = cells.ny, nx = cells.nx;
-const F hz = cells.hz, hy = cells.hy, hx = cells.hx;
+const F hz = cells.hz, hy = cells.hy, hx = cells.hx;  // a cell's sides
+const F lz = cells.lz, ly = cells.ly, lx = cells.lx;  // the grid's lower corner
 const int rows = nz * ny, c = item / (rows * cells.parts);
 const int row = item / cells.parts - c * rows;
 const int begin = (item % cells.parts) * cells.width;
@@ -48,7 +49,7 @@ def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") 
     `program` has.
     """
     F = number_type(bits)
-    fields = dict.fromkeys((*_NUMBERS, *numbers.split()), int) | dict.fromkeys(_STEPS, F)
+    fields = dict.fromkeys((*_NUMBERS, *numbers.split()), int) | dict.fromkeys(_LENGTHS, F)
     fields |= dict.fromkeys(arrays.split(), wp.uint64)
     # The arrays' addresses.
     Cells = wp.struct(type("Cells", (), {"__annotations__": fields, "__module__": __name__}))
@@ -77,6 +78,7 @@ def launch_rows(
     cells = made.Cells()
     cells.nz, cells.ny, cells.nx = grid.shape
     cells.hz, cells.hy, cells.hx = grid.spacing
+    cells.lz, cells.ly, cells.lx = grid.lower
     cells.width = 1 if like.is_cuda else cells.nx
     cells.parts = cells.nx // cells.width
     # Addresses, since making Warp's arrays takes longer; `held` keeps what lies there.
