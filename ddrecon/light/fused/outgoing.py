@@ -62,10 +62,11 @@ class _Scatter(torch.autograd.Function):
         names = "mean", *_FLUX[: len(flux)]
         found = {f"{name}_bar": torch.empty_like(radiance_bar) for name in names}
         values = _given(ctx.is_eye, *ctx.saved_tensors) | found
-        if flux and (needs_point or needs_factors):
+        with_along = bool(flux) and (needs_point or needs_factors)
+        if with_along:
             values["along_bar"] = torch.empty_like(radiance_bar)
         launch_rows(
-            functools.partial(scatter_adjoint_kernel, bool(flux)),
+            functools.partial(scatter_adjoint_kernel, bool(flux), with_along),
             ctx.grid,
             len(radiance_bar),
             radiance_bar,
@@ -79,7 +80,7 @@ class _Scatter(torch.autograd.Function):
         point_bar = factors_bar = None
         if needs_factors:
             factors_bar = torch.stack([(mean * mean_bar).sum() / factors[0], 0 * factors[0]])
-        if "along_bar" in values:
+        if with_along:
             point_bar, factor_bar = _direction_bars(ctx, values["along_bar"])
             factors_bar = None if factors_bar is None else factors_bar + factor_bar
         return None, None, point_bar, factors_bar, mean_bar, *flux_bars

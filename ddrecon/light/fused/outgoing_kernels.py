@@ -53,7 +53,7 @@ for (int i = begin; i < end; ++i) {
 _ADJOINT = """
 const long long to = c * size + start;
 const F* bar = radiance_bar + to;
-F *u_bars = mean_bar + to, *along_bars = along_bar ? along_bar + to : nullptr;
+F *u_bars = mean_bar + to, *along_bars = along_bar + to;
 F *qz_bars = flux_z_bar + to, *qy_bars = flux_y_bar + to, *qx_bars = flux_x_bar + to;
 #pragma clang loop vectorize(assume_safety)
 for (int i = begin; i < end; ++i) {
@@ -68,7 +68,7 @@ for (int i = begin; i < end; ++i) {
         const F divisor = margin > F(LEAST) ? margin : F(LEAST);
         const F part = bend(r, divisor), opened = F(1) + part;
         // The slope within the bend, by r and by its margin.
-        const bool is_inside = r >= -divisor && r <= divisor;
+        const bool is_inside = (r >= -divisor) & (r <= divisor);
         const F slope = is_inside ? F(0.5) * opened * (margin / divisor) : F(0);
         const F moved = margin >= F(LEAST) ? slope * part : F(0);
         const F r_bar = bar[i] * (r >= margin ? F(1) : slope);
@@ -80,7 +80,7 @@ for (int i = begin; i < end; ++i) {
         qz_bars[i] = flux_bar * dz;
         qy_bars[i] = flux_bar * dy;
         qx_bars[i] = flux_bar * dx;
-        if (along_bars) along_bars[i] = direct_bar;
+        if (WITH_ALONG) along_bars[i] = direct_bar;
     }
 }
 """
@@ -97,13 +97,13 @@ def scatter_kernel(is_directed: bool, bits: int) -> Any:
 
 
 @functools.cache
-def scatter_adjoint_kernel(is_directed: bool, bits: int) -> Any:
+def scatter_adjoint_kernel(is_directed: bool, with_along: bool, bits: int) -> Any:
     """The kernel of the cotangents of L0 and L1, in all colors.
 
-    `along_bar`, where it is given, gets that of `factors[1]` L1 . w.
+    And `with_along` of `factors[1]` L1 . w.
     """
     arrays = "radiance_bar mean_bar flux_z_bar flux_y_bar flux_x_bar along_bar"
-    text = _text(_ADJOINT, is_directed, bits)
+    text = _text(_ADJOINT.replace("WITH_ALONG", str(with_along).lower()), is_directed, bits)
     return row_kernel("scatter_towards_adjoint", bits, text, _GIVEN + arrays, _NUMBERS)
 
 
