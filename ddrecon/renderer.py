@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays, cast_rays, subpixel_offsets
-from ddrecon.diffusion.closures import CLOSURES, smooth
+from ddrecon.diffusion.closures import Closure, smooth
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
@@ -150,10 +150,6 @@ def solve_diffuse(
 
     `source`: Q0 and Q1; `outside` [C, 1, 1, 1]: the radiance of ambient light.
     """
-
-    def closure(transport_extinction: Tensor) -> Tensor:
-        return CLOSURES[settings.closure](transport_extinction, medium.grid, settings.floor)
-
     if settings.scheme == "printed":
         by_jacobi = SolverWithMemory(iterate_jacobi, settings.tolerance, memory)
         diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
@@ -165,6 +161,7 @@ def solve_diffuse(
         return solve_flux_limited(
             medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux
         )
+    closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.has_flux)
     light = solve_conservative(problem, solve)
     return run_rounds(

@@ -12,6 +12,7 @@ from functools import cached_property
 
 from torch import Tensor
 
+from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import (
     AXES,
@@ -25,8 +26,6 @@ from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import is_fused, recompute
 
-Closure = Callable[[Tensor], Tensor]
-
 
 @dataclass(frozen=True)
 class DiffusionProblem:
@@ -39,7 +38,7 @@ class DiffusionProblem:
     """
 
     medium: Medium
-    closure: Closure
+    closure: Callable[[Tensor], Tensor]
     source: Moments
     outside: Tensor
     has_flux: bool
@@ -47,6 +46,10 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
+        if is_fused() and isinstance(self.closure, Closure):
+            from ddrecon.diffusion.fused.closure import close_medium
+
+            return close_medium(self.medium, self.closure)
         return recompute(_diffusion, self.medium, self.closure)
 
     @cached_property
@@ -94,7 +97,7 @@ def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operat
     return Moments(mean, problem.flux(mean))
 
 
-def _diffusion(medium: Medium, closure: Closure) -> Tensor:
+def _diffusion(medium: Medium, closure: Callable[[Tensor], Tensor]) -> Tensor:
     return closure(medium.transport_extinction)
 
 
