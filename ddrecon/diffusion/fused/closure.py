@@ -48,12 +48,13 @@ def _extinction_terms(medium: Medium) -> tuple[Tensor, ...]:
 def _inverse_distance(grid: Grid, *terms: Tensor) -> Tensor:
     """`inverse_distance` of kappa_tr, `[C, z, y, coarse]`: interpolated along z and y only."""
     coarse = coarse_grid(grid)
-    # The mass of each cell's share in kappa_tr, and of the haze; potentials add up as masses do.
+    # The masses of kappa_tr's terms and of the haze, and their potentials, which add up as they do.
     masses = [adaptive_avg_pool3d(field, coarse.shape) for field in terms[1::2]]
-    ones = torch.ones_like(masses[0][:1])
-    parts = [*zip(terms[::2], masses, strict=True), (haze(grid) * ones[:, :1, :1, :1], ones)]
-    whole = sum(scale * mass.sum((1, 2, 3), keepdim=True) for scale, mass in parts)
-    inverse = sum(scale * potential(mass, coarse) for scale, mass in parts) / whole
+    whole, potentials = haze(grid) * coarse.cells, haze(grid) * _even(coarse, masses[0])
+    for scale, mass in zip(terms[::2], masses, strict=True):
+        whole = whole + scale * mass.sum((1, 2, 3), keepdim=True)
+        potentials = potentials + scale * potential(mass, coarse)
+    inverse = potentials / whole
     z, y, _ = (
         _weights(cells, few, inverse.dtype, inverse.device)
         for cells, few in zip(grid.shape, coarse.shape, strict=True)
@@ -61,7 +62,19 @@ def _inverse_distance(grid: Grid, *terms: Tensor) -> Tensor:
     return (z @ (y @ inverse).flatten(2)).unflatten(2, (grid.shape[1], -1))
 
 
+def _even(grid: Grid, like: Tensor) -> Tensor:
+    """The potential of a mass of 1 in every cell."""
+    return _even_potential(grid, like.dtype, like.device)
+
+
+@functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _even_potential(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return potential(torch.ones(1, *grid.shape, dtype=dtype, device=device), grid)
+
+
 @functools.lru_cache(maxsize=32)
+@torch.inference_mode(False)
 def _places(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
     """Where `cells` lie among `few`: the number of the lower one, and the way from it to the next.
 
@@ -73,6 +86,7 @@ def _places(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> t
 
 
 @functools.lru_cache(maxsize=32)
+@torch.inference_mode(False)
 def _weights(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """The matrix [cells, few] that interpolates linearly."""
     lower, part = _places(cells, few, torch.float64, torch.device("cpu"))
