@@ -109,7 +109,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     outside = ambient_radiance(lights, medium.g)
     # L0 and L1: E4 to E6.
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
-    # E3, of skies as well; beams are scattered by E2 on each view ray.
+    # Skies scatter by E3 as well; beams by E2 on each view ray.
     return LightField(medium, reduced.beams, diffuse.plus(sky))
 
 

@@ -30,7 +30,9 @@ def close_medium(medium: Medium, closure: Closure) -> Tensor:
     """D [u], `[C, z, y, x]`, of `medium` by `closure`."""
     terms = _extinction_terms(medium)
     if closure.name == "smooth":
-        diffusion: Tensor = _Smooth.apply(medium.grid, least_extinction(medium.grid, closure.floor), *terms)
+        diffusion: Tensor = _Smooth.apply(
+            medium.grid, least_extinction(medium.grid, closure.floor), *terms
+        )
     else:
         diffusion = _Geometric.apply(medium.grid, _inverse_distance(medium.grid, *terms), *terms)
     return diffusion
@@ -50,7 +52,8 @@ def _inverse_distance(grid: Grid, *terms: Tensor) -> Tensor:
     coarse = coarse_grid(grid)
     # The masses of kappa_tr's terms and of the haze, and their potentials, which add up as they do.
     masses = [adaptive_avg_pool3d(field, coarse.shape) for field in terms[1::2]]
-    whole, potentials = haze(grid) * coarse.cells, haze(grid) * _even(coarse, masses[0])
+    potentials = haze(grid) * _even(coarse, masses[0])
+    whole = potentials.new_tensor(haze(grid) * coarse.cells)
     for scale, mass in zip(terms[::2], masses, strict=True):
         whole = whole + scale * mass.sum((1, 2, 3), keepdim=True)
         potentials = potentials + scale * potential(mass, coarse)

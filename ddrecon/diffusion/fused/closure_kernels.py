@@ -97,9 +97,7 @@ def geometric_adjoint_kernel(has_two: bool, bits: int) -> Any:
 @functools.cache
 def smooth_kernel(has_two: bool, bits: int) -> Any:
     """The kernel of D by `smooth`: kappa_tr is at `least` that of empty space."""
-    return row_kernel(
-        "smooth", bits, _text(_SMOOTH, has_two), _GIVEN + "least diffusion", _NUMBERS
-    )
+    return row_kernel("smooth", bits, _text(_SMOOTH, has_two), _GIVEN + "least diffusion", _NUMBERS)
 
 
 @functools.cache

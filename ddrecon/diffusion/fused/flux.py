@@ -82,9 +82,7 @@ class _Flux(torch.autograd.Function):
         return None, diffusion_bar, *scattering_bars, outside_bar, *mean_bars
 
 
-def _inflow_bar(
-    bars: tuple[Tensor, ...], diffusion: Tensor, grid: Grid, outside: Tensor
-) -> Tensor:
+def _inflow_bar(bars: tuple[Tensor, ...], diffusion: Tensor, grid: Grid, outside: Tensor) -> Tensor:
     """The cotangent of the radiance `outside`, which E6 lets in: upwards at low ends."""
     found = torch.zeros_like(outside)
     for axis, bar, step in zip(AXES, bars, grid.spacing, strict=True):
