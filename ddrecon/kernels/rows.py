@@ -6,7 +6,7 @@ more streams from memory than a processor looks ahead in.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import warp as wp
@@ -68,22 +68,31 @@ def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") 
 
 
 def launch_rows(
-    kernel: Callable[[int], Any], grid: Grid, colors: int, like: Tensor, **values: Tensor | int
+    kernel: Callable[[int], Any],
+    grid: Grid,
+    colors: int,
+    given: Mapping[str, Tensor | int],
+    made: Mapping[str, Tensor],
 ) -> None:
-    """Runs `kernel` of as many bits as `like` on all cells of `grid` in `colors` colors.
+    """Runs `kernel` on all cells of `grid` in `colors` colors, which writes what is `made`.
 
-    `values` are its arrays and numbers, by their names.
+    Both hold arrays and numbers by their names; those that are made are contiguous.
     """
-    made = kernel(8 * like.element_size())
-    cells = made.Cells()
+    like = next(iter(made.values()))
+    ready = kernel(8 * like.element_size())
+    cells = ready.Cells()
     cells.nz, cells.ny, cells.nx = grid.shape
     cells.hz, cells.hy, cells.hx = grid.spacing
     cells.lz, cells.ly, cells.lx = grid.lower
     cells.width = 1 if like.is_cuda else cells.nx
     cells.parts = cells.nx // cells.width
     # Addresses, since making Warp's arrays takes longer; `held` keeps what lies there.
-    held = {name: value.contiguous() for name, value in values.items() if is_tensor(value)}
-    values |= {name: value.data_ptr() for name, value in held.items()}
-    for name, value in values.items():
-        setattr(cells, name, value)
-    launch(made, colors * grid.shape[0] * grid.shape[1] * cells.parts, [cells], like)
+    held = {
+        name: value.to(like.dtype).contiguous() if is_tensor(value) else value
+        for name, value in given.items()
+    }
+    for name, value in (held | made).items():
+        setattr(cells, name, value.data_ptr() if is_tensor(value) else value)
+    if not all(value.is_contiguous() for value in made.values()):
+        raise ValueError("arrays that kernels write are contiguous")
+    launch(ready, colors * grid.shape[0] * grid.shape[1] * cells.parts, [cells], like)

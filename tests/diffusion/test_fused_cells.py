@@ -53,7 +53,9 @@ def make_problem(
 ) -> tuple[DiffusionProblem, list[Tensor]]:
     """A problem in `medium` with a random source, and the leaves of that."""
     shape = medium.grid.shape
-    mean, *flux = (random_values(colors, *shape, seed=s, dtype=dtype) for s in range(11, 15))
+    mean, *flux = (
+        random_values(*shape, colors, seed=s, dtype=dtype).movedim(-1, 0) for s in range(11, 15)
+    )
     outside = random_values(colors, 1, 1, 1, seed=3, dtype=dtype)
     leaves = [outside, mean, *(flux if is_directed else [])]
     for leaf in leaves:
@@ -62,9 +64,14 @@ def make_problem(
     return DiffusionProblem(medium, lambda k: 1 / (3 * k + 0.5), source, outside, True), leaves
 
 
+def bar_of(result: Tensor, seed: int) -> Tensor:
+    """A random cotangent of `result`, as a view of what has its colors last."""
+    return random_values(*result.shape[1:], len(result), seed=seed).to(result).movedim(-1, 0)
+
+
 def weigh(results: list[Tensor], leaves: list[Tensor]) -> Found:
     """`results`, and the cotangents of `leaves` for random cotangents of the results."""
-    bars = [random_values(*r.shape, seed=20 + i).to(r) for i, r in enumerate(results)]
+    bars = [bar_of(r, 20 + i) for i, r in enumerate(results)]
     return results, list(torch.autograd.grad(results, leaves, bars))
 
 
@@ -161,7 +168,7 @@ def test_adjoints_are_the_transposes_of_tangents():
         ]
     leaf = density.clone().requires_grad_()
     found, (bar,) = weigh(results(leaf), [leaf])
-    bars = [random_values(*r.shape, seed=20 + i) for i, r in enumerate(found)]
+    bars = [bar_of(r, 20 + i) for i, r in enumerate(found)]
     along = sum(float((d.detach() * b).sum()) for d, b in zip(tangents, bars, strict=True))
     assert float((bar * change).sum()) == pytest.approx(along, rel=1e-10)
 

@@ -58,7 +58,8 @@ def radiance_and_bars(
     volume = Volume(box_grid(shape), half_empty(*shape, dtype=dtype), sigma, sigma, cosine)
     light = Moments(mean, (z, y, x) if has_flux else None)
     radiance = scatter_towards(scale_medium(volume), light, rays)
-    bar = random_values(*radiance.shape, seed=1).to(dtype)
+    # As a view of what has its colors last.
+    bar = random_values(*radiance.shape[1:], len(radiance), seed=1).to(dtype).movedim(-1, 0)
     leaves = [mean, cosine, *((z, y, x, point) if has_flux else ())]
     return [radiance, *torch.autograd.grad(radiance, leaves, bar)]
 
@@ -74,7 +75,9 @@ def test_radiance_and_cotangents_are_those_of_torch(shape: tuple[int, int, int],
                     for engine in ("torch", "warp")
                 )
                 for one, other in zip(found, known, strict=True):
-                    limit = error * max(float(other.detach().norm()), 1e-3)
+                    # Sums over cells cancel in part.
+                    size = max(float(other.detach().norm()), 1e-3) * (1 if one.ndim > 1 else 10)
+                    limit = error * size
                     torch.testing.assert_close(one, other, rtol=0, atol=limit)
 
 

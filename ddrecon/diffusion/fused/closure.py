@@ -7,6 +7,7 @@ medium's fields: one Fourier transform serves all colors of a field that they sh
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -116,12 +117,11 @@ class _Geometric(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, diffusion_bar: Tensor) -> tuple[Tensor | None, ...]:
         inverse, *terms = ctx.saved_tensors
-        inverse_bar = torch.empty_like(diffusion_bar)
-        terms_bars = _run_adjoint(
-            functools.partial(geometric_adjoint_kernel, len(terms) > 2),
-            ctx.grid, terms, ctx.needs_input_grad[2:], diffusion_bar,
-            **_distances(ctx.grid, inverse), inverse_distance_bar=inverse_bar,
-        )  # fmt: skip
+        inverse_bar = diffusion_bar.new_empty(diffusion_bar.shape)
+        kernel = functools.partial(geometric_adjoint_kernel, len(terms) > 2)
+        given = _distances(ctx.grid, inverse) | {"diffusion_bar": diffusion_bar}
+        made = {"inverse_distance_bar": inverse_bar}
+        terms_bars = _run_adjoint(kernel, ctx, terms, given, made)
         weights = _weights(ctx.grid.shape[2], inverse.shape[3], inverse.dtype, inverse.device)
         return None, inverse_bar @ weights, *terms_bars
 
@@ -142,30 +142,33 @@ class _Smooth(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, diffusion_bar: Tensor) -> tuple[Tensor | None, ...]:
         terms = ctx.saved_tensors
-        terms_bars = _run_adjoint(
-            functools.partial(smooth_adjoint_kernel, len(terms) > 2),
-            ctx.grid, terms, ctx.needs_input_grad[2:], diffusion_bar,
-            least=diffusion_bar.new_tensor([ctx.least]),
-        )  # fmt: skip
+        kernel = functools.partial(smooth_adjoint_kernel, len(terms) > 2)
+        least = diffusion_bar.new_tensor([ctx.least])
+        given = {"least": least, "diffusion_bar": diffusion_bar}
+        terms_bars = _run_adjoint(kernel, ctx, terms, given, {})
         return None, None, *terms_bars
 
 
-def _run(kernel: Any, grid: Grid, terms: Any, **values: Any) -> Tensor:
+def _run(kernel: Any, grid: Grid, terms: Sequence[Tensor], **given: Any) -> Tensor:
     """D by `kernel`."""
     diffusion = terms[1].new_empty(max(map(len, terms)), *grid.shape)
-    values |= _given(len(diffusion), *terms)
-    launch_rows(kernel, grid, len(diffusion), diffusion, diffusion=diffusion, **values)
+    colors = len(diffusion)
+    launch_rows(kernel, grid, colors, given | _given(colors, *terms), {"diffusion": diffusion})
     return diffusion
 
 
 def _run_adjoint(
-    kernel: Any, grid: Grid, terms: Any, needs: Any, diffusion_bar: Tensor, **values: Any
+    kernel: Any,
+    ctx: Any,
+    terms: Sequence[Tensor],
+    given: dict[str, Tensor],
+    made: dict[str, Tensor],
 ) -> list[Tensor | None]:
-    """Cotangents of scales and fields by `kernel`."""
-    colors, has_two = len(diffusion_bar), len(terms) > 2
+    """Cotangents of scales and fields by `kernel`, which is `given` more and has more `made`."""
+    colors, has_two, needs = len(given["diffusion_bar"]), len(terms) > 2, ctx.needs_input_grad[2:]
     extinction = FieldBar(terms[0], terms[1], colors, has_two or needs[0])
-    values |= _given(colors, *terms) | {"factor": extinction.factor, "field_bar": extinction.bar}
-    launch_rows(kernel, grid, colors, diffusion_bar, diffusion_bar=diffusion_bar, **values)
+    given = given | _given(colors, *terms) | {"factor": extinction.factor}
+    launch_rows(kernel, ctx.grid, colors, given, {"field_bar": extinction.bar} | made)
     if not has_two:
         return [*extinction.split()]
     bars: list[Tensor | None] = []

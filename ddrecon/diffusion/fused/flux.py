@@ -45,10 +45,10 @@ class _Flux(torch.autograd.Function):
     @staticmethod
     def forward(grid: Grid, *tensors: Tensor) -> tuple[Tensor, ...]:
         mean, is_directed = tensors[4], len(tensors) > 5
-        light = tuple(torch.empty_like(mean) for _ in _NAMES)
+        light = tuple(mean.new_empty(mean.shape) for _ in _NAMES)
         kernel = functools.partial(flux_kernel, is_directed)
-        values = dict(zip(_NAMES, light, strict=True)) | _given(*tensors)
-        launch_rows(kernel, grid, len(mean), mean, **values)
+        made = dict(zip(_NAMES, light, strict=True))
+        launch_rows(kernel, grid, len(mean), _given(*tensors), made)
         return light
 
     @staticmethod
@@ -62,17 +62,10 @@ class _Flux(torch.autograd.Function):
         _, needs_scale, _, needs_outside = ctx.needs_input_grad[1:5]
         scattering = FieldBar(scale, field, len(mean), needs_scale)
         found = empty_bars(len(mean), diffusion=diffusion, mean=mean, **name_flux(flux))
-        launch_rows(
-            functools.partial(flux_adjoint_kernel, bool(flux)),
-            ctx.grid,
-            len(mean),
-            mean,
-            **_given(*ctx.saved_tensors),
-            **{f"{name}_bar": bar for name, bar in zip(_NAMES, bars, strict=True)},
-            scattering_factor=scattering.factor,
-            field_bar=scattering.bar,
-            **found,
-        )
+        given = _given(*ctx.saved_tensors) | {"scattering_factor": scattering.factor}
+        given |= {f"{name}_bar": bar for name, bar in zip(_NAMES, bars, strict=True)}
+        kernel = functools.partial(flux_adjoint_kernel, bool(flux))
+        launch_rows(kernel, ctx.grid, len(mean), given, found | {"field_bar": scattering.bar})
         scattering_bars = scattering.split() if flux else (None, None)
         outside_bar = _inflow_bar(bars, diffusion, ctx.grid, outside) if needs_outside else None
         diffusion_bar, *mean_bars = (

@@ -62,10 +62,11 @@ class _System(torch.autograd.Function):
         shapes = (nz - 1, ny, nx), (nz, ny - 1, nx), (nz, ny, nx - 1)
         conductances = [diffusion.new_empty(len(diffusion), *shape) for shape in shapes]
         right = diffusion.new_empty(_colors(*tensors), *grid.shape)
-        made = *conductances, torch.empty_like(diffusion), right
+        loss = diffusion.new_empty(diffusion.shape)
+        made = *conductances, loss, right
         kernel = functools.partial(system_kernel, is_directed)
-        values = dict(zip(_NAMES, made, strict=True)) | _given(len(right), *tensors)
-        launch_rows(kernel, grid, len(right), right, **values)
+        given = _given(len(right), *tensors)
+        launch_rows(kernel, grid, len(right), given, dict(zip(_NAMES, made, strict=True)))
         return made
 
     @staticmethod
@@ -83,18 +84,11 @@ class _System(torch.autograd.Function):
         scattering = FieldBar(s_scale, s_field, colors, needs_s_scale)
         is_one = ctx.is_shared and not needs_a_scale and not needs_s_scale
         found = empty_bars(colors, diffusion=diffusion, mean=mean, **name_flux(flux))
-        launch_rows(
-            functools.partial(system_adjoint_kernel, bool(flux)),
-            ctx.grid,
-            colors,
-            right_bar,
-            **given,
-            **{f"{name}_bar": bar for name, bar in zip(_NAMES, bars, strict=True)},
-            scattering_factor=scattering.factor,
-            absorption_factor=given["absorption_scale"] * float(is_one),
-            field_bar=scattering.bar,
-            **found,
-        )
+        given |= {f"{name}_bar": bar for name, bar in zip(_NAMES, bars, strict=True)}
+        given["scattering_factor"] = scattering.factor
+        given["absorption_factor"] = given["absorption_scale"] * float(is_one)
+        kernel = functools.partial(system_adjoint_kernel, bool(flux))
+        launch_rows(kernel, ctx.grid, colors, given, found | {"field_bar": scattering.bar})
         a_scale_bar = a_field_bar = outside_bar = None
         if needs_a_scale:
             a_scale_bar = total(a_field * loss_bar, a_scale)

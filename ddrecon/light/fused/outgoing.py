@@ -46,8 +46,8 @@ class _Scatter(torch.autograd.Function):
         *_, mean = tensors[:3]
         radiance = mean.new_empty(max(map(len, tensors[2:])), *grid.shape)
         kernel = functools.partial(scatter_kernel, len(tensors) > 3)
-        values = _given(is_eye, *tensors)
-        launch_rows(kernel, grid, len(radiance), mean, **values, radiance=radiance)
+        given = _given(is_eye, *tensors)
+        launch_rows(kernel, grid, len(radiance), given, {"radiance": radiance})
         return radiance
 
     @staticmethod
@@ -59,20 +59,14 @@ class _Scatter(torch.autograd.Function):
     def backward(ctx: Any, radiance_bar: Tensor) -> tuple[Tensor | None, ...]:
         _, factors, mean, *flux = ctx.saved_tensors
         needs_point, needs_factors = ctx.needs_input_grad[2:4]
-        names = "mean", *_FLUX[: len(flux)]
-        found = {f"{name}_bar": torch.empty_like(radiance_bar) for name in names}
-        values = _given(ctx.is_eye, *ctx.saved_tensors) | found
         with_along = bool(flux) and (needs_point or needs_factors)
-        if with_along:
-            values["along_bar"] = torch.empty_like(radiance_bar)
-        launch_rows(
-            functools.partial(scatter_adjoint_kernel, bool(flux), with_along),
-            ctx.grid,
-            len(radiance_bar),
-            radiance_bar,
-            **values,
-            radiance_bar=radiance_bar,
-        )
+        names = "mean", *_FLUX[: len(flux)], *(["along"] if with_along else [])
+        shape = radiance_bar.shape
+        found = {f"{name}_bar": radiance_bar.new_empty(shape) for name in names}
+        kernel = functools.partial(scatter_adjoint_kernel, bool(flux), with_along)
+        given = _given(ctx.is_eye, *ctx.saved_tensors) | {"radiance_bar": radiance_bar}
+        launch_rows(kernel, ctx.grid, len(radiance_bar), given, found)
+        along_bar = found.pop("along_bar", None)
         mean_bar, *flux_bars = (
             bar.sum_to_size(like.shape)
             for bar, like in zip(found.values(), (mean, *flux), strict=True)
@@ -80,8 +74,8 @@ class _Scatter(torch.autograd.Function):
         point_bar = factors_bar = None
         if needs_factors:
             factors_bar = torch.stack([(mean * mean_bar).sum() / factors[0], 0 * factors[0]])
-        if with_along:
-            point_bar, factor_bar = _direction_bars(ctx, values["along_bar"])
+        if along_bar is not None:
+            point_bar, factor_bar = _direction_bars(ctx, along_bar)
             factors_bar = None if factors_bar is None else factors_bar + factor_bar
         return None, None, point_bar, factors_bar, mean_bar, *flux_bars
 
