@@ -99,7 +99,7 @@ def case(sigma_t: float, eye: tuple[float, float, float], pixels: int) -> Case:
     camera = Camera(
         look_at(origin, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), (pixels, pixels), half_width
     )
-    leaves = density, light.beams[0].mass.requires_grad_(), light.outgoing.mean.requires_grad_()
+    leaves = density, light.beams[0].mass.requires_grad_(), light.diffuse.mean.requires_grad_()
     return Case(scene, replace(light, medium=replace(light.medium, **coefficients)), leaves, camera)
 
 

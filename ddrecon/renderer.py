@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, Rays
-from ddrecon.diffusion.closures import CLOSURES, smooth
+from ddrecon.diffusion.closures import Closure, smooth
 from ddrecon.diffusion.conservative import DiffusionProblem, solve_conservative
 from ddrecon.diffusion.flux_limited import solve_flux_limited
 from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
@@ -27,6 +27,7 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments
+from ddrecon.light.outgoing import scatter_once_more, scatter_towards
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import Sky, decompose_lights
@@ -35,7 +36,7 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
-from ddrecon.numerics.autodiff import is_varied, recompute
+from ddrecon.numerics.autodiff import is_varied
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
 
@@ -44,16 +45,20 @@ from ddrecon.settings import DiffusionSettings
 class LightField:
     """All light inside a medium.
 
-    `beams` are those of directional and point lights (E2). `outgoing` is what one more scattering
-    makes of the other light, per unit length and kappa_s: (1 - f) (L0 + g' L1.w), E3. `skies` are
-    those whose light it lacks: they scatter by the exact phase function, into each camera's rays
-    anew.
+    `beams` are those of directional and point lights (E2). `diffuse` is the other light, L0 and L1.
+    `skies` are those whose light it lacks: they scatter by the exact phase function, into each
+    camera's rays anew.
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
-    outgoing: Moments
+    diffuse: Moments
     skies: tuple[Sky, ...] = ()
+
+    @property
+    def outgoing(self) -> Moments:
+        """What one more scattering makes of `diffuse`, per unit length and kappa_s (E3)."""
+        return scatter_once_more(self.medium, self.diffuse)
 
 
 @dataclass(frozen=True)
@@ -105,8 +110,8 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     outside = ambient_radiance(lights, medium.g)
     # L0 and L1: E4 to E6.
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
-    # E3, of skies as well; beams are scattered by E2 on each view ray.
-    return LightField(medium, reduced.beams, _scatter_once_more(medium, diffuse.plus(sky)))
+    # Skies scatter by E3 as well; beams by E2 on each view ray.
+    return LightField(medium, reduced.beams, diffuse.plus(sky))
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
@@ -123,11 +128,6 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     if medium.has_flux:
         return LightField(medium, beams, nothing, skies)
     return LightField(medium, beams, sum_unscattered_sky(medium, skies, has_flux=False))
-
-
-def _scatter_once_more(medium: Medium, light: Moments) -> Moments:
-    kept = 1 - medium.forward_fraction
-    return light.scaled(kept, kept * medium.mean_cosine)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
@@ -151,10 +151,6 @@ def solve_diffuse(
 
     `source`: Q0 and Q1; `outside` [C, 1, 1, 1]: the radiance of ambient light.
     """
-
-    def closure(transport_extinction: Tensor) -> Tensor:
-        return CLOSURES[settings.closure](transport_extinction, medium.grid, settings.floor)
-
     if settings.scheme == "printed":
         by_jacobi = SolverWithMemory(iterate_jacobi, settings.tolerance, memory)
         diffusion = smooth(medium.transport_extinction, medium.grid, settings.floor)
@@ -166,6 +162,7 @@ def solve_diffuse(
         return solve_flux_limited(
             medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux
         )
+    closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.has_flux)
     light = solve_conservative(problem, solve)
     return run_rounds(
@@ -184,8 +181,8 @@ def view_image(
     if derivatives == "all":
         sight = look_through(camera, scene.volume.grid, scene.render)
         return _image(_emission(light_field, sight.rays), scene, sight).unflatten(-1, camera.size)
-    nothing = Moments(torch.zeros_like(light_field.outgoing.mean[:1]))
-    single = replace(light_field, outgoing=nothing), scene
+    nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
+    single = replace(light_field, diffuse=nothing), scene
     diffusion = replace(light_field, beams=(), skies=()), _without_background(scene)
     varied, fixed = {"single": (single, diffusion), "diffusion": (diffusion, single)}[derivatives]
     with torch.no_grad():
@@ -225,9 +222,9 @@ def _image(emission: Emission, scene: Scene, sight: Sight) -> Tensor:
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to (E2, E3)."""
     medium = light_field.medium
-    towards = bundle.towards_eye(medium.grid)
-    diffuse = recompute(light_field.outgoing.positive_along, towards)
+    diffuse = scatter_towards(medium, light_field.diffuse, bundle)
     if light_field.skies:
+        towards = bundle.towards_eye(medium.grid)
         diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
     return Emission(
         medium.grid,

@@ -7,8 +7,10 @@ file chooses from.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -35,8 +37,13 @@ COARSE_CELLS = 32
 
 def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
     """D = 1 / (3 sqrt(kappa_tr^2 + (floor / shortest side of the box)^2))."""
-    least = floor / min(grid.extent)
+    least = least_extinction(grid, floor)
     return 1 / (3 * torch.sqrt(transport_extinction**2 + least**2))
+
+
+def least_extinction(grid: Grid, floor: float) -> float:
+    """kappa_tr [1/u] that `smooth` gives empty space."""
+    return floor / min(grid.extent)
 
 
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
@@ -59,21 +66,41 @@ def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
     It is computed on a coarse grid and interpolated. Outside a sphere this is
     1 / (distance to its center), exactly: Newton's shell theorem.
     """
-    coarse = grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
-    mass = adaptive_avg_pool3d(weight, coarse.shape) + 3 * BACKGROUND / sum(grid.extent)
-    potential = _potential(mass, coarse) / mass.sum((1, 2, 3), keepdim=True)
-    return interpolate(potential[None], size=grid.shape, mode="trilinear")[0]
+    coarse = coarse_grid(grid)
+    mass = adaptive_avg_pool3d(weight, coarse.shape) + haze(grid)
+    inverse = potential(mass, coarse) / mass.sum((1, 2, 3), keepdim=True)
+    return interpolate(inverse[None], size=grid.shape, mode="trilinear")[0]
 
 
-def _potential(mass: Tensor, grid: Grid) -> Tensor:
+def coarse_grid(grid: Grid) -> Grid:
+    """The grid on which distances in `grid` are computed."""
+    return grid.coarsen(math.ceil(max(grid.shape) / COARSE_CELLS))
+
+
+def haze(grid: Grid) -> float:
+    """kappa_tr [1/u] that cells have besides their own, in distances only."""
+    return 3 * BACKGROUND / sum(grid.extent)
+
+
+def potential(mass: Tensor, grid: Grid) -> Tensor:
     """The sum over cells of `mass` / distance [1/u], by Fourier transform.
 
     The box is twice as wide, so that periods do not overlap; colors come one at a time, for memory.
     """
     wide = [2 * cells for cells in grid.shape]
+    spectrum = _spectrum(grid, mass.dtype, mass.device)
+    summed = [torch.fft.irfftn(torch.fft.rfftn(color, wide) * spectrum, wide) for color in mass]
+    depth, height, width = grid.shape
+    return torch.stack(summed)[:, :depth, :height, :width]
+
+
+@functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _spectrum(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The Fourier transform of 1 / distance in a box twice as wide."""
     axes = [
-        torch.fft.fftfreq(n, 1 / (n * step), dtype=mass.dtype, device=mass.device)
-        for n, step in zip(wide, grid.spacing, strict=True)
+        torch.fft.fftfreq(2 * n, 1 / (2 * n * step), dtype=dtype, device=device)
+        for n, step in zip(grid.shape, grid.spacing, strict=True)
     ]
     z, y, x = torch.meshgrid(*axes, indexing="ij")
     # 1 / distance; within a cell, its mean over the sphere of the cell's volume, 3 / (2 radius)
@@ -81,13 +108,22 @@ def _potential(mass: Tensor, grid: Grid) -> Tensor:
     square = z * z + y * y + x * x
     within = square == 0
     kernel = torch.where(within, 1.5 / radius, torch.where(within, 1, square).rsqrt())
-    spectrum = torch.fft.rfftn(kernel)
-    summed = [torch.fft.irfftn(torch.fft.rfftn(color, wide) * spectrum, wide) for color in mass]
-    depth, height, width = grid.shape
-    return torch.stack(summed)[:, :depth, :height, :width]
+    return torch.fft.rfftn(kernel)
 
 
 CLOSURES: dict[str, Callable[[Tensor, Grid, float], Tensor]] = {
     "geometric": geometric,
     "smooth": smooth,
 }
+
+
+@dataclass(frozen=True)
+class Closure:
+    """The closure called `name` on `grid`, as a function of the transport extinction."""
+
+    name: str
+    grid: Grid
+    floor: float = FLOOR
+
+    def __call__(self, transport_extinction: Tensor) -> Tensor:
+        return CLOSURES[self.name](transport_extinction, self.grid, self.floor)

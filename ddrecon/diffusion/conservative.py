@@ -12,6 +12,7 @@ from functools import cached_property
 
 from torch import Tensor
 
+from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import (
     AXES,
@@ -23,9 +24,7 @@ from ddrecon.diffusion.operator import (
 )
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import recompute
-
-Closure = Callable[[Tensor], Tensor]
+from ddrecon.numerics.autodiff import is_fused, recompute
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class DiffusionProblem:
     """
 
     medium: Medium
-    closure: Closure
+    closure: Callable[[Tensor], Tensor]
     source: Moments
     outside: Tensor
     has_flux: bool
@@ -47,11 +46,22 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
+        if is_fused() and isinstance(self.closure, Closure):
+            from ddrecon.diffusion.fused.closure import close_medium
+
+            return close_medium(self.medium, self.closure)
         return recompute(_diffusion, self.medium, self.closure)
 
     @cached_property
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E7."""
+        if is_fused():
+            from ddrecon.diffusion.fused.system import assemble_system
+
+            z, y, x, loss, right = assemble_system(
+                self.medium, self.diffusion, self.source, self.outside
+            )
+            return Operator((z, y, x), loss), right
         flux_along = self._source_flux()
         z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
         loss, right = recompute(
@@ -66,6 +76,10 @@ class DiffusionProblem:
         """L1 of L0 = `mean`; None where light's direction does not matter."""
         if not self.has_flux:
             return None
+        if is_fused():
+            from ddrecon.diffusion.fused.flux import find_flux
+
+            return find_flux(self.medium, self.diffusion, self.source.flux, self.outside, mean)
         along = self._source_flux().items()
         z, y, x = (
             recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)
@@ -83,7 +97,7 @@ def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operat
     return Moments(mean, problem.flux(mean))
 
 
-def _diffusion(medium: Medium, closure: Closure) -> Tensor:
+def _diffusion(medium: Medium, closure: Callable[[Tensor], Tensor]) -> Tensor:
     return closure(medium.transport_extinction)
 
 

@@ -192,7 +192,7 @@ def boundary_loss(diffusion: Tensor, grid: Grid) -> Tensor:
     loss = torch.zeros_like(diffusion)
     for axis, step in zip(AXES, grid.spacing, strict=True):
         for end in (_first, _last):
-            end(loss, axis).add_(_escape(end(diffusion, axis), step) / step)
+            end(loss, axis).add_(escape(end(diffusion, axis), step) / step)
     return loss
 
 
@@ -230,7 +230,7 @@ def face_fluxes(
         # E6 for L0 - outside in place of L0
         low, high = low + outside, high - outside
     # E6 divides by 2 + h / (2 D); inside, the drive is multiplied by the harmonic mean of D (E7)
-    into, out = (_escape(end(diffusion, axis), step) for end in (_first, _last))
+    into, out = (escape(end(diffusion, axis), step) for end in (_first, _last))
     return torch.cat([into * low, harmonic_mean(diffusion, axis) * inside, out * high], axis)
 
 
@@ -239,7 +239,7 @@ def cell_average(faces: Tensor, axis: int) -> Tensor:
     return 0.5 * (lower_cells(faces, axis) + upper_cells(faces, axis))
 
 
-def _escape(diffusion: Tensor, step: float) -> Tensor:
+def escape(diffusion: Tensor, step: float) -> Tensor:
     """The flux out of a cell at the box, per unit L0: 1 / (2 + h / (2 D)) (Marshak, E6)."""
     return 1 / (2 + step / (2 * diffusion))
 

@@ -13,6 +13,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.autograd.graph import saved_tensors_hooks
 
+from ddrecon.engine import current_engine
+
 T = TypeVar("T")
 _GRID_SAMPLE_BACKWARD = {
     4: torch.ops.aten.grid_sampler_2d_backward,
@@ -38,6 +40,14 @@ def version_of(tensor: Tensor) -> int:
     That is in inference mode.
     """
     return -1 if tensor.is_inference() else tensor._version
+
+
+def is_fused() -> bool:
+    """Whether kernels that have a backward pass only may stand for torch's operations.
+
+    Not in forward mode, whose derivatives are those of the operations.
+    """
+    return current_engine() == "warp" and not is_forward()
 
 
 def keep(ctx: Any, *tensors: Tensor) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, face_fluxes
 from ddrecon.light.reduced import ambient_radiance, reduced_light
@@ -40,7 +40,7 @@ def balance_of(scene: Scene, solution: Tensor) -> Balance:
     lights, is_directed = decompose_lights(scene.lights), medium.has_flux
     problem = DiffusionProblem(
         medium,
-        lambda extinction: CLOSURES[settings.closure](extinction, grid, settings.floor),
+        Closure(settings.closure, grid, settings.floor),
         reduced_light(medium, lights, is_directed).source,
         ambient_radiance(lights, solution),
         is_directed,

@@ -1,0 +1,102 @@
+"""The flux of E5 as one function of tensors, with its backward pass.
+
+Forward mode takes the formulas of `diffusion/operator.py` instead.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.fused.colors import (
+    FieldBar,
+    empty_bars,
+    name_flux,
+    per_color,
+    remaining_scale,
+    sum_colors,
+    total,
+)
+from ddrecon.diffusion.fused.flux_kernels import flux_adjoint_kernel, flux_kernel
+from ddrecon.diffusion.operator import AXES, escape
+from ddrecon.grid import Grid
+from ddrecon.kernels.rows import launch_rows
+from ddrecon.light.moments import Vector
+from ddrecon.medium.coefficients import Medium
+
+_NAMES = "light_z", "light_y", "light_x"
+
+
+def find_flux(
+    medium: Medium, diffusion: Tensor, flux: Vector | None, outside: Tensor, mean: Tensor
+) -> Vector:
+    """L1 of L0 = `mean` (E5, E6); `flux` is Q1."""
+    scale, field = remaining_scale(medium), medium.scattering.field
+    z, y, x = _Flux.apply(medium.grid, diffusion, scale, field, outside, mean, *(flux or ()))
+    return z, y, x
+
+
+class _Flux(torch.autograd.Function):
+    """L1 along z, y, x."""
+
+    @staticmethod
+    def forward(grid: Grid, *tensors: Tensor) -> tuple[Tensor, ...]:
+        mean, is_directed = tensors[4], len(tensors) > 5
+        light = tuple(mean.new_empty(mean.shape) for _ in _NAMES)
+        kernel = functools.partial(flux_kernel, is_directed)
+        made = dict(zip(_NAMES, light, strict=True))
+        launch_rows(kernel, grid, len(mean), _given(*tensors), made)
+        return light
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.grid, *tensors = inputs
+        ctx.save_for_backward(*tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
+        diffusion, scale, field, outside, mean, *flux = ctx.saved_tensors
+        _, needs_scale, _, needs_outside = ctx.needs_input_grad[1:5]
+        scattering = FieldBar(scale, field, len(mean), needs_scale)
+        found = empty_bars(len(mean), diffusion=diffusion, mean=mean, **name_flux(flux))
+        given = _given(*ctx.saved_tensors) | {"scattering_factor": scattering.factor}
+        given |= {f"{name}_bar": bar for name, bar in zip(_NAMES, bars, strict=True)}
+        kernel = functools.partial(flux_adjoint_kernel, bool(flux))
+        launch_rows(kernel, ctx.grid, len(mean), given, found | {"field_bar": scattering.bar})
+        scattering_bars = scattering.split() if flux else (None, None)
+        outside_bar = _inflow_bar(bars, diffusion, ctx.grid, outside) if needs_outside else None
+        diffusion_bar, *mean_bars = (
+            sum_colors(bar, like)
+            for bar, like in zip(found.values(), (diffusion, mean, *flux), strict=True)
+        )
+        return None, diffusion_bar, *scattering_bars, outside_bar, *mean_bars
+
+
+def _inflow_bar(bars: tuple[Tensor, ...], diffusion: Tensor, grid: Grid, outside: Tensor) -> Tensor:
+    """The cotangent of the radiance `outside`, which E6 lets in: upwards at low ends."""
+    found = torch.zeros_like(outside)
+    for axis, bar, step in zip(AXES, bars, grid.spacing, strict=True):
+        for place, sign in ((0, 1.5), (bar.shape[axis] - 1, -1.5)):
+            part = escape(diffusion.narrow(axis, place, 1), step) * bar.narrow(axis, place, 1)
+            found += sign * total(part, outside)
+    return found
+
+
+def _given(
+    diffusion: Tensor, scale: Tensor, field: Tensor, outside: Tensor, mean: Tensor, *flux: Tensor
+) -> dict[str, Any]:
+    """What both kernels are given, by its names."""
+    return {
+        "own": len(diffusion),
+        "scattering_fields": len(field),
+        "sources": len(flux[0]) if flux else 1,
+        "diffusion": diffusion,
+        "scattering_scale": per_color(scale, len(mean)),
+        "scattering": field,
+        "outside": per_color(outside, len(mean)),
+        "mean": mean,
+        **name_flux(flux),
+    }

@@ -1,0 +1,1 @@
+"""Light at cells, as fused kernels."""

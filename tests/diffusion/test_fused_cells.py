@@ -1,0 +1,202 @@
+"""The fused kernels of D, of the system and of the flux compute what PyTorch's operations compute.
+
+Values and cotangents, for coefficients that are constant or differ from cell to cell.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward
+from media import box_grid, half_empty, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.closures import Closure
+from ddrecon.diffusion.conservative import DiffusionProblem
+from ddrecon.engine import use_engine
+from ddrecon.light.moments import Moments
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+
+wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.diffusion.fused import closure_kernels, flux_kernels, system_kernels  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+Shape = tuple[int, int, int]
+Found = tuple[list[Tensor], list[Tensor]]
+SHAPES: list[Shape] = [(5, 7, 19), (2, 2, 2), (1, 4, 3), (3, 1, 2), (4, 3, 1), (1, 1, 1)]
+COLORS = [(1, 1), (1, 3), (3, 3)]
+"""Of the medium and of the light."""
+each_shape = pytest.mark.parametrize("shape", SHAPES, ids=str)
+each_colors = pytest.mark.parametrize("colors", COLORS, ids=str)
+
+
+def make_medium(
+    shape: Shape, colors: int, *, has_fields: bool, dtype: torch.dtype, shift: float = 0.0
+) -> tuple[Medium, list[Tensor]]:
+    """A medium, empty in parts, and its leaves: density and, last, cross sections and g."""
+    cells = shape if has_fields else ()
+    sigma_a, sigma_s = (random_values(colors, *cells, seed=s, dtype=dtype) for s in (7, 8))
+    density = 5 * half_empty(*shape, dtype=dtype) - shift
+    leaves = [density, sigma_a, 6 * sigma_s, density.new_tensor(0.4)]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    return scale_medium(Volume(box_grid(shape), *leaves)), leaves
+
+
+def make_problem(
+    medium: Medium, colors: int, is_directed: bool, dtype: torch.dtype
+) -> tuple[DiffusionProblem, list[Tensor]]:
+    """A problem in `medium` with a random source, and the leaves of that."""
+    shape = medium.grid.shape
+    mean, *flux = (
+        random_values(*shape, colors, seed=s, dtype=dtype).movedim(-1, 0) for s in range(11, 15)
+    )
+    outside = random_values(colors, 1, 1, 1, seed=3, dtype=dtype)
+    leaves = [outside, mean, *(flux if is_directed else [])]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    source = Moments(mean, (flux[0], flux[1], flux[2]) if is_directed else None)
+    return DiffusionProblem(medium, lambda k: 1 / (3 * k + 0.5), source, outside, True), leaves
+
+
+def bar_of(result: Tensor, seed: int) -> Tensor:
+    """A random cotangent of `result`, as a view of what has its colors last."""
+    return random_values(*result.shape[1:], len(result), seed=seed).to(result).movedim(-1, 0)
+
+
+def weigh(results: list[Tensor], leaves: list[Tensor]) -> Found:
+    """`results`, and the cotangents of `leaves` for random cotangents of the results."""
+    bars = [bar_of(r, 20 + i) for i, r in enumerate(results)]
+    return results, list(torch.autograd.grad(results, leaves, bars))
+
+
+def problem_of(
+    engine: str, shape: Shape, colors: tuple[int, int], kind: tuple[bool, bool], dtype: torch.dtype
+) -> Found:
+    """System and flux, with the derivatives by density, sections, g, Q0, Q1, outside and L0."""
+    use_engine(engine)
+    medium, leaves = make_medium(shape, colors[0], has_fields=kind[0], dtype=dtype)
+    problem, more = make_problem(medium, colors[1], kind[1], dtype)
+    operator, right = problem.system
+    mean = random_values(*right.shape, seed=5, dtype=dtype).requires_grad_()
+    flux = problem.flux(mean)
+    assert flux is not None
+    return weigh([*operator.conductances, operator.loss, right, *flux], [*leaves, *more, mean])
+
+
+def assert_equal(find: Callable[[str], Found], error: float) -> None:
+    (known, known_bars), (found, found_bars) = find("torch"), find("warp")
+    for one, other in zip([*found, *found_bars], [*known, *known_bars], strict=True):
+        torch.testing.assert_close(
+            one, other, rtol=0, atol=error * max(float(other.detach().norm()), 1e-3)
+        )
+
+
+@each_shape
+@each_colors
+def test_systems_and_fluxes_are_those_of_torch(shape: Shape, colors: tuple[int, int]):
+    for kind in itertools.product((False, True), repeat=2):
+        assert_equal(lambda e, k=kind: problem_of(e, shape, colors, k, torch.float64), 1e-12)
+        assert_equal(lambda e, k=kind: problem_of(e, shape, colors, k, torch.float32), 1e-5)
+
+
+@pytest.mark.parametrize("name", ["geometric", "smooth"])
+@pytest.mark.parametrize("shape", [*SHAPES[::2], (35, 3, 70)], ids=str)
+@pytest.mark.parametrize("shift", [0.0, 0.05], ids=["positive", "negative"])
+def test_closures_are_those_of_torch(name: str, shape: Shape, shift: float):
+    """Also where density is negative, as only finite differences have it."""
+
+    def find(engine: str, colors: int, has_fields: bool, dtype: torch.dtype) -> Found:
+        use_engine(engine)
+        medium, leaves = make_medium(shape, colors, has_fields=has_fields, dtype=dtype, shift=shift)
+        nothing = Moments(torch.zeros(()))
+        closure = Closure(name, medium.grid)
+        problem = DiffusionProblem(medium, closure, nothing, nothing.mean, has_flux=True)
+        return weigh([problem.diffusion], leaves)
+
+    for colors, has_fields in itertools.product((1, 3), (False, True)):
+        kind = colors, has_fields
+        assert_equal(lambda e, k=kind: find(e, *k, torch.float64), 1e-12)
+        assert_equal(lambda e, k=kind: find(e, *k, torch.float32), 1e-5 + 2e-3 * shift)
+
+
+def test_density_alone_gets_one_sum_of_all_colors():
+    """Where only the field varies that coefficients share, kernels sum what goes to it."""
+
+    def find(engine: str) -> Found:
+        use_engine(engine)
+        density, sections = half_empty(4, 5, 6).requires_grad_(), random_values(2, 3)
+        volume = Volume(box_grid((4, 5, 6)), density, *sections, sections.new_tensor(0.4))
+        medium = scale_medium(volume)
+        problem, _ = make_problem(medium, 3, True, torch.float64)
+        problem = DiffusionProblem(
+            medium, Closure("geometric", medium.grid), problem.source, problem.outside, True
+        )
+        operator, right = problem.system
+        flux = problem.flux(right)
+        assert flux is not None
+        return weigh([*operator.conductances, operator.loss, *flux], [density])
+
+    assert_equal(find, 1e-12)
+
+
+def test_adjoints_are_the_transposes_of_tangents():
+    """Forward mode, which has the formulas in torch, and the kernels' backward pass."""
+    use_engine("warp")
+    density, change = half_empty(4, 5, 6), random_values(4, 5, 6, seed=9)
+    sections = random_values(2, 3)
+
+    def results(density: Tensor) -> list[Tensor]:
+        volume = Volume(box_grid((4, 5, 6)), density, *sections, sections.new_tensor(0.4))
+        medium = scale_medium(volume)
+        problem, _ = make_problem(medium, 3, True, torch.float64)
+        problem = DiffusionProblem(
+            medium, Closure("geometric", medium.grid), problem.source, problem.outside, True
+        )
+        operator, right = problem.system
+        return [*operator.conductances, operator.loss, right, *(problem.flux(right) or ())]
+
+    with forward.dual_level():
+        tangents = [
+            forward.unpack_dual(result).tangent
+            for result in results(forward.make_dual(density, change))
+        ]
+    leaf = density.clone().requires_grad_()
+    found, (bar,) = weigh(results(leaf), [leaf])
+    bars = [bar_of(r, 20 + i) for i, r in enumerate(found)]
+    along = sum(float((d.detach() * b).sum()) for d, b in zip(tangents, bars, strict=True))
+    assert float((bar * change).sum()) == pytest.approx(along, rel=1e-10)
+
+
+def test_threads_change_no_bit():
+    """Every item writes to cells of its own."""
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        two = problem_of("warp", (5, 7, 19), (1, 3), (False, True), torch.float64)
+        torch.set_num_threads(1)
+        one = problem_of("warp", (5, 7, 19), (1, 3), (False, True), torch.float64)
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(two[0] + two[1], one[0] + one[1], strict=True))
+
+
+@pytest.mark.parametrize("architecture", [80, 90])
+def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
+    kernels = [
+        system_kernels.system_kernel(True, 32),
+        system_kernels.system_adjoint_kernel(True, 32),
+        flux_kernels.flux_kernel(True, 64),
+        flux_kernels.flux_adjoint_kernel(True, 64),
+        closure_kernels.geometric_kernel(True, 32),
+        closure_kernels.geometric_adjoint_kernel(True, 32),
+        closure_kernels.smooth_adjoint_kernel(True, 64),
+    ]
+    for kernel in kernels:
+        wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)

@@ -1,0 +1,96 @@
+"""The fused kernels of E3 towards a camera compute what PyTorch's operations compute."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+import torch
+from media import box_grid, half_empty, random_values
+from torch import Tensor
+
+from ddrecon.cameras import Rays
+from ddrecon.engine import use_engine
+from ddrecon.light.moments import Moments
+from ddrecon.light.outgoing import scatter_towards
+from ddrecon.medium.coefficients import Volume, scale_medium
+
+wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.light.fused.outgoing_kernels import (  # noqa: E402
+    scatter_adjoint_kernel,
+    scatter_kernel,
+)
+
+pytestmark = pytest.mark.slow
+
+
+def make_light(
+    shape: tuple[int, int, int], colors: tuple[int, int], dtype: torch.dtype
+) -> list[Tensor]:
+    """L0 and L1 that are dark in parts, and so directed that E3 is of either sign."""
+    seeds = range(11, 15)
+    light = [
+        random_values(colors[s > 11], *shape, seed=s) * half_empty(*shape, seed=2) for s in seeds
+    ]
+    return [light[0].to(dtype), *(6 * (part - 0.1).to(dtype) for part in light[1:])]
+
+
+def radiance_and_bars(
+    engine: str,
+    shape: tuple[int, int, int],
+    colors: tuple[int, int],
+    view: tuple[bool, bool],
+    g: float,
+    dtype: torch.dtype,
+) -> list[Tensor]:
+    """E3, and the cotangents of L0, L1, g and the camera.
+
+    `view`: whether light has a flux, and whether the camera is a point, inside the box.
+    """
+    use_engine(engine)
+    has_flux, is_eye = view
+    mean, z, y, x = (part.requires_grad_() for part in make_light(shape, colors, dtype))
+    point = torch.tensor([0.1, 0.2, 0.3] if is_eye else [0.6, 0.0, 0.8], dtype=dtype)
+    cosine = torch.tensor(g, dtype=dtype).requires_grad_()
+    rays = Rays(point[None], -point.requires_grad_()[None], point if is_eye else None)
+    sigma = torch.ones(1, dtype=dtype)
+    volume = Volume(box_grid(shape), half_empty(*shape, dtype=dtype), sigma, sigma, cosine)
+    light = Moments(mean, (z, y, x) if has_flux else None)
+    radiance = scatter_towards(scale_medium(volume), light, rays)
+    # As a view of what has its colors last.
+    bar = random_values(*radiance.shape[1:], len(radiance), seed=1).to(dtype).movedim(-1, 0)
+    leaves = [mean, cosine, *((z, y, x, point) if has_flux else ())]
+    return [radiance, *torch.autograd.grad(radiance, leaves, bar)]
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 19), (1, 4, 3), (1, 1, 1)], ids=str)
+@pytest.mark.parametrize("g", [0.0, 0.4, -0.4])
+def test_radiance_and_cotangents_are_those_of_torch(shape: tuple[int, int, int], g: float):
+    for view in itertools.product((False, True), repeat=2):
+        for colors in itertools.product((1, 3), repeat=2):
+            for dtype, error in ((torch.float64, 1e-12), (torch.float32, 1e-5)):
+                known, found = (
+                    radiance_and_bars(engine, shape, colors, view, g, dtype)
+                    for engine in ("torch", "warp")
+                )
+                for one, other in zip(found, known, strict=True):
+                    # Sums over cells cancel in part.
+                    size = max(float(other.detach().norm()), 1e-3) * (1 if one.ndim > 1 else 10)
+                    limit = error * size
+                    torch.testing.assert_close(one, other, rtol=0, atol=limit)
+
+
+def test_radiance_is_bent_somewhere():
+    """What the other test compares has all three parts of the bend."""
+    use_engine("warp")
+    radiance = radiance_and_bars("warp", (5, 7, 19), (3, 3), (True, True), 0.4, torch.float64)[0]
+    assert bool((radiance == 0).any()) and bool((radiance > 1e-2).any())
+    assert bool(((radiance > 0) & (radiance < 1e-2)).any())
+
+
+@pytest.mark.parametrize("architecture", [80, 90])
+def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
+    for kernel in (scatter_kernel(True, 32), scatter_adjoint_kernel(True, True, 64)):
+        wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == 2
