@@ -53,7 +53,7 @@ def march(
     channels = pack_channels(emission)
     sampler = choose_sampler(channels, grid, rays, crossing, settings.steps_per_voxel)
     if settings.tolerance > 0 and isinstance(sampler, Bands):
-        lattice = choose_lattice(grid, sampler.slices.axis, rays.select(crossing.hit))
+        lattice = choose_lattice(grid, sampler.axis, rays.select(crossing.hit))
         if lattice is not None:
             values = march_lattice(emission, sampler, lattice)
             places = lattice.places(rays.select(crossing.hit))

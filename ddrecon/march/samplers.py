@@ -29,6 +29,6 @@ def choose_sampler(
     along = speed[:, axis]
     is_steep = bool((along > STEEPEST).all()) or bool((along < -STEEPEST).all())
     if is_steep and bool((crossing.near > 0).all()):
-        return Bands.of(channels, grid, axis, bool(along[0] < 0), steps)
+        return Bands(channels, grid, axis, bool(along[0] < 0), steps)
     longest = float((crossing.far - crossing.near).detach().max())
     return Equidistant(channels, grid, longest, steps)

@@ -51,7 +51,11 @@ def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: in
         name: factor * (0.5 + random_values(3, *SHAPE, seed=seed, dtype=dtype))
         for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
     }
-    scene = make_scene(density, g=0.5, camera=camera, **fields)
+    scene = (
+        make_scene(density, g=-0.3, camera=camera)
+        if kind == "points"
+        else make_scene(density, g=0.5, camera=camera, **fields)
+    )
     outside = PointLight(density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5]))
     inside = PointLight(density.new_tensor([0.1, 0.05, -0.1]), density.new_tensor([0.3]))
     scene.lights += [outside, inside]
@@ -90,11 +94,20 @@ EMISSIONS = [
     ("peaked", OUTSIDE, [*LIGHT, "sigma_s", *POSE]),
     ("fields", OUTSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
     ("fields", INSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
+    # With all rays where they are, packets of them are marched back.
+    ("gray", OUTSIDE, ["density", "g", "sigma_a", "sigma_s"]),
+    ("backward", OUTSIDE, LIGHT),
+    ("peaked", OUTSIDE, [*LIGHT, "sigma_s"]),
+    ("points", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
+    ("fields", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
 ]
 each_case = pytest.mark.parametrize(
     ("kind", "view", "names"),
     EMISSIONS,
-    ids=[f"{kind}-{'inside' if view is INSIDE else 'outside'}" for kind, view, _ in EMISSIONS],
+    ids=[
+        f"{kind}-{'inside' if view is INSIDE else 'outside'}-{names[-1]}"
+        for kind, view, names in EMISSIONS
+    ],
 )
 
 

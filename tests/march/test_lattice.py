@@ -59,7 +59,9 @@ def scene_of():
 def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
     bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
-    slices = choose_sampler(Channels(scene.volume.density[None]), grid, bundle, crossing, 1).slices
+    slices = choose_sampler(
+        Channels([scene.volume.density[None]]), grid, bundle, crossing, 1
+    ).slices
     return choose_lattice(grid, slices.axis, bundle.select(crossing.hit)), slices
 
 

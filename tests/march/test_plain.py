@@ -165,7 +165,7 @@ def test_where_both_sample_alike_transmittance_is_the_same():
     """At equal steps both take the depth by trapezoids."""
     emission, rays = emit(lit_scene(LIGHTS["two beams"], VIEWS["inside"]))
     crossing = cross_box(emission.grid, rays)
-    channels = Channels(emission.extinction.field)
+    channels = Channels([emission.extinction.field])
     count = choose_sampler(channels, emission.grid, rays, crossing, 1).nodes - 1
     torch.testing.assert_close(
         march_fast(emission, rays, 1)[1],

@@ -1,0 +1,152 @@
+"""C++ of packets of rays: what a ray and a node are, where nodes lie, and what they emit.
+
+The text of a kernel is that of `program(layout, walk)`: constants of the layout, all structs, and
+what comes before every walk.
+"""
+
+from ddrecon.kernels.packets import packet_program
+from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_cells import CELLS, PLACES
+from ddrecon.march.fused.packet_optics import DECAYS, PHASES, POLYNOMIALS
+
+_RECORDS = """
+struct Ray {
+    V o0, o1, o2, d0, d1, d2, near, far;
+    V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * COEFFICIENTS + 1];
+};
+// Distances `s` sampled at and `t` held in the box; values; emission, depth, exp(-depth), and p.
+struct Node {
+    Place y, x;
+    Corners q;
+    V s, t, v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
+};
+"""
+_BEGIN = """
+const int last = given.rays.shape[0] - 1, begin = packet * LANES;
+const F* numbers = given.numbers.data;
+const F* scale = numbers;
+const F* peaks = numbers + C;
+const F g = numbers[2 * C], bound = numbers[2 * C + 1];
+Ray ray;
+const F* of_rays = given.rays.data;
+ray.o0 = P::load(of_rays, begin, 8, last);
+ray.o1 = P::load(of_rays + 1, begin, 8, last);
+ray.o2 = P::load(of_rays + 2, begin, 8, last);
+ray.d0 = P::load(of_rays + 3, begin, 8, last);
+ray.d1 = P::load(of_rays + 4, begin, 8, last);
+ray.d2 = P::load(of_rays + 5, begin, 8, last);
+ray.near = P::load(of_rays + 6, begin, 8, last);
+ray.far = P::load(of_rays + 7, begin, 8, last);
+for (int b = 0; b < BEAMS; ++b) {
+    ray.foot[b] = P::load(given.angles.data + b * (last + 1), begin, 1, last);
+    ray.across[b] = P::load(given.angles.data + (BEAMS + b) * (last + 1), begin, 1, last);
+}
+if (HAS_PEAK)
+    for (int k = 0; k < BEAMS * COEFFICIENTS; ++k)
+        ray.coefficients[k] = P::load(given.coefficients.data + k * (last + 1), begin, 1, last);
+auto distance = [&](int n) -> V { return (given.planes.data[n] - ray.o0) / ray.d0; };
+// Nodes before the box and behind it are held at its faces: between them nothing is added.
+int first_node = 0, last_node = given.planes.shape[0] - 1;
+while (first_node < last_node && P::every(distance(first_node + 1) <= ray.near)) ++first_node;
+while (last_node > first_node && P::every(distance(last_node - 1) >= ray.far)) --last_node;
+if (P::every(ray.near >= ray.far)) last_node = first_node;
+auto slice = [&](int n) -> long long {
+    return (long long)given.slices.data[n] * given.plane_stride;
+};
+auto sample = [&](int n, Node& node) {
+    node.s = distance(n);
+    node.t = P::least(P::most(node.s, ray.near), ray.far);
+    node.y = Place::at(ray.o1 + node.s * ray.d1, given.rows, given.row_stride);
+    node.x = Place::at(ray.o2 + node.s * ray.d2, given.columns, given.column_stride);
+    node.q = Corners::of(node.y, node.x);
+    const long long offset = slice(n);
+    for (int c = 0; c < CHANNELS; ++c) {
+        const F* field = (const F*)given.fields[c] + offset;
+        const int k = c - FIRST_MASS;
+        if (k >= 0 && k < MASSES) {
+            node.v[c] = Cells::curved(field, node.q, node.y, node.x, node.bend[k]);
+            const V bent = bound * node.bend[k];
+            node.v[c] -= node.bend[k] / P::root(F(1) + bent * bent);
+        } else {
+            node.v[c] = Cells::linear(field, node.q);
+        }
+    }
+};
+auto peak_of = [&](const Node& node, int c) -> V {
+    return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
+};
+// All outputs' emission, depth and p behind the mass `m`.
+auto emit = [&](Node& node, const W* m) {
+    for (int c = 0; c < C; ++c) {
+        const V mass = P::narrow(m[c * MASS_STEP]);
+        const V scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
+        node.w[c] = scattering * node.v[FIRST_DIFFUSE + c * DIFFUSE_STEP];
+        node.u[c] = scale[c] * mass;
+        for (int b = 0; b < BEAMS; ++b) {
+            const int i = C + b * C + c;
+            const V way = mass + node.v[FIRST_MASS + b * EXTINCTION + c * MASS_STEP];
+            V p = P::all(F(1));
+            if (IS_POINT[b]) {
+                const V cosine = Point::cosine(ray.foot[b], ray.across[b], node.t);
+                p = HAS_PEAK ? Phase::peaked(peak_of(node, c) * way, cosine, g)
+                             : Phase::plain(cosine, g);
+            } else if (HAS_PEAK) {
+                const V* polynomial = ray.coefficients + b * COEFFICIENTS;
+                const V place = Polynomial::place(peak_of(node, c) * way);
+                p = P::most(Polynomial::at(polynomial, place), P::all(F(0)));
+            }
+            node.p[i] = p;
+            node.w[i] = scattering * p;
+            node.u[i] = scale[c] * way;
+        }
+    }
+    for (int i = 0; i < OUT; ++i) node.decay[i] = P::decay(node.u[i]);
+};
+auto mass_between = [&](const Node& a, const Node& b, int k) -> W {
+    return P::wide(F(0.5) * (a.v[k] + b.v[k]) * (b.t - a.t));
+};
+// What output i is integrated by: length, or for a point light the integral of 1 / r^2.
+auto measure = [&](const Node& a, const Node& b, int i) -> V {
+    const int beam = i / C - 1;
+    if (i >= C && IS_POINT[beam])
+        return Point::subtended(ray.foot[beam], ray.across[beam], a.t, b.t);
+    return b.t - a.t;
+};
+"""
+
+
+def program(layout: Layout, walk: str) -> str:
+    """C++ of `walk` along the rays number `packet` of `given`, of `layout`."""
+    parts = [_constants(layout), PLACES, CELLS, DECAYS, POLYNOMIALS, PHASES, _RECORDS, _BEGIN, walk]
+    return packet_program(layout.bits, "".join(parts))
+
+
+def _constants(layout: Layout) -> str:
+    """Where in a node the channels of color c are: the first of a kind plus c times its step."""
+    mass_step = int(layout.extinction > 1)
+    first_scattering, scattering_step = (
+        (layout.first_scattering, int(layout.scattering > 1))
+        if layout.scattering
+        else (0, mass_step)
+    )
+    numbers = {
+        "C": layout.colors,
+        "EXTINCTION": layout.extinction,
+        "BEAMS": len(layout.beams),
+        "MASSES": layout.masses,
+        "CHANNELS": layout.channels,
+        "OUT": layout.outputs,
+        "MASS_STEP": mass_step,
+        "FIRST_DIFFUSE": layout.extinction,
+        "DIFFUSE_STEP": int(layout.diffuse > 1),
+        "FIRST_MASS": layout.first_mass,
+        "FIRST_SCATTERING": first_scattering,
+        "SCATTERING_STEP": scattering_step,
+        "FIRST_PEAK": layout.first_peak,
+        "PEAK_STEP": int((layout.peak or 0) > 1),
+        "HAS_PEAK": int(layout.peak is not None),
+        "IS_PEAK_FIELD": int(bool(layout.peak)),
+    }
+    lines = [f"constexpr int {name} = {number};" for name, number in numbers.items()]
+    points = ", ".join(str(int(is_point)) for is_point in (*layout.beams, False))
+    return "\n" + "\n".join([*lines, f"constexpr int IS_POINT[BEAMS + 1] = {{{points}}};"])
