@@ -6,7 +6,7 @@ what comes before every walk.
 
 from ddrecon.kernels.packets import packet_program
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.packet_cells import CELLS, PLACES
+from ddrecon.march.fused.packet_cells import PLACES, VALUES
 from ddrecon.march.fused.packet_optics import DECAYS, PHASES, POLYNOMIALS
 
 _RECORDS = """
@@ -50,25 +50,41 @@ int first_node = 0, last_node = given.planes.shape[0] - 1;
 while (first_node < last_node && P::every(distance(first_node + 1) <= ray.near)) ++first_node;
 while (last_node > first_node && P::every(distance(last_node - 1) >= ray.far)) --last_node;
 if (P::every(ray.near >= ray.far)) last_node = first_node;
+// Along y the packet's rays are closer together than along x.
+Lines lines = {given.rows, given.columns, given.row_stride, given.column_stride};
+if (LANES > 1) {
+    const V s = distance((first_node + last_node) / 2);
+    const V y = ray.o1 + s * ray.d1, x = ray.o2 + s * ray.d2;
+    const int end = begin + LANES <= last ? LANES - 1 : last - begin;
+    const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
+    if (high * high > wide * wide) {
+        lines = {given.columns, given.rows, given.column_stride, given.row_stride};
+        const V o = ray.o1, d = ray.d1;
+        ray.o1 = ray.o2;
+        ray.d1 = ray.d2;
+        ray.o2 = o;
+        ray.d2 = d;
+    }
+}
 auto slice = [&](int n) -> long long {
     return (long long)given.slices.data[n] * given.plane_stride;
 };
 auto sample = [&](int n, Node& node) {
     node.s = distance(n);
     node.t = P::least(P::most(node.s, ray.near), ray.far);
-    node.y = Place::at(ray.o1 + node.s * ray.d1, given.rows, given.row_stride);
-    node.x = Place::at(ray.o2 + node.s * ray.d2, given.columns, given.column_stride);
-    node.q = Corners::of(node.y, node.x);
+    node.y = Place::at(ray.o1 + node.s * ray.d1, lines.rows);
+    node.x = Place::at(ray.o2 + node.s * ray.d2, lines.columns);
+    node.q = Corners::of(node.y, node.x, lines);
     const long long offset = slice(n);
     for (int c = 0; c < CHANNELS; ++c) {
         const F* field = (const F*)given.fields[c] + offset;
         const int k = c - FIRST_MASS;
         if (k >= 0 && k < MASSES) {
-            node.v[c] = Cells::curved(field, node.q, node.y, node.x, node.bend[k]);
+            node.v[c] = Values::curved(field, node.q, node.y, node.x, lines, node.bend[k]);
             const V bent = bound * node.bend[k];
             node.v[c] -= node.bend[k] / P::root(F(1) + bent * bent);
         } else {
-            node.v[c] = Cells::linear(field, node.q);
+            node.v[c] = Values::linear(field, node.q);
         }
     }
 };
@@ -117,7 +133,7 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 
 def program(layout: Layout, walk: str) -> str:
     """C++ of `walk` along the rays number `packet` of `given`, of `layout`."""
-    parts = [_constants(layout), PLACES, CELLS, DECAYS, POLYNOMIALS, PHASES, _RECORDS, _BEGIN, walk]
+    parts = [_constants(layout), PLACES, VALUES, DECAYS, POLYNOMIALS, PHASES, _RECORDS, _BEGIN, walk]
     return packet_program(layout.bits, "".join(parts))
 
 

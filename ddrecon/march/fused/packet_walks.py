@@ -13,6 +13,7 @@ import warp as wp
 from ddrecon.kernels.native import number_type
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_rays import program
+from ddrecon.march.fused.packet_spread import SPREAD
 
 _INTEGRATE = """
 V total[OUT];
@@ -114,20 +115,13 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
     }
 };
 auto spread = [&](int n, const Node& node, const V* v_bar) {
-    const long long offset = slice(n);
-    for (int c = 0; c < CHANNELS; ++c) {
-        F* field = (F*)bars[c];
-        if (!field) continue;
-        const int k = c - FIRST_MASS;
-        if (k >= 0 && k < MASSES) {
-            const V bent = bound * node.bend[k], inverse = F(1) / P::root(F(1) + bent * bent);
-            const V bend_bar = -v_bar[c] * inverse * inverse * inverse;
-            bound_bar -= bend_bar * bent * node.bend[k] * node.bend[k];
-            Cells::spread_curved(field + offset, node.q, node.y, node.x, v_bar[c], bend_bar);
-        } else {
-            Cells::spread(field + offset, node.q, v_bar[c]);
-        }
+    V bend_bar[MASSES + 1];
+    for (int k = 0; k < MASSES; ++k) {
+        const V bent = bound * node.bend[k], inverse = F(1) / P::root(F(1) + bent * bent);
+        bend_bar[k] = -v_bar[FIRST_MASS + k] * inverse * inverse * inverse;
+        bound_bar -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
     }
+    spread_to_cells(node, slice(n), v_bar, bend_bar);
 };
 Node nodes[2];
 Node* a = nodes;
@@ -252,7 +246,7 @@ def packet_adjoint_kernel(layout: Layout) -> Any:
     F: Any = types.F
     Given, Fields = types.Given, types.Fields
 
-    @wp.func_native(program(layout, _TRANSPOSE))
+    @wp.func_native(program(layout, SPREAD + _TRANSPOSE))
     def transpose_packet(
         given: Given,
         masses: wp.array2d(dtype=wp.float64),
