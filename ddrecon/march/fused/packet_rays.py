@@ -6,7 +6,7 @@ what comes before every walk.
 
 from ddrecon.kernels.packets import packet_program
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.packet_cells import PLACES, VALUES
+from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
 from ddrecon.march.fused.packet_optics import DECAYS, PHASES, POLYNOMIALS
 
 _RECORDS = """
@@ -18,6 +18,10 @@ struct Ray {
 struct Node {
     Place y, x;
     Corners q;
+    int runs;
+#if !defined(__CUDA_ARCH__)
+    Run run[LANES];
+#endif
     V s, t, v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
 };
 """
@@ -69,6 +73,61 @@ if (LANES > 1) {
 auto slice = [&](int n) -> long long {
     return (long long)given.slices.data[n] * given.plane_stride;
 };
+auto sample_lanes = [&](Node& node, long long offset) {
+    for (int c = 0; c < CHANNELS; ++c) {
+        const F* field = (const F*)given.fields[c] + offset;
+        const int k = c - FIRST_MASS;
+        node.v[c] = k >= 0 && k < MASSES
+            ? Values::curved(field, node.q, node.y, node.x, lines, node.bend[k])
+            : Values::linear(field, node.q);
+    }
+};
+#if !defined(__CUDA_ARCH__)
+I lanes_numbers;
+for (int l = 0; l < LANES; ++l) lanes_numbers[l] = l;
+auto sample_runs = [&](Node& node, long long offset) {
+    const Place &y = node.y, &x = node.x;
+    for (int r = 0; r < node.runs; ++r) {
+        const Run& run = node.run[r];
+        const I xm = x.m - run.first, xi = x.i - run.first;
+        const I xj = x.j - run.first, xp = x.p - run.first;
+        const V number = P::real(lanes_numbers);
+        const M is_in = (number >= F(run.begin)) & (number < F(run.end));
+        const long long at_m = (long long)y.m[run.begin] * lines.row;
+        const long long at_i = (long long)y.i[run.begin] * lines.row;
+        const long long at_j = (long long)y.j[run.begin] * lines.row;
+        const long long at_p = (long long)y.p[run.begin] * lines.row;
+        for (int c = 0; c < CHANNELS; ++c) {
+            const F* field = (const F*)given.fields[c] + offset;
+            const int k = c - FIRST_MASS;
+            const V row_i = Rows::read(field + at_i, run.first, lines.column);
+            const V row_j = Rows::read(field + at_j, run.first, lines.column);
+            const V i0 = Rows::pick(row_i, xi), i1 = Rows::pick(row_i, xj);
+            const V j0 = Rows::pick(row_j, xi), j1 = Rows::pick(row_j, xj);
+            const V top = i0 + x.a * (i1 - i0), low = j0 + x.a * (j1 - j0);
+            const V value = top + y.a * (low - top);
+            node.v[c] = P::pick(is_in, value, node.v[c]);
+            if (k >= 0 && k < MASSES) {
+                const V row_m = Rows::read(field + at_m, run.first, lines.column);
+                const V row_p = Rows::read(field + at_p, run.first, lines.column);
+                const V m0 = Rows::pick(row_m, xi), p0 = Rows::pick(row_p, xi);
+                const V over = m0 + x.a * (Rows::pick(row_m, xj) - m0);
+                const V under = p0 + x.a * (Rows::pick(row_p, xj) - p0);
+                // Second differences along y, and along x in both rows.
+                const V along_y = (F(1) - y.a) * (over - F(2) * top + low)
+                                + y.a * (top - F(2) * low + under);
+                const V in_i = (F(1) - x.a) * (Rows::pick(row_i, xm) - F(2) * i0 + i1)
+                             + x.a * (i0 - F(2) * i1 + Rows::pick(row_i, xp));
+                const V in_j = (F(1) - x.a) * (Rows::pick(row_j, xm) - F(2) * j0 + j1)
+                             + x.a * (j0 - F(2) * j1 + Rows::pick(row_j, xp));
+                const V along_x = in_i + y.a * (in_j - in_i);
+                const V bend = y.excess * along_y + x.excess * along_x;
+                node.bend[k] = P::pick(is_in, bend, node.bend[k]);
+            }
+        }
+    }
+};
+#endif
 auto sample = [&](int n, Node& node) {
     node.s = distance(n);
     node.t = P::least(P::most(node.s, ray.near), ray.far);
@@ -76,16 +135,16 @@ auto sample = [&](int n, Node& node) {
     node.x = Place::at(ray.o2 + node.s * ray.d2, lines.columns);
     node.q = Corners::of(node.y, node.x, lines);
     const long long offset = slice(n);
-    for (int c = 0; c < CHANNELS; ++c) {
-        const F* field = (const F*)given.fields[c] + offset;
-        const int k = c - FIRST_MASS;
-        if (k >= 0 && k < MASSES) {
-            node.v[c] = Values::curved(field, node.q, node.y, node.x, lines, node.bend[k]);
-            const V bent = bound * node.bend[k];
-            node.v[c] -= node.bend[k] / P::root(F(1) + bent * bent);
-        } else {
-            node.v[c] = Values::linear(field, node.q);
-        }
+#if !defined(__CUDA_ARCH__)
+    node.runs = find_runs(node.y, node.x, lines, node.run);
+    if (HAS_PERMUTATION && node.runs <= MOST_RUNS && lines.columns >= LANES)
+        sample_runs(node, offset);
+    else
+#endif
+        sample_lanes(node, offset);
+    for (int k = 0; k < MASSES; ++k) {
+        const V bent = bound * node.bend[k];
+        node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
     }
 };
 auto peak_of = [&](const Node& node, int c) -> V {
@@ -133,7 +192,7 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 
 def program(layout: Layout, walk: str) -> str:
     """C++ of `walk` along the rays number `packet` of `given`, of `layout`."""
-    parts = [_constants(layout), PLACES, VALUES, DECAYS, POLYNOMIALS, PHASES, _RECORDS, _BEGIN, walk]
+    parts = [_constants(layout), PLACES, RUNS, ROWS, VALUES, DECAYS, POLYNOMIALS, PHASES, _RECORDS, _BEGIN, walk]
     return packet_program(layout.bits, "".join(parts))
 
 
@@ -146,6 +205,7 @@ def _constants(layout: Layout) -> str:
         else (0, mass_step)
     )
     numbers = {
+        "MOST_RUNS": 3,
         "C": layout.colors,
         "EXTINCTION": layout.extinction,
         "BEAMS": len(layout.beams),

@@ -77,18 +77,9 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
     const int *xm = (const int*)&x.m, *xi = (const int*)&x.i, *xj = (const int*)&x.j;
     const int *xp = (const int*)&x.p, *yi = (const int*)&y.i;
     const F *xa = (const F*)&x.a, *excess = (const F*)&x.excess;
-    for (int begin = 0, end; begin < LANES; begin = end) {
-        // The run: lanes `begin` to before `end`, columns `low` to `high`.
-        int low = xm[begin], high = xp[begin];
-        for (end = begin + 1; end < LANES; ++end) {
-            const int lower = xm[end] < low ? xm[end] : low;
-            const int higher = xp[end] > high ? xp[end] : high;
-            if (yi[end] != yi[begin] || higher - lower >= LANES) break;
-            low = lower;
-            high = higher;
-        }
-        const int most = lines.columns > LANES ? lines.columns - LANES : 0;
-        const int first = low < most ? low : most;
+    for (int r = 0; r < node.runs; ++r) {
+        const int begin = node.run[r].begin, end = node.run[r].end, first = node.run[r].first;
+        const int low = node.run[r].low, high = node.run[r].high;
         V sums[CHANNELS][2], sums_before[MASSES + 1], sums_behind[MASSES + 1];
         for (int c = 0; c < CHANNELS; ++c) sums[c][0] = sums[c][1] = P::all(F(0));
         for (int k = 0; k < MASSES; ++k) sums_before[k] = sums_behind[k] = P::all(F(0));
