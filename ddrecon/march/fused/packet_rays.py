@@ -14,11 +14,12 @@ struct Ray {
     V o0, o1, o2, d0, d1, d2, near, far;
     V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * COEFFICIENTS + 1];
 };
-// Distances `s` sampled at and `t` held in the box; values; emission, depth, exp(-depth), and p.
+// Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at and `t` held in the box; values; emission, depth, exp(-depth), and p.
 struct Node {
     Place y, x;
     Corners q;
     int runs;
+    bool is_empty, is_lit;
 #if !defined(__CUDA_ARCH__)
     Run run[LANES];
 #endif
@@ -73,8 +74,9 @@ if (LANES > 1) {
 auto slice = [&](int n) -> long long {
     return (long long)given.slices.data[n] * given.plane_stride;
 };
-auto sample_lanes = [&](Node& node, long long offset) {
-    for (int c = 0; c < CHANNELS; ++c) {
+// Values of channels `from` to before `to`, of each lane by itself.
+auto sample_lanes = [&](Node& node, long long offset, int from, int to) {
+    for (int c = from; c < to; ++c) {
         const F* field = (const F*)given.fields[c] + offset;
         const int k = c - FIRST_MASS;
         node.v[c] = k >= 0 && k < MASSES
@@ -85,7 +87,7 @@ auto sample_lanes = [&](Node& node, long long offset) {
 #if !defined(__CUDA_ARCH__)
 I lanes_numbers;
 for (int l = 0; l < LANES; ++l) lanes_numbers[l] = l;
-auto sample_runs = [&](Node& node, long long offset) {
+auto sample_runs = [&](Node& node, long long offset, int from, int to) {
     const Place &y = node.y, &x = node.x;
     for (int r = 0; r < node.runs; ++r) {
         const Run& run = node.run[r];
@@ -97,7 +99,7 @@ auto sample_runs = [&](Node& node, long long offset) {
         const long long at_i = (long long)y.i[run.begin] * lines.row;
         const long long at_j = (long long)y.j[run.begin] * lines.row;
         const long long at_p = (long long)y.p[run.begin] * lines.row;
-        for (int c = 0; c < CHANNELS; ++c) {
+        for (int c = from; c < to; ++c) {
             const F* field = (const F*)given.fields[c] + offset;
             const int k = c - FIRST_MASS;
             const V row_i = Rows::read(field + at_i, run.first, lines.column);
@@ -128,30 +130,43 @@ auto sample_runs = [&](Node& node, long long offset) {
     }
 };
 #endif
-auto sample = [&](int n, Node& node) {
+auto sample = [&](Node& node, int n, int from, int to) {
+#if !defined(__CUDA_ARCH__)
+    if (HAS_PERMUTATION && node.runs <= MOST_RUNS && lines.columns >= LANES)
+        sample_runs(node, slice(n), from, to);
+    else
+#endif
+        sample_lanes(node, slice(n), from, to);
+};
+// Where node n lies, and the matter there.
+auto locate = [&](int n, Node& node) {
     node.s = distance(n);
     node.t = P::least(P::most(node.s, ray.near), ray.far);
     node.y = Place::at(ray.o1 + node.s * ray.d1, lines.rows);
     node.x = Place::at(ray.o2 + node.s * ray.d2, lines.columns);
     node.q = Corners::of(node.y, node.x, lines);
-    const long long offset = slice(n);
 #if !defined(__CUDA_ARCH__)
     node.runs = find_runs(node.y, node.x, lines, node.run);
-    if (HAS_PERMUTATION && node.runs <= MOST_RUNS && lines.columns >= LANES)
-        sample_runs(node, offset);
-    else
 #endif
-        sample_lanes(node, offset);
-    for (int k = 0; k < MASSES; ++k) {
-        const V bent = bound * node.bend[k];
-        node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
-    }
+    sample(node, n, 0, EXTINCTION);
+    if (SCATTERING) sample(node, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
+    node.is_empty = true;
+    for (int c = 0; c < EXTINCTION; ++c)
+        node.is_empty = node.is_empty && P::every(node.v[c] == P::all(F(0)));
+    for (int c = FIRST_OWN_SCATTERING; c < FIRST_PEAK; ++c)
+        node.is_empty = node.is_empty && P::every(node.v[c] == P::all(F(0)));
 };
 auto peak_of = [&](const Node& node, int c) -> V {
     return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
 };
-// All outputs' emission, depth and p behind the mass `m`.
-auto emit = [&](Node& node, const W* m) {
+// All else at node n: all outputs' emission, depth and p behind the mass `m`.
+auto emit = [&](int n, Node& node, const W* m) {
+    sample(node, n, EXTINCTION, FIRST_OWN_SCATTERING);
+    if (IS_PEAK_FIELD) sample(node, n, FIRST_PEAK, CHANNELS);
+    for (int k = 0; k < MASSES; ++k) {
+        const V bent = bound * node.bend[k];
+        node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
+    }
     for (int c = 0; c < C; ++c) {
         const V mass = P::narrow(m[c * MASS_STEP]);
         const V scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
@@ -205,7 +220,7 @@ def _constants(layout: Layout) -> str:
         else (0, mass_step)
     )
     numbers = {
-        "MOST_RUNS": 3,
+        "MOST_RUNS": 5,
         "C": layout.colors,
         "EXTINCTION": layout.extinction,
         "BEAMS": len(layout.beams),
@@ -218,6 +233,8 @@ def _constants(layout: Layout) -> str:
         "FIRST_MASS": layout.first_mass,
         "FIRST_SCATTERING": first_scattering,
         "SCATTERING_STEP": scattering_step,
+        "SCATTERING": layout.scattering,
+        "FIRST_OWN_SCATTERING": layout.first_scattering,
         "FIRST_PEAK": layout.first_peak,
         "PEAK_STEP": int((layout.peak or 0) > 1),
         "HAS_PEAK": int(layout.peak is not None),

@@ -59,65 +59,56 @@ auto add_row = [&](F* row, int first, int low, int high, const V& sum) {
 };
 auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, const V* bend_bar) {
     const Place &y = node.y, &x = node.x;
-    // What columns' weights L, and those of second differences, count for in rows m, i, j, p.
-    V linear[CHANNELS][2], before[MASSES + 1], behind[MASSES + 1], bent[MASSES + 1][2];
-    for (int c = 0; c < CHANNELS; ++c) {
-        linear[c][1] = v_bar[c] * y.a;
-        linear[c][0] = v_bar[c] - linear[c][1];
-        const int k = c - FIRST_MASS;
-        if (k >= 0 && k < MASSES) {
-            bent[k][1] = bend_bar[k] * y.a;
-            bent[k][0] = bend_bar[k] - bent[k][1];
-            before[k] = y.excess * bent[k][0];
-            behind[k] = y.excess * bent[k][1];
-            linear[c][0] += behind[k] - F(2) * before[k];
-            linear[c][1] += before[k] - F(2) * behind[k];
-        }
-    }
     const int *xm = (const int*)&x.m, *xi = (const int*)&x.i, *xj = (const int*)&x.j;
-    const int *xp = (const int*)&x.p, *yi = (const int*)&y.i;
+    const int *xp = (const int*)&x.p;
     const F *xa = (const F*)&x.a, *excess = (const F*)&x.excess;
     for (int r = 0; r < node.runs; ++r) {
         const int begin = node.run[r].begin, end = node.run[r].end, first = node.run[r].first;
         const int low = node.run[r].low, high = node.run[r].high;
-        V sums[CHANNELS][2], sums_before[MASSES + 1], sums_behind[MASSES + 1];
-        for (int c = 0; c < CHANNELS; ++c) sums[c][0] = sums[c][1] = P::all(F(0));
-        for (int k = 0; k < MASSES; ++k) sums_before[k] = sums_behind[k] = P::all(F(0));
+        // Each lane's weights of columns: L, and those of a (1 - a) / 2 second differences.
+        V L[LANES], bent[LANES];
         for (int l = begin; l < end; ++l) {
             const V at_i = one_at(xi[l] - first), at_j = one_at(xj[l] - first);
             const F w1 = xa[l], w0 = F(1) - w1;
-            const V L = w0 * at_i + w1 * at_j;
-            V bend = L;
+            L[l] = w0 * at_i + w1 * at_j;
             if (MASSES)
-                bend = (excess[l] * (w1 - F(2) * w0)) * at_i + (excess[l] * (w0 - F(2) * w1)) * at_j
-                     + (excess[l] * w0) * one_at(xm[l] - first)
-                     + (excess[l] * w1) * one_at(xp[l] - first);
-            for (int c = 0; c < CHANNELS; ++c) {
-                sums[c][0] += ((const F*)&linear[c][0])[l] * L;
-                sums[c][1] += ((const F*)&linear[c][1])[l] * L;
-                const int k = c - FIRST_MASS;
-                if (k >= 0 && k < MASSES) {
-                    sums[c][0] += ((const F*)&bent[k][0])[l] * bend;
-                    sums[c][1] += ((const F*)&bent[k][1])[l] * bend;
-                    sums_before[k] += ((const F*)&before[k])[l] * L;
-                    sums_behind[k] += ((const F*)&behind[k])[l] * L;
+                bent[l] = (excess[l] * (w1 - F(2) * w0)) * at_i
+                        + (excess[l] * (w0 - F(2) * w1)) * at_j
+                        + (excess[l] * w0) * one_at(xm[l] - first)
+                        + (excess[l] * w1) * one_at(xp[l] - first);
+        }
+        const long long at_m = (long long)y.m[begin] * lines.row;
+        const long long at_i = (long long)y.i[begin] * lines.row;
+        const long long at_j = (long long)y.j[begin] * lines.row;
+        const long long at_p = (long long)y.p[begin] * lines.row;
+        #pragma clang loop unroll(disable)
+        for (int c = 0; c < CHANNELS; ++c) {
+            const int k = c - FIRST_MASS;
+            if (!bars[c] || P::every(v_bar[c] == P::all(F(0)))) continue;
+            F* field = (F*)bars[c] + offset;
+            V in_j = v_bar[c] * y.a, in_i = v_bar[c] - in_j, sum_i = P::all(F(0)), sum_j = sum_i;
+            if (k >= 0 && k < MASSES) {
+                const V bend_j = bend_bar[k] * y.a, bend_i = bend_bar[k] - bend_j;
+                const V in_m = y.excess * bend_i, in_p = y.excess * bend_j;
+                in_i += in_p - F(2) * in_m;
+                in_j += in_m - F(2) * in_p;
+                V sum_m = P::all(F(0)), sum_p = sum_m;
+                for (int l = begin; l < end; ++l) {
+                    sum_m += ((const F*)&in_m)[l] * L[l];
+                    sum_p += ((const F*)&in_p)[l] * L[l];
+                    sum_i += ((const F*)&in_i)[l] * L[l] + ((const F*)&bend_i)[l] * bent[l];
+                    sum_j += ((const F*)&in_j)[l] * L[l] + ((const F*)&bend_j)[l] * bent[l];
+                }
+                add_row(field + at_m, first, low, high, sum_m);
+                add_row(field + at_p, first, low, high, sum_p);
+            } else {
+                for (int l = begin; l < end; ++l) {
+                    sum_i += ((const F*)&in_i)[l] * L[l];
+                    sum_j += ((const F*)&in_j)[l] * L[l];
                 }
             }
-        }
-        const long long at_m = (long long)((const int*)&y.m)[begin] * lines.row;
-        const long long at_i = (long long)yi[begin] * lines.row;
-        const long long at_j = (long long)((const int*)&y.j)[begin] * lines.row;
-        const long long at_p = (long long)((const int*)&y.p)[begin] * lines.row;
-        for (int c = 0; c < CHANNELS; ++c) {
-            if (!bars[c]) continue;
-            F* field = (F*)bars[c] + offset;
-            add_row(field + at_i, first, low, high, sums[c][0]);
-            add_row(field + at_j, first, low, high, sums[c][1]);
-            const int k = c - FIRST_MASS;
-            if (k >= 0 && k < MASSES) {
-                add_row(field + at_m, first, low, high, sums_before[k]);
-                add_row(field + at_p, first, low, high, sums_behind[k]);
-            }
+            add_row(field + at_i, first, low, high, sum_i);
+            add_row(field + at_j, first, low, high, sum_j);
         }
     }
 };

@@ -23,19 +23,22 @@ for (int k = 0; k < EXTINCTION; ++k) m[k] = P::wide(total[0]);
 Node nodes[2];
 Node* a = nodes;
 Node* b = nodes + 1;
-if (first_node < last_node) {
-    sample(first_node, *a);
-    emit(*a, m);
-}
+locate(first_node, *a);
+a->is_lit = false;
 for (int n = first_node + 1; n <= last_node; ++n) {
-    // The next node, the mass passed on the way to it, and what it emits behind that.
-    sample(n, *b);
-    for (int k = 0; k < EXTINCTION; ++k) m[k] += mass_between(*a, *b, k);
-    emit(*b, m);
-    // E2, E3: what arrives from the segment between both.
-    for (int i = 0; i < OUT; ++i) {
-        const V decay = Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i]);
-        total[i] += F(0.5) * (a->w[i] + b->w[i]) * measure(*a, *b, i) * decay;
+    locate(n, *b);
+    b->is_lit = !(a->is_empty && b->is_empty);
+    // Between empty nodes nothing is added: what light there is does not matter.
+    if (b->is_lit) {
+        if (!a->is_lit) emit(n - 1, *a, m);
+        // The mass passed on the way to the next node, and what it emits behind that.
+        for (int k = 0; k < EXTINCTION; ++k) m[k] += mass_between(*a, *b, k);
+        emit(n, *b, m);
+        // E2, E3: what arrives from the segment between both.
+        for (int i = 0; i < OUT; ++i) {
+            const V decay = Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i]);
+            total[i] += F(0.5) * (a->w[i] + b->w[i]) * measure(*a, *b, i) * decay;
+        }
     }
     Node* passed = a;
     a = b;
@@ -130,21 +133,24 @@ V a_bar[CHANNELS], b_bar[CHANNELS], wa_bar[OUT], wb_bar[OUT], ua_bar[OUT], ub_ba
 for (int c = 0; c < CHANNELS; ++c) b_bar[c] = none;
 for (int i = 0; i < OUT; ++i) wb_bar[i] = ub_bar[i] = none;
 if (first_node < last_node) {
-    sample(last_node, *b);
-    emit(*b, m);
+    locate(last_node, *b);
+    emit(last_node, *b, m);
 }
 // Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
 for (int n = last_node - 1; n >= first_node; --n) {
     W m_b[EXTINCTION];
-    sample(n, *a);
+    locate(n, *a);
     for (int k = 0; k < EXTINCTION; ++k) {
         m_b[k] = m[k];
         m[k] -= mass_between(*a, *b, k);
     }
-    emit(*a, m);
+    emit(n, *a, m);
+    const bool is_empty = a->is_empty && b->is_empty;
     for (int i = 0; i < OUT; ++i) {
-        V by_a, by_b;
-        const V decay = Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
+        V by_a = none, by_b = none;
+        const V decay = is_empty
+            ? Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i])
+            : Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
         const V half = F(0.5) * bar[i] * measure(*a, *b, i);
         const V both = half * (a->w[i] + b->w[i]);
         wa_bar[i] = half * decay;
