@@ -62,6 +62,11 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
     const int *xm = (const int*)&x.m, *xi = (const int*)&x.i, *xj = (const int*)&x.j;
     const int *xp = (const int*)&x.p;
     const F *xa = (const F*)&x.a, *excess = (const F*)&x.excess;
+    bool is_wanted[CHANNELS], is_bent = false;
+    for (int c = 0; c < CHANNELS; ++c) {
+        is_wanted[c] = bars[c] && !P::every(v_bar[c] == P::all(F(0)));
+        is_bent = is_bent || (is_wanted[c] && c >= FIRST_MASS && c < FIRST_MASS + MASSES);
+    }
     for (int r = 0; r < node.runs; ++r) {
         const int begin = node.run[r].begin, end = node.run[r].end, first = node.run[r].first;
         const int low = node.run[r].low, high = node.run[r].high;
@@ -71,7 +76,7 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
             const V at_i = one_at(xi[l] - first), at_j = one_at(xj[l] - first);
             const F w1 = xa[l], w0 = F(1) - w1;
             L[l] = w0 * at_i + w1 * at_j;
-            if (MASSES)
+            if (is_bent)
                 bent[l] = (excess[l] * (w1 - F(2) * w0)) * at_i
                         + (excess[l] * (w0 - F(2) * w1)) * at_j
                         + (excess[l] * w0) * one_at(xm[l] - first)
@@ -84,7 +89,7 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
         #pragma clang loop unroll(disable)
         for (int c = 0; c < CHANNELS; ++c) {
             const int k = c - FIRST_MASS;
-            if (!bars[c] || P::every(v_bar[c] == P::all(F(0)))) continue;
+            if (!is_wanted[c]) continue;
             F* field = (F*)bars[c] + offset;
             V in_j = v_bar[c] * y.a, in_i = v_bar[c] - in_j, sum_i = P::all(F(0)), sum_j = sum_i;
             if (k >= 0 && k < MASSES) {

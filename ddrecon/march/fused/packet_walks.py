@@ -87,7 +87,9 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
             v_bar[s] += w_bar[i] * node.p[i];
             const V p_bar = w_bar[i] * scattering;
             V depth_bar = none;
-            if (IS_POINT[b]) {
+            if (node.is_empty) {
+                // What scatters nothing has no phase function to vary.
+            } else if (IS_POINT[b]) {
                 const V cosine = Point::cosine(ray.foot[b], ray.across[b], node.t);
                 if (HAS_PEAK) {
                     V by_depth, by_g;
