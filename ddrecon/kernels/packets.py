@@ -44,9 +44,9 @@ struct P {{
     INLINE V most(V a, V b) {{ return a > b ? a : b; }}
 #if defined(__CUDA_ARCH__)
     INLINE V all(F x) {{ return x; }}
-    INLINE I whole(V x) {{ return int(x); }}
+    INLINE I whole(V x) {{ return (int)x; }}
     INLINE V real(I x) {{ return F(x); }}
-    INLINE W wide(V x) {{ return double(x); }}
+    INLINE W wide(V x) {{ return (double)x; }}
     INLINE V narrow(W x) {{ return F(x); }}
     INLINE V root(V x) {{ return sqrt(x); }}
     INLINE V size(V x) {{ return x < F(0) ? -x : x; }}
@@ -98,7 +98,7 @@ struct P {{
     // The lanes' sum, in double precision.
     INLINE double sum(V x) {{
         double total = 0.0;
-        for (int l = 0; l < LANES; ++l) total += double(lane(x, l));
+        for (int l = 0; l < LANES; ++l) total += (double)lane(x, l);
         return total;
     }}
     // Entries first, first + step, ... of p; `last` stands for those beyond it.

@@ -26,6 +26,10 @@ from ddrecon.variables.values import value_of, with_values
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused.adjoint import adjoint_kernel  # noqa: E402
 from ddrecon.march.fused.layout import Layout  # noqa: E402
+from ddrecon.march.fused.packet_walks import (  # noqa: E402
+    packet_adjoint_kernel,
+    packet_integral_kernel,
+)
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -202,8 +206,10 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
     layout = Layout(3, 1, 3, (False, True), 0, 0, 32)
-    kernels = [integral_kernel(layout, True), tangent_kernel(layout, True)]
+    kernels = [integral_kernel(layout, False), tangent_kernel(layout, True)]
     kernels += [adjoint_kernel(layout, is_sliced, True) for is_sliced in (True, False)]
+    for several in (layout, Layout(3, 3, 3, (False, True), 3, 3, 64)):
+        kernels += [packet_integral_kernel(several), packet_adjoint_kernel(several)]
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)

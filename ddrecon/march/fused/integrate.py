@@ -23,9 +23,6 @@ from ddrecon.march.fused.rays import ray_types
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
 from ddrecon.numerics.autodiff import keep
 
-RAYS = slice(0, 2)
-"""Arguments, of those that vary, that rays' places enter: bundle and angles."""
-
 
 class Integrate(torch.autograd.Function):
     """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `rays.Bundle` has.
@@ -137,11 +134,12 @@ def _transpose_packets(
     layout, cells, (needs_polynomials, needs_fields) = ctx.layout, ctx.cells, needs
     masses, rays, angles, coefficients, numbers, *fields = ctx.saved_tensors
     given, _kept = _packets(layout, cells, (rays, angles, coefficients, numbers), fields)
+    wanted = list(zip(fields, needs_fields, strict=True))
     polynomials_bar = coefficients.new_empty(len(coefficients) * needs_polynomials, len(rays))
     numbers_bar = masses.new_empty(len(numbers), _packet_count(rays))
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
     shares = [
-        [f.new_zeros(f.shape) if is_needed else None for f, is_needed in zip(fields, needs_fields)]
+        [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
         for _ in range(thread_count(rays))
     ]
     pointers = [_pointers(layout, share, fields) for share in shares]
@@ -168,6 +166,7 @@ def _packets(
     """What kernels of packets are given, and tensors that must live as long as it does."""
     given = packet_types(layout).Given()
     kept = [field.contiguous() for field in fields]
+    assert cells.order is not None, "rays meet no slices"
     names = "planes", "slices", "rays", "angles", "coefficients", "numbers"
     for name, tensor in zip(names, (cells.planes, cells.order, *varied), strict=True):
         setattr(given, name, array(tensor))
@@ -178,7 +177,7 @@ def _packets(
 
 
 def _pointers(layout: Layout, tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> Any:
-    """Where each channel of contiguous `tensors` begins; 0 for those of None, which is as `like`."""
+    """Where each channel of contiguous `tensors`, which are as `like`, begins; 0 of those None."""
     places: list[int] = []
     for tensor, field in zip(tensors, like, strict=True):
         size = field[0].numel() * field.element_size()

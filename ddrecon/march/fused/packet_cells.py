@@ -1,7 +1,7 @@
-"""C++ of packets of rays: where a node lies among cells, the values there, and their adjoint.
+"""C++ of packets of rays: where a node lies among cells, and the values there.
 
 As `lines` and `planes` have it for one ray: linear interpolation in a slice, beams' masses to third
-order. Fields are read in place, and cotangents added in place, by strides.
+order. Fields are read in place, by strides.
 """
 
 PLACES = """

@@ -14,7 +14,8 @@ struct Ray {
     V o0, o1, o2, d0, d1, d2, near, far;
     V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * COEFFICIENTS + 1];
 };
-// Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at and `t` held in the box; values; emission, depth, exp(-depth), and p.
+// Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at
+// and `t` held in the box; values; emission, depth, exp(-depth), and p.
 struct Node {
     Place y, x;
     Corners q;
@@ -207,7 +208,19 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 
 def program(layout: Layout, walk: str) -> str:
     """C++ of `walk` along the rays number `packet` of `given`, of `layout`."""
-    parts = [_constants(layout), PLACES, RUNS, ROWS, VALUES, DECAYS, POLYNOMIALS, PHASES, _RECORDS, _BEGIN, walk]
+    parts = [
+        _constants(layout),
+        PLACES,
+        RUNS,
+        ROWS,
+        VALUES,
+        DECAYS,
+        POLYNOMIALS,
+        PHASES,
+        _RECORDS,
+        _BEGIN,
+        walk,
+    ]
     return packet_program(layout.bits, "".join(parts))
 
 
