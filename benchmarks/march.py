@@ -60,7 +60,7 @@ class Case:
         grid, bundle = self.scene.volume.grid, cast_rays(self.camera)
         crossing = cross_box(grid, bundle)
         fields = torch.cat([leaf.detach() for leaf in self.leaves])
-        sampler = make_sampler(Channels(fields), grid, choose_way(grid, bundle, crossing), 1)
+        sampler = make_sampler(Channels([fields]), grid, choose_way(grid, bundle, crossing), 1)
         if not isinstance(sampler, Bands):
             raise SystemExit("the view is not one by slices")
         whole = sampler.slices

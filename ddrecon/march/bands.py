@@ -6,6 +6,7 @@ that hold nothing for these rays are left out as well.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,50 +30,69 @@ REACH = 2
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """All `slices` of a volume, and the span of planes where each of their bands holds anything.
+    """`channels` in slices across `axis`, `steps` planes a cell, from below or `is_reversed`."""
 
-    A span is the first and the last such plane, None for an empty band.
-    """
+    channels: Channels
+    grid: Grid
+    axis: int
+    is_reversed: bool
+    steps: int
 
-    slices: Slices
-    spans: list[tuple[int, int] | None]
+    @functools.cached_property
+    def order(self) -> Tensor:
+        """Which slice of cells lies in each plane, before cells are subdivided."""
+        count = self.grid.shape[self.axis]
+        device = self.channels.fields[0].device
+        index = torch.arange(-1, count + 1, device=device).clamp(0, count - 1)
+        return index.flip(0) if self.is_reversed else index
 
-    @staticmethod
-    def of(channels: Channels, grid: Grid, axis: int, is_reversed: bool, steps: int) -> Bands:
-        """Those of `channels`, `steps` planes a cell along `axis`, from below or `is_reversed`."""
-        fields, count = channels.values, grid.shape[axis]
-        # Planes through the cell centers and in both faces of the box, in cells: 0, 0.5, 1.5, ...
-        place = torch.arange(count + 2, dtype=fields.dtype, device=fields.device) - 0.5
+    @functools.cached_property
+    def planes(self) -> Tensor:
+        """Planes [N] across the axis [u]: through all centers of cells, and both faces."""
+        grid, axis, like = self.grid, self.axis, self.channels.fields[0]
+        count = grid.shape[axis]
+        # In cells: 0, 0.5, 1.5, ...
+        place = torch.arange(count + 2, dtype=like.dtype, device=like.device) - 0.5
         planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
-        index = (place - 0.5).clamp(0, count - 1).long()
-        if is_reversed:
-            index, planes = index.flip(0), planes.flip(0)
-        row, column = across(axis)
+        return subdivide(planes.flip(0) if self.is_reversed else planes, self.steps)
+
+    @functools.cached_property
+    def slices(self) -> Slices:
+        """All slices, in bands."""
+        row, column = across(self.axis)
         # Rows are the second dimension in memory, so that each band of a plane is one piece.
         slices = (
-            fields.permute(1 + axis, 1 + row, 0, 1 + column).index_select(0, index).transpose(1, 2)
+            self.channels.values.permute(1 + self.axis, 1 + row, 0, 1 + column)
+            .index_select(0, self.order)
+            .transpose(1, 2)
         )
-        bands = subdivide(slices, steps, channels.third_order).split(BAND, 2)
-        whole = Slices(grid, axis, subdivide(planes, steps), bands, channels.third_order)
-        return Bands(whole, _spans(bands, channels.matter))
+        third_order = self.channels.third_order
+        bands = subdivide(slices, self.steps, third_order).split(BAND, 2)
+        return Slices(self.grid, self.axis, self.planes, bands, third_order)
+
+    @functools.cached_property
+    def spans(self) -> list[tuple[int, int] | None]:
+        """The first and the last plane where each band holds anything; None for an empty one."""
+        return _spans(self.slices.bands, self.channels.matter)
 
     @property
     def nodes(self) -> int:
         """How many a ray has."""
-        return len(self.slices.planes)
+        return len(self.planes)
 
     def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Slices]]:
         """All of `rays`, `count` at a time and neighbors together: indices, and what they meet."""
+        whole = self.slices
         with torch.no_grad():
-            distance = self.slices.distances(rays.origin, rays.direction)[[0, -1]]
-            row = across(self.slices.axis)[0]
+            distance = whole.distances(rays.origin, rays.direction)[[0, -1]]
+            row = across(self.axis)[0]
             rows = rays.origin[:, row] + distance * rays.direction[:, row]
         return self._meet(rows, rows.sum(0).argsort(stable=True).split(count))
 
     def lattice_parts(self, lattice: Lattice, count: int) -> list[tuple[Tensor, Slices]]:
         """All rows of `lattice`, `count` at a time: indices, and what their rays meet."""
         with torch.no_grad():
-            rows = lattice.crossings(self.slices.planes[[0, -1]], 0, lattice.rows)
+            rows = lattice.crossings(self.planes[[0, -1]], 0, lattice.rows)
         return self._meet(rows, torch.arange(rows.shape[1], device=rows.device).split(count))
 
     def _meet(self, rows: Tensor, chunks: Sequence[Tensor]) -> list[tuple[Tensor, Slices]]:

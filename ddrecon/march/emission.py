@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -70,13 +72,9 @@ class Sampled:
             emission.peak,
         )
 
-    def pack(self) -> Tensor:
-        """The different fields as channels of one tensor, which one interpolation serves."""
-        return torch.cat(self._fields())
-
     def unpack(self, values: Tensor) -> Sampled:
-        """The same fields at nodes, from `values` [N, channels, R] of the channels of `pack`."""
-        fields = iter(values.split([field.shape[0] for field in self._fields()], 1))
+        """The same fields at nodes, from `values` [N, channels, R] of the channels of `fields`."""
+        fields = iter(values.split([field.shape[0] for field in self.fields()], 1))
         extinction, diffuse = next(fields), next(fields)
         masses = tuple(next(fields) for _ in self.masses)
         scattering = next(fields) if self._has_own_scattering else extinction
@@ -85,7 +83,8 @@ class Sampled:
             peak = next(fields) if is_field(peak) else peak.view(-1, 1)
         return Sampled(extinction, diffuse, masses, scattering, peak)
 
-    def _fields(self) -> list[Tensor]:
+    def fields(self) -> list[Tensor]:
+        """Those that differ, in the order in which they are channels of one interpolation."""
         fields = [self.extinction, self.diffuse, *self.masses]
         if self._has_own_scattering:
             fields.append(self.scattering)
@@ -105,15 +104,20 @@ def is_field(peak: Tensor) -> bool:
 
 @dataclass(frozen=True)
 class Channels:
-    """Fields to interpolate: `values` [channels, z, y, x], linearly or to `third_order`.
+    """Fields to interpolate, each [channels, z, y, x], linearly or to `third_order`.
 
     Where the first `matter` channels are zero nothing is to be seen, and slices leave that out; 0:
     something may be anywhere.
     """
 
-    values: Tensor
+    fields: Sequence[Tensor]
     third_order: ThirdOrder | None = None
     matter: int = 0
+
+    @functools.cached_property
+    def values(self) -> Tensor:
+        """All fields as channels of one tensor, which one interpolation serves."""
+        return torch.cat(list(self.fields))
 
 
 def pack_channels(emission: Emission) -> Channels:
@@ -127,4 +131,4 @@ def pack_channels(emission: Emission) -> Channels:
     last = first + sum(mass.shape[0] for mass in cells.masses)
     third_order = ThirdOrder(first, last, emission.extinction.mass_bound) if cells.masses else None
     is_fixed = not (is_varied(cells.extinction) or is_varied(cells.scattering))
-    return Channels(cells.pack(), third_order, cells.extinction.shape[0] if is_fixed else 0)
+    return Channels(cells.fields(), third_order, cells.extinction.shape[0] if is_fixed else 0)

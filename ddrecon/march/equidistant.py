@@ -25,14 +25,14 @@ class Equidistant:
     """
 
     def __init__(self, channels: Channels, grid: Grid, longest: float, steps: int):
-        self.fields, self.third_order = channels.values, channels.third_order
-        self.lower = self.fields.new_tensor(grid.lower)
-        self.extent = self.fields.new_tensor(grid.extent)
+        self.channels = channels
+        like = channels.fields[0]
+        self.lower, self.extent = like.new_tensor(grid.lower), like.new_tensor(grid.extent)
         self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
 
     def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Equidistant]]:
         """All of `rays`, `count` at a time, in large volumes more: indices, and what they meet."""
-        size = max(count, self.fields[0].numel() // (CELLS_PER_NODE * self.nodes))
+        size = max(count, self.channels.fields[0][0].numel() // (CELLS_PER_NODE * self.nodes))
         indices = torch.arange(len(rays.direction), device=rays.direction.device)
         return [(chunk, self) for chunk in indices.split(size)]
 
@@ -43,5 +43,5 @@ class Equidistant:
         part = torch.linspace(0, 1, self.nodes, dtype=near.dtype, device=near.device)[:, None]
         distance = near + part * (far - near)
         points = 2 * (origin + distance[..., None] * direction - self.lower) / self.extent - 1
-        values = sample_volume(self.fields, points.flip(-1), self.third_order)
+        values = sample_volume(self.channels.values, points.flip(-1), self.channels.third_order)
         return values.transpose(0, 1), distance

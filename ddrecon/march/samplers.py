@@ -46,4 +46,4 @@ def make_sampler(channels: Channels, grid: Grid, way: Way, steps: int) -> Bands 
     """Slices of `channels`, in bands, or equal steps through them, `steps` to a cell."""
     if way.axis is None:
         return Equidistant(channels, grid, way.longest, steps)
-    return Bands.of(channels, grid, way.axis, way.is_reversed, steps)
+    return Bands(channels, grid, way.axis, way.is_reversed, steps)

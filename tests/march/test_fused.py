@@ -26,6 +26,10 @@ from ddrecon.variables.values import value_of, with_values
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused.adjoint import adjoint_kernel  # noqa: E402
 from ddrecon.march.fused.layout import Layout  # noqa: E402
+from ddrecon.march.fused.packet_walks import (  # noqa: E402
+    packet_adjoint_kernel,
+    packet_integral_kernel,
+)
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -51,7 +55,11 @@ def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: in
         name: factor * (0.5 + random_values(3, *SHAPE, seed=seed, dtype=dtype))
         for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
     }
-    scene = make_scene(density, g=0.5, camera=camera, **fields)
+    scene = (
+        make_scene(density, g=-0.3, camera=camera)
+        if kind == "points"
+        else make_scene(density, g=0.5, camera=camera, **fields)
+    )
     outside = PointLight(density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5]))
     inside = PointLight(density.new_tensor([0.1, 0.05, -0.1]), density.new_tensor([0.3]))
     scene.lights += [outside, inside]
@@ -90,11 +98,20 @@ EMISSIONS = [
     ("peaked", OUTSIDE, [*LIGHT, "sigma_s", *POSE]),
     ("fields", OUTSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
     ("fields", INSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
+    # With all rays where they are, packets of them are marched back.
+    ("gray", OUTSIDE, ["density", "g", "sigma_a", "sigma_s"]),
+    ("backward", OUTSIDE, LIGHT),
+    ("peaked", OUTSIDE, [*LIGHT, "sigma_s"]),
+    ("points", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
+    ("fields", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
 ]
 each_case = pytest.mark.parametrize(
     ("kind", "view", "names"),
     EMISSIONS,
-    ids=[f"{kind}-{'inside' if view is INSIDE else 'outside'}" for kind, view, _ in EMISSIONS],
+    ids=[
+        f"{kind}-{'inside' if view is INSIDE else 'outside'}-{names[-1]}"
+        for kind, view, names in EMISSIONS
+    ],
 )
 
 
@@ -189,8 +206,10 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
     layout = Layout(3, 1, 3, (False, True), 0, 0, 32)
-    kernels = [integral_kernel(layout, True), tangent_kernel(layout, True)]
+    kernels = [integral_kernel(layout, False), tangent_kernel(layout, True)]
     kernels += [adjoint_kernel(layout, is_sliced, True) for is_sliced in (True, False)]
+    for several in (layout, Layout(3, 3, 3, (False, True), 3, 3, 64)):
+        kernels += [packet_integral_kernel(several), packet_adjoint_kernel(several)]
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)

@@ -164,7 +164,7 @@ def test_where_both_sample_alike_transmittance_is_the_same():
     """At equal steps both take the depth by trapezoids."""
     emission, rays = emit(lit_scene(LIGHTS["two beams"], VIEWS["inside"]))
     crossing = cross_box(emission.grid, rays)
-    channels = Channels(emission.extinction.field)
+    channels = Channels([emission.extinction.field])
     way = choose_way(emission.grid, rays, crossing)
     count = make_sampler(channels, emission.grid, way, 1).nodes - 1
     torch.testing.assert_close(

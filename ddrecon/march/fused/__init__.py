@@ -1,7 +1,12 @@
-"""The view-ray integral as fused kernels (NVIDIA Warp): one thread a ray, nothing kept between.
+"""The view-ray integral as fused kernels (NVIDIA Warp): nothing is kept between out and back.
 
-`layout` says what a node holds and `rays` what a ray is; `lines`, `planes` and `sampling` find the
-values at a node, `nodes` what it emits (by the formulas of `optics`), and `segments` what arrives
-from between two. `walks` and `adjoint` are the kernels. `integrate` makes of them one function of
-tensors, and `march` calls that for an `Emission`.
+`layout` says what a node holds and `rays` what a ray is, `cells` where its nodes are.
+Rays that meet slices go in packets, a ray a lane of a processor's vectors: `packet_cells` and
+`packet_spread` have values at nodes and their adjoint, `packet_optics` the formulas, `packet_rays`
+what a node emits, and `packet_walks` the kernels.
+A ray a thread, in Warp's own language, are equal steps, derivatives by the rays themselves, and
+forward mode: `lines`, `planes` and `sampling` find the values at a node, `nodes` what it emits (by
+the formulas of `optics`), and `segments` what arrives from between two; `walks` and `adjoint` are
+the kernels.
+`integrate` makes of all that one function of tensors, and `march` calls it for an `Emission`.
 """

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.packets import LANES
 from ddrecon.march.fused.adjoint import adjoint_kernel
+from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_walks import (
+    packet_adjoint_kernel,
+    packet_integral_kernel,
+    packet_types,
+)
 from ddrecon.march.fused.rays import ray_types
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
 from ddrecon.numerics.autodiff import keep
@@ -20,81 +28,162 @@ class Integrate(torch.autograd.Function):
     """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `rays.Bundle` has.
 
     The masses come once more in double precision, for the walk back. Differentiable in both modes
-    with respect to all tensors but `planes`.
+    with respect to all tensors.
     """
 
     @staticmethod
     def forward(
         layout: Layout,
-        is_sliced: bool,
-        planes: Tensor,
-        cells: Tensor,
+        cells: Cells,
         rays: Tensor,
         angles: Tensor,
         coefficients: Tensor,
         numbers: Tensor,
+        *fields: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        given = _bundle(layout, planes, cells, rays, angles, coefficients, numbers)
-        out = cells.new_empty(layout.outputs, len(rays))
-        masses = cells.new_empty(layout.extinction, len(rays), dtype=torch.float64)
-        arguments = [given, array(out), array(masses)]
-        launch(integral_kernel(layout, is_sliced), len(rays), arguments, rays)
-        return out, masses.to(cells.dtype, copy=True), masses
+        out = rays.new_empty(layout.outputs, len(rays))
+        masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
+        varied = rays, angles, coefficients, numbers
+        if cells.is_sliced:
+            given, _kept = _packets(layout, cells, varied, fields)
+            kernel, count = packet_integral_kernel(layout), _packet_count(rays)
+        else:
+            given = _bundle(layout, cells.planes, cells.pack(fields), *varied)
+            kernel, count = integral_kernel(layout, False), len(rays)
+        launch(kernel, count, [given, array(out), array(masses)], rays)
+        return out, masses.to(rays.dtype, copy=True), masses
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.layout, ctx.is_sliced = inputs[:2]
+        ctx.layout, ctx.cells = inputs[:2]
         ctx.mark_non_differentiable(output[2])
-        keep(ctx, *inputs[2:], output[2])
+        keep(ctx, output[2], *inputs[2:])
 
     @staticmethod
     def backward(ctx: Any, out_bar: Tensor, masses_bar: Tensor, _: None) -> tuple[Any, ...]:
-        *inputs, masses = ctx.saved_tensors
-        planes, cells, rays, angles, coefficients, numbers = inputs
-        varies_rays = any(ctx.needs_input_grad[4:7])
-        given = _bundle(ctx.layout, *inputs)
-        bars = [torch.zeros_like(x if varies_rays else x[:0]) for x in (rays, angles, coefficients)]
-        numbers_bar = cells.new_empty(len(numbers), len(rays))
-        # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        shares = [torch.zeros_like(cells) for _ in range(thread_count(rays))]
-        fixed = [given, *map(array, (masses, out_bar, masses_bar))]
-        bundles = [_bundle(ctx.layout, planes, share, *bars, numbers) for share in shares]
-        kernel = adjoint_kernel(ctx.layout, ctx.is_sliced, varies_rays)
-        launch(kernel, len(rays), lambda i: [*fixed, bundles[i], array(numbers_bar)], rays)
-        cells_bar = functools.reduce(Tensor.add_, shares)
-        found = bars if varies_rays else [None, None, None]
-        return None, None, None, cells_bar, *found, numbers_bar.sum(1)
+        needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
+        varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))
+        if ctx.cells.is_sliced and not varies_rays:
+            needs = needs_polynomials, ctx.needs_input_grad[6:]
+            found = _transpose_packets(ctx, needs, out_bar, masses_bar)
+        else:
+            varies_rays = varies_rays or needs_angles or needs_polynomials
+            found = _transpose(ctx, varies_rays, out_bar, masses_bar)
+        return None, None, *found
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
-        planes, *varied, _ = ctx.saved_tensors
+        varied = ctx.saved_tensors[1:]
         d_varied = [
             torch.zeros_like(tensor) if change is None else change
-            for tensor, change in zip(varied, changes[3:], strict=True)
+            for tensor, change in zip(varied, changes[2:], strict=True)
         ]
-        d_out, d_masses = _Tangent.apply(ctx.layout, ctx.is_sliced, planes, *varied, *d_varied)
+        d_out, d_masses = _Tangent.apply(ctx.layout, ctx.cells, *varied, *d_varied)
         return d_out, d_masses, None
 
 
 class _Tangent(torch.autograd.Function):
-    """The changes of outputs and masses with those of all tensors but `planes`.
+    """The changes of outputs and masses with those of all tensors.
 
     A function of its own, so that torch.func hands it plain tensors, which kernels need.
     """
 
     @staticmethod
-    def forward(layout: Layout, is_sliced: bool, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        planes, cells, rays = tensors[:3]
-        bundles = [_bundle(layout, planes, *part) for part in (tensors[1:6], tensors[6:])]
-        d_out = cells.new_empty(layout.outputs, len(rays))
-        d_masses = cells.new_empty(layout.extinction, len(rays))
+    def forward(layout: Layout, cells: Cells, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        rays, count = tensors[0], len(tensors) // 2
+        bundles = [
+            _bundle(layout, cells.planes, cells.pack(part[4:]), *part[:4])
+            for part in (tensors[:count], tensors[count:])
+        ]
+        d_out = rays.new_empty(layout.outputs, len(rays))
+        d_masses = rays.new_empty(layout.extinction, len(rays))
         arguments = [*bundles, array(d_out), array(d_masses)]
-        launch(tangent_kernel(layout, is_sliced), len(rays), arguments, rays)
+        launch(tangent_kernel(layout, cells.is_sliced), len(rays), arguments, rays)
         return d_out, d_masses
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
         ctx.mark_non_differentiable(*output)
+
+
+def _transpose(
+    ctx: Any, varies_rays: bool, out_bar: Tensor, masses_bar: Tensor
+) -> list[Tensor | None]:
+    """Cotangents of all tensors, a ray a thread; those of rays only where it `varies_rays`."""
+    layout, cells = ctx.layout, ctx.cells
+    masses, rays, angles, coefficients, numbers, *fields = ctx.saved_tensors
+    packed = cells.pack(fields)
+    given = _bundle(layout, cells.planes, packed, rays, angles, coefficients, numbers)
+    bars = [torch.zeros_like(x if varies_rays else x[:0]) for x in (rays, angles, coefficients)]
+    numbers_bar = rays.new_empty(len(numbers), len(rays))
+    # Each thread adds to cells of its own: the same bits, whichever of them is faster.
+    shares = [torch.zeros_like(packed) for _ in range(thread_count(rays))]
+    fixed = [given, *map(array, (masses, out_bar, masses_bar))]
+    bundles = [_bundle(layout, cells.planes, share, *bars, numbers) for share in shares]
+    kernel = adjoint_kernel(layout, cells.is_sliced, varies_rays)
+    launch(kernel, len(rays), lambda i: [*fixed, bundles[i], array(numbers_bar)], rays)
+    found = bars if varies_rays else [None, None, None]
+    fields_bar = cells.unpack(functools.reduce(Tensor.add_, shares), fields)
+    return [*found, numbers_bar.sum(1), *fields_bar]
+
+
+def _transpose_packets(
+    ctx: Any, needs: tuple[bool, Sequence[bool]], out_bar: Tensor, masses_bar: Tensor
+) -> list[Tensor | None]:
+    """The same in packets of rays, but of rays; of polynomials and fields those it `needs`."""
+    layout, cells, (needs_polynomials, needs_fields) = ctx.layout, ctx.cells, needs
+    masses, rays, angles, coefficients, numbers, *fields = ctx.saved_tensors
+    given, _kept = _packets(layout, cells, (rays, angles, coefficients, numbers), fields)
+    wanted = list(zip(fields, needs_fields, strict=True))
+    polynomials_bar = coefficients.new_empty(len(coefficients) * needs_polynomials, len(rays))
+    numbers_bar = masses.new_empty(len(numbers), _packet_count(rays))
+    # Each thread adds to cells of its own: the same bits, whichever of them is faster.
+    shares = [
+        [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
+        for _ in range(thread_count(rays))
+    ]
+    pointers = [_pointers(layout, share, fields) for share in shares]
+    fixed = [given, *map(array, (masses, out_bar, masses_bar))]
+    rest = [array(polynomials_bar), array(numbers_bar)]
+    kernel = packet_adjoint_kernel(layout)
+    launch(kernel, _packet_count(rays), lambda i: [*fixed, pointers[i], *rest], rays)
+    for share in shares[1:]:
+        for total, part in zip(shares[0], share, strict=True):
+            if total is not None:
+                total += part
+    found = polynomials_bar if needs_polynomials else None
+    return [None, None, found, numbers_bar.sum(1).to(numbers.dtype), *shares[0]]
+
+
+def _packet_count(rays: Tensor) -> int:
+    lanes = 1 if rays.is_cuda else LANES
+    return -(-len(rays) // lanes)
+
+
+def _packets(
+    layout: Layout, cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]
+) -> tuple[Any, list[Tensor]]:
+    """What kernels of packets are given, and tensors that must live as long as it does."""
+    given = packet_types(layout).Given()
+    kept = [field.contiguous() for field in fields]
+    assert cells.order is not None, "rays meet no slices"
+    names = "planes", "slices", "rays", "angles", "coefficients", "numbers"
+    for name, tensor in zip(names, (cells.planes, cells.order, *varied), strict=True):
+        setattr(given, name, array(tensor))
+    given.fields = _pointers(layout, kept, fields)
+    for name, number in cells.strides(fields[0].shape).items():
+        setattr(given, name, number)
+    return given, kept
+
+
+def _pointers(layout: Layout, tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> Any:
+    """Where each channel of contiguous `tensors`, which are as `like`, begins; 0 of those None."""
+    places: list[int] = []
+    for tensor, field in zip(tensors, like, strict=True):
+        size = field[0].numel() * field.element_size()
+        begin = None if tensor is None else tensor.data_ptr()
+        places += [0 if begin is None else begin + c * size for c in range(len(field))]
+    return packet_types(layout).Fields(*places)
 
 
 def _bundle(layout: Layout, *tensors: Tensor) -> Any:

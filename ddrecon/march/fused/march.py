@@ -15,6 +15,7 @@ from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.march.emission import Emission, is_field
 from ddrecon.march.equidistant import Equidistant
+from ddrecon.march.fused.cells import cells_of
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.lattice import Lattice
@@ -43,8 +44,8 @@ def _integrate(
     emission: Emission, sampler: Bands | Equidistant, rays: Rays, near: Tensor, far: Tensor
 ) -> Tensor:
     """Scattered radiance and opacity [2 C, R] along `rays` between `near` and `far` [R] [u]."""
-    layout, is_sliced = layout_of(emission), isinstance(sampler, Bands)
-    planes, cells, bound = _cells(sampler, near)
+    layout, (cells, fields) = layout_of(emission), cells_of(sampler)
+    bound = _bound(sampler, near)
     origin, direction = _in_cells(rays, emission.grid, sampler)
     bundle = torch.cat([origin, direction, near[:, None], far[:, None]], 1)
     feet, squares, coefficients, factors = _beams(emission, rays)
@@ -54,7 +55,7 @@ def _integrate(
         peak = emission.peak.view(-1).expand(layout.colors)
     numbers = torch.cat([scale, peak, emission.g.view(1), bound])
     out, masses, _ = Integrate.apply(
-        layout, is_sliced, planes, cells, bundle, torch.cat([feet, squares]), coefficients, numbers
+        layout, cells, bundle, torch.cat([feet, squares]), coefficients, numbers, *fields
     )
     # What does not change along a ray is multiplied in here: irradiance, and p where there is no
     # peak (E2); the scale of kappa_s; and E1's 1 - tau of what is behind.
@@ -79,17 +80,11 @@ def layout_of(emission: Emission) -> Layout:
     )
 
 
-def _cells(sampler: Bands | Equidistant, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Planes [N], values [n, h, w, channels] and the bound [1] of third-order corrections."""
-    if isinstance(sampler, Bands):
-        slices = sampler.slices
-        planes, third_order = slices.planes, slices.third_order
-        cells = torch.cat(slices.bands, 2).permute(0, 2, 3, 1)
-    else:
-        planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
-        third_order, cells = sampler.third_order, sampler.fields.permute(1, 2, 3, 0)
+def _bound(sampler: Bands | Equidistant, like: Tensor) -> Tensor:
+    """The bound [1] of third-order corrections."""
+    third_order = sampler.channels.third_order
     bound = like.new_zeros(()) if third_order is None else third_order.bound
-    return planes, cells.contiguous(), torch.as_tensor(bound).to(like).view(1)
+    return torch.as_tensor(bound).to(like).view(1)
 
 
 def _in_cells(rays: Rays, grid: Grid, sampler: Bands | Equidistant) -> tuple[Tensor, Tensor]:
@@ -102,7 +97,7 @@ def _in_cells(rays: Rays, grid: Grid, sampler: Bands | Equidistant) -> tuple[Ten
     direction = rays.direction / spacing
     if not isinstance(sampler, Bands):
         return origin, direction
-    axis = sampler.slices.axis
+    axis = sampler.axis
     order = list(across(axis))
     return (
         torch.cat([rays.origin[:, [axis]], origin[:, order]], 1),

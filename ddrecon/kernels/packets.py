@@ -1,0 +1,152 @@
+"""C++ for kernels whose items are many alike: a packet of them runs in a processor's vector lanes.
+
+Where neighboring items need values from places of their own (rays that walk through cells), a loop
+over numbers beside each other does not do. Then every value is a vector `V` of LANES numbers, one
+of each item, and the text reads as that for a single item does: `a * b`, `pick(a < b, a, b)`. On a
+GPU a packet is one item, `V` a plain number, and a thread does it.
+
+    @wp.func_native(packet_program(bits, "V x = P::load(given.x.data, first, 1, last); ..."))
+
+`V` are numbers of type `F`, `I` whole numbers, `W` numbers in double precision; `P` has the
+functions below.
+"""
+
+from __future__ import annotations
+
+import math
+
+LANES = 16
+"""Items in a packet on a processor."""
+
+_TEXT = """
+typedef {number} F;
+#if defined(__CUDA_ARCH__)
+typedef F V;
+typedef int I;
+typedef double W;
+typedef bool M;
+typedef bool IM;
+constexpr int LANES = 1;
+#define INLINE static __device__ __forceinline__
+#else
+constexpr int LANES = {lanes};
+typedef F V __attribute__((vector_size(LANES * sizeof(F))));
+typedef int I __attribute__((vector_size(LANES * sizeof(int))));
+typedef double W __attribute__((vector_size(LANES * sizeof(double))));
+typedef decltype(V{{}} < V{{}}) M;
+typedef I IM;
+#define INLINE static inline __attribute__((always_inline))
+#endif
+struct P {{
+    INLINE V pick(M is, V one, V other) {{ return is ? one : other; }}
+    INLINE I pick(IM is, I one, I other) {{ return is ? one : other; }}
+    INLINE V least(V a, V b) {{ return a < b ? a : b; }}
+    INLINE V most(V a, V b) {{ return a > b ? a : b; }}
+#if defined(__CUDA_ARCH__)
+    INLINE V all(F x) {{ return x; }}
+    INLINE I whole(V x) {{ return (int)x; }}
+    INLINE V real(I x) {{ return F(x); }}
+    INLINE W wide(V x) {{ return (double)x; }}
+    INLINE V narrow(W x) {{ return F(x); }}
+    INLINE V root(V x) {{ return sqrt(x); }}
+    INLINE V size(V x) {{ return x < F(0) ? -x : x; }}
+    INLINE bool every(M is) {{ return is; }}
+    INLINE F lane(V x, int) {{ return x; }}
+    INLINE double lane_of(W x, int) {{ return x; }}
+    INLINE W load_wide(const double* p, int first, int) {{ return p[first]; }}
+    INLINE void put(V& x, int, F value) {{ x = value; }}
+    INLINE V gather(const F* p, I at) {{ return p[at]; }}
+    INLINE void add(F* p, I at, V x) {{ atomicAdd(p + at, x); }}
+    INLINE V decay(V depth) {{ return {exp}(-depth); }}
+#else
+    INLINE V all(F x) {{ return x - V{{}}; }}
+    INLINE I whole(V x) {{ return __builtin_convertvector(x, I); }}
+    INLINE V real(I x) {{ return __builtin_convertvector(x, V); }}
+    INLINE W wide(V x) {{ return __builtin_convertvector(x, W); }}
+    INLINE V narrow(W x) {{ return __builtin_convertvector(x, V); }}
+    INLINE V root(V x) {{ return __builtin_elementwise_sqrt(x); }}
+    INLINE V size(V x) {{ return __builtin_elementwise_abs(x); }}
+    INLINE bool every(M is) {{ return __builtin_reduce_and(is) != 0; }}
+    INLINE F lane(V x, int l) {{ return x[l]; }}
+    INLINE double lane_of(W x, int l) {{ return x[l]; }}
+    INLINE W load_wide(const double* p, int first, int last) {{
+        W x;
+        for (int l = 0; l < LANES; ++l) x[l] = p[first + l < last ? first + l : last];
+        return x;
+    }}
+    INLINE void put(V& x, int l, F value) {{ x[l] = value; }}
+    INLINE V gather(const F* p, I at) {{
+        V x;
+        for (int l = 0; l < LANES; ++l) x[l] = p[at[l]];
+        return x;
+    }}
+    INLINE void add(F* p, I at, V x) {{
+        for (int l = 0; l < LANES; ++l) p[at[l]] += x[l];
+    }}
+    // exp(-depth) = 2^n e^r with n whole and |r| < log(2) / 2, as in `native`.
+    INLINE V decay(V depth) {{
+        const V x = pick(depth < all(F({most})), -most(depth, all(F(-{most}))), all(F(-{most})));
+        const V shifted = x * F(1.4426950408889634074) + F({shift});
+        const V n = shifted - F({shift});
+        const V r = (x - n * F({log2_high})) - n * F({log2_low});
+        V p = all(F({first}));
+        {horner}
+        return __builtin_bit_cast(
+            V, __builtin_bit_cast(M, p) + (__builtin_bit_cast(M, shifted) << {digits}));
+    }}
+#endif
+    // The lanes' sum, in double precision.
+    INLINE double sum(V x) {{
+        double total = 0.0;
+        for (int l = 0; l < LANES; ++l) total += (double)lane(x, l);
+        return total;
+    }}
+    // Entries first, first + step, ... of p; `last` stands for those beyond it.
+    INLINE V load(const F* p, int first, int step, int last) {{
+        V x = all(F(0));
+        for (int l = 0; l < LANES; ++l)
+            put(x, l, p[(long long)(first + l < last ? first + l : last) * step]);
+        return x;
+    }}
+    // (1 - phi(depth)) / depth of depths from 0 to 1/2, where phi = (1 - exp(-depth)) / depth.
+    INLINE V psi_series(V depth) {{
+        V p = all(F({psi_first}));
+        {psi}
+        return p;
+    }}
+}};
+"""
+
+
+def _taylor(terms: int, shift: int, sign: int) -> tuple[str, str]:
+    """The last of `terms` coefficients sign^k / (k + shift)!, and Horner's lines for the others."""
+    coefficients = [sign**k / math.factorial(k + shift) for k in range(terms)]
+    variable = "depth" if shift else "r"
+    lines = [f"p = p * {variable} + F({c!r});" for c in reversed(coefficients[:-1])]
+    return repr(coefficients[-1]), " ".join(lines)
+
+
+def _text(bits: int, **names: object) -> str:
+    first, horner = _taylor(14 if bits == 64 else 8, 0, 1)
+    psi_first, psi = _taylor(14 if bits == 64 else 8, 2, -1)
+    return _TEXT.format(
+        first=first, horner=horner, psi_first=psi_first, psi=psi, lanes=LANES, **names
+    )
+
+
+_TEXTS = {
+    32: _text(
+        32, number="float", exp="expf", most="87.0", shift="12582912.0", digits=23,
+        log2_high="0.693145751953125", log2_low="1.42860682030941723212e-6",
+    ),
+    64: _text(
+        64, number="double", exp="exp", most="700.0",
+        shift="6755399441055744.0", digits=52,
+        log2_high="0.693147180369123816490", log2_low="1.90821492927058770002e-10",
+    ),
+}  # fmt: skip
+
+
+def packet_program(bits: int, body: str) -> str:
+    """C++ for `wp.func_native`: `body` behind the types and functions of packets."""
+    return _TEXTS[bits] + body

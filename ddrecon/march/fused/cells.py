@@ -1,0 +1,76 @@
+"""The cells that nodes of rays lie in, as kernels are given them: in place, or packed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.march.bands import Bands
+from ddrecon.march.equidistant import Equidistant
+from ddrecon.numerics.slicing import across
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Where nodes of rays are among cells of fields [channels, ., ., .].
+
+    `planes` [N]: nodes, across the slices [u] or as parts of the way from near to far. `order` [N]
+    (int32) are the slices across `axis` in which these lie; None where rays meet no slices.
+    """
+
+    planes: Tensor
+    axis: int = 0
+    order: Tensor | None = None
+
+    @property
+    def is_sliced(self) -> bool:
+        """Whether nodes lie in slices."""
+        return self.order is not None
+
+    def strides(self, shape: Sequence[int]) -> dict[str, int]:
+        """How many cells on the next one is, and how many there are; of fields of `shape`."""
+        along = (shape[-2] * shape[-1], shape[-1], 1)
+        row, column = across(self.axis)
+        return {
+            "plane_stride": along[self.axis],
+            "row_stride": along[row],
+            "column_stride": along[column],
+            "rows": shape[row - 3],
+            "columns": shape[column - 3],
+        }
+
+    def pack(self, fields: Sequence[Tensor]) -> Tensor:
+        """Values [n, h, w, channels] of all `fields`, in the order in which rays meet them."""
+        values = torch.cat(list(fields)).permute(self._dims)
+        return (values if self.order is None else values[self.order.long()]).contiguous()
+
+    def unpack(self, bars: Tensor, fields: Sequence[Tensor]) -> list[Tensor]:
+        """Cotangents of `fields` from those [n, h, w, channels] of what `pack` made of them."""
+        shape = [fields[0].shape[dim] for dim in self._dims[:3]]
+        if self.order is not None:
+            bars = bars.new_zeros(*shape, bars.shape[3]).index_add_(0, self.order, bars)
+        inverse = [self._dims.index(dim) for dim in range(4)]
+        return list(bars.permute(inverse).split([len(field) for field in fields]))
+
+    @property
+    def _dims(self) -> tuple[int, int, int, int]:
+        row, column = across(self.axis)
+        return (1 + self.axis, 1 + row, 1 + column, 0)
+
+
+def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
+    """Where nodes lie for `sampler`, and the fields among whose cells that is."""
+    fields = list(sampler.channels.fields)
+    if not isinstance(sampler, Bands):
+        like = fields[0]
+        planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
+        return Cells(planes), fields
+    if sampler.steps == 1:
+        return Cells(sampler.planes, sampler.axis, sampler.order.int()), fields
+    # Slices between those of cells are interpolated beforehand.
+    whole = sampler.slices
+    order = torch.arange(sampler.nodes, dtype=torch.int32, device=whole.planes.device)
+    return Cells(whole.planes, 0, order), [torch.cat(whole.bands, 2).transpose(0, 1)]

@@ -1,0 +1,258 @@
+"""C++ of packets of rays: what a ray and a node are, where nodes lie, and what they emit.
+
+The text of a kernel is that of `program(layout, walk)`: constants of the layout, all structs, and
+what comes before every walk.
+"""
+
+from ddrecon.kernels.packets import packet_program
+from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
+from ddrecon.march.fused.packet_optics import DECAYS, PHASES, POLYNOMIALS
+
+_RECORDS = """
+struct Ray {
+    V o0, o1, o2, d0, d1, d2, near, far;
+    V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * COEFFICIENTS + 1];
+};
+// Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at
+// and `t` held in the box; values; emission, depth, exp(-depth), and p.
+struct Node {
+    Place y, x;
+    Corners q;
+    int runs;
+    bool is_empty, is_lit;
+#if !defined(__CUDA_ARCH__)
+    Run run[LANES];
+#endif
+    V s, t, v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
+};
+"""
+_BEGIN = """
+const int last = given.rays.shape[0] - 1, begin = packet * LANES;
+const F* numbers = given.numbers.data;
+const F* scale = numbers;
+const F* peaks = numbers + C;
+const F g = numbers[2 * C], bound = numbers[2 * C + 1];
+Ray ray;
+const F* of_rays = given.rays.data;
+ray.o0 = P::load(of_rays, begin, 8, last);
+ray.o1 = P::load(of_rays + 1, begin, 8, last);
+ray.o2 = P::load(of_rays + 2, begin, 8, last);
+ray.d0 = P::load(of_rays + 3, begin, 8, last);
+ray.d1 = P::load(of_rays + 4, begin, 8, last);
+ray.d2 = P::load(of_rays + 5, begin, 8, last);
+ray.near = P::load(of_rays + 6, begin, 8, last);
+ray.far = P::load(of_rays + 7, begin, 8, last);
+for (int b = 0; b < BEAMS; ++b) {
+    ray.foot[b] = P::load(given.angles.data + b * (last + 1), begin, 1, last);
+    ray.across[b] = P::load(given.angles.data + (BEAMS + b) * (last + 1), begin, 1, last);
+}
+if (HAS_PEAK)
+    for (int k = 0; k < BEAMS * COEFFICIENTS; ++k)
+        ray.coefficients[k] = P::load(given.coefficients.data + k * (last + 1), begin, 1, last);
+auto distance = [&](int n) -> V { return (given.planes.data[n] - ray.o0) / ray.d0; };
+// Nodes before the box and behind it are held at its faces: between them nothing is added.
+int first_node = 0, last_node = given.planes.shape[0] - 1;
+while (first_node < last_node && P::every(distance(first_node + 1) <= ray.near)) ++first_node;
+while (last_node > first_node && P::every(distance(last_node - 1) >= ray.far)) --last_node;
+if (P::every(ray.near >= ray.far)) last_node = first_node;
+// Along y the packet's rays are closer together than along x.
+Lines lines = {given.rows, given.columns, given.row_stride, given.column_stride};
+if (LANES > 1) {
+    const V s = distance((first_node + last_node) / 2);
+    const V y = ray.o1 + s * ray.d1, x = ray.o2 + s * ray.d2;
+    const int end = begin + LANES <= last ? LANES - 1 : last - begin;
+    const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
+    if (high * high > wide * wide) {
+        lines = {given.columns, given.rows, given.column_stride, given.row_stride};
+        const V o = ray.o1, d = ray.d1;
+        ray.o1 = ray.o2;
+        ray.d1 = ray.d2;
+        ray.o2 = o;
+        ray.d2 = d;
+    }
+}
+auto slice = [&](int n) -> long long {
+    return (long long)given.slices.data[n] * given.plane_stride;
+};
+// Values of channels `from` to before `to`, of each lane by itself.
+auto sample_lanes = [&](Node& node, long long offset, int from, int to) {
+    for (int c = from; c < to; ++c) {
+        const F* field = (const F*)given.fields[c] + offset;
+        const int k = c - FIRST_MASS;
+        node.v[c] = k >= 0 && k < MASSES
+            ? Values::curved(field, node.q, node.y, node.x, lines, node.bend[k])
+            : Values::linear(field, node.q);
+    }
+};
+#if !defined(__CUDA_ARCH__)
+I lanes_numbers;
+for (int l = 0; l < LANES; ++l) lanes_numbers[l] = l;
+auto sample_runs = [&](Node& node, long long offset, int from, int to) {
+    const Place &y = node.y, &x = node.x;
+    for (int r = 0; r < node.runs; ++r) {
+        const Run& run = node.run[r];
+        const I xm = x.m - run.first, xi = x.i - run.first;
+        const I xj = x.j - run.first, xp = x.p - run.first;
+        const V number = P::real(lanes_numbers);
+        const M is_in = (number >= F(run.begin)) & (number < F(run.end));
+        const long long at_m = (long long)y.m[run.begin] * lines.row;
+        const long long at_i = (long long)y.i[run.begin] * lines.row;
+        const long long at_j = (long long)y.j[run.begin] * lines.row;
+        const long long at_p = (long long)y.p[run.begin] * lines.row;
+        for (int c = from; c < to; ++c) {
+            const F* field = (const F*)given.fields[c] + offset;
+            const int k = c - FIRST_MASS;
+            const V row_i = Rows::read(field + at_i, run.first, lines.column);
+            const V row_j = Rows::read(field + at_j, run.first, lines.column);
+            const V i0 = Rows::pick(row_i, xi), i1 = Rows::pick(row_i, xj);
+            const V j0 = Rows::pick(row_j, xi), j1 = Rows::pick(row_j, xj);
+            const V top = i0 + x.a * (i1 - i0), low = j0 + x.a * (j1 - j0);
+            const V value = top + y.a * (low - top);
+            node.v[c] = P::pick(is_in, value, node.v[c]);
+            if (k >= 0 && k < MASSES) {
+                const V row_m = Rows::read(field + at_m, run.first, lines.column);
+                const V row_p = Rows::read(field + at_p, run.first, lines.column);
+                const V m0 = Rows::pick(row_m, xi), p0 = Rows::pick(row_p, xi);
+                const V over = m0 + x.a * (Rows::pick(row_m, xj) - m0);
+                const V under = p0 + x.a * (Rows::pick(row_p, xj) - p0);
+                // Second differences along y, and along x in both rows.
+                const V along_y = (F(1) - y.a) * (over - F(2) * top + low)
+                                + y.a * (top - F(2) * low + under);
+                const V in_i = (F(1) - x.a) * (Rows::pick(row_i, xm) - F(2) * i0 + i1)
+                             + x.a * (i0 - F(2) * i1 + Rows::pick(row_i, xp));
+                const V in_j = (F(1) - x.a) * (Rows::pick(row_j, xm) - F(2) * j0 + j1)
+                             + x.a * (j0 - F(2) * j1 + Rows::pick(row_j, xp));
+                const V along_x = in_i + y.a * (in_j - in_i);
+                const V bend = y.excess * along_y + x.excess * along_x;
+                node.bend[k] = P::pick(is_in, bend, node.bend[k]);
+            }
+        }
+    }
+};
+#endif
+auto sample = [&](Node& node, int n, int from, int to) {
+#if !defined(__CUDA_ARCH__)
+    if (HAS_PERMUTATION && node.runs <= MOST_RUNS && lines.columns >= LANES)
+        sample_runs(node, slice(n), from, to);
+    else
+#endif
+        sample_lanes(node, slice(n), from, to);
+};
+// Where node n lies, and the matter there.
+auto locate = [&](int n, Node& node) {
+    node.s = distance(n);
+    node.t = P::least(P::most(node.s, ray.near), ray.far);
+    node.y = Place::at(ray.o1 + node.s * ray.d1, lines.rows);
+    node.x = Place::at(ray.o2 + node.s * ray.d2, lines.columns);
+    node.q = Corners::of(node.y, node.x, lines);
+#if !defined(__CUDA_ARCH__)
+    node.runs = find_runs(node.y, node.x, lines, node.run);
+#endif
+    sample(node, n, 0, EXTINCTION);
+    if (SCATTERING) sample(node, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
+    node.is_empty = true;
+    for (int c = 0; c < EXTINCTION; ++c)
+        node.is_empty = node.is_empty && P::every(node.v[c] == P::all(F(0)));
+    for (int c = FIRST_OWN_SCATTERING; c < FIRST_PEAK; ++c)
+        node.is_empty = node.is_empty && P::every(node.v[c] == P::all(F(0)));
+};
+auto peak_of = [&](const Node& node, int c) -> V {
+    return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
+};
+// All else at node n: all outputs' emission, depth and p behind the mass `m`.
+auto emit = [&](int n, Node& node, const W* m) {
+    sample(node, n, EXTINCTION, FIRST_OWN_SCATTERING);
+    if (IS_PEAK_FIELD) sample(node, n, FIRST_PEAK, CHANNELS);
+    for (int k = 0; k < MASSES; ++k) {
+        const V bent = bound * node.bend[k];
+        node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
+    }
+    for (int c = 0; c < C; ++c) {
+        const V mass = P::narrow(m[c * MASS_STEP]);
+        const V scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
+        node.w[c] = scattering * node.v[FIRST_DIFFUSE + c * DIFFUSE_STEP];
+        node.u[c] = scale[c] * mass;
+        for (int b = 0; b < BEAMS; ++b) {
+            const int i = C + b * C + c;
+            const V way = mass + node.v[FIRST_MASS + b * EXTINCTION + c * MASS_STEP];
+            V p = P::all(F(1));
+            if (IS_POINT[b]) {
+                const V cosine = Point::cosine(ray.foot[b], ray.across[b], node.t);
+                p = HAS_PEAK ? Phase::peaked(peak_of(node, c) * way, cosine, g)
+                             : Phase::plain(cosine, g);
+            } else if (HAS_PEAK) {
+                const V* polynomial = ray.coefficients + b * COEFFICIENTS;
+                const V place = Polynomial::place(peak_of(node, c) * way);
+                p = P::most(Polynomial::at(polynomial, place), P::all(F(0)));
+            }
+            node.p[i] = p;
+            node.w[i] = scattering * p;
+            node.u[i] = scale[c] * way;
+        }
+    }
+    for (int i = 0; i < OUT; ++i) node.decay[i] = P::decay(node.u[i]);
+};
+auto mass_between = [&](const Node& a, const Node& b, int k) -> W {
+    return P::wide(F(0.5) * (a.v[k] + b.v[k]) * (b.t - a.t));
+};
+// What output i is integrated by: length, or for a point light the integral of 1 / r^2.
+auto measure = [&](const Node& a, const Node& b, int i) -> V {
+    const int beam = i / C - 1;
+    if (i >= C && IS_POINT[beam])
+        return Point::subtended(ray.foot[beam], ray.across[beam], a.t, b.t);
+    return b.t - a.t;
+};
+"""
+
+
+def program(layout: Layout, walk: str) -> str:
+    """C++ of `walk` along the rays number `packet` of `given`, of `layout`."""
+    parts = [
+        _constants(layout),
+        PLACES,
+        RUNS,
+        ROWS,
+        VALUES,
+        DECAYS,
+        POLYNOMIALS,
+        PHASES,
+        _RECORDS,
+        _BEGIN,
+        walk,
+    ]
+    return packet_program(layout.bits, "".join(parts))
+
+
+def _constants(layout: Layout) -> str:
+    """Where in a node the channels of color c are: the first of a kind plus c times its step."""
+    mass_step = int(layout.extinction > 1)
+    first_scattering, scattering_step = (
+        (layout.first_scattering, int(layout.scattering > 1))
+        if layout.scattering
+        else (0, mass_step)
+    )
+    numbers = {
+        "MOST_RUNS": 5,
+        "C": layout.colors,
+        "EXTINCTION": layout.extinction,
+        "BEAMS": len(layout.beams),
+        "MASSES": layout.masses,
+        "CHANNELS": layout.channels,
+        "OUT": layout.outputs,
+        "MASS_STEP": mass_step,
+        "FIRST_DIFFUSE": layout.extinction,
+        "DIFFUSE_STEP": int(layout.diffuse > 1),
+        "FIRST_MASS": layout.first_mass,
+        "FIRST_SCATTERING": first_scattering,
+        "SCATTERING_STEP": scattering_step,
+        "SCATTERING": layout.scattering,
+        "FIRST_OWN_SCATTERING": layout.first_scattering,
+        "FIRST_PEAK": layout.first_peak,
+        "PEAK_STEP": int((layout.peak or 0) > 1),
+        "HAS_PEAK": int(layout.peak is not None),
+        "IS_PEAK_FIELD": int(bool(layout.peak)),
+    }
+    lines = [f"constexpr int {name} = {number};" for name, number in numbers.items()]
+    points = ", ".join(str(int(is_point)) for is_point in (*layout.beams, False))
+    return "\n" + "\n".join([*lines, f"constexpr int IS_POINT[BEAMS + 1] = {{{points}}};"])

@@ -1,0 +1,291 @@
+"""The walks along packets of rays that meet slices: the integral, and its adjoint.
+
+They compute what `walks` and `adjoint` do for one ray a thread, in vector lanes; derivatives by the
+rays themselves are left to those.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from ddrecon.kernels.native import number_type
+from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_rays import program
+from ddrecon.march.fused.packet_spread import SPREAD
+
+_INTEGRATE = """
+V total[OUT];
+W m[EXTINCTION];
+for (int i = 0; i < OUT; ++i) total[i] = P::all(F(0));
+for (int k = 0; k < EXTINCTION; ++k) m[k] = P::wide(total[0]);
+Node nodes[2];
+Node* a = nodes;
+Node* b = nodes + 1;
+locate(first_node, *a);
+a->is_lit = false;
+for (int n = first_node + 1; n <= last_node; ++n) {
+    locate(n, *b);
+    b->is_lit = !(a->is_empty && b->is_empty);
+    // Between empty nodes nothing is added: what light there is does not matter.
+    if (b->is_lit) {
+        if (!a->is_lit) emit(n - 1, *a, m);
+        // The mass passed on the way to the next node, and what it emits behind that.
+        for (int k = 0; k < EXTINCTION; ++k) m[k] += mass_between(*a, *b, k);
+        emit(n, *b, m);
+        // E2, E3: what arrives from the segment between both.
+        for (int i = 0; i < OUT; ++i) {
+            const V decay = Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i]);
+            total[i] += F(0.5) * (a->w[i] + b->w[i]) * measure(*a, *b, i) * decay;
+        }
+    }
+    Node* passed = a;
+    a = b;
+    b = passed;
+}
+for (int l = 0; l < LANES && begin + l <= last; ++l) {
+    for (int i = 0; i < OUT; ++i)
+        out.data[(long long)i * (last + 1) + begin + l] = P::lane(total[i], l);
+    for (int k = 0; k < EXTINCTION; ++k)
+        masses.data[(long long)k * (last + 1) + begin + l] = P::lane_of(m[k], l);
+}
+"""
+_TRANSPOSE = """
+const V none = P::all(F(0));
+V inside = none;
+for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
+V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], g_bar = none, bound_bar = none;
+V polynomial_bar[BEAMS * COEFFICIENTS + 1];
+const bool varies_polynomials = polynomials_bar.shape[0] > 0;
+for (int i = 0; i < OUT; ++i)
+    bar[i] = inside * P::load(out_bar.data + (long long)i * (last + 1), begin, 1, last);
+W m[EXTINCTION];
+for (int k = 0; k < EXTINCTION; ++k) {
+    const long long row = (long long)k * (last + 1);
+    m_bar[k] = inside * P::load(masses_bar.data + row, begin, 1, last);
+    m[k] = P::load_wide(masses.data + row, begin, last);
+}
+for (int c = 0; c < C; ++c) scale_bar[c] = peak_bar[c] = none;
+for (int k = 0; k < BEAMS * COEFFICIENTS; ++k) polynomial_bar[k] = none;
+// What node b emits, and its values go back to the cells. Its mass is that behind it, `m_b`.
+auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_bar, const V* u_bar,
+                  V* m_bar) {
+    for (int c = 0; c < C; ++c) {
+        const int k = c * MASS_STEP, s = FIRST_SCATTERING + c * SCATTERING_STEP;
+        const int d = FIRST_DIFFUSE + c * DIFFUSE_STEP;
+        const V mass = P::narrow(m_b[k]), scattering = node.v[s];
+        v_bar[s] += w_bar[c] * node.v[d];
+        v_bar[d] += w_bar[c] * scattering;
+        m_bar[k] += u_bar[c] * scale[c];
+        scale_bar[c] += u_bar[c] * mass;
+        for (int b = 0; b < BEAMS; ++b) {
+            const int i = C + b * C + c, j = FIRST_MASS + b * EXTINCTION + k;
+            const V way = mass + node.v[j];
+            V way_bar = u_bar[i] * scale[c];
+            scale_bar[c] += u_bar[i] * way;
+            v_bar[s] += w_bar[i] * node.p[i];
+            const V p_bar = w_bar[i] * scattering;
+            V depth_bar = none;
+            if (node.is_empty) {
+                // What scatters nothing has no phase function to vary.
+            } else if (IS_POINT[b]) {
+                const V cosine = Point::cosine(ray.foot[b], ray.across[b], node.t);
+                if (HAS_PEAK) {
+                    V by_depth, by_g;
+                    Phase::peaked_slopes(peak_of(node, c) * way, cosine, g, by_depth, by_g);
+                    depth_bar = p_bar * by_depth;
+                    g_bar += p_bar * by_g;
+                } else {
+                    g_bar += p_bar * Phase::plain_by_g(cosine, g);
+                }
+            } else if (HAS_PEAK) {
+                const V place = Polynomial::place(peak_of(node, c) * way);
+                V power = P::pick(node.p[i] > none, p_bar, none);
+                depth_bar = power * Polynomial::slope(ray.coefficients + b * COEFFICIENTS, place);
+                if (varies_polynomials)
+                    for (int k = 0; k < COEFFICIENTS; ++k) {
+                        polynomial_bar[b * COEFFICIENTS + k] += power;
+                        power *= place;
+                    }
+            }
+            if (HAS_PEAK) {
+                way_bar += depth_bar * peak_of(node, c);
+                if (IS_PEAK_FIELD) v_bar[FIRST_PEAK + c * PEAK_STEP] += depth_bar * way;
+                else peak_bar[c] += depth_bar * way;
+            }
+            m_bar[k] += way_bar;
+            v_bar[j] += way_bar;
+        }
+    }
+};
+auto spread = [&](int n, const Node& node, const V* v_bar) {
+    V bend_bar[MASSES + 1];
+    for (int k = 0; k < MASSES; ++k) {
+        const V bent = bound * node.bend[k], inverse = F(1) / P::root(F(1) + bent * bent);
+        bend_bar[k] = -v_bar[FIRST_MASS + k] * inverse * inverse * inverse;
+        bound_bar -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
+    }
+    spread_to_cells(node, slice(n), v_bar, bend_bar);
+};
+Node nodes[2];
+Node* a = nodes;
+Node* b = nodes + 1;
+V a_bar[CHANNELS], b_bar[CHANNELS], wa_bar[OUT], wb_bar[OUT], ua_bar[OUT], ub_bar[OUT];
+for (int c = 0; c < CHANNELS; ++c) b_bar[c] = none;
+for (int i = 0; i < OUT; ++i) wb_bar[i] = ub_bar[i] = none;
+if (first_node < last_node) {
+    locate(last_node, *b);
+    emit(last_node, *b, m);
+}
+// Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
+for (int n = last_node - 1; n >= first_node; --n) {
+    W m_b[EXTINCTION];
+    locate(n, *a);
+    for (int k = 0; k < EXTINCTION; ++k) {
+        m_b[k] = m[k];
+        m[k] -= mass_between(*a, *b, k);
+    }
+    emit(n, *a, m);
+    const bool is_empty = a->is_empty && b->is_empty;
+    for (int i = 0; i < OUT; ++i) {
+        V by_a = none, by_b = none;
+        const V decay = is_empty
+            ? Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i])
+            : Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
+        const V half = F(0.5) * bar[i] * measure(*a, *b, i);
+        const V both = half * (a->w[i] + b->w[i]);
+        wa_bar[i] = half * decay;
+        wb_bar[i] += wa_bar[i];
+        ua_bar[i] = both * by_a;
+        ub_bar[i] += both * by_b;
+    }
+    finish(n + 1, *b, m_b, b_bar, wb_bar, ub_bar, m_bar);
+    // Its mass is that of node a and half the sum of extinctions, by the length.
+    for (int c = 0; c < CHANNELS; ++c) a_bar[c] = none;
+    for (int k = 0; k < EXTINCTION; ++k) {
+        a_bar[k] = F(0.5) * m_bar[k] * (b->t - a->t);
+        b_bar[k] += a_bar[k];
+    }
+    spread(n + 1, *b, b_bar);
+    for (int c = 0; c < CHANNELS; ++c) b_bar[c] = a_bar[c];
+    for (int i = 0; i < OUT; ++i) {
+        wb_bar[i] = wa_bar[i];
+        ub_bar[i] = ua_bar[i];
+    }
+    Node* passed = b;
+    b = a;
+    a = passed;
+}
+if (first_node < last_node) {
+    finish(first_node, *b, m, b_bar, wb_bar, ub_bar, m_bar);
+    spread(first_node, *b, b_bar);
+}
+const int packets = numbers_bar.shape[1];
+for (int c = 0; c < C; ++c) {
+    numbers_bar.data[c * packets + packet] = P::sum(scale_bar[c]);
+    numbers_bar.data[(C + c) * packets + packet] = P::sum(peak_bar[c]);
+}
+numbers_bar.data[2 * C * packets + packet] = P::sum(g_bar);
+numbers_bar.data[(2 * C + 1) * packets + packet] = P::sum(bound_bar);
+if (varies_polynomials)
+    for (int k = 0; k < BEAMS * COEFFICIENTS; ++k)
+        for (int l = 0; l < LANES && begin + l <= last; ++l)
+            polynomials_bar.data[(long long)k * (last + 1) + begin + l] =
+                P::lane(polynomial_bar[k], l);
+"""
+
+
+@functools.cache
+def packet_types(layout: Layout) -> SimpleNamespace:
+    """The records that kernels of packets are given."""
+    F: Any = number_type(layout.bits)
+    Fields = wp.types.vector(length=layout.channels, dtype=wp.uint64)
+
+    @wp.struct
+    class Given:
+        """As `rays.Bundle`; `slices` [N] of `fields`, which are pointers to channels of cells."""
+
+        planes: wp.array(dtype=F)
+        slices: wp.array(dtype=wp.int32)
+        rays: wp.array2d(dtype=F)
+        angles: wp.array2d(dtype=F)
+        coefficients: wp.array2d(dtype=F)
+        numbers: wp.array(dtype=F)
+        fields: Fields
+        plane_stride: int
+        row_stride: int
+        column_stride: int
+        rows: int
+        columns: int
+
+    return SimpleNamespace(F=F, Fields=Fields, Given=Given)
+
+
+@functools.cache
+def packet_integral_kernel(layout: Layout) -> Any:
+    """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
+    types = packet_types(layout)
+    F: Any = types.F
+    Given = types.Given
+
+    @wp.func_native(program(layout, _INTEGRATE))
+    def integrate_packet(
+        given: Given, out: wp.array2d(dtype=F), masses: wp.array2d(dtype=wp.float64), packet: int
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def integrate(
+        first: int, given: Given, out: wp.array2d(dtype=F), masses: wp.array2d(dtype=wp.float64)
+    ):
+        integrate_packet(given, out, masses, first + wp.tid())
+
+    return integrate
+
+
+@functools.cache
+def packet_adjoint_kernel(layout: Layout) -> Any:
+    """The kernel that adds to cells `bars` what bars of outputs and masses are for them.
+
+    `bars` are pointers as `fields` are, 0 where none are asked for. Each packet has its own
+    `numbers_bar` [2 C + 2, packets]; `polynomials_bar` [10 beams, R] may be empty.
+    """
+    types = packet_types(layout)
+    F: Any = types.F
+    Given, Fields = types.Given, types.Fields
+
+    @wp.func_native(program(layout, SPREAD + _TRANSPOSE))
+    def transpose_packet(
+        given: Given,
+        masses: wp.array2d(dtype=wp.float64),
+        out_bar: wp.array2d(dtype=F),
+        masses_bar: wp.array2d(dtype=F),
+        bars: Fields,
+        polynomials_bar: wp.array2d(dtype=F),
+        numbers_bar: wp.array2d(dtype=wp.float64),
+        packet: int,
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def transpose(
+        first: int,
+        given: Given,
+        masses: wp.array2d(dtype=wp.float64),
+        out_bar: wp.array2d(dtype=F),
+        masses_bar: wp.array2d(dtype=F),
+        bars: Fields,
+        polynomials_bar: wp.array2d(dtype=F),
+        numbers_bar: wp.array2d(dtype=wp.float64),
+    ):
+        transpose_packet(
+            given,
+            masses,
+            out_bar,
+            masses_bar,
+            bars,
+            polynomials_bar,
+            numbers_bar,
+            first + wp.tid(),
+        )
+
+    return transpose
