@@ -93,7 +93,10 @@ const int count = begin + BLOCK < W ? BLOCK : W - begin;
 const int row = item / blocks % H, k = item / blocks / H % N, channel = item / blocks / H / N;
 """
 
-RAYS = _GEOMETRY + _RAY_ITEM + """
+RAYS = (
+    _GEOMETRY
+    + _RAY_ITEM
+    + """
 F passed[BLOCK], bends[BLOCK], here[BLOCK + 1], midway[BLOCK + 1], unused[2 * BLOCK];
 clear(passed, BLOCK), clear(bends, BLOCK);
 for (int k = 0; k < N; ++k) {
@@ -143,6 +146,7 @@ for (int k = 0; k < N; ++k) {
         for (int q = COLUMNS - c.n + 1; q < W + 3; ++q) masses.data[at + q] = mass[size - 1];
 }
 """
+)
 
 _BLENDS = """
 // Rows of rays around the cells, blended: linearly, and as third order's correction for rows.
@@ -165,20 +169,33 @@ const F x = ct.linear[1] * bent[t + 1] + ct.linear[2] * bent[t + 2] + ct.bend[0]
 const F root = F(1) / wp::sqrt(F(1) + bound * bound * x * x);
 """
 
-CELLS = _GEOMETRY + _CELL_ITEM + _BLENDS + """
+CELLS = (
+    _GEOMETRY
+    + _CELL_ITEM
+    + _BLENDS
+    + """
 F* __restrict out = &entered.data[at];
 for (int t = 0; t < count; ++t) {
-""" + _CORRECTION + """
+"""
+    + _CORRECTION
+    + """
     out[t] = ct.linear[1] * linear[t + 1] + ct.linear[2] * linear[t + 2] - x * root;
 }
 """
+)
 
 # The correction's cotangent at each cell; of the numbers, what comes by carrying masses back.
-CELLS_ADJOINT = _GEOMETRY + _CELL_ITEM + _BLENDS + """
+CELLS_ADJOINT = (
+    _GEOMETRY
+    + _CELL_ITEM
+    + _BLENDS
+    + """
 const F* __restrict bar = &entered_bar.data[at];
 F* __restrict out = &corrections_bar.data[at];
 for (int t = 0; t < count; ++t) {
-""" + _CORRECTION + """
+"""
+    + _CORRECTION
+    + """
     out[t] = bar[t] * root * root * root;
 }
 if (!varies) return;
@@ -191,7 +208,9 @@ for (int u = 0; u < 4; ++u) {
 const Taps first = taps_of(c, COLUMNS, true);
 double by_row = 0, by_column = 0, by_bound = 0;
 for (int t = 0; t < count; ++t) {
-""" + _CORRECTION + """
+"""
+    + _CORRECTION
+    + """
     const Taps& here = begin + t == 0 ? first : ct;
     F along_row = F(0), along_column = F(0), bent_row = F(0), bent_column = F(0);
     for (int u = 0; u < 4; ++u) {
@@ -208,9 +227,13 @@ sums.data[4 * item] = -k * by_row;
 sums.data[4 * item + 1] = -k * by_column;
 sums.data[4 * item + 3] = by_bound;
 """
+)
 
 # Cotangents of the field on rays, on slices and midway, in place of masses and refinements.
-RAYS_ADJOINT = _GEOMETRY + _RAY_ITEM + """
+RAYS_ADJOINT = (
+    _GEOMETRY
+    + _RAY_ITEM
+    + """
 F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], bent[BLOCK + 6], bar[BLOCK + 3];
 clear(passed, BLOCK), clear(bends, BLOCK);
 double by_step = 0, by_bound = 0;
@@ -282,8 +305,12 @@ if (varies) {
     sums.data[4 * item + 3] = by_bound;
 }
 """
+)
 
-FIELD_ADJOINT = _GEOMETRY + _CELL_ITEM + """
+FIELD_ADJOINT = (
+    _GEOMETRY
+    + _CELL_ITEM
+    + """
 F linear[BLOCK + 3], slopes[BLOCK + 3];
 double by_row = 0, by_column = 0;
 const size_t at = cell_row(channel, k, row) + begin;
@@ -320,3 +347,4 @@ if (varies) {
     sums.data[4 * item + 1] = by_column;
 }
 """
+)
