@@ -66,16 +66,6 @@ for (int c = 0; c < COLORS; ++c) {
 _ADJOINT = (
     _ITEM
     + """
-// Sums of numbers beside each other, in double precision and eight at a time.
-auto total = [](const F* values, int count) -> double {
-    double lanes[8] = {0, 0, 0, 0, 0, 0, 0, 0}, sum = 0;
-    int t = 0;
-    for (; t + 8 <= count; t += 8)
-        for (int i = 0; i < 8; ++i) lanes[i] += (double)values[t + i];
-    for (; t < count; ++t) sum += (double)values[t];
-    for (int i = 0; i < 8; ++i) sum += lanes[i];
-    return sum;
-};
 const F* const bars[4] = {mean_bar.data, flux_z_bar.data, flux_y_bar.data, flux_x_bar.data};
 double* const found = sums.data + size_t(item) * (1 + 5 * COLORS);
 double by_step = 0;

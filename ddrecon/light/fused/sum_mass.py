@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.fused.shear import Shear, sum_adjoint, sum_to_cells
+from ddrecon.light.fused.shear import Shear, Sum
 from ddrecon.numerics.slicing import Slicing, across
 
 
@@ -49,7 +49,7 @@ class _SumMass(torch.autograd.Function):
     def forward(ctx: Any, shear: Shear, field: Tensor, numbers: Tensor) -> Tensor:
         ctx.shear = shear
         ctx.save_for_backward(field, numbers)
-        return shear.lift(sum_to_cells(shear, shear.lay(field.detach()), numbers, 0)[0])
+        return shear.lift(Sum(shear, shear.lay(field.detach()), numbers, 0).entered)
 
     @staticmethod
     def backward(ctx: Any, entered_bar: Tensor) -> tuple[Tensor | None, ...]:
@@ -57,7 +57,6 @@ class _SumMass(torch.autograd.Function):
         shear, varies = ctx.shear, ctx.needs_input_grad[2]
         laid = shear.lay(field)
         field_bar = torch.zeros_like(laid)
-        kept = sum_to_cells(shear, laid, numbers, 0)[1]
-        found = sum_adjoint(shear, laid, kept, shear.lay(entered_bar), field_bar, varies)
+        found = Sum(shear, laid, numbers, 0).adjoint(shear.lay(entered_bar), field_bar, varies)
         numbers_bar = None if found is None else found.to(numbers)[None]
         return None, shear.lift(field_bar), numbers_bar

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.light.fused.receive import Receiver
-from ddrecon.light.fused.shear import Shear, sum_adjoint, sum_to_cells
+from ddrecon.light.fused.shear import Shear, Sum
 
 
 class Unscattered(torch.autograd.Function):
@@ -38,8 +38,7 @@ class Unscattered(torch.autograd.Function):
         moments, masses = receiver.new_moments(), []
         laid = _Laid(field)
         for light, shear in enumerate(shears):
-            entered, _ = sum_to_cells(shear, laid.of(shear), numbers, light)
-            entered = shear.lift(entered)
+            entered = shear.lift(Sum(shear, laid.of(shear), numbers, light).entered)
             receiver.receive(light, entered, moments, adds=light > 0)
             if has_mass:
                 masses.append(torch.addcmul(entered, field, 0.5 * numbers[light, 2]))
@@ -57,22 +56,16 @@ class Unscattered(torch.autograd.Function):
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
         weights_bar = torch.zeros_like(weights, dtype=torch.float64)
         for light, shear in enumerate(ctx.shears):
-            entered, kept = sum_to_cells(shear, laid.of(shear), numbers, light)
+            summed = Sum(shear, laid.of(shear), numbers, light)
             entered_bar, found = receiver.adjoint(
-                light, shear.lift(entered), moments_bar, field_bar, True, varies
+                light, shear.lift(summed.entered), moments_bar, field_bar, True, varies
             )
             mass_bar = masses_bar[light] if ctx.has_mass else None
             if mass_bar is not None:
                 entered_bar += mass_bar
                 field_bar.addcmul_(mass_bar, 0.5 * numbers[light, 2])
-            by_beam = sum_adjoint(
-                shear,
-                laid.of(shear),
-                kept,
-                shear.lay(entered_bar),
-                field_bar if shear.axis != 2 else laid_bar.of(shear),
-                varies,
-            )
+            to = field_bar if shear.axis != 2 else laid_bar.of(shear)
+            by_beam = summed.adjoint(shear.lay(entered_bar), to, varies)
             if by_beam is not None and found is not None:
                 numbers_bar[light] += by_beam
                 numbers_bar[light, 2] += found[0]
