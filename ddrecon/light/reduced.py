@@ -40,11 +40,13 @@ def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> R
     """
     beams: dict[int, Beam | PointBeam] = {}
     parts, received = [], []
-    directional = [i for i, light in enumerate(lights) if isinstance(light, DirectionalLight)]
+    directional = {
+        i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
+    }
     if directional and is_fused():
         from ddrecon.light.fused.beams import follow_beams
 
-        found, moments = follow_beams(medium, [lights[i] for i in directional], has_flux)
+        found, moments = follow_beams(medium, list(directional.values()), has_flux)
         beams.update(zip(directional, found, strict=True))
         parts.append(moments)
     for i, light in enumerate(lights):

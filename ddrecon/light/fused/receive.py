@@ -15,10 +15,13 @@ import warp as wp
 from torch import Tensor
 
 from ddrecon.kernels.launch import array, launch
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.native import TOTAL, number_type, program
 
 CHUNK = 512
 """Cells that one item does on a processor; on a GPU it is one."""
+
+MOMENTS = "mean", "flux_z", "flux_y", "flux_x"
+"""The moments in the order in which weights have them."""
 
 _ITEM = """
 #if defined(__CUDA_ARCH__)
@@ -26,10 +29,11 @@ enum { CHUNK = 1 };
 #else
 enum { CHUNK = 512 };
 #endif
-const int COLORS = sizes.colors, CHANNELS = sizes.channels;
-const size_t cells = sizes.cells, begin = size_t(item) * CHUNK;
+const int COLORS = beams.colors, CHANNELS = beams.channels;
+const size_t cells = beams.cells, begin = size_t(item) * CHUNK;
 const int count = begin + CHUNK < cells ? CHUNK : (int)(cells - begin);
-const F step = numbers.data[4 * light + 2];
+const int light = beams.light;
+const F step = beams.numbers.data[4 * light + 2];
 """
 # tau of a cell by entered mass and field: exp(-s e) phi(d) with d = s field step.
 _VISIBLE = """
@@ -42,10 +46,10 @@ _RECEIVE = (
     _ITEM
     + """
 for (int c = 0; c < COLORS; ++c) {
-    const F s = scale.data[c];
+    const F s = beams.scale.data[c];
     const size_t channel = CHANNELS == 1 ? 0 : c;
-    const F* __restrict e = &entered.data[channel * cells + begin];
-    const F* __restrict f = &field.data[channel * cells + begin];
+    const F* __restrict e = &beams.entered.data[channel * cells + begin];
+    const F* __restrict f = &beams.field.data[channel * cells + begin];
     F visible[CHUNK];
     for (int t = 0; t < count; ++t) {
 """
@@ -53,34 +57,35 @@ for (int c = 0; c < COLORS; ++c) {
     + """
         visible[t] = clear * phi;
     }
-    F* const outs[4] = {mean.data, flux_z.data, flux_y.data, flux_x.data};
-    for (int a = 0; a < sizes.moments; ++a) {
-        const F weight = weights.data[(light * sizes.moments + a) * COLORS + c];
+    F* const outs[4] = {beams.mean.data, beams.flux_z.data, beams.flux_y.data, beams.flux_x.data};
+    for (int a = 0; a < beams.moments; ++a) {
+        const F weight = beams.weights.data[(light * beams.moments + a) * COLORS + c];
         F* __restrict out = outs[a] + c * cells + begin;
-        if (adds) for (int t = 0; t < count; ++t) out[t] += weight * visible[t];
+        if (beams.adds) for (int t = 0; t < count; ++t) out[t] += weight * visible[t];
         else for (int t = 0; t < count; ++t) out[t] = weight * visible[t];
     }
 }
 """
 )
 _ADJOINT = (
-    _ITEM
+    TOTAL
+    + _ITEM
     + """
-const F* const bars[4] = {mean_bar.data, flux_z_bar.data, flux_y_bar.data, flux_x_bar.data};
-double* const found = sums.data + size_t(item) * (1 + 5 * COLORS);
+const F* const bars[4] = {beams.mean.data, beams.flux_z.data, beams.flux_y.data, beams.flux_x.data};
+double* const found = beams.sums.data + size_t(item) * (1 + 5 * COLORS);
 double by_step = 0;
 for (int channel = 0; channel < CHANNELS; ++channel) {
-    const F* __restrict e = &entered.data[channel * cells + begin];
-    const F* __restrict f = &field.data[channel * cells + begin];
+    const F* __restrict e = &beams.entered.data[channel * cells + begin];
+    const F* __restrict f = &beams.field.data[channel * cells + begin];
     F of_entered[CHUNK], of_field[CHUNK], of_step[CHUNK];
     for (int t = 0; t < count; ++t) of_entered[t] = of_field[t] = F(0);
     for (int c = CHANNELS == 1 ? 0 : channel; c < (CHANNELS == 1 ? COLORS : channel + 1); ++c) {
-        const F s = scale.data[c];
+        const F s = beams.scale.data[c];
         F bar[CHUNK], visible[CHUNK], of_scale[CHUNK];
         for (int t = 0; t < count; ++t) bar[t] = F(0);
-        for (int a = 0; a < sizes.moments; ++a) {
-            if (!(given >> a & 1)) continue;
-            const F weight = weights.data[(light * sizes.moments + a) * COLORS + c];
+        for (int a = 0; a < beams.moments; ++a) {
+            if (!(beams.given >> a & 1)) continue;
+            const F weight = beams.weights.data[(light * beams.moments + a) * COLORS + c];
             const F* __restrict from = bars[a] + c * cells + begin;
             for (int t = 0; t < count; ++t) bar[t] += weight * from[t];
         }
@@ -96,134 +101,71 @@ for (int channel = 0; channel < CHANNELS; ++channel) {
             of_scale[t] = f[t] * step * by_depth - e[t] * visible[t] * bar[t];
             of_step[t] = s * f[t] * by_depth;
         }
-        if (!varies) continue;
+        if (!beams.varies) continue;
         by_step += total(of_step, count);
         found[1 + c] = total(of_scale, count);
-        for (int a = 0; a < sizes.moments; ++a) {
-            if (!(given >> a & 1)) continue;
+        for (int a = 0; a < beams.moments; ++a) {
+            if (!(beams.given >> a & 1)) continue;
             const F* __restrict from = bars[a] + c * cells + begin;
             for (int t = 0; t < count; ++t) of_scale[t] = from[t] * visible[t];
             found[1 + (1 + a) * COLORS + c] = total(of_scale, count);
         }
     }
-    F* __restrict out = &entered_bar.data[channel * cells + begin];
-    F* __restrict of_cell = &field_bar.data[channel * cells + begin];
-    if (adds) for (int t = 0; t < count; ++t) of_field[t] += of_cell[t];
+    F* __restrict out = &beams.entered_bar.data[channel * cells + begin];
+    F* __restrict of_cell = &beams.field_bar.data[channel * cells + begin];
     for (int t = 0; t < count; ++t) out[t] = of_entered[t];
-    for (int t = 0; t < count; ++t) of_cell[t] = of_field[t];
+    for (int t = 0; t < count; ++t) of_cell[t] += of_field[t];
 }
-if (varies) found[0] = by_step;
+if (beams.varies) found[0] = by_step;
 """
 )
 
 
-@wp.struct
-class Sizes:
-    """How many cells, colors, channels of the field, and moments: 1, or 4 with a flux."""
-
-    cells: int
-    colors: int
-    channels: int
-    moments: int
-
-
 @functools.cache
 def receive_kernels(bits: int) -> SimpleNamespace:
-    """The kernels for numbers of so many `bits`."""
+    """The kernels for numbers of so many `bits`, and the record `Beams` that they are given."""
     F = number_type(bits)
-    Numbers, Sums = wp.array(dtype=F), wp.array(dtype=wp.float64)
 
-    @wp.func_native(program(bits, _RECEIVE))
-    def receive_chunk(
-        item: int,
-        sizes: Sizes,
-        numbers: Numbers,
-        scale: Numbers,
-        weights: Numbers,
-        light: int,
-        field: Numbers,
-        entered: Numbers,
-        adds: bool,
-        mean: Numbers,
-        flux_z: Numbers,
-        flux_y: Numbers,
-        flux_x: Numbers,
-    ): ...
+    @wp.struct
+    class Beams:
+        """The arrays of `Receiver`, and numbers of cells, colors, of the field's channels, moments.
 
-    @wp.func_native(program(bits, _ADJOINT))
-    def receive_chunk_adjoint(
-        item: int,
-        sizes: Sizes,
-        numbers: Numbers,
-        scale: Numbers,
-        weights: Numbers,
-        light: int,
-        field: Numbers,
-        entered: Numbers,
-        adds: bool,
-        given: int,
-        mean_bar: Numbers,
-        flux_z_bar: Numbers,
-        flux_y_bar: Numbers,
-        flux_x_bar: Numbers,
-        entered_bar: Numbers,
-        field_bar: Numbers,
-        varies: bool,
-        sums: Sums,
-    ): ...
+        `light` is the beam it is about; whether something `adds` to what is written; which moments
+        have cotangents `given`, a bit each.
+        """
 
-    options = {"enable_backward": False, "module": "unique"}
+        cells: int
+        colors: int
+        channels: int
+        moments: int
+        light: int
+        adds: bool
+        varies: bool
+        given: int
+        numbers: wp.array(dtype=F)
+        scale: wp.array(dtype=F)
+        weights: wp.array(dtype=F)
+        field: wp.array(dtype=F)
+        entered: wp.array(dtype=F)
+        mean: wp.array(dtype=F)
+        flux_z: wp.array(dtype=F)
+        flux_y: wp.array(dtype=F)
+        flux_x: wp.array(dtype=F)
+        entered_bar: wp.array(dtype=F)
+        field_bar: wp.array(dtype=F)
+        sums: wp.array(dtype=wp.float64)
 
-    @wp.kernel(**options)
-    def receive(
-        first: int,
-        sizes: Sizes,
-        numbers: Numbers,
-        scale: Numbers,
-        weights: Numbers,
-        light: int,
-        field: Numbers,
-        entered: Numbers,
-        adds: bool,
-        mean: Numbers,
-        flux_z: Numbers,
-        flux_y: Numbers,
-        flux_x: Numbers,
-    ):
-        item = first + wp.tid()
-        receive_chunk(
-            item, sizes, numbers, scale, weights, light, field, entered, adds,
-            mean, flux_z, flux_y, flux_x,
-        )  # fmt: skip
+    def kernel(body: str) -> Any:
+        @wp.func_native(program(bits, body))
+        def do_item(item: int, beams: Beams): ...
 
-    @wp.kernel(**options)
-    def receive_adjoint(
-        first: int,
-        sizes: Sizes,
-        numbers: Numbers,
-        scale: Numbers,
-        weights: Numbers,
-        light: int,
-        field: Numbers,
-        entered: Numbers,
-        adds: bool,
-        given: int,
-        mean_bar: Numbers,
-        flux_z_bar: Numbers,
-        flux_y_bar: Numbers,
-        flux_x_bar: Numbers,
-        entered_bar: Numbers,
-        field_bar: Numbers,
-        varies: bool,
-        sums: Sums,
-    ):
-        item = first + wp.tid()
-        receive_chunk_adjoint(
-            item, sizes, numbers, scale, weights, light, field, entered, adds, given,
-            mean_bar, flux_z_bar, flux_y_bar, flux_x_bar, entered_bar, field_bar, varies, sums,
-        )  # fmt: skip
+        @wp.kernel(enable_backward=False, module="unique")
+        def do_items(first: int, beams: Beams):
+            do_item(first + wp.tid(), beams)
 
-    return SimpleNamespace(receive=receive, receive_adjoint=receive_adjoint)
+        return do_items
+
+    return SimpleNamespace(Beams=Beams, receive=kernel(_RECEIVE), adjoint=kernel(_ADJOINT))
 
 
 class Receiver:
@@ -235,11 +177,11 @@ class Receiver:
     def __init__(self, field: Tensor, scale: Tensor, numbers: Tensor, weights: Tensor):
         self.field, self.colors, self.moments = field, weights.shape[2], weights.shape[1]
         self.kernels = receive_kernels(field.element_size() * 8)
-        sizes = Sizes()
-        sizes.cells, sizes.channels = field[0].numel(), field.shape[0]
-        sizes.colors, sizes.moments = self.colors, self.moments
-        self.items = math.ceil(sizes.cells / (1 if field.is_cuda else CHUNK))
-        self.fixed = [sizes, *(array(part.reshape(-1)) for part in (numbers, scale, weights))]
+        self.items = math.ceil(field[0].numel() / (1 if field.is_cuda else CHUNK))
+        self.beams = beams = self.kernels.Beams()
+        beams.cells, beams.channels = field[0].numel(), field.shape[0]
+        beams.colors, beams.moments = self.colors, self.moments
+        self._give(numbers=numbers, scale=scale, weights=weights, field=field)
 
     def new_moments(self) -> list[Tensor]:
         """Uninitialized moments of all colors."""
@@ -248,10 +190,9 @@ class Receiver:
 
     def receive(self, light: int, entered: Tensor, moments: Sequence[Tensor], adds: bool) -> None:
         """Writes what is received of one beam to `moments`, or `adds` it."""
-        arguments = [*self.fixed, light, *_lines(self.field, entered), adds]
-        outs = _lines(*moments)
-        outs += [outs[0]] * (4 - len(outs))
-        launch(self.kernels.receive, self.items, [*arguments, *outs], entered)
+        self.beams.light, self.beams.adds = light, adds
+        self._give(entered=entered, **dict(zip(MOMENTS, moments, strict=False)))
+        launch(self.kernels.receive, self.items, [self.beams], entered)
 
     def adjoint(
         self,
@@ -259,26 +200,23 @@ class Receiver:
         entered: Tensor,
         bars: Sequence[Tensor | None],
         field_bar: Tensor,
-        adds: bool,
         varies: bool,
     ) -> tuple[Tensor, Tensor | None]:
         """The cotangent of `entered`, and if it `varies` those of step, scale and weights.
 
-        `bars`: of the moments, None for zero. Writes the cotangent of the field, or `adds` it.
+        `bars`: of the moments, None for zero. Adds to the cotangent of the field.
         """
+        beams, width = self.beams, 1 + 5 * self.colors
         entered_bar = torch.empty_like(entered)
-        width = 1 + 5 * self.colors
-        sums = entered.new_zeros(self.items * width if varies else 0, dtype=torch.float64)
-        given = sum(1 << a for a, bar in enumerate(bars) if bar is not None)
-        lines = [
-            array((entered[:0] if bar is None else bar).reshape(-1))
-            for bar in [*bars, *([None] * (4 - len(bars)))]
-        ]
-        arguments = [*self.fixed, light, *_lines(self.field, entered), adds, given, *lines]
-        arguments += [*_lines(entered_bar, field_bar), varies, array(sums)]
-        launch(self.kernels.receive_adjoint, self.items, arguments, entered)
+        sums = entered.new_zeros(self.items * width * varies, dtype=torch.float64)
+        given = {name: bar for name, bar in zip(MOMENTS, bars, strict=False) if bar is not None}
+        beams.light, beams.varies = light, varies
+        beams.given = sum(1 << a for a, bar in enumerate(bars) if bar is not None)
+        self._give(entered=entered, entered_bar=entered_bar, field_bar=field_bar, sums=sums)
+        self._give(**given)
+        launch(self.kernels.adjoint, self.items, [beams], entered)
         return entered_bar, sums.view(-1, width).sum(0) if varies else None
 
-
-def _lines(*tensors: Tensor) -> list[Any]:
-    return [array(tensor.reshape(-1)) for tensor in tensors]
+    def _give(self, **tensors: Tensor) -> None:
+        for name, tensor in tensors.items():
+            setattr(self.beams, name, array(tensor.reshape(-1)))

@@ -37,7 +37,9 @@ class Shear:
         more = [math.floor(abs(s) * (count - 1) + 1e-9) + 1 for s in slope]
         # A row of one slice is followed by the same row of the next, but for slices across z.
         is_slices_first = self.axis != 0
-        slice_stride, row_stride = (width, count * width) if is_slices_first else (height * width, width)
+        slice_stride, row_stride = (
+            (width, count * width) if is_slices_first else (height * width, width)
+        )
         window = (width + 3, (width + 3) * (count if is_slices_first else height + 3))
         self.record = {
             "slices": count,

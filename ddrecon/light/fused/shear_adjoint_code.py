@@ -10,7 +10,8 @@ from ddrecon.light.fused.shear_code import BLENDS, CELL_ITEM, CORRECTION, GEOMET
 
 # The correction's cotangent at each cell; of the numbers, what comes by carrying masses back.
 CELLS_ADJOINT = (
-    GEOMETRY + TOTAL
+    GEOMETRY
+    + TOTAL
     + CELL_ITEM
     + BLENDS
     + """
@@ -59,7 +60,8 @@ sums[3] = total(of_bound, count);
 
 # Cotangents of the field on rays, on slices and midway, in place of masses and refinements.
 RAYS_ADJOINT = (
-    GEOMETRY + TOTAL
+    GEOMETRY
+    + TOTAL
     + RAY_ITEM
     + """
 F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], bent[BLOCK + 6], bar[BLOCK + 3];
@@ -141,7 +143,8 @@ if (varies) {
 )
 
 FIELD_ADJOINT = (
-    GEOMETRY + TOTAL
+    GEOMETRY
+    + TOTAL
     + CELL_ITEM
     + """
 F linear[BLOCK + 3], slopes[BLOCK + 3], of_row[BLOCK], of_column[BLOCK];

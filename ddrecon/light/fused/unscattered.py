@@ -58,7 +58,7 @@ class Unscattered(torch.autograd.Function):
         for light, shear in enumerate(ctx.shears):
             summed = Sum(shear, laid.of(shear), numbers, light)
             entered_bar, found = receiver.adjoint(
-                light, shear.lift(summed.entered), moments_bar, field_bar, True, varies
+                light, shear.lift(summed.entered), moments_bar, field_bar, varies
             )
             mass_bar = masses_bar[light] if ctx.has_mass else None
             if mass_bar is not None:
@@ -76,8 +76,8 @@ class Unscattered(torch.autograd.Function):
         field_bar = laid_bar.add_to(field_bar)
         if not varies:
             return None, None, field_bar, None, None, None
-        found = (bar.to(field) for bar in (scale_bar, numbers_bar, weights_bar))
-        return None, None, field_bar, *found
+        by_numbers = (bar.to(field) for bar in (scale_bar, numbers_bar, weights_bar))
+        return None, None, field_bar, *by_numbers
 
 
 class _Laid:
