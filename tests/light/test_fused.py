@@ -26,6 +26,7 @@ from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.light.fused.point_light import way_kernels  # noqa: E402
 from ddrecon.light.fused.receive import receive_kernels  # noqa: E402
 from ddrecon.light.fused.shear import shear_kernels  # noqa: E402
 
@@ -144,6 +145,27 @@ def test_light_and_its_derivatives_are_those_of_torch(kind: str, has_flux: bool)
         assert_near(one, other, 1e-11)
 
 
+POSITIONS = {
+    "outside": (0.9, 0.7, 0.2),
+    "inside": (0.11, 0.13, 0.17),
+    "in a center": (0.083333333333333333, 0.0, -0.04),
+    "before an axis": (0.083333333333333333, 0.0, 3.0),
+}
+
+
+@pytest.mark.parametrize("place", POSITIONS)
+@pytest.mark.parametrize("kind", ["gray", "fields"])
+def test_point_lights_are_those_of_torch(kind: str, place: str):
+    """Also where ways run through cells' centers, at which interpolation has kinks."""
+    scene = scene_of(kind)
+    position = vector(*POSITIONS[place])
+    scene.lights = [PointLight(position, vector(2.0)), *scene.lights]
+    names = ["density", "sigma_a", "g", "lights.0.position", "lights.0.intensity"]
+    found, known = (gradients(scene, names, engine, True) for engine in ("warp", "torch"))
+    for one, other in zip(found, known, strict=True):
+        assert_near(one, other, 1e-11)
+
+
 def test_the_density_alone():
     scene = scene_of("colors")
     found, known = (gradients(scene, ["density"], engine, True) for engine in ("warp", "torch"))
@@ -202,9 +224,10 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 
 @pytest.mark.parametrize("architecture", [80, 90])
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
-    made = [*vars(shear_kernels(32)).values(), *vars(receive_kernels(32)).values()]
+    rooms = shear_kernels(32), receive_kernels(32), way_kernels(32)
+    made = [each for room in rooms for each in vars(room).values()]
     kernels = [each for each in made if isinstance(each, wp.Kernel)]
-    assert len(kernels) == 7
+    assert len(kernels) == 9
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)
