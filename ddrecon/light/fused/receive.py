@@ -32,8 +32,9 @@ enum { CHUNK = 512 };
 const int COLORS = beams.colors, CHANNELS = beams.channels;
 const size_t cells = beams.cells, begin = size_t(item) * CHUNK;
 const int count = begin + CHUNK < cells ? CHUNK : (int)(cells - begin);
-const int light = beams.light;
-const F step = beams.numbers.data[4 * light + 2];
+const int LIGHTS = beams.lights, MOMENTS = beams.moments;
+const F* const steps = &beams.numbers.data[4 * beams.light + 2];
+const F* const weights = &beams.weights.data[beams.light * MOMENTS * COLORS];
 """
 # tau of a cell by entered mass and field: exp(-s e) phi(d) with d = s field step.
 _VISIBLE = """
@@ -48,21 +49,29 @@ _RECEIVE = (
 for (int c = 0; c < COLORS; ++c) {
     const F s = beams.scale.data[c];
     const size_t channel = CHANNELS == 1 ? 0 : c;
-    const F* __restrict e = &beams.entered.data[channel * cells + begin];
     const F* __restrict f = &beams.field.data[channel * cells + begin];
-    F visible[CHUNK];
-    for (int t = 0; t < count; ++t) {
+    F sums[4][CHUNK];
+    for (int a = 0; a < MOMENTS; ++a) for (int t = 0; t < count; ++t) sums[a][t] = F(0);
+    for (int i = 0; i < LIGHTS; ++i) {
+        const F* __restrict e = &beams.entered.data[(i * CHANNELS + channel) * cells + begin];
+        const F step = steps[4 * i];
+        F visible[CHUNK];
+        for (int t = 0; t < count; ++t) {
 """
     + _VISIBLE
     + """
-        visible[t] = clear * phi;
+            visible[t] = clear * phi;
+        }
+        for (int a = 0; a < MOMENTS; ++a) {
+            const F weight = weights[(i * MOMENTS + a) * COLORS + c];
+            for (int t = 0; t < count; ++t) sums[a][t] += weight * visible[t];
+        }
     }
     F* const outs[4] = {beams.mean.data, beams.flux_z.data, beams.flux_y.data, beams.flux_x.data};
-    for (int a = 0; a < beams.moments; ++a) {
-        const F weight = beams.weights.data[(light * beams.moments + a) * COLORS + c];
+    for (int a = 0; a < MOMENTS; ++a) {
         F* __restrict out = outs[a] + c * cells + begin;
-        if (beams.adds) for (int t = 0; t < count; ++t) out[t] += weight * visible[t];
-        else for (int t = 0; t < count; ++t) out[t] = weight * visible[t];
+        if (beams.adds) for (int t = 0; t < count; ++t) out[t] += sums[a][t];
+        else for (int t = 0; t < count; ++t) out[t] = sums[a][t];
     }
 }
 """
@@ -72,20 +81,21 @@ _ADJOINT = (
     + _ITEM
     + """
 const F* const bars[4] = {beams.mean.data, beams.flux_z.data, beams.flux_y.data, beams.flux_x.data};
-double* const found = beams.sums.data + size_t(item) * (1 + 5 * COLORS);
-double by_step = 0;
-for (int channel = 0; channel < CHANNELS; ++channel) {
-    const F* __restrict e = &beams.entered.data[channel * cells + begin];
+for (int i = 0; i < LIGHTS * CHANNELS; ++i) {
+    const int light = i / CHANNELS, channel = i % CHANNELS;
+    const F* __restrict e = &beams.entered.data[i * cells + begin];
     const F* __restrict f = &beams.field.data[channel * cells + begin];
+    const F step = steps[4 * light];
+    double* const found = beams.sums.data + (size_t(item) * LIGHTS + light) * (1 + 5 * COLORS);
     F of_entered[CHUNK], of_field[CHUNK], of_step[CHUNK];
     for (int t = 0; t < count; ++t) of_entered[t] = of_field[t] = F(0);
     for (int c = CHANNELS == 1 ? 0 : channel; c < (CHANNELS == 1 ? COLORS : channel + 1); ++c) {
         const F s = beams.scale.data[c];
         F bar[CHUNK], visible[CHUNK], of_scale[CHUNK];
         for (int t = 0; t < count; ++t) bar[t] = F(0);
-        for (int a = 0; a < beams.moments; ++a) {
+        for (int a = 0; a < MOMENTS; ++a) {
             if (!(beams.given >> a & 1)) continue;
-            const F weight = beams.weights.data[(light * beams.moments + a) * COLORS + c];
+            const F weight = weights[(light * MOMENTS + a) * COLORS + c];
             const F* __restrict from = bars[a] + c * cells + begin;
             for (int t = 0; t < count; ++t) bar[t] += weight * from[t];
         }
@@ -102,21 +112,20 @@ for (int channel = 0; channel < CHANNELS; ++channel) {
             of_step[t] = s * f[t] * by_depth;
         }
         if (!beams.varies) continue;
-        by_step += total(of_step, count);
+        found[0] += total(of_step, count);
         found[1 + c] = total(of_scale, count);
-        for (int a = 0; a < beams.moments; ++a) {
+        for (int a = 0; a < MOMENTS; ++a) {
             if (!(beams.given >> a & 1)) continue;
             const F* __restrict from = bars[a] + c * cells + begin;
             for (int t = 0; t < count; ++t) of_scale[t] = from[t] * visible[t];
             found[1 + (1 + a) * COLORS + c] = total(of_scale, count);
         }
     }
-    F* __restrict out = &beams.entered_bar.data[channel * cells + begin];
+    F* __restrict out = &beams.entered_bar.data[i * cells + begin];
     F* __restrict of_cell = &beams.field_bar.data[channel * cells + begin];
     for (int t = 0; t < count; ++t) out[t] = of_entered[t];
     for (int t = 0; t < count; ++t) of_cell[t] += of_field[t];
 }
-if (beams.varies) found[0] = by_step;
 """
 )
 
@@ -130,8 +139,8 @@ def receive_kernels(bits: int) -> SimpleNamespace:
     class Beams:
         """The arrays of `Receiver`, and numbers of cells, colors, of the field's channels, moments.
 
-        `light` is the beam it is about; whether something `adds` to what is written; which moments
-        have cotangents `given`, a bit each.
+        It is about so many `lights` from number `light` on. Whether something `adds` to what is
+        written; which moments have cotangents `given`, a bit each.
         """
 
         cells: int
@@ -139,6 +148,7 @@ def receive_kernels(bits: int) -> SimpleNamespace:
         channels: int
         moments: int
         light: int
+        lights: int
         adds: bool
         varies: bool
         given: int
@@ -189,8 +199,11 @@ class Receiver:
         return [self.field.new_empty(shape) for _ in range(self.moments)]
 
     def receive(self, light: int, entered: Tensor, moments: Sequence[Tensor], adds: bool) -> None:
-        """Writes what is received of one beam to `moments`, or `adds` it."""
-        self.beams.light, self.beams.adds = light, adds
+        """Writes what is received of beams from number `light` on to `moments`, or `adds` it.
+
+        `entered` [n, K, z, y, x]: the mass that n of them pass up to where they enter each cell.
+        """
+        self.beams.light, self.beams.lights, self.beams.adds = light, len(entered), adds
         self._give(entered=entered, **dict(zip(MOMENTS, moments, strict=False)))
         launch(self.kernels.receive, self.items, [self.beams], entered)
 
@@ -202,20 +215,21 @@ class Receiver:
         field_bar: Tensor,
         varies: bool,
     ) -> tuple[Tensor, Tensor | None]:
-        """The cotangent of `entered`, and if it `varies` those of step, scale and weights.
+        """The cotangent of `entered`, and if it `varies` those [n, ...] of step, scale and weights.
 
-        `bars`: of the moments, None for zero. Adds to the cotangent of the field.
+        Arguments as of `receive`; `bars`: of the moments, None for zero. Adds to the cotangent of
+        the field.
         """
         beams, width = self.beams, 1 + 5 * self.colors
         entered_bar = torch.empty_like(entered)
-        sums = entered.new_zeros(self.items * width * varies, dtype=torch.float64)
+        sums = entered.new_zeros(self.items * len(entered) * width * varies, dtype=torch.float64)
         given = {name: bar for name, bar in zip(MOMENTS, bars, strict=False) if bar is not None}
-        beams.light, beams.varies = light, varies
+        beams.light, beams.lights, beams.varies = light, len(entered), varies
         beams.given = sum(1 << a for a, bar in enumerate(bars) if bar is not None)
         self._give(entered=entered, entered_bar=entered_bar, field_bar=field_bar, sums=sums)
         self._give(**given)
         launch(self.kernels.adjoint, self.items, [beams], entered)
-        return entered_bar, sums.view(-1, width).sum(0) if varies else None
+        return entered_bar, sums.view(self.items, -1, width).sum(0) if varies else None
 
     def _give(self, **tensors: Tensor) -> None:
         for name, tensor in tensors.items():

@@ -10,6 +10,12 @@ from torch import Tensor
 from ddrecon.light.fused.receive import Receiver
 from ddrecon.light.fused.shear import Shear, Sum
 
+MOST_BEAMS = 8
+MOST_NUMBERS = 1 << 22
+"""Of so many beams, and of so many numbers, masses are held at once: cells then receive the light
+of all of them in one pass.
+"""
+
 
 class Unscattered(torch.autograd.Function):
     """Moments [C, z, y, x] of L beams together, and the mass up to cells' centers of each.
@@ -37,11 +43,20 @@ class Unscattered(torch.autograd.Function):
         receiver = Receiver(field, scale, numbers, weights)
         moments, masses = receiver.new_moments(), []
         laid = _Laid(field)
-        for light, shear in enumerate(shears):
-            entered = shear.lift(Sum(shear, laid.of(shear), numbers, light).entered)
-            receiver.receive(light, entered, moments, adds=light > 0)
+        for lights in _batches(len(shears), field):
+            entered = field.new_empty(len(lights), *field.shape)
+            for light, to in zip(lights, entered, strict=True):
+                to.copy_(
+                    shears[light].lift(
+                        Sum(shears[light], laid.of(shears[light]), numbers, light).entered
+                    )
+                )
+            receiver.receive(lights[0], entered, moments, adds=lights[0] > 0)
             if has_mass:
-                masses.append(torch.addcmul(entered, field, 0.5 * numbers[light, 2]))
+                masses += [
+                    torch.addcmul(one, field, 0.5 * numbers[light, 2])
+                    for light, one in zip(lights, entered, strict=True)
+                ]
         return *moments, *masses
 
     @staticmethod
@@ -55,29 +70,40 @@ class Unscattered(torch.autograd.Function):
         scale_bar = torch.zeros_like(scale, dtype=torch.float64)
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
         weights_bar = torch.zeros_like(weights, dtype=torch.float64)
-        for light, shear in enumerate(ctx.shears):
-            summed = Sum(shear, laid.of(shear), numbers, light)
-            entered_bar, found = receiver.adjoint(
-                light, shear.lift(summed.entered), moments_bar, field_bar, varies
+        for lights in _batches(len(ctx.shears), field):
+            shears = [ctx.shears[light] for light in lights]
+            sums = [Sum(s, laid.of(s), numbers, i) for i, s in zip(lights, shears, strict=True)]
+            entered = torch.stack([each.shear.lift(each.entered) for each in sums])
+            entered_bars, found = receiver.adjoint(
+                lights[0], entered, moments_bar, field_bar, varies
             )
-            mass_bar = masses_bar[light] if ctx.has_mass else None
-            if mass_bar is not None:
-                entered_bar += mass_bar
-                field_bar.addcmul_(mass_bar, 0.5 * numbers[light, 2])
-            to = field_bar if shear.axis != 2 else laid_bar.of(shear)
-            by_beam = summed.adjoint(shear.lay(entered_bar), to, varies)
-            if by_beam is not None and found is not None:
-                numbers_bar[light] += by_beam
-                numbers_bar[light, 2] += found[0]
+            for i, (light, shear, each) in enumerate(zip(lights, shears, sums, strict=True)):
+                mass_bar = masses_bar[light] if ctx.has_mass else None
                 if mass_bar is not None:
-                    numbers_bar[light, 2] += 0.5 * (field * mass_bar).sum(dtype=torch.float64)
-                scale_bar += found[1 : 1 + len(scale)]
-                weights_bar[light] = found[1 + len(scale) :].view(4, -1)[: receiver.moments]
+                    entered_bars[i] += mass_bar
+                    field_bar.addcmul_(mass_bar, 0.5 * numbers[light, 2])
+                to = field_bar if shear.axis != 2 else laid_bar.of(shear)
+                by_beam = each.adjoint(shear.lay(entered_bars[i]), to, varies)
+                if by_beam is not None and found is not None:
+                    numbers_bar[light] += by_beam
+                    numbers_bar[light, 2] += found[i, 0]
+                    if mass_bar is not None:
+                        numbers_bar[light, 2] += 0.5 * (field * mass_bar).sum(dtype=torch.float64)
+            if found is not None:
+                scale_bar += found[:, 1 : 1 + len(scale)].sum(0)
+                by_weights = found[:, 1 + len(scale) :].view(len(lights), 4, -1)
+                weights_bar[lights[0] : lights[-1] + 1] = by_weights[:, : receiver.moments]
         field_bar = laid_bar.add_to(field_bar)
         if not varies:
             return None, None, field_bar, None, None, None
         by_numbers = (bar.to(field) for bar in (scale_bar, numbers_bar, weights_bar))
         return None, None, field_bar, *by_numbers
+
+
+def _batches(lights: int, field: Tensor) -> list[range]:
+    """The numbers of beams, in parts small enough for their masses to be held at once."""
+    size = max(1, min(MOST_BEAMS, MOST_NUMBERS // field.numel()))
+    return [range(first, min(first + size, lights)) for first in range(0, lights, size)]
 
 
 class _Laid:
