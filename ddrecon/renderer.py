@@ -106,12 +106,15 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
     lights = decompose_lights(scene.lights)
     reduced = reduced_light(medium, lights, medium.has_flux)
     sky = sum_unscattered_sky(medium, lights, medium.has_flux)
-    source = reduced.source.plus(sky.scaled(1.0, medium.mean_cosine))
+    source = reduced.source
+    if sky is not None:
+        source = source.plus(sky.scaled(1.0, medium.mean_cosine))
     outside = ambient_radiance(lights, medium.g)
     # L0 and L1: E4 to E6.
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
     # Skies scatter by E3 as well; beams by E2 on each view ray.
-    return LightField(medium, reduced.beams, diffuse.plus(sky))
+    light = diffuse if sky is None else diffuse.plus(sky)
+    return LightField(medium, reduced.beams, light)
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
@@ -127,7 +130,8 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     nothing = Moments(torch.zeros_like(medium.extinction.value))
     if medium.has_flux:
         return LightField(medium, beams, nothing, skies)
-    return LightField(medium, beams, sum_unscattered_sky(medium, skies, has_flux=False))
+    sky = sum_unscattered_sky(medium, skies, has_flux=False)
+    return LightField(medium, beams, nothing if sky is None else sky)
 
 
 def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:

@@ -50,6 +50,19 @@ auto psi_series = [](F depth) -> F {{
 }};
 """
 
+TOTAL = """
+auto total = [](const F* values, int count) -> double {
+    double lanes[8] = {0, 0, 0, 0, 0, 0, 0, 0}, sum = 0;
+    int t = 0;
+    for (; t + 8 <= count; t += 8)
+        for (int i = 0; i < 8; ++i) lanes[i] += (double)values[t + i];
+    for (; t < count; ++t) sum += (double)values[t];
+    for (int i = 0; i < 8; ++i) sum += lanes[i];
+    return sum;
+};
+"""
+"""`total(values, count)`: a sum in double precision, eight at a time; to be put before a body."""
+
 
 def _polynomial(degree: int) -> dict[str, str]:
     """exp's, of its Taylor series: the first coefficient and Horner's lines."""

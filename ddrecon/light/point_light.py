@@ -23,6 +23,7 @@ from torch import Tensor
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.shear import is_fused
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import henyey_greenstein, peaked_phase
 from ddrecon.numerics.autodiff import recompute
@@ -145,6 +146,13 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
         values = sample_volume(field, places.flip(-1))
         return values.mean(1) * (inside * distance)
 
+    if is_fused():
+        from ddrecon.light.fused.point_light import integrate_ways
+
+        inside = _part_inside(grid, position, ends)
+        begins = ends - inside[:, None] * (ends - position)
+        total = integrate_ways(field, grid, begins, ends, inside * distance, fraction)
+        return total.unflatten(1, grid.shape)
     count = max(1, CHUNK_SAMPLES // (2 * pairs))
     chunks = zip(ends.split(count), distance.split(count), strict=True)
     return torch.cat([recompute(integrate, *chunk) for chunk in chunks], 1).unflatten(1, grid.shape)

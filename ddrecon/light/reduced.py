@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from ddrecon.light.beam import Beam, follow_beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam, follow_point_light
+from ddrecon.light.shear import is_fused
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
 
@@ -36,18 +38,30 @@ def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> R
     Q0 = sum of E tau / (4 pi) and Q1 = 3 g' sum of E tau w / (4 pi) over lights that go along w, g'
     being the mean cosine of the scattering that remains. Without `has_flux` no Q1 is computed.
     """
-    beams: list[Beam | PointBeam] = []
-    total = Moments(torch.zeros_like(medium.extinction.value))
-    for light in lights:
-        if isinstance(light, DirectionalLight | PointLight):
-            beam, received = (
+    beams: dict[int, Beam | PointBeam] = {}
+    parts, received = [], []
+    directional = {
+        i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
+    }
+    if directional and is_fused():
+        from ddrecon.light.fused.beams import follow_beams
+
+        found, moments = follow_beams(medium, list(directional.values()), has_flux)
+        beams.update(zip(directional, found, strict=True))
+        parts.append(moments)
+    for i, light in enumerate(lights):
+        if i not in beams and isinstance(light, DirectionalLight | PointLight):
+            beams[i], moments = (
                 follow_beam(medium, light, has_flux)
                 if isinstance(light, DirectionalLight)
                 else follow_point_light(medium, light, has_flux)
             )
-            beams.append(beam)
-            total = total.plus(received)
-    return ReducedLight(tuple(beams), total.scaled(1.0, 3 * medium.mean_cosine))
+            received.append(moments)
+    if received:
+        parts.append(reduce(Moments.plus, received).scaled(1.0, 3 * medium.mean_cosine))
+    elif not parts:
+        parts.append(Moments(torch.zeros_like(medium.extinction.value)))
+    return ReducedLight(tuple(beams[i] for i in sorted(beams)), reduce(Moments.plus, parts))
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:

@@ -13,12 +13,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.autodiff import is_forward, recompute
 from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
+
+
+def is_fused() -> bool:
+    """Whether fused kernels follow light through cells; in forward mode torch does."""
+    return current_engine() == "warp" and not is_forward()
 
 
 def sum_mass_to_cells(
@@ -37,6 +43,10 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
+    if is_fused():
+        from ddrecon.light.fused.sum_mass import sum_mass
+
+        return sum_mass(field, grid, direction, bound)
     if field.shape[0] == 1:
         return _sum_mass(field, grid, direction, bound)
     each = [recompute(_sum_mass, one, grid, direction, bound) for one in field.split(1)]

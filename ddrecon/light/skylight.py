@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.light.moments import Moments, Vector
-from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.light.shear import is_fused, sum_mass_to_cells
 from ddrecon.light.sky import Sky
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import henyey_greenstein
@@ -27,18 +27,32 @@ def ambient_sky(radiance: Tensor) -> Sky:
     return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
 
 
-def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments:
-    """Light of all skies in `lights` not yet scattered, to first order in angle.
+def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments | None:
+    """Light of all skies in `lights` not yet scattered, to first order in angle; None of no sky.
 
     Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
     and Q1 but for g (docs/theory.md section 1). Without `has_flux` there is no flux.
     """
-    total = Moments(torch.zeros_like(medium.extinction.value))
-    for sky in _lit_skies(lights):
+    skies = _lit_skies(lights)
+    if skies and is_fused():
+        return _sum_fused(medium, skies, has_flux)
+    total = None
+    for sky in skies:
         vectors = sky.vector if has_flux else [None] * len(sky.travel)
         for travel, irradiance, vector in zip(sky.travel, sky.irradiance, vectors, strict=True):
-            total = total.plus(recompute(_attenuate_direction, medium, travel, irradiance, vector))
-    return total.scaled(1 / (4 * math.pi), 3 / (4 * math.pi))
+            part = recompute(_attenuate_direction, medium, travel, irradiance, vector)
+            total = part if total is None else total.plus(part)
+    return None if total is None else total.scaled(1 / (4 * math.pi), 3 / (4 * math.pi))
+
+
+def _sum_fused(medium: Medium, skies: Sequence[Sky], has_flux: bool) -> Moments:
+    """What `sum_unscattered_sky` returns, by fused kernels: directions one after the other."""
+    from ddrecon.light.fused.beams import attenuate
+
+    mean, flux = torch.cat([sky.irradiance for sky in skies]), torch.cat([s.vector for s in skies])
+    weights = torch.cat([mean[:, None], 3 * flux], 1) if has_flux else mean[:, None]
+    directions = torch.cat([sky.travel for sky in skies])
+    return attenuate(medium, directions, weights / (4 * math.pi))[0]
 
 
 def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
@@ -80,6 +94,10 @@ def _attenuate_direction(
 
     tau is averaged over each cell.
     """
+    if is_fused() and vector is None:
+        from ddrecon.light.fused.beams import attenuate
+
+        return attenuate(medium, direction[None], irradiance.view(1, 1, -1))[0]
     extinction = medium.extinction
     entered, step = sum_mass_to_cells(
         extinction.field, medium.grid, direction, extinction.mass_bound

@@ -1,1 +1,4 @@
-"""Light at cells, as fused kernels."""
+"""Light at cells by fused kernels in NVIDIA Warp.
+
+`light.shear`, `light.moments` and `Coefficient` are their definition.
+"""

@@ -1,0 +1,62 @@
+"""What `light.shear.sum_mass_to_cells` returns, as a differentiable function, by fused kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.light.fused.shear import Shear, Sum
+from ddrecon.numerics.slicing import Slicing, across
+
+
+def sum_mass(
+    field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """The mass `[K, z, y, x]` up to where a beam enters each cell, and its path in a slice [u]."""
+    shears, numbers = follow(grid, direction[None], bound)
+    entered: Tensor = _SumMass.apply(shears[0], field, numbers)
+    return entered, numbers[0, 2]
+
+
+def follow(
+    grid: Grid, directions: Tensor, bound: Tensor | float
+) -> tuple[tuple[Shear, ...], Tensor]:
+    """How beams along `directions` [L, 3] cross slices, and the numbers [L, 4] of each.
+
+    These are the slope by rows and by columns, the path in a slice [u] and the `bound`.
+    """
+    speed = directions / directions.new_tensor(grid.spacing)
+    slicings = [Slicing.of(each) for each in speed.tolist()]
+    order = [[*across(slicing.axis), slicing.axis] for slicing in slicings]
+    ordered = speed.gather(1, torch.tensor(order, device=speed.device))
+    fastest = ordered[:, 2:].abs()
+    slope = ordered[:, :2] / fastest
+    bounds = torch.as_tensor(bound).to(speed).expand(len(speed), 1)
+    shears = [
+        Shear(grid, slicing, (row, column))
+        for slicing, (row, column) in zip(slicings, slope.tolist(), strict=True)
+    ]
+    return tuple(shears), torch.cat([slope, 1 / fastest, bounds], 1)
+
+
+class _SumMass(torch.autograd.Function):
+    """The mass entered; differentiable by the field and by the beam's numbers."""
+
+    @staticmethod
+    def forward(ctx: Any, shear: Shear, field: Tensor, numbers: Tensor) -> Tensor:
+        ctx.shear = shear
+        ctx.save_for_backward(field, numbers)
+        return shear.lift(Sum(shear, shear.lay(field.detach()), numbers, 0).entered)
+
+    @staticmethod
+    def backward(ctx: Any, entered_bar: Tensor) -> tuple[Tensor | None, ...]:
+        field, numbers = ctx.saved_tensors
+        shear, varies = ctx.shear, ctx.needs_input_grad[2]
+        laid = shear.lay(field)
+        field_bar = torch.zeros_like(laid)
+        found = Sum(shear, laid, numbers, 0).adjoint(shear.lay(entered_bar), field_bar, varies)
+        numbers_bar = None if found is None else found.to(numbers)[None]
+        return None, shear.lift(field_bar), numbers_bar

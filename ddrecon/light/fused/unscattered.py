@@ -1,0 +1,129 @@
+"""Light of many beams that reaches cells unscattered, as one differentiable function of tensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.light.fused.receive import Receiver
+from ddrecon.light.fused.shear import Shear, Sum
+
+MOST_BEAMS = 8
+MOST_NUMBERS = 1 << 22
+"""Of so many beams, and of so many numbers, masses are held at once: cells then receive the light
+of all of them in one pass.
+"""
+
+
+class Unscattered(torch.autograd.Function):
+    """Moments [C, z, y, x] of L beams together, and the mass up to cells' centers of each.
+
+    `shears`: how each crosses the slices; `has_mass`: whether masses are wanted; `field`
+    [K, z, y, x] and `scale` [C] of the extinction; `numbers` [L, 4]: of each beam its slope by rows
+    and by columns, its path in a slice [u] and the bound of corrections; `weights` [L, moments, C]:
+    what transmittance is multiplied by. Moments are the mean, or the mean and three of a flux.
+    Nothing but these is kept for the backward pass.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        shears: tuple[Shear, ...],
+        has_mass: bool,
+        field: Tensor,
+        scale: Tensor,
+        numbers: Tensor,
+        weights: Tensor,
+    ) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        ctx.shears, ctx.has_mass = shears, has_mass
+        ctx.save_for_backward(field, scale, numbers, weights)
+        receiver = Receiver(field, scale, numbers, weights)
+        moments, masses = receiver.new_moments(), []
+        laid = _Laid(field)
+        for lights in _batches(len(shears), field):
+            entered = field.new_empty(len(lights), *field.shape)
+            for light, to in zip(lights, entered, strict=True):
+                to.copy_(
+                    shears[light].lift(
+                        Sum(shears[light], laid.of(shears[light]), numbers, light).entered
+                    )
+                )
+            receiver.receive(lights[0], entered, moments, adds=lights[0] > 0)
+            if has_mass:
+                masses += [
+                    torch.addcmul(one, field, 0.5 * numbers[light, 2])
+                    for light, one in zip(lights, entered, strict=True)
+                ]
+        return *moments, *masses
+
+    @staticmethod
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
+        field, scale, numbers, weights = ctx.saved_tensors
+        varies = any(ctx.needs_input_grad[3:])
+        receiver = Receiver(field, scale, numbers, weights)
+        moments_bar, masses_bar = bars[: receiver.moments], bars[receiver.moments :]
+        laid, laid_bar = _Laid(field), _Laid(torch.zeros_like(field))
+        field_bar = torch.zeros_like(field)
+        scale_bar = torch.zeros_like(scale, dtype=torch.float64)
+        numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
+        weights_bar = torch.zeros_like(weights, dtype=torch.float64)
+        for lights in _batches(len(ctx.shears), field):
+            shears = [ctx.shears[light] for light in lights]
+            sums = [Sum(s, laid.of(s), numbers, i) for i, s in zip(lights, shears, strict=True)]
+            entered = torch.stack([each.shear.lift(each.entered) for each in sums])
+            entered_bars, found = receiver.adjoint(
+                lights[0], entered, moments_bar, field_bar, varies
+            )
+            for i, (light, shear, each) in enumerate(zip(lights, shears, sums, strict=True)):
+                mass_bar = masses_bar[light] if ctx.has_mass else None
+                if mass_bar is not None:
+                    entered_bars[i] += mass_bar
+                    field_bar.addcmul_(mass_bar, 0.5 * numbers[light, 2])
+                to = field_bar if shear.axis != 2 else laid_bar.of(shear)
+                by_beam = each.adjoint(shear.lay(entered_bars[i]), to, varies)
+                if by_beam is not None and found is not None:
+                    numbers_bar[light] += by_beam
+                    numbers_bar[light, 2] += found[i, 0]
+                    if mass_bar is not None:
+                        numbers_bar[light, 2] += 0.5 * (field * mass_bar).sum(dtype=torch.float64)
+            if found is not None:
+                scale_bar += found[:, 1 : 1 + len(scale)].sum(0)
+                by_weights = found[:, 1 + len(scale) :].view(len(lights), 4, -1)
+                weights_bar[lights[0] : lights[-1] + 1] = by_weights[:, : receiver.moments]
+        field_bar = laid_bar.add_to(field_bar)
+        if not varies:
+            return None, None, field_bar, None, None, None
+        by_numbers = (bar.to(field) for bar in (scale_bar, numbers_bar, weights_bar))
+        return None, None, field_bar, *by_numbers
+
+
+def _batches(lights: int, field: Tensor) -> list[range]:
+    """The numbers of beams, in parts small enough for their masses to be held at once."""
+    size = max(1, min(MOST_BEAMS, MOST_NUMBERS // field.numel()))
+    return [range(first, min(first + size, lights)) for first in range(0, lights, size)]
+
+
+class _Laid:
+    """A field as it lies in the grid, and laid out for slices across x where that is wanted."""
+
+    def __init__(self, cells: Tensor):
+        self.cells = cells.contiguous()
+        self.across_x: Tensor | None = None
+        self.shear: Shear | None = None
+
+    def of(self, shear: Shear) -> Tensor:
+        """The field as `shear` lays it, the same tensor each time."""
+        if shear.axis != 2:
+            return self.cells
+        if self.across_x is None:
+            self.across_x, self.shear = shear.lay(self.cells), shear
+        return self.across_x
+
+    def add_to(self, cells: Tensor) -> Tensor:
+        """`cells` with what was laid out added."""
+        if self.across_x is None or self.shear is None:
+            return cells
+        return cells + self.shear.lift(self.across_x)

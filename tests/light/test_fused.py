@@ -1,0 +1,233 @@
+"""Light not yet scattered by fused kernels is what PyTorch's operations compute.
+
+Values and derivatives, on grids and along directions where interpolation has kinks.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from media import half_empty, make_scene, random_values
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ddrecon.engine import use_engine
+from ddrecon.grid import Grid
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.light.moments import Moments
+from ddrecon.light.reduced import reduced_light
+from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.light.sky import decompose_lights
+from ddrecon.light.skylight import sum_unscattered_sky
+from ddrecon.medium.coefficients import scale_medium
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, with_values
+
+wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.light.fused.point_light import way_kernels  # noqa: E402
+from ddrecon.light.fused.receive import receive_kernels  # noqa: E402
+from ddrecon.light.fused.shear import shear_kernels  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+DIRECTIONS = [
+    *[(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)],  # along axes
+    *[(1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, 0.5, 0.5), (1.0, 0.0, -1.0)],  # through centers
+    *[(0.3, -0.9, 0.2), (-0.1, 0.2, -0.8), (0.4, 0.2, 0.8), (0.9, 0.05, -0.01), (0.01, 1.0, 0.999)],
+]
+SHAPES = [(5, 4, 6), (1, 5, 3), (7, 1, 1), (1, 1, 1), (3, 9, 5)]
+
+
+def vector(*values: float, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.tensor(values, dtype=dtype)
+
+
+def assert_near(found: Tensor, known: Tensor, error: float) -> None:
+    assert found.shape == known.shape
+    assert float((found - known).abs().max()) <= error * max(float(known.abs().max()), 1e-3)
+
+
+def masses(
+    engine: str, grid: Grid, field: Tensor, direction: Tensor, bound: Tensor
+) -> tuple[Tensor, ...]:
+    """Mass and path, and the derivatives of a random functional of both by all arguments."""
+    use_engine(engine)
+    leaves = [each.detach().clone().requires_grad_() for each in (field, direction, bound)]
+    entered, step = sum_mass_to_cells(leaves[0], grid, leaves[1], leaves[2])
+    loss = (entered * random_values(*entered.shape, seed=1).to(entered)).sum() + 0.7 * step
+    return entered.detach(), step.detach(), *torch.autograd.grad(loss, leaves)
+
+
+@pytest.mark.parametrize("upper", ["cubes", "boxes"])
+@pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
+def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float, ...], upper: str):
+    """Also where places lie exactly on cells' centers: there the mean of both sides' slopes."""
+    heading = torch.nn.functional.normalize(vector(*direction), dim=0)
+    for shape in SHAPES:
+        corner = (1.25, 1.3, 0.9) if upper == "boxes" else tuple(0.2 * cells for cells in shape)
+        grid, field = Grid(shape, (0, 0, 0), corner), random_values(2, *shape)
+        for bound in (0.0, 1.7):
+            given = grid, field, heading, vector(bound).squeeze()
+            for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):
+                assert_near(found, known, 1e-12)
+
+
+@pytest.mark.parametrize("shape", [(3, 300, 5), (3, 5, 300), (300, 3, 5)], ids=str)
+def test_rows_longer_than_a_block(shape: tuple[int, int, int]):
+    grid = Grid(shape, (0, 0, 0), tuple(0.2 * cells for cells in shape))
+    for direction in ((0.8, 0.1, -0.2), (0.2, -0.7, 0.4), (0.3, 0.2, 0.9)):
+        heading = torch.nn.functional.normalize(vector(*direction), dim=0)
+        given = grid, random_values(1, *shape), heading, vector(0.5).squeeze()
+        for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):
+            assert_near(found, known, 1e-11)
+
+
+def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
+    """A scene with several lights of all kinds, with a medium of `kind`."""
+    density = half_empty(5, 7, 6, dtype=dtype)
+    options: dict = {"sigma_a": (1.0,), "sigma_s": (6.0,), "directional": (3.0,)}
+    if kind != "gray":
+        options = {"directional": (3.0, 2.0, 1.0)}
+    if kind == "fields":
+        options |= {
+            name: 3 * random_values(3, *density.shape, seed=seed, dtype=dtype)
+            for seed, name in enumerate(("sigma_a", "sigma_s"), 1)
+        }
+    scene = make_scene(density, g=0.4, **options)
+    radiance = random_values(1 if kind == "gray" else 3, 6, 8, seed=4, dtype=dtype)
+    number = density.new_tensor
+    scene.lights += [
+        DirectionalLight(number([0.2, 0.9, 0.3]), number([1.5])),
+        EnvironmentLight(radiance, number(1.3), number(20.0), directions=12),
+        AmbientLight(number([0.3])),
+        PointLight(number([0.9, 0.7, 0.2]), number([1.0])),
+    ]
+    return scene
+
+
+def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, has_flux: bool) -> list[Tensor]:
+    """Masses of beams, and all moments of the light not yet scattered."""
+    use_engine(engine)
+    changed = with_values(scene, values)
+    medium, lights = scale_medium(changed.volume), decompose_lights(changed.lights)
+    reduced = reduced_light(medium, lights, has_flux)
+    sky = sum_unscattered_sky(medium, lights, has_flux)
+    assert sky is not None
+
+    def parts(moments: Moments) -> list[Tensor]:
+        return [moments.mean, *(moments.flux or ())]
+
+    return [*(beam.mass for beam in reduced.beams), *parts(reduced.source), *parts(sky)]
+
+
+def gradients(scene: Scene, names: list[str], engine: str, has_flux: bool) -> list[Tensor]:
+    """The light, and the derivatives of a random functional of it by `names`."""
+    leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
+    found = fields_of(scene, leaves, engine, has_flux)
+    loss = sum((each * random_values(*each.shape, seed=3).to(each)).sum() for each in found)
+    return [each.detach() for each in found] + list(torch.autograd.grad(loss, [*leaves.values()]))
+
+
+NUMBERS = ["density", "sigma_a", "sigma_s", "g", "lights.0.direction", "lights.0.irradiance"]
+NUMBERS += ["lights.1.irradiance", "lights.2.radiance", "lights.2.rotation"]
+each_kind = pytest.mark.parametrize("kind", ["gray", "colors", "fields"])
+
+
+@each_kind
+@pytest.mark.parametrize("has_flux", [True, False])
+def test_light_and_its_derivatives_are_those_of_torch(kind: str, has_flux: bool):
+    names = NUMBERS if has_flux else [name for name in NUMBERS if name != "lights.2.rotation"]
+    scene = scene_of(kind)
+    found, known = (gradients(scene, names, engine, has_flux) for engine in ("warp", "torch"))
+    for one, other in zip(found, known, strict=True):
+        assert_near(one, other, 1e-11)
+
+
+POSITIONS = {
+    "outside": (0.9, 0.7, 0.2),
+    "inside": (0.11, 0.13, 0.17),
+    "in a center": (0.083333333333333333, 0.0, -0.04),
+    "before an axis": (0.083333333333333333, 0.0, 3.0),
+}
+
+
+@pytest.mark.parametrize("place", POSITIONS)
+@pytest.mark.parametrize("kind", ["gray", "fields"])
+def test_point_lights_are_those_of_torch(kind: str, place: str):
+    """Also where ways run through cells' centers, at which interpolation has kinks."""
+    scene = scene_of(kind)
+    position = vector(*POSITIONS[place])
+    scene.lights = [PointLight(position, vector(2.0)), *scene.lights]
+    names = ["density", "sigma_a", "g", "lights.0.position", "lights.0.intensity"]
+    found, known = (gradients(scene, names, engine, True) for engine in ("warp", "torch"))
+    for one, other in zip(found, known, strict=True):
+        assert_near(one, other, 1e-11)
+
+
+def test_the_density_alone():
+    scene = scene_of("colors")
+    found, known = (gradients(scene, ["density"], engine, True) for engine in ("warp", "torch"))
+    for one, other in zip(found, known, strict=True):
+        assert_near(one, other, 1e-11)
+
+
+def test_single_precision():
+    scene = scene_of("fields", torch.float32)
+    found, known = (gradients(scene, NUMBERS, engine, True) for engine in ("warp", "torch"))
+    for one, other in zip(found, known, strict=True):
+        assert_near(one, other, 2e-5)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_tangent_and_adjoint_are_transposes_of_each_other(name: str):
+    scene = scene_of("fields")
+    value = value_of(scene, name).detach()
+    shift = random_values(*value.shape, seed=5)
+    with forward_ad.dual_level():
+        found = fields_of(scene, {name: forward_ad.make_dual(value, shift)}, "warp", True)
+        tangents = [forward_ad.unpack_dual(each).tangent for each in found]
+    along = sum(
+        float((each * random_values(*each.shape, seed=3)).sum())
+        for each in tangents
+        if each is not None
+    )
+    back = float((gradients(scene, [name], "warp", True)[-1] * shift).sum())
+    assert along == pytest.approx(back, rel=1e-10)
+
+
+def test_opaque_and_empty_media_have_finite_derivatives():
+    scene = scene_of("colors")
+    for factor in (0.0, 1e4):
+        scene.volume.density = factor * scene.volume.density
+        found, known = (gradients(scene, NUMBERS, engine, True) for engine in ("warp", "torch"))
+        for one, other in zip(found, known, strict=True):
+            assert bool(torch.isfinite(one).all())
+            assert_near(one, other, 1e-11)
+        scene = scene_of("colors")
+
+
+def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
+    scene, threads = scene_of("colors"), torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        first, again = (gradients(scene, NUMBERS, "warp", True) for _ in range(2))
+        torch.set_num_threads(1)
+        alone = gradients(scene, NUMBERS, "warp", True)
+    finally:
+        torch.set_num_threads(threads)
+    for one, same, other in zip(first, again, alone, strict=True):
+        assert torch.equal(one, same)
+        assert_near(one, other, 1e-12)
+
+
+@pytest.mark.parametrize("architecture", [80, 90])
+def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
+    rooms = shear_kernels(32), receive_kernels(32), way_kernels(32)
+    made = [each for room in rooms for each in vars(room).values()]
+    kernels = [each for each in made if isinstance(each, wp.Kernel)]
+    assert len(kernels) == 9
+    for kernel in kernels:
+        wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)
