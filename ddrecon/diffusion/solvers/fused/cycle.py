@@ -168,7 +168,7 @@ const auto prolong_x = [&](const F* in, F* out, const F* below, const F* above, 
 const auto go_down = [&](int s, int matrix, const F* source, F* out, F* W, int from, int to) {
     const Level l = level_of(s, matrix);
     const Ways way = ways_of(s);
-    const Size slice = l.slice, margin = l.nx + 1, length = slice + 2 * margin;
+    const Size slice = l.slice, margin = (l.nx + 16) / 16 * 16, length = (slice + 15) / 16 * 16 + 2 * margin;
     const auto slot = [&](int k) { return W + k * length + margin; };
     clear(W, 4 * length);
     F* const zero = slot(12);
@@ -232,7 +232,7 @@ const auto go_up = [&](int s, int matrix, const F* source, const F* u, F* out, F
                        int to, bool is_finest) -> double {
     const Level l = level_of(s, matrix);
     const Ways way = ways_of(s);
-    const Size slice = l.slice, margin = l.nx + 1, length = slice + 2 * margin;
+    const Size slice = l.slice, margin = (l.nx + 16) / 16 * 16, length = (slice + 15) / 16 * 16 + 2 * margin;
     const auto slot = [&](int k) { return W + k * length + margin; };
     clear(W, 8 * length);
     int corrected = max_of(from - 2, 0), relaxed = max_of(from - 1, 0);

@@ -24,7 +24,7 @@ BODY = (
     + """
 const int color = item / shares, part = item - color * shares, matrix = matrices > 1 ? color : 0;
 const Level l = level_of(0, matrix);
-const Size nx = l.nx, slice = l.slice, margin = nx + 1, length = slice + 2 * margin;
+const Size nx = l.nx, slice = l.slice, margin = (nx + 16) / 16 * 16, length = (slice + 15) / 16 * 16 + 2 * margin;
 const int from = (int)((Size)l.nz * part / shares), to = (int)((Size)l.nz * (part + 1) / shares);
 const Size start = color * l.cells, first_cell = from * slice, count = (to - from) * slice;
 F* const W = &scratch.data[item * scratch_size];
@@ -44,7 +44,8 @@ const auto take = [&](const F* __restrict s, const F* __restrict b, F* __restric
 if (act == START) {
     // Beside the residual lie numbers that the cycle reads, and multiplies by zero.
     if (item == 0) for (Size i = 1; i <= margin; ++i) r[-i] = F(0);
-    if (item == all_colors * shares - 1) for (Size i = 0; i < margin; ++i) r[l.cells + i] = F(0);
+    if (item == all_colors * shares - 1)
+        for (Size i = 0; i < margin; ++i) r[l.cells + i] = F(0);
     double square = 0.0, norm = 0.0;
     if (has_guess) for (Size i = 0; i < 4 * length; ++i) W[i] = F(0);
     const F* const guessed = guess.data + (has_guess ? start : 0);

@@ -19,6 +19,7 @@ from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.fused.cycle import SLOTS, cycle_kernel
 from ddrecon.diffusion.solvers.fused.gradients import gradient_kernel
 from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, table_of
+from ddrecon.diffusion.solvers.fused.stages import margin
 from ddrecon.diffusion.solvers.fused.sums import ROWS
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.errors import SolveError
@@ -87,14 +88,14 @@ class _Run:
     ):
         self.hierarchy, self.source, stages = hierarchy, source, hierarchy.stages
         self.colors, (_, y, x) = len(source), source.shape[1:]
-        cells, margin = source[0].numel(), x + 1
+        cells, edge = source[0].numel(), margin(x)
         self.shares, self.threads = shares_of(cells, self.colors, source)
-        # solution, residual between margins, two directions, what the cycle makes, A d
-        size = self.colors * cells
-        self.places = [0, size + margin, *((k * size + 2 * margin) for k in range(2, VECTORS))]
-        self.vectors = source.new_empty(VECTORS * size + 2 * margin)
+        # solution, residual, two directions, what the cycle makes, A d
+        size = -(-self.colors * cells // 16) * 16 + edge
+        self.places = [edge + k * size for k in range(VECTORS)]
+        self.vectors = source.new_empty(VECTORS * size + edge)
         coarser = source.new_zeros(self.colors * stages.vectors)
-        slots = SLOTS * (y * x + 2 * margin)
+        slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
         scratch = source.new_empty(self.colors * self.shares * slots)
         self.sums = source.new_empty(
             len(ROWS) * self.colors * self.shares + 2, dtype=torch.float64
@@ -144,7 +145,7 @@ class _Run:
 
     def value(self) -> Tensor:
         """The solution u = S y."""
-        y = self.vectors[: self.source.numel()].view_as(self.source)
+        y = self.vectors[self.places[0] :][: self.source.numel()].view_as(self.source)
         return y * self.hierarchy.scale
 
     def _cycle(self, leg: int, iteration: int) -> None:

@@ -87,6 +87,10 @@ const auto scale_faces = [&](int s, int color, int first, int last, double* sums
     const Grid g = grid_of(s, color);
     const F* const scales = in_data(s, SCALE, color, g.cells);
     const int across[3] = {g.ny * g.nx, g.nx, 1};
+    // Before the first faces lie numbers that the cycle reads as those of a face on the box.
+    if (color == 0 && first == 0)
+        for (int a = 1; a < 3; ++a)
+            for (int i = 1; i <= g.nx; ++i) in_data(s, SZ + a, 0, 0)[-i] = F(0);
     for (int r = first; r < last; ++r) {
         const int z = r / g.ny, y = r - z * g.ny, nx = g.nx;
         const F* __restrict here = scales + (Size)r * nx;

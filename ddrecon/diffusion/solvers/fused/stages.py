@@ -79,19 +79,27 @@ def strong_axes(shape: Shape, found: Axes, means: Sequence[Sequence[float]]) -> 
     return tuple(_completed(shape, axes))
 
 
+def margin(width: int) -> int:
+    """How many numbers lie before and behind every array of a grid so wide.
+
+    Loops over slices read as far, and multiply by zero. It also keeps arrays from beginning at the
+    same place of a processor's cache, in lines of which they all begin.
+    """
+    return (width + 16) // 16 * 16
+
+
 @functools.cache
 def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
     """The stages of `shape` cells and matrices of so many `colors`."""
     rows, sizes = list(_rows(shape, axes)), {"data": 0, "work": 0, "vectors": 0}
     levels = [i for i, row in enumerate(rows) if row["is_level"]]
     following = dict(itertools.pairwise(levels))
-    margin = shape[2] + 1  # what loops over slices read, and multiply by zero, at either end
 
     def take(kind: str, count: int) -> int:
-        sizes[kind] += count
-        return sizes[kind] - count
+        begin = sizes[kind] + margin(shape[2])
+        sizes[kind] = begin + -(-count // 16) * 16
+        return begin
 
-    take("vectors", margin)
     for i, row in enumerate(rows):
         cells, is_last = math.prod(row["shape"]), row["axis"] < 0
         row |= dict(zip(COLUMNS[:3], row["shape"], strict=True))
@@ -102,13 +110,13 @@ def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
             coarse = colors * math.prod(rows[i + 1]["shape"])
             row |= {name: take("data", coarse) for name in ("BELOW", "ABOVE")}
         if row["is_level"] and not (is_last and i > 0):
-            # In this order: before the first entry of SY and SX lie faces on the box, which are 0.
-            names = ("SZ", "SY", "SX", "SCALE", "TAKEN")
-            row |= {name: take("data", colors * cells) for name in names}
+            row |= {name: take("data", colors * cells) for name in COLUMNS[11:16]}
         if is_last:
             row["INVERSE"] = take("data", colors * cells**2)
         if row["is_level"] and i > 0:
-            row |= {name: take("vectors", cells + margin) for name in ("SOURCE", "U")}
+            row |= {name: take("vectors", cells) for name in ("SOURCE", "U")}
+    for kind in sizes:
+        take(kind, 0)
     table = tuple(row.get(name, 0) for row in rows for name in COLUMNS)
     return Stages(axes, colors, table, tuple(levels), **sizes)
 
