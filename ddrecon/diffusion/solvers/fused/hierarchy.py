@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,7 @@ from ddrecon.diffusion.solvers.fused.stages import (
     strong_axes,
 )
 from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.spare import borrow, give_back
 
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
@@ -33,7 +35,7 @@ It is checked, so no result depends on it.
 """
 
 
-@dataclass
+@dataclass(eq=False)
 class Hierarchy:
     """The grids of an operator: numbers `data`, laid out as `stages` say.
 
@@ -123,8 +125,7 @@ def _make(operator: Operator, axes: Axes) -> Hierarchy:
     shares, threads = shares_of(math.prod(shape), colors, loss)
     given = (*operator.conductances, loss)
     levels, few = len(stages.levels) - 1, math.prod(stages.shape(stages.levels[-1]))
-    data = loss.new_empty(stages.data)
-    work = loss.new_empty(stages.work)
+    data, work = borrow(stages.data, loss), borrow(stages.work, loss)
     scratch = loss.new_empty(colors * shares * 3 * (shape[2] + 3))
     strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
     dense = loss.new_empty(2 * colors * few**2 if levels else 0, dtype=torch.float64)
@@ -149,4 +150,7 @@ def _make(operator: Operator, axes: Axes) -> Hierarchy:
         do("coarse cells", stage, shares, threads)
     if levels:
         do("all but first", second, 1, min(threads, colors))
-    return Hierarchy(stages, shares, data, strengths)
+    give_back(work)
+    made = Hierarchy(stages, shares, data, strengths)
+    weakref.finalize(made, give_back, data)
+    return made

@@ -24,6 +24,7 @@ from ddrecon.diffusion.solvers.fused.sums import ROWS
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.errors import SolveError
 from ddrecon.kernels.launch import array, launch
+from ddrecon.kernels.spare import borrow, give_back
 
 DOWN, COARSER, UP = range(3)
 START, CHOOSE, DIRECT, ADVANCE = range(4)
@@ -93,10 +94,10 @@ class _Run:
         # solution, residual, two directions, what the cycle makes, A d
         size = -(-self.colors * cells // 16) * 16 + edge
         self.places = [edge + k * size for k in range(VECTORS)]
-        self.vectors = source.new_empty(VECTORS * size + edge)
-        coarser = source.new_zeros(self.colors * stages.vectors)
+        self.vectors = borrow(VECTORS * size + edge, source)
+        self.coarser = borrow(self.colors * stages.vectors, source).zero_()
         slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
-        scratch = source.new_empty(self.colors * self.shares * slots)
+        self.scratch = borrow(self.colors * self.shares * slots, source)
         self.sums = source.new_empty(
             len(ROWS) * self.colors * self.shares + 2, dtype=torch.float64
         )
@@ -105,9 +106,9 @@ class _Run:
         self.cycle, self.gradient = cycle_kernel(bits), gradient_kernel(bits)
         table, data, vectors = table_of(stages, source.device), array(hierarchy.data), array(self.vectors)
         self.scalars = [stages.colors, self.colors]
-        rest = [array(scratch), slots, array(self.sums)]
+        rest = [array(self.scratch), slots, array(self.sums)]
         self.for_cycle = [
-            table, data, vectors, self.places[1], self.places[4], array(coarser), stages.vectors, *rest
+            table, data, vectors, self.places[1], self.places[4], array(self.coarser), stages.vectors, *rest
         ]
         is_fitting = guess is not None and guess.shape == source.shape
         start = guess if is_fitting else source
@@ -144,9 +145,12 @@ class _Run:
         return _Verdict(int(count), worst), found[len(self.sums) :]
 
     def value(self) -> Tensor:
-        """The solution u = S y."""
+        """The solution u = S y; nothing else can be asked for after it."""
+        # The last act: what it was computed in is free again.
         y = self.vectors[self.places[0] :][: self.source.numel()].view_as(self.source)
-        return y * self.hierarchy.scale
+        value = y * self.hierarchy.scale
+        give_back(self.vectors, self.coarser, self.scratch)
+        return value
 
     def _cycle(self, leg: int, iteration: int) -> None:
         shares, threads = self.shares, self.threads
