@@ -19,8 +19,16 @@ from ddrecon.kernels.native import number_type, program
 SLOTS = 13
 """Slices that a share of a leg keeps."""
 
+APART = """
+#if defined(__CUDA_ARCH__)
+#define APART
+#else
+#define APART __attribute__((noinline))  // compiled once, however often it is called
+#endif
+"""
+
 # What neighbors send to cell i: conductance times value, faces lying at the cell below them.
-LEVEL = """
+LEVEL = APART + """
 typedef long long Size;
 const auto at = [&](int stage, int column) -> Size {
     return table.data[(Size)stage * COLUMNS + column];
@@ -44,14 +52,14 @@ const auto level_of = [&](int s, int matrix) {
 // taken from the last slice, where faces lie on the box and are zero.
 const auto stencil = [](const Level& l, int z, const F* __restrict lower, const F* __restrict here,
                         const F* __restrict upper, const F* __restrict base, F a, F b, F times,
-                        F* __restrict out) {
+                        F* __restrict out) APART {
     const Size nx = l.nx, slice = l.slice;
     const F *__restrict cz = l.cz + z * slice, *__restrict cy = l.cy + z * slice;
     const F *__restrict cx = l.cx + z * slice;
     const F* __restrict lz = l.cz + (z > 0 ? z - 1 : l.nz - 1) * slice;
     for (Size i = 0; i < slice; ++i) out[i] = a * here[i] + b * base[i] + times * NEIGHBORS(here);
 };
-const auto inner = [](const F* __restrict a, const F* __restrict b, Size count) -> double {
+const auto inner = [](const F* __restrict a, const F* __restrict b, Size count) APART -> double {
     double part[16] = {}, total = 0.0;
     Size i = 0;
     for (; i + 16 <= count; i += 16)
@@ -102,13 +110,13 @@ const auto restrict_pair = [](const F* __restrict before, const F* __restrict on
                               const F* __restrict two, const F* __restrict after,
                               const F* __restrict below_before, const F* __restrict above_before,
                               const F* __restrict below, const F* __restrict above,
-                              F* __restrict out, Size count) {
+                              F* __restrict out, Size count) APART {
     for (Size i = 0; i < count; ++i)
         out[i] = one[i] + two[i] - (below[i] * two[i] - above[i] * after[i])
             + (below_before[i] * before[i] - above_before[i] * one[i]);
 };
 const auto restrict_y = [&](const F* in, F* out, const F* below, const F* above, const F* zero,
-                            int ny, int nx) {
+                            int ny, int nx) APART {
     for (int j = 0; 2 * j < ny; ++j) {
         const F* one = in + (Size)2 * j * nx;
         const F *b = below + (Size)j * nx, *a = above + (Size)j * nx;
@@ -117,7 +125,7 @@ const auto restrict_y = [&](const F* in, F* out, const F* below, const F* above,
                       j > 0 ? a - nx : zero, b, a, out + (Size)j * nx, nx);
     }
 };
-const auto restrict_x = [&](const F* in, F* out, const F* below, const F* above, int rows, int nx) {
+const auto restrict_x = [&](const F* in, F* out, const F* below, const F* above, int rows, int nx) APART {
     const int coarse = (nx + 1) / 2;
     for (int j = 0; j < rows; ++j) {
         const F* __restrict r = in + (Size)j * nx;
@@ -137,7 +145,7 @@ const auto restrict_x = [&](const F* in, F* out, const F* below, const F* above,
         if (coarse > 1) end(coarse - 1);
     }
 };
-const auto prolong_y = [&](const F* in, F* out, const F* below, const F* above, int ny, int nx) {
+const auto prolong_y = [&](const F* in, F* out, const F* below, const F* above, int ny, int nx) APART {
     const int coarse = (ny + 1) / 2;
     for (int j = 0; j < ny; ++j) {
         // towards the pair below or above; at the ends there is none, and the difference is zero
@@ -148,7 +156,7 @@ const auto prolong_y = [&](const F* in, F* out, const F* below, const F* above, 
         for (int i = 0; i < nx; ++i) o[i] = u[i] + w[i] * (v[i] - u[i]);
     }
 };
-const auto prolong_x = [&](const F* in, F* out, const F* below, const F* above, int rows, int nx) {
+const auto prolong_x = [&](const F* in, F* out, const F* below, const F* above, int rows, int nx) APART {
     const int coarse = (nx + 1) / 2;
     for (int j = 0; j < rows; ++j) {
         const F* __restrict u = in + (Size)j * coarse;
@@ -165,7 +173,7 @@ const auto prolong_x = [&](const F* in, F* out, const F* below, const F* above, 
 };
 
 // Restricts T (source - M y), y being two relaxations from zero, to slices `from` to `to`.
-const auto go_down = [&](int s, int matrix, const F* source, F* out, F* W, int from, int to) {
+const auto go_down = [&](int s, int matrix, const F* source, F* out, F* W, int from, int to) APART {
     const Level l = level_of(s, matrix);
     const Ways way = ways_of(s);
     const Size slice = l.slice, margin = (l.nx + 16) / 16 * 16, length = (slice + 15) / 16 * 16 + 2 * margin;
@@ -229,7 +237,7 @@ const auto go_down = [&](int s, int matrix, const F* source, F* out, F* W, int f
 // The cycle's result in slices `from` to `to`, from the solution `u` of the coarser grid; returns
 // its inner product with `source`. Multiplied by S where a finer grid is to be corrected by it.
 const auto go_up = [&](int s, int matrix, const F* source, const F* u, F* out, F* W, int from,
-                       int to, bool is_finest) -> double {
+                       int to, bool is_finest) APART -> double {
     const Level l = level_of(s, matrix);
     const Ways way = ways_of(s);
     const Size slice = l.slice, margin = (l.nx + 16) / 16 * 16, length = (slice + 15) / 16 * 16 + 2 * margin;

@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from ddrecon.diffusion.solvers.fused.cycle import APART
 from ddrecon.diffusion.solvers.fused.stages import ENUM
 from ddrecon.kernels.native import number_type, program
 
@@ -17,6 +18,7 @@ STEPS = """enum { SCALE_CELLS, SCALE_FACES, WEIGHTS, COARSE_CELLS, ALL_BUT_FIRST
 BODY = (
     ENUM
     + STEPS
+    + APART
     + """
 typedef long long Size;
 const auto at = [&](int stage, int column) -> Size {
@@ -61,7 +63,7 @@ const auto in_data = [&](int s, int column, int color, Size cells) -> F* {
 };
 
 // S = diagonal^(-1/2), and S times what a cell exchanges with its neighbors
-const auto scale_cells = [&](int s, int color, int first, int last) {
+const auto scale_cells = [&](int s, int color, int first, int last) APART {
     const Grid g = grid_of(s, color);
     F* const padded = own;
     padded[0] = F(0);
@@ -83,7 +85,7 @@ const auto scale_cells = [&](int s, int color, int first, int last) {
     }
 };
 // The conductances of S A S, and their sums along each axis
-const auto scale_faces = [&](int s, int color, int first, int last, double* sums) {
+const auto scale_faces = [&](int s, int color, int first, int last, double* sums) APART {
     const Grid g = grid_of(s, color);
     const F* const scales = in_data(s, SCALE, color, g.cells);
     const int across[3] = {g.ny * g.nx, g.nx, 1};
@@ -117,7 +119,7 @@ const auto scale_faces = [&](int s, int color, int first, int last, double* sums
 // Resistors from a pair's cell to the next pair's: where the face between stands, and 1 / resistance
 const auto resist = [](const F* __restrict low, const F* __restrict face, const F* __restrict high,
                        F* __restrict below, F* __restrict above, F* __restrict along, int count,
-                       int step, F after) {
+                       int step, F after) APART {
     for (int i = 0; i < count; ++i) {
         const F half_low = F(0.5) / low[i * step], half_high = after / high[i * step];
         const F resistance = half_low + F(1) / face[i * step] + half_high;
@@ -126,7 +128,7 @@ const auto resist = [](const F* __restrict low, const F* __restrict face, const 
         along[i] = F(1) / resistance;
     }
 };
-const auto weigh = [&](int s, int color, int first, int last) {
+const auto weigh = [&](int s, int color, int first, int last) APART {
     const Grid g = grid_of(s, color), c = grid_of(s + 1, color);
     const int a = (int)at(s, AXIS);
     for (int r = first; r < last; ++r) {
@@ -159,13 +161,13 @@ const auto weigh = [&](int s, int color, int first, int last) {
 const auto stiffen = [](F* __restrict along, const F* __restrict low, const F* __restrict high,
                         const F* __restrict below, const F* __restrict below_next,
                         const F* __restrict above, const F* __restrict above_next, int count,
-                        int step) {
+                        int step) APART {
     for (int i = 0; i < count; ++i) {
         const F b = below[i] - below_next[i], a = above[i] - above_next[i];
         along[i] += F(0.5) * (low[i * step] * b * b + high[i * step] * a * a);
     }
 };
-const auto coarsen_cells = [&](int s, int color, int first, int last) {
+const auto coarsen_cells = [&](int s, int color, int first, int last) APART {
     const Grid g = grid_of(s, color), c = grid_of(s + 1, color);
     const int a = (int)at(s, AXIS), nx = c.nx;
     F* const second = own + widest;
