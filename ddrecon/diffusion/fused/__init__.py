@@ -1,0 +1,1 @@
+"""The diffusion problem's formulas for each cell and its faces, as fused kernels."""
