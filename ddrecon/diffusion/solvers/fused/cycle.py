@@ -28,7 +28,9 @@ APART = """
 """
 
 # What neighbors send to cell i: conductance times value, faces lying at the cell below them.
-LEVEL = APART + """
+LEVEL = (
+    APART
+    + """
 typedef long long Size;
 const auto at = [&](int stage, int column) -> Size {
     return table.data[(Size)stage * COLUMNS + column];
@@ -69,6 +71,7 @@ const auto inner = [](const F* __restrict a, const F* __restrict b, Size count) 
     return total;
 };
 """
+)
 
 LEGS = "enum { DOWN, COARSER, UP };"
 """What a launch does: the finest level's way down, all coarser levels, the finest's way up."""
@@ -406,7 +409,7 @@ def cycle_kernel(bits: int) -> Any:
         scratch_size: wp.int64,
         sums: wp.array(dtype=wp.float64),
     ):
-                run(first + wp.tid(), leg, iteration, matrices, all_colors, parts, shares,
+        run(first + wp.tid(), leg, iteration, matrices, all_colors, parts, shares,
             tolerance, tiny, table, data, vectors, residual_at, result_at, coarser, share,
             scratch, scratch_size, sums)  # fmt: skip
 

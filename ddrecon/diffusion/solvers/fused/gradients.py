@@ -182,7 +182,7 @@ def gradient_kernel(bits: int) -> Any:
         scratch_size: wp.int64,
         sums: wp.array(dtype=wp.float64),
     ):
-                run(first + wp.tid(), act, iteration, matrices, all_colors, shares, tolerance,
+        run(first + wp.tid(), act, iteration, matrices, all_colors, shares, tolerance,
             tiny, table, data, vectors, places, source, guess, has_guess, scratch, scratch_size,
             sums)  # fmt: skip
 

@@ -98,23 +98,38 @@ class _Run:
         self.coarser = borrow(self.colors * stages.vectors, source).zero_()
         slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
         self.scratch = borrow(self.colors * self.shares * slots, source)
-        self.sums = source.new_empty(
-            len(ROWS) * self.colors * self.shares + 2, dtype=torch.float64
-        )
+        self.sums = source.new_empty(len(ROWS) * self.colors * self.shares + 2, dtype=torch.float64)
         self.tiny = torch.finfo(source.dtype).tiny
         bits = source.element_size() * 8
         self.cycle, self.gradient = cycle_kernel(bits), gradient_kernel(bits)
-        table, data, vectors = table_of(stages, source.device), array(hierarchy.data), array(self.vectors)
+        table, data, vectors = (
+            table_of(stages, source.device),
+            array(hierarchy.data),
+            array(self.vectors),
+        )
         self.scalars = [stages.colors, self.colors]
         rest = [array(self.scratch), slots, array(self.sums)]
         self.for_cycle = [
-            table, data, vectors, self.places[1], self.places[4], array(self.coarser), stages.vectors, *rest
+            table,
+            data,
+            vectors,
+            self.places[1],
+            self.places[4],
+            array(self.coarser),
+            stages.vectors,
+            *rest,
         ]
         is_fitting = guess is not None and guess.shape == source.shape
         start = guess if is_fitting else source
         places = torch.tensor(self.places, device=source.device)
         self.for_gradient = [
-            table, data, vectors, array(places), *(array(each.reshape(-1)) for each in (source, start)), int(is_fitting), *rest
+            table,
+            data,
+            vectors,
+            array(places),
+            *(array(each.reshape(-1)) for each in (source, start)),
+            int(is_fitting),
+            *rest,
         ]
         self.tolerance = tolerance
         self._advance(START, 0)
@@ -135,7 +150,9 @@ class _Run:
         size = self.colors * self.shares
 
         def norms(row: int) -> list[float]:
-            parts = [found[row * size + c * self.shares :][: self.shares] for c in range(self.colors)]
+            parts = [
+                found[row * size + c * self.shares :][: self.shares] for c in range(self.colors)
+            ]
             return [math.sqrt(sum(part)) for part in parts]
 
         left, norm = norms(ROWS.index("RESIDUAL") + launched % 2), norms(ROWS.index("SOURCE_NORM"))

@@ -8,7 +8,9 @@ of even and of odd number.
 ROWS = ("CORRECTED", "CORRECTED_ODD", "CURVED", "RESIDUAL", "RESIDUAL_ODD", "SOURCE_NORM", "COUNT")
 """r M r of cycle M, d A d of direction d, squares of residual and right side, the counts."""
 
-TEXT = f"enum {{{', '.join(name + '_ROW' for name in ROWS)}}};" + """
+TEXT = (
+    f"enum {{{', '.join(name + '_ROW' for name in ROWS)}}};"
+    + """
 const auto total_of = [&](int row, int c) -> double {
     double total = 0.0;
     for (int k = 0; k < shares; ++k) total += sums.data[(row * all_colors + c) * shares + k];
@@ -25,3 +27,4 @@ for (int c = 0; c < all_colors; ++c) {
     if (relative != relative) { is_done = true; break; }
 }
 """
+)
