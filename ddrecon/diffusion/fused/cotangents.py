@@ -29,9 +29,11 @@ for (int c = 0; c < colors; ++c) {
     F* __restrict out = &loss_bar.data[place(0, cells) + (Size)row * nx];
     const bool adds = is_sum(0);
     for (int i = 0; i < nx; ++i) out[i] = adds ? out[i] - a[i] * b[i] : -a[i] * b[i];
-    if (z < nz - 1) faces(z_bar.data + place(1, cells - slice) + (Size)row * nx, slice, nx, is_sum(1));
+    if (z < nz - 1) faces(z_bar.data + place(1, cells - slice) + (Size)row * nx, slice, nx,
+        is_sum(1));
     if (y < ny - 1)
-        faces(y_bar.data + place(2, cells - nz * nx) + ((Size)z * (ny - 1) + y) * nx, nx, nx, is_sum(2));
+        faces(y_bar.data + place(2, cells - nz * nx) + ((Size)z * (ny - 1) + y) * nx, nx, nx,
+            is_sum(2));
     faces(x_bar.data + place(3, cells - nz * ny) + (Size)row * (nx - 1), 1, nx - 1, is_sum(3));
 }
 """

@@ -1,1 +1,1 @@
-"""Multigrid for the engine warp: the same cycle as PyTorch's, in a few launches of fused kernels."""
+"""Multigrid for the engine warp: the cycle of PyTorch in a few launches of fused kernels."""

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ddrecon.diffusion.solvers.fused import sums
-from ddrecon.diffusion.solvers.fused.cycle import LEVEL
+from ddrecon.diffusion.solvers.fused.level import LEVEL
 from ddrecon.diffusion.solvers.fused.stages import ENUM
 from ddrecon.kernels.native import number_type, program
 
@@ -24,7 +24,8 @@ BODY = (
     + """
 const int color = item / shares, part = item - color * shares, matrix = matrices > 1 ? color : 0;
 const Level l = level_of(0, matrix);
-const Size nx = l.nx, slice = l.slice, margin = (nx + 16) / 16 * 16, length = (slice + 15) / 16 * 16 + 2 * margin;
+const Size nx = l.nx, slice = l.slice, margin = (nx + 16) / 16 * 16,
+    length = (slice + 15) / 16 * 16 + 2 * margin;
 const int from = (int)((Size)l.nz * part / shares), to = (int)((Size)l.nz * (part + 1) / shares);
 const Size start = color * l.cells, first_cell = from * slice, count = (to - from) * slice;
 F* const W = &scratch.data[item * scratch_size];
@@ -58,7 +59,8 @@ if (act == START) {
         if (has_guess) {
             for (; ready <= z + 1 && ready < l.nz; ++ready) {
                 F* __restrict v = slot(ready & 3);
-                const F *__restrict s = l.scale + ready * slice, *__restrict g = guessed + ready * slice;
+                const F *__restrict s = l.scale + ready * slice,
+                    *__restrict g = guessed + ready * slice;
                 for (Size i = 0; i < slice; ++i) v[i] = g[i] / s[i];
             }
             const F* v = slot(z & 3);
@@ -100,7 +102,8 @@ if (act == DIRECT && !is_done) {
             if (ready >= from && ready < to) for (Size i = 0; i < slice; ++i) kept[i] = v[i];
         }
         const F* v = slot(z & 3);
-        stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v, v, F(1),
+        stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v, v,
+            F(1),
                 F(0), F(-1), q + z * slice);
         curved += inner(v, q + z * slice, slice);
     }

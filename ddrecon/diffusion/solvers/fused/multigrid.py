@@ -1,7 +1,7 @@
 """Conjugate gradients preconditioned by multigrid, as launches of fused kernels.
 
-Every launch of an iteration finds out for itself whether the residual is small enough, and then does
-nothing. So iterations are launched ahead, as many as solves of this size took before, and the
+Every launch of an iteration finds out for itself whether the residual is small enough, and then
+does nothing. So iterations are launched ahead, as many as solves of this size took before, and the
 residual is looked at after them: results and counts are those of looking at it in every iteration.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import defaultdict, deque
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +21,6 @@ from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, tabl
 from ddrecon.diffusion.solvers.fused.stages import margin
 from ddrecon.diffusion.solvers.fused.sums import ROWS
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.errors import SolveError
 from ddrecon.kernels.launch import array, launch
 from ddrecon.kernels.spare import borrow, give_back
 
@@ -119,8 +117,7 @@ class _Run:
             stages.vectors,
             *rest,
         ]
-        is_fitting = guess is not None and guess.shape == source.shape
-        start = guess if is_fitting else source
+        start = source if guess is None or guess.shape != source.shape else guess
         places = torch.tensor(self.places, device=source.device)
         self.for_gradient = [
             table,
@@ -128,7 +125,7 @@ class _Run:
             vectors,
             array(places),
             *(array(each.reshape(-1)) for each in (source, start)),
-            int(is_fitting),
+            int(start is not source),
             *rest,
         ]
         self.tolerance = tolerance

@@ -92,7 +92,7 @@ def margin(width: int) -> int:
 def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
     """The stages of `shape` cells and matrices of so many `colors`."""
     rows, sizes = list(_rows(shape, axes)), {"data": 0, "work": 0, "vectors": 0}
-    levels = [i for i, row in enumerate(rows) if row["is_level"]]
+    levels = [i for i, row in enumerate(rows) if row["IS_LEVEL"]]
     following = dict(itertools.pairwise(levels))
 
     def take(kind: str, count: int) -> int:
@@ -101,32 +101,35 @@ def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
         return begin
 
     for i, row in enumerate(rows):
-        cells, is_last = math.prod(row["shape"]), row["axis"] < 0
-        row |= dict(zip(COLUMNS[:3], row["shape"], strict=True))
-        row |= {"AXIS": row["axis"], "NEXT": following.get(i, -1)}
+        cells, is_last = _cells(row), row["AXIS"] < 0
+        row["NEXT"] = following.get(i, -1)
         if i > 0:
             row |= {name: take("work", colors * cells) for name in COLUMNS[5:9]}
         if not is_last:
-            coarse = colors * math.prod(rows[i + 1]["shape"])
-            row |= {name: take("data", coarse) for name in ("BELOW", "ABOVE")}
-        if row["is_level"] and not (is_last and i > 0):
+            coarse = colors * _cells(rows[i + 1])
+            row |= {name: take("data", coarse) for name in COLUMNS[9:11]}
+        if row["IS_LEVEL"] and not (is_last and i > 0):
             row |= {name: take("data", colors * cells) for name in COLUMNS[11:16]}
         if is_last:
             row["INVERSE"] = take("data", colors * cells**2)
-        if row["is_level"] and i > 0:
-            row |= {name: take("vectors", cells) for name in ("SOURCE", "U")}
+        if row["IS_LEVEL"] and i > 0:
+            row |= {name: take("vectors", cells) for name in COLUMNS[17:19]}
     for kind in sizes:
         take(kind, 0)
     table = tuple(row.get(name, 0) for row in rows for name in COLUMNS)
     return Stages(axes, colors, table, tuple(levels), **sizes)
 
 
-def _rows(shape: Shape, axes: Axes) -> Iterator[dict[str, int | Shape]]:
+def _rows(shape: Shape, axes: Axes) -> Iterator[dict[str, int]]:
     for level in axes:
         for number, axis in enumerate(level):
-            yield {"shape": shape, "axis": axis, "is_level": number == 0}
+            yield dict(zip(COLUMNS[:4], (*shape, axis), strict=True)) | {"IS_LEVEL": number == 0}
             shape = _halved(shape, (axis,))
-    yield {"shape": shape, "axis": -1, "is_level": True}
+    yield dict(zip(COLUMNS[:4], (*shape, -1), strict=True)) | {"IS_LEVEL": True}
+
+
+def _cells(row: dict[str, int]) -> int:
+    return row["NZ"] * row["NY"] * row["NX"]
 
 
 def _completed(shape: Shape, axes: Sequence[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:

@@ -1,4 +1,4 @@
-"""The scalars of conjugate gradients, which stay where the kernels run: `sums`, in double precision.
+"""The scalars of conjugate gradients, in double precision; they stay where the kernels run.
 
 Each row has a partial sum of every share of every color; behind the rows two counts of iterations.
 What one launch writes no other share of it reads, so rows that are both come twice, for iterations
