@@ -2,8 +2,8 @@
 
 An engine is an implementation of the inner loops. `torch` is the readable definition and has them
 all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. Today warp has the view-ray integral and light
-not yet scattered, whose tangents in forward mode are torch's; diffusion runs in torch with either.
+same formulas, so their numbers agree to rounding. Tangents in forward mode are torch's where a
+kernel has none, and so are the model `flux_limited` and the scheme `printed`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ENGINES = ("torch", "warp")
 """The engines there are."""
 CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
-PARTS = {"view rays": ENGINES, "light": ENGINES, "diffusion": ("torch",)}
+PARTS = {"view rays": ENGINES, "light": ENGINES, "diffusion": ENGINES}
 """Which engines have which part of the renderer."""
 VARIABLE = "DDRECON_ENGINE"
 """The environment variable that chooses where `use_engine` was not called; `auto` without it."""

@@ -160,7 +160,29 @@ class ImplicitSolve(torch.autograd.Function):
         right = torch.zeros_like(u) if d_source is None else d_source.clone()
         for term in operator.change_terms(d_tensors, u):
             right -= term
-        return ctx.solve("tangent", operator, right).clone()
+        d_u: Tensor = _Tangent.apply(ctx.solve, ctx.assemble, ctx.prepared, right, *tensors)
+        return d_u
+
+
+class _Tangent(torch.autograd.Function):
+    """The solution du of E8 for its right side.
+
+    A function of its own, so that torch.func hands it plain tensors, which kernels need.
+    """
+
+    @staticmethod
+    def forward(
+        solve: SolverWithMemory[AnyOperator],
+        assemble: Callable[..., AnyOperator],
+        prepared: dict[Any, Any],
+        right: Tensor,
+        *tensors: Tensor,
+    ) -> Tensor:
+        return solve("tangent", assemble(prepared, *tensors), right).clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
 
 
 def solve_diffusion(

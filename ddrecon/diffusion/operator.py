@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import keep
 
@@ -76,6 +77,10 @@ class Operator:
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
         """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E9)."""
+        if current_engine() == "warp":
+            from ddrecon.diffusion.fused.cotangents import find_cotangents  # imports Warp
+
+            return find_cotangents((self.loss, *self.conductances), adjoint, u)
         conductance_bars = (
             (-difference(adjoint, axis) * difference(u, axis)).sum_to_size(conductance.shape)
             for axis, conductance in zip(AXES, self.conductances, strict=True)

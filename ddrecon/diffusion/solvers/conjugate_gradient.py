@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, inner
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up, inner
 
 MAX_ITERATIONS = 20_000
 CHECK_EVERY = 4
@@ -37,5 +37,5 @@ def conjugate_gradient(
         previous, square = square, inner(residual, residual)
         direction.mul_(square / previous.clamp(min=tiny)).add_(residual)
     if not relative <= tolerance:
-        raise system.give_up("conjugate_gradient", iteration, relative)
+        raise give_up("conjugate_gradient", iteration, relative)
     return system.solution(y, iteration, relative)

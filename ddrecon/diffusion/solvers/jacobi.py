@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up
 
 MAX_ITERATIONS = 200_000
 CHECK_EVERY = 16
@@ -24,5 +24,5 @@ def jacobi(operator: Operator, source: Tensor, guess: Tensor | None, tolerance: 
         y += residual
         residual = system.matrix.residual(y, system.source)
     if not relative <= tolerance:
-        raise system.give_up("jacobi", iteration, relative)
+        raise give_up("jacobi", iteration, relative)
     return system.solution(y, iteration, relative)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
-from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, inner
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up, inner
+from ddrecon.engine import current_engine
 
 MAX_ITERATIONS = 2_000
 
@@ -23,6 +24,13 @@ def multigrid(
 
     Raises SolveError when it is not reached.
     """
+    if current_engine() == "warp":
+        from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
+
+        solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)
+        if not solution.residual <= tolerance:
+            raise give_up("multigrid", solution.iterations, solution.residual)
+        return solution
     system = ScaledSystem.of(operator, source)
     y, residual = system.start(guess)
     direction, square = torch.zeros_like(y), torch.ones_like(system.source_norm)
@@ -38,5 +46,5 @@ def multigrid(
         residual.addcmul_(step, product, value=-1)
         iteration += 1
     if not relative <= tolerance:
-        raise system.give_up("multigrid", iteration, relative)
+        raise give_up("multigrid", iteration, relative)
     return system.solution(y, iteration, relative)

@@ -94,14 +94,15 @@ class ScaledSystem:
         """The solution that y is."""
         return Solution(self.matrix.scale * y, iterations, residual)
 
-    def give_up(self, name: str, iterations: int, residual: float) -> SolveError:
-        """The error of a solve that did not converge."""
-        return SolveError(
-            f"{name} did not reach its tolerance",
-            iterations,
-            residual,
-            "raise diffusion.tolerance or use --dtype float64",
-        )
+
+def give_up(name: str, iterations: int, residual: float) -> SolveError:
+    """The error of a solve that did not converge."""
+    return SolveError(
+        f"{name} did not reach its tolerance",
+        iterations,
+        residual,
+        "raise diffusion.tolerance or use --dtype float64",
+    )
 
 
 def inner(a: Tensor, b: Tensor) -> Tensor:

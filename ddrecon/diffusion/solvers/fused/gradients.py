@@ -1,0 +1,192 @@
+"""The kernel of conjugate gradients: start, directions, steps (`solvers/multigrid.py`)."""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from ddrecon.diffusion.solvers.fused import sums
+from ddrecon.diffusion.solvers.fused.level import LEVEL
+from ddrecon.diffusion.solvers.fused.stages import ENUM
+from ddrecon.kernels.native import number_type, program
+
+ACTS = "enum { START, CHOOSE, DIRECT, ADVANCE };"
+"""What a launch does: residual of a guess, which start is better, a direction, a step along it."""
+VECTORS = "enum { Y, R, D, D_ODD, P, Q };"
+"""Solution, residual, directions of even and odd iterations, what the cycle makes, A d."""
+
+BODY = (
+    ENUM
+    + ACTS
+    + VECTORS
+    + LEVEL
+    + sums.TEXT
+    + """
+const int color = item / shares, part = item - color * shares, matrix = matrices > 1 ? color : 0;
+const Level l = level_of(0, matrix);
+const Size nx = l.nx, slice = l.slice, margin = (nx + 16) / 16 * 16,
+    length = (slice + 15) / 16 * 16 + 2 * margin;
+const int from = (int)((Size)l.nz * part / shares), to = (int)((Size)l.nz * (part + 1) / shares);
+const Size start = color * l.cells, first_cell = from * slice, count = (to - from) * slice;
+F* const W = &scratch.data[item * scratch_size];
+const auto slot = [&](int k) { return W + k * length + margin; };
+const auto vector = [&](int k) { return &vectors.data[places.data[k] + start]; };
+const auto sum = [&](int row) -> double& {
+    return sums.data[(row * all_colors + color) * shares + part];
+};
+F *const y = vector(Y), *const r = vector(R), *const p = vector(P);
+F *const q = vector(Q), *const d = vector(D + now);
+F* const d_new = vector(D + later);
+const F* const b = source.data + start;
+const auto take = [&](const F* __restrict s, const F* __restrict b, F* __restrict r, Size n) {
+    for (Size i = 0; i < n; ++i) r[i] = s[i] * b[i];
+};
+
+if (act == START) {
+    // Beside the residual lie numbers that the cycle reads, and multiplies by zero.
+    if (item == 0) for (Size i = 1; i <= margin; ++i) r[-i] = F(0);
+    if (item == all_colors * shares - 1)
+        for (Size i = 0; i < margin; ++i) r[l.cells + i] = F(0);
+    double square = 0.0, norm = 0.0;
+    if (has_guess) for (Size i = 0; i < 4 * length; ++i) W[i] = F(0);
+    const F* const guessed = guess.data + (has_guess ? start : 0);
+    int ready = from > 0 ? from - 1 : 0;
+    for (int z = from; z < to; ++z) {
+        const Size at_ = z * slice;
+        F* const right = slot(4);
+        take(l.scale + at_, b + at_, right, slice);
+        norm += inner(right, right, slice);
+        if (has_guess) {
+            for (; ready <= z + 1 && ready < l.nz; ++ready) {
+                F* __restrict v = slot(ready & 3);
+                const F *__restrict s = l.scale + ready * slice,
+                    *__restrict g = guessed + ready * slice;
+                for (Size i = 0; i < slice; ++i) v[i] = g[i] / s[i];
+            }
+            const F* v = slot(z & 3);
+            stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v,
+                    right, F(-1), F(1), F(1), r + at_);
+            for (Size i = 0; i < slice; ++i) y[at_ + i] = v[i];
+            square += inner(r + at_, r + at_, slice);
+        } else
+            for (Size i = 0; i < slice; ++i) { r[at_ + i] = right[i]; y[at_ + i] = F(0); }
+    }
+    sum(SOURCE_NORM_ROW) = norm;
+    sum(RESIDUAL_ODD_ROW) = has_guess ? square : norm;
+    if (item == 0) sums.data[COUNT_ROW * all_colors * shares] = 0.0;
+}
+if (act == CHOOSE) {
+    const bool helps = !has_guess
+        || sqrt(total_of(RESIDUAL_ODD_ROW, color)) < sqrt(total_of(SOURCE_NORM_ROW, color));
+    if (!helps) {
+        take(l.scale + first_cell, b + first_cell, r + first_cell, count);
+        for (Size i = 0; i < count; ++i) y[first_cell + i] = F(0);
+    }
+    sum(RESIDUAL_ROW) = helps ? sum(RESIDUAL_ODD_ROW) : sum(SOURCE_NORM_ROW);
+}
+if (act == DIRECT && !is_done) {
+    const double square = total_of(CORRECTED_ROW + now, color);
+    const F more = iteration == 0 ? F(0)
+        : (F)(square / above(total_of(CORRECTED_ROW + later, color), tiny));
+    // Where nothing is to be added of the direction before, it is not read: it may be anything.
+    const F* const before = iteration == 0 ? p : d;
+    for (Size i = 0; i < 4 * length; ++i) W[i] = F(0);
+    double curved = 0.0;
+    int ready = from > 0 ? from - 1 : 0;
+    for (int z = from; z < to; ++z) {
+        for (; ready <= z + 1 && ready < l.nz; ++ready) {
+            F* __restrict v = slot(ready & 3);
+            const F *__restrict e = before + ready * slice, *__restrict c = p + ready * slice;
+            for (Size i = 0; i < slice; ++i) v[i] = more * e[i] + c[i];
+            F* __restrict kept = d_new + ready * slice;
+            if (ready >= from && ready < to) for (Size i = 0; i < slice; ++i) kept[i] = v[i];
+        }
+        const F* v = slot(z & 3);
+        stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v, v,
+            F(1),
+                F(0), F(-1), q + z * slice);
+        curved += inner(v, q + z * slice, slice);
+    }
+    sum(CURVED_ROW) = curved;
+}
+if (act == ADVANCE) {
+    if (item == 0) {
+        double* counts = &sums.data[COUNT_ROW * all_colors * shares];
+        counts[later] = counts[now] + (is_done ? 0.0 : 1.0);
+    }
+    if (is_done) sum(RESIDUAL_ROW + later) = sum(RESIDUAL_ROW + now);
+    else {
+        const F step = (F)(total_of(CORRECTED_ROW + now, color)
+                           / above(total_of(CURVED_ROW, color), tiny));
+        const F *__restrict v = d_new + first_cell, *__restrict product = q + first_cell;
+        F *__restrict solution = y + first_cell, *__restrict left = r + first_cell;
+        double square = 0.0;
+        const Size block = 4096;
+        for (Size i0 = 0; i0 < count; i0 += block) {
+            const Size i1 = i0 + block < count ? i0 + block : count;
+            for (Size i = i0; i < i1; ++i) {
+                solution[i] += step * v[i];
+                left[i] -= step * product[i];
+            }
+            square += inner(left + i0, left + i0, i1 - i0);
+        }
+        sum(RESIDUAL_ROW + later) = square;
+    }
+}
+"""
+)
+
+
+@functools.cache
+def gradient_kernel(bits: int) -> Any:
+    """An act of conjugate gradients, for a share of the slices of a color."""
+    F = number_type(bits)
+
+    @wp.func_native(program(bits, BODY))
+    def run(
+        item: int,
+        act: int,
+        iteration: int,
+        matrices: int,
+        all_colors: int,
+        shares: int,
+        tolerance: wp.float64,
+        tiny: wp.float64,
+        table: wp.array(dtype=wp.int64),
+        data: wp.array(dtype=F),
+        vectors: wp.array(dtype=F),
+        places: wp.array(dtype=wp.int64),
+        source: wp.array(dtype=F),
+        guess: wp.array(dtype=F),
+        has_guess: int,
+        scratch: wp.array(dtype=F),
+        scratch_size: wp.int64,
+        sums: wp.array(dtype=wp.float64),
+    ): ...
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def advance(
+        first: int,
+        act: int,
+        iteration: int,
+        matrices: int,
+        all_colors: int,
+        shares: int,
+        tolerance: wp.float64,
+        tiny: wp.float64,
+        table: wp.array(dtype=wp.int64),
+        data: wp.array(dtype=F),
+        vectors: wp.array(dtype=F),
+        places: wp.array(dtype=wp.int64),
+        source: wp.array(dtype=F),
+        guess: wp.array(dtype=F),
+        has_guess: int,
+        scratch: wp.array(dtype=F),
+        scratch_size: wp.int64,
+        sums: wp.array(dtype=wp.float64),
+    ):
+        run(first + wp.tid(), act, iteration, matrices, all_colors, shares, tolerance,
+            tiny, table, data, vectors, places, source, guess, has_guess, scratch, scratch_size,
+            sums)  # fmt: skip
+
+    return advance

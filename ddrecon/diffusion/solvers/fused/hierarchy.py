@@ -1,0 +1,156 @@
+"""A hierarchy of grids in the memory of fused kernels."""
+
+from __future__ import annotations
+
+import functools
+import math
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solvers.fused.prepare import prepare_kernel
+from ddrecon.diffusion.solvers.fused.stages import (
+    Axes,
+    Shape,
+    Stages,
+    first_guess,
+    stages_of,
+    strong_axes,
+)
+from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.spare import borrow, give_back
+
+SMALL = 30_000
+"""So few cells, of all colors, are best done by one thread."""
+STEPS = {"scale cells": 0, "scale faces": 1, "weights": 2, "coarse cells": 3, "all but first": 4}
+_last_axes: dict[tuple[Shape, int], Axes] = {}
+"""What hierarchies of a shape and so many colors coarsened last: where the next begins to try.
+
+It is checked, so no result depends on it.
+"""
+
+
+@dataclass(eq=False)
+class Hierarchy:
+    """The grids of an operator: numbers `data`, laid out as `stages` say.
+
+    Which axes are strong is known only with the conductances of each level. So that nobody waits
+    for them, a hierarchy is made with the axes of the last one of its shape; `strengths` then say
+    whether these were right. `shares`: of a color, so that threads have equally many.
+    """
+
+    stages: Stages
+    shares: int
+    data: Tensor
+    strengths: Tensor
+    is_checked: bool = False
+
+    @staticmethod
+    def of(operator: Operator) -> Hierarchy:
+        """All grids of `operator`; which axes are strong may have to be checked yet."""
+        shape, colors = _shape(operator)
+        axes = _last_axes.get((shape, colors))
+        if axes is not None:
+            return _make(operator, axes)
+        made = _make(operator, first_guess(shape))
+        return made.checked(operator, made.strengths.tolist())
+
+    def checked(self, operator: Operator, strengths: Sequence[float]) -> Hierarchy:
+        """This hierarchy if it coarsens the axes it should by `strengths`, else one that does."""
+        shape, colors = _shape(operator)
+        made = self
+        while (axes := strong_axes(shape, made.stages.axes, made.means(strengths))) != made.axes:
+            made = _make(operator, axes)
+            strengths = made.strengths.tolist()
+        _last_axes[shape, colors] = axes
+        made.is_checked = True
+        return made
+
+    @property
+    def scale(self) -> Tensor:
+        """S of the finest grid [matrices, z, y, x]."""
+        shape, colors = self.stages.shape(0), self.stages.colors
+        begin = self.stages.column(0, "SCALE")
+        return self.data[begin : begin + colors * math.prod(shape)].view(colors, *shape)
+
+    @property
+    def axes(self) -> Axes:
+        """The axes that each level coarsens."""
+        return self.stages.axes
+
+    def means(self, strengths: Sequence[float]) -> list[list[float]]:
+        """The mean scaled conductance along each axis, of each level that is coarsened."""
+        found, begin = [], 0
+        for number, stage in enumerate(self.stages.levels[: len(self.axes)]):
+            shape = self.stages.shape(stage)
+            end = begin + 3 * self.stages.colors * (self.shares if number == 0 else 1)
+            sums = [math.fsum(strengths[begin + axis : end : 3]) for axis in range(3)]
+            cells = self.stages.colors * math.prod(shape)
+            found.append(
+                [s * n / (cells * max(n - 1, 1)) for s, n in zip(sums, shape, strict=True)]
+            )
+            begin = end
+        return found
+
+
+def shares_of(cells: int, colors: int, like: Tensor) -> tuple[int, int]:
+    """Into how many shares a color's slices are cut, and how many threads work on those of all."""
+    if like.is_cuda:
+        return 32, 1
+    threads = thread_count(like) if cells * colors > SMALL else 1
+    return threads // math.gcd(threads, colors), threads
+
+
+@functools.cache
+def table_of(stages: Stages, device: torch.device) -> Any:
+    """The table of `stages` for kernels on `device`."""
+    return array(torch.tensor(stages.table, dtype=torch.int64, device=device))
+
+
+def _shape(operator: Operator) -> tuple[Shape, int]:
+    """Cells along z, y and x, and how many matrices there are."""
+    z, y, x = operator.loss.shape[1:]
+    return (z, y, x), max(len(tensor) for tensor in (operator.loss, *operator.conductances))
+
+
+def _make(operator: Operator, axes: Axes) -> Hierarchy:
+    """The grids of `operator` that come about by coarsening these `axes`."""
+    shape, colors = _shape(operator)
+    stages, loss = stages_of(shape, colors, axes), operator.loss
+    shares, threads = shares_of(math.prod(shape), colors, loss)
+    given = (*operator.conductances, loss)
+    levels, few = len(stages.levels) - 1, math.prod(stages.shape(stages.levels[-1]))
+    data, work = borrow(stages.data, loss), borrow(stages.work, loss)
+    scratch = loss.new_empty(colors * shares * 3 * (shape[2] + 3))
+    strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
+    dense = loss.new_empty(2 * colors * few**2 if levels else 0, dtype=torch.float64)
+    arrays = [array(tensor) for tensor in (data, work, scratch, strengths, dense)]
+    fixed = [
+        table_of(stages, loss.device),
+        *(array(tensor.reshape(-1)) for tensor in given),
+        *(int(len(tensor) < colors) for tensor in given),
+        *arrays,
+    ]
+    kernel = prepare_kernel(loss.element_size() * 8)
+
+    def do(step: str, stage: int, parts: int, threads: int) -> None:
+        numbers = [STEPS[step], stage, colors, parts, shares]
+        launch(kernel, colors * parts, [*numbers, *fixed], loss, threads)
+
+    do("scale cells", 0, shares, threads)
+    do("scale faces", 0, shares, threads)
+    second = stages.levels[1] if levels else 0
+    for stage in range(second):
+        do("weights", stage, shares, threads)
+        do("coarse cells", stage, shares, threads)
+    if levels:
+        do("all but first", second, 1, min(threads, colors))
+    give_back(work)
+    made = Hierarchy(stages, shares, data, strengths)
+    weakref.finalize(made, give_back, data)
+    return made

@@ -1,0 +1,180 @@
+"""Conjugate gradients preconditioned by multigrid, as launches of fused kernels.
+
+Every launch of an iteration finds out for itself whether the residual is small enough, and then
+does nothing. So iterations are launched ahead, as many as solves of this size took before, and the
+residual is looked at after them: results and counts are those of looking at it in every iteration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict, deque
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solvers.fused.cycle import SLOTS, cycle_kernel
+from ddrecon.diffusion.solvers.fused.gradients import gradient_kernel
+from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, table_of
+from ddrecon.diffusion.solvers.fused.stages import margin
+from ddrecon.diffusion.solvers.fused.sums import ROWS
+from ddrecon.diffusion.solvers.scaled import Solution
+from ddrecon.kernels.launch import array, launch
+from ddrecon.kernels.spare import borrow, give_back
+
+DOWN, COARSER, UP = range(3)
+START, CHOOSE, DIRECT, ADVANCE = range(4)
+VECTORS = 6
+MOST_AHEAD = 16
+"""So many iterations are launched at most before the residual is looked at."""
+_counts: dict[torch.Size, deque[int]] = defaultdict(lambda: deque([3], maxlen=6))
+"""How many iterations solves of a shape took: how many to launch ahead. No result depends on it."""
+
+
+def solve(
+    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: float, most: int
+) -> Solution:
+    """The solution of `operator` u = `source` [C, z, y, x], after at most so many iterations.
+
+    Its residual may be above `tolerance` then.
+    """
+    hierarchy = operator.once(Hierarchy.of)
+    solution, strengths = _solve(hierarchy, source, guess, tolerance, most)
+    while not hierarchy.is_checked:
+        found = hierarchy.checked(operator, strengths)
+        operator.prepared[Hierarchy.of] = found
+        if found is not hierarchy:
+            solution, strengths = _solve(found, source, guess, tolerance, most)
+        hierarchy = found
+    return solution
+
+
+def _solve(
+    hierarchy: Hierarchy, source: Tensor, guess: Tensor | None, tolerance: float, most: int
+) -> tuple[Solution, list[float]]:
+    """The solution, and the strengths of a hierarchy that is not checked yet."""
+    run, counts = _Run(hierarchy, source, guess, tolerance), _counts[source.shape]
+    launched = min(max(counts), most)
+    run.iterate(0, launched)
+    verdict, strengths = run.verdict(launched)
+    while verdict.is_open(tolerance) and launched < most:
+        more = min(2 * launched + 1, launched + MOST_AHEAD, most)
+        run.iterate(launched, more)
+        launched = more
+        verdict, strengths = run.verdict(launched)
+    counts.append(verdict.iterations)
+    return Solution(run.value(), verdict.iterations, verdict.residual), strengths
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """How many `iterations` were needed so far, and the relative `residual` that is left."""
+
+    iterations: int
+    residual: float
+
+    def is_open(self, tolerance: float) -> bool:
+        return self.residual > tolerance
+
+
+class _Run:
+    """A solve under way: its vectors, and the launches that change them."""
+
+    def __init__(
+        self, hierarchy: Hierarchy, source: Tensor, guess: Tensor | None, tolerance: float
+    ):
+        self.hierarchy, self.source, stages = hierarchy, source, hierarchy.stages
+        self.colors, (_, y, x) = len(source), source.shape[1:]
+        cells, edge = source[0].numel(), margin(x)
+        self.shares, self.threads = shares_of(cells, self.colors, source)
+        # solution, residual, two directions, what the cycle makes, A d
+        size = -(-self.colors * cells // 16) * 16 + edge
+        self.places = [edge + k * size for k in range(VECTORS)]
+        self.vectors = borrow(VECTORS * size + edge, source)
+        self.coarser = borrow(self.colors * stages.vectors, source).zero_()
+        slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
+        self.scratch = borrow(self.colors * self.shares * slots, source)
+        self.sums = source.new_empty(len(ROWS) * self.colors * self.shares + 2, dtype=torch.float64)
+        self.tiny = torch.finfo(source.dtype).tiny
+        bits = source.element_size() * 8
+        self.cycle, self.gradient = cycle_kernel(bits), gradient_kernel(bits)
+        table, data, vectors = (
+            table_of(stages, source.device),
+            array(hierarchy.data),
+            array(self.vectors),
+        )
+        self.scalars = [stages.colors, self.colors]
+        rest = [array(self.scratch), slots, array(self.sums)]
+        self.for_cycle = [
+            table,
+            data,
+            vectors,
+            self.places[1],
+            self.places[4],
+            array(self.coarser),
+            stages.vectors,
+            *rest,
+        ]
+        start = source if guess is None or guess.shape != source.shape else guess
+        places = torch.tensor(self.places, device=source.device)
+        self.for_gradient = [
+            table,
+            data,
+            vectors,
+            array(places),
+            *(array(each.reshape(-1)) for each in (source, start)),
+            int(start is not source),
+            *rest,
+        ]
+        self.tolerance = tolerance
+        self._advance(START, 0)
+        self._advance(CHOOSE, 0)
+
+    def iterate(self, first: int, last: int) -> None:
+        """Launches these iterations."""
+        for iteration in range(first, last):
+            for leg in (DOWN, COARSER, UP):
+                self._cycle(leg, iteration)
+            for act in (DIRECT, ADVANCE):
+                self._advance(act, iteration)
+
+    def verdict(self, launched: int) -> tuple[_Verdict, list[float]]:
+        """What came of so many iterations launched; one read."""
+        unread = self.sums.new_empty(0) if self.hierarchy.is_checked else self.hierarchy.strengths
+        found = torch.cat([self.sums, unread]).tolist() if len(unread) else self.sums.tolist()
+        size = self.colors * self.shares
+
+        def norms(row: int) -> list[float]:
+            parts = [
+                found[row * size + c * self.shares :][: self.shares] for c in range(self.colors)
+            ]
+            return [math.sqrt(sum(part)) for part in parts]
+
+        left, norm = norms(ROWS.index("RESIDUAL") + launched % 2), norms(ROWS.index("SOURCE_NORM"))
+        relative = [a / max(b, self.tiny) for a, b in zip(left, norm, strict=True)]
+        worst = math.nan if any(map(math.isnan, relative)) else max(relative)
+        count = found[ROWS.index("COUNT") * size + launched % 2]
+        return _Verdict(int(count), worst), found[len(self.sums) :]
+
+    def value(self) -> Tensor:
+        """The solution u = S y; nothing else can be asked for after it."""
+        # The last act: what it was computed in is free again.
+        y = self.vectors[self.places[0] :][: self.source.numel()].view_as(self.source)
+        value = y * self.hierarchy.scale
+        give_back(self.vectors, self.coarser, self.scratch)
+        return value
+
+    def _cycle(self, leg: int, iteration: int) -> None:
+        shares, threads = self.shares, self.threads
+        if leg == COARSER:
+            shares, threads = 1, min(self.threads, self.colors)
+        numbers = [leg, iteration, *self.scalars, shares, self.shares, self.tolerance, self.tiny]
+        items = self.colors * shares
+        launch(self.cycle, items, [*numbers, *self.for_cycle], self.source, threads)
+
+    def _advance(self, act: int, iteration: int) -> None:
+        numbers = [act, iteration, *self.scalars, self.shares, self.tolerance, self.tiny]
+        items = self.colors * self.shares
+        launch(self.gradient, items, [*numbers, *self.for_gradient], self.source, self.threads)

@@ -1,0 +1,43 @@
+"""Memory that is used again: a processor's fresh pages cost more than the numbers in them.
+
+The system clears a page when it is first written to, a few hundred microseconds for each megabyte,
+and what a large tensor gives up goes back to the system at once. A solve would spend half its time
+on that. On a GPU torch keeps the memory itself.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import torch
+from torch import Tensor
+
+MOST_BYTES = 2**30
+"""So much is kept unused at most."""
+_spare: list[Tensor] = []
+_lock = threading.Lock()
+
+
+def borrow(count: int, like: Tensor) -> Tensor:
+    """`count` numbers of any value, of the type of `like` and beside it; for `give_back`."""
+    if like.is_cuda:
+        return like.new_empty(count)
+    size = count * like.element_size()
+    with _lock:
+        fitting = [memory for memory in _spare if size <= len(memory) <= max(2 * size, 2**20)]
+        best = min(fitting, key=len, default=None)
+        if best is not None:
+            _spare[:] = [memory for memory in _spare if memory is not best]
+    memory = like.new_empty(size, dtype=torch.uint8) if best is None else best
+    return memory[:size].view(like.dtype)
+
+
+def give_back(*tensors: Tensor) -> None:
+    """Keeps the memory of `tensors`, which nobody uses any more, for those to come."""
+    with _lock:
+        for tensor in tensors:
+            if not tensor.is_cuda:
+                whole = tensor.untyped_storage()
+                _spare.append(torch.empty(0, dtype=torch.uint8).set_(whole))
+        while sum(map(len, _spare)) > MOST_BYTES:
+            del _spare[0]
