@@ -31,13 +31,13 @@ def records(bits: int) -> SimpleNamespace:
     class Given:
         """What is swept, all arrays flat.
 
-        `light`: what scatters; `extinction` and `scattering`: fields [K, z + 2, y + 2, x + 2],
+        `light`: what scatters; `extinction` and `scattering`: fields [K, z + 2, y + 2, stretch],
         empty around the box; `numbers` [3, C]: scale of extinction and of scattering, inflow;
         `directions` [D, 10]: half a step [u], drift along rows and columns, w, weights in the
         moments; `signs` [D, 3]: signs of the drifts, and whether both are of whole cells; `items`
         [N, 6]: axis, way, first direction, how many, color, whether its moments are the first.
         `group`: most directions of an item; `rows`: most rows of a slice; `lanes`: how many colors
-        are gone through side by side.
+        are gone through side by side; `stretch`: what a row takes, with empty cells around it.
         """
 
         light: Light
@@ -56,20 +56,20 @@ def records(bits: int) -> SimpleNamespace:
         group: int
         rows: int
         lanes: int
+        stretch: int
 
     @wp.struct
     class Work:
         """What a thread has of its own; see `rows.py`.
 
-        `light`: its sum of moments, or of their cotangents; `far` and `arriving`: q and I where
-        rays were, of all slices; `nothing`: an empty row; `extinction` and `scattering`: its sums
+        `light`: its sum of moments, or of their cotangents; `arriving`: I where rays were, of all
+        slices; `nothing`: an empty row; `extinction` and `scattering`: its sums
         of cotangents of fields, and `numbers` [3, C, rows, x] of those numbers.
         """
 
         light: Light
         near: wp.array(dtype=F)
         radiance: wp.array(dtype=F)
-        far: wp.array(dtype=F)
         arriving: wp.array(dtype=F)
         nothing: wp.array(dtype=F)
         returning: wp.array(dtype=F)
@@ -86,11 +86,13 @@ def records(bits: int) -> SimpleNamespace:
 
 
 @functools.cache
-def sweep_kernels(bits: int, has_flux: bool, shares_field: bool) -> SimpleNamespace:
+def sweep_kernels(
+    bits: int, has_flux: bool, shares_field: bool, varies_numbers: bool
+) -> SimpleNamespace:
     """The kernels of a sweep: `follow`, `transpose` for items, and the same for cells of a slice.
 
     `has_flux`: whether what scatters has a flux; `shares_field`: whether extinction and scattering
-    have the same field.
+    have the same field; `varies_numbers`: whether derivatives by scales and inflow are asked for.
     """
     types = records(bits)
     Light, Given, Work = types.Light, types.Given, types.Work
@@ -126,7 +128,7 @@ def sweep_kernels(bits: int, has_flux: bool, shares_field: bool) -> SimpleNamesp
         last: int,
     ): ...
 
-    @wp.func_native(text(RETURN))
+    @wp.func_native(text(RETURN, VARIES_NUMBERS=varies_numbers))
     def return_rows(
         given: Given,
         work: Work,

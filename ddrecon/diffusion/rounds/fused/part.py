@@ -16,6 +16,7 @@ from torch.nn.functional import pad
 
 from ddrecon.diffusion.rounds.characteristics import Direction
 from ddrecon.diffusion.rounds.fused.kernels import records, sweep_kernels
+from ddrecon.diffusion.rounds.fused.rows import MARGIN
 from ddrecon.diffusion.rounds.fused.schedule import Item, Schedule, share_items
 from ddrecon.grid import Grid
 from ddrecon.kernels.launch import array, launch, thread_count
@@ -61,12 +62,14 @@ class Part:
         self.light = [self.turn(moment) for moment in swept.light]
         self.colors, self.depth, self.height, self.width = self.light[0].shape
         self.rows = max(self.depth, self.height)
+        self.stretch = -(-self.width // MARGIN) * MARGIN + 2 * MARGIN
         self.threads = 1 if plan.by_cells else thread_count(self.like)
         self.lanes = self.colors if plan.by_cells else 1
         has_flux, shares_field = len(self.light) > 1, swept.scattering is None
-        self.kernels = sweep_kernels(self.bits, has_flux, shares_field)
+        self.kernels = functools.partial(sweep_kernels, self.bits, has_flux, shares_field)
+        margins = MARGIN, self.stretch - self.width - MARGIN
         self.fields = [
-            pad(self.turn(field.detach()), (1,) * 6)
+            pad(self.turn(field.detach()), (*margins, 1, 1, 1, 1))
             for field in (swept.extinction, swept.scattering)
             if field is not None
         ]
@@ -88,13 +91,14 @@ class Part:
             for first in range(0, len(items), self.colors):
                 piece = items[first : first + self.colors]
                 slices = range(-1, self._slices(piece[0]))
-                self._launch_piece(self.kernels.follow_cells, first, piece, [given, works[0]], slices)
+                self._launch_piece(self.kernels(False).follow_cells, first, piece, [given, works[0]], slices)
         else:
-            self._launch_items(self.kernels.follow_items, given, works, [], bounds)
+            self._launch_items(self.kernels(False).follow_items, given, works, [], bounds)
         return [self.turn(moment) for moment in _add_up(sums)]
 
-    def transpose(self, bars: Sequence[Tensor]) -> list[Tensor]:
+    def transpose(self, bars: Sequence[Tensor], varies_numbers: bool) -> list[Tensor]:
         """Cotangents of numbers, of fields and of moments, from those of moments."""
+        kernels = self.kernels(varies_numbers)
         items, bounds, given = self._given(is_kept=True)
         bars_record = self._light([self.turn(bar) for bar in bars])
         sums, fields, numbers, works = self._sums(items, bounds), [], [], []
@@ -105,7 +109,7 @@ class Part:
             )
             work.light = self._light(moments)
             kept = self.lanes * given.group * self._cells
-            work.far, work.arriving = (self._array(self.like.new_empty(kept)) for _ in range(2))
+            work.arriving = self._array(self.like.new_empty(kept))
             # Sums of fields are by color where colors go side by side.
             own = [
                 self.like.new_zeros(
@@ -124,13 +128,13 @@ class Part:
             for first in range(0, len(items), self.colors):
                 piece = items[first : first + self.colors]
                 slices = range(-1, self._slices(piece[0]))
-                self._launch_piece(self.kernels.keep_cells, first, piece, [given, works[0]], slices)
+                self._launch_piece(kernels.keep_cells, first, piece, [given, works[0]], slices)
                 arguments = [given, works[0], bars_record]
                 self._launch_piece(
-                    self.kernels.return_cells, first, piece, arguments, slices[::-1]
+                    kernels.return_cells, first, piece, arguments, slices[::-1]
                 )
         else:
-            self._launch_items(self.kernels.return_items, given, works, [bars_record], bounds)
+            self._launch_items(kernels.return_items, given, works, [bars_record], bounds)
         field_bars = [
             self.turn(bar.sum_to_size(len(field), *bar.shape[1:]))
             for bar, field in zip(_add_up(fields), self.fields, strict=True)
@@ -157,6 +161,7 @@ class Part:
         given.items = self._array(torch.tensor(items, dtype=torch.int32, device=self.like.device))
         given.depth, given.height, given.width = self.depth, self.height, self.width
         given.colors, given.rows, given.lanes = self.colors, self.rows, self.lanes
+        given.stretch = self.stretch
         given.group = max(item[3] for item in items)
         return items, bounds, given
 
@@ -171,10 +176,10 @@ class Part:
 
     def _work(self, given: Any, names: Sequence[str]) -> Any:
         work = records(self.bits).Work()
-        size = 2 * self.lanes * given.group * self.rows * (self.width + 2)
+        size = 2 * self.lanes * given.group * self.rows * self.stretch
         for name in names:
             setattr(work, name, self._array(self.like.new_zeros(size)))
-        work.nothing = self._array(self.like.new_zeros(self.width + 2))
+        work.nothing = self._array(self.like.new_zeros(self.stretch))
         return work
 
     def _light(self, moments: Sequence[Tensor]) -> Any:

@@ -11,10 +11,12 @@ slices only the last one is kept, with an empty cell before and behind each row:
 `upstream` is P, `downstream` its transpose P^T.
 """
 
-PLACES = """
+MARGIN = 16
+"""Cells before each row, and at least so many behind it: rows begin where vectors do."""
+PLACES = f"const int MARGIN = {MARGIN};" + """
 const int* item = given.items.data + 6 * number;
 const int axis = item[0], forward = item[1], begin = item[2], count = item[3], color = item[4];
-const int width = given.width, wide = width + 2;
+const int width = given.width, wide = given.stretch;
 const int slices = axis == 0 ? given.depth : given.height;
 const int rows = axis == 0 ? given.height : given.depth;
 const long long plane = (long long)given.height * width, cells = given.depth * plane;
@@ -31,9 +33,9 @@ const F inflow = given.numbers.data[2 * given.colors + color];
 const int lane = given.lanes > 1 ? color : 0;
 auto row_of = [&](const wp::array_t<F>& buffer, int slice, int j, int row) -> F* {
     const long long line = ((lane * 2LL + (slice & 1)) * given.group + j) * given.rows + row;
-    return buffer.data + line * wide + 1;
+    return buffer.data + line * wide + MARGIN;
 };
-const F* nothing = work.nothing.data + 1;
+const F* nothing = work.nothing.data + MARGIN;
 struct Whole { enum { value = 1 }; };
 struct Between { enum { value = 0 }; };
 """
@@ -121,7 +123,7 @@ for (int s = slice_first; s < slice_last; ++s) {
                 const F* near_behind = is_inside ? row_of(work.near, s - 1, j, behind) : near_here;
                 const F* radiance_here = row_of(work.radiance, s - 1, j, r);
                 const F* radiance_behind = is_inside ? row_of(work.radiance, s - 1, j, behind) : nothing;
-                const long long there = (k + 1) * far_slice + (r + 1) * far_row + 1;
+                const long long there = (k + 1) * far_slice + (r + 1) * far_row + MARGIN;
                 const long long before = there - forward * far_slice;
                 const F* __restrict e = extinction + there;
                 const F* e_here = extinction + before;
@@ -130,7 +132,6 @@ for (int s = slice_first; s < slice_last; ++s) {
                 const F* sc_here = scattering + before;
                 const F* sc_behind = sc_here - row_sign * far_row;
                 const long long kept = ((lane * (long long)given.group + j) * slices + s) * rows + r;
-                F* __restrict far_row_kept = work.far.data + (KEEPS ? kept * width : 0);
                 F* __restrict arriving_kept = work.arriving.data + (KEEPS ? kept * width : 0);
                 auto pass = [&](auto whole) {
                     INDEPENDENT
@@ -150,7 +151,6 @@ for (int s = slice_first; s < slice_last; ++s) {
                         near_row[c] = near;
                         radiance_row[c] = radiance;
                         if (KEEPS) {
-                            far_row_kept[c] = far;
                             arriving_kept[c] = arriving;
                         } else {
                             const F whole_radiance = radiance + inflow;
@@ -181,10 +181,13 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
     for (int r = row_first; r < row_last; ++r) {
         const long long inner = k * slice_step + r * row_step, at = color * cells + inner;
         const long long at_flux = HAS_FLUX ? at : 0;
-        const F* __restrict q = given.light.mean.data + at;
-        const F* __restrict q_z = given.light.z.data + at_flux;
-        const F* __restrict q_y = given.light.y.data + at_flux;
-        const F* __restrict q_x = given.light.x.data + at_flux;
+        // What scatters two slices before, which takes the place of this slice's in the buffer.
+        const int before_last = forward > 0 ? (s < 2 ? 0 : s - 2) : slices - 1 - (s < 2 ? 0 : s - 2);
+        const long long early = color * cells + before_last * slice_step + r * row_step;
+        const F* __restrict q = given.light.mean.data + early;
+        const F* __restrict q_z = given.light.z.data + (HAS_FLUX ? early : 0);
+        const F* __restrict q_y = given.light.y.data + (HAS_FLUX ? early : 0);
+        const F* __restrict q_x = given.light.x.data + (HAS_FLUX ? early : 0);
         const F* __restrict mean_bar = bars.mean.data + at;
         const F* __restrict z_bar = bars.z.data + at_flux;
         const F* __restrict y_bar = bars.y.data + at_flux;
@@ -248,7 +251,7 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                 F* __restrict far_bar_row = row_of(work.far_bar, s, j, r);
                 F* __restrict mass_bar_row = row_of(work.mass_bar, s, j, r);
                 F* __restrict scattered_row = row_of(work.scattering_mass_bar, s, j, r);
-                const long long there = (k + 1) * far_slice + (r + 1) * far_row + 1;
+                const long long there = (k + 1) * far_slice + (r + 1) * far_row + MARGIN;
                 const long long before = there - forward * far_slice;
                 const F* __restrict e = extinction + there;
                 const F* e_here = extinction + before;
@@ -257,7 +260,11 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                 const F* sc_here = scattering + before;
                 const F* sc_behind = sc_here - row_sign * far_row;
                 const long long kept = ((lane * (long long)given.group + j) * slices + s) * rows + r;
-                const F* __restrict far_kept = work.far.data + kept * width;
+                F* __restrict near_row = row_of(work.near, s, j, r);
+                const int behind = r - row_sign;
+                const F* near_here = row_of(work.near, s - 1, j, r);
+                const F* near_behind = behind >= 0 && behind < rows
+                    ? row_of(work.near, s - 1, j, behind) : near_here;
                 const F* __restrict arriving_kept = work.arriving.data + kept * width;
                 const F own_part = F(1) - row_part;"""
     + _UPSTREAM
@@ -265,9 +272,8 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                 auto pass = [&](auto whole, auto whole_far) {
                     INDEPENDENT
                     for (int c = first; c < last; ++c) {
-                        const F near = HAS_FLUX
-                            ? q[c] + w_z * q_z[c] + w_y * q_y[c] + w_x * q_x[c] : q[c];
-                        const F far = far_kept[c], arriving = arriving_kept[c];
+                        const F near = near_row[c], arriving = arriving_kept[c];
+                        const F far = upstream(whole, near_here, near_behind, c);
                         const F mass = half * (e[c] + upstream(whole, e_here, e_behind, c));
                         const F scattering_mass = SHARES_FIELD
                             ? mass : half * (sc[c] + upstream(whole, sc_here, sc_behind, c));"""
@@ -306,17 +312,23 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                                 + downstream(whole, scattered_here, scattered_ahead, own_part, c);
                             scattered_row[c] = scattering_mass_bar;
                         }
-                        scale_bar[c] += depth_bar * mass;
-                        strength_bar[c] += scattering_depth_bar * scattering_mass;
-                        inflow_bar[c] += radiance_bar - source_bar * lost;
+                        if (VARIES_NUMBERS) {
+                            scale_bar[c] += depth_bar * mass;
+                            strength_bar[c] += scattering_depth_bar * scattering_mass;
+                            inflow_bar[c] += radiance_bar - source_bar * lost;
+                        }
                         returning_row[c] = passed * source_bar;
                         far_bar_row[c] = line_bar * (phi - psi);
                         mass_bar_row[c] = mass_bar;
+                        near_row[c] = HAS_FLUX
+                            ? q[c] + w_z * q_z[c] + w_y * q_y[c] + w_x * q_x[c] : q[c];
                     }
                 };
                 if (!signs[2]) pass(Between(), Between());
                 else if (is_edge) pass(Whole(), Between());
                 else pass(Whole(), Whole());
+                if (first == 0) near_row[-1] = near_row[0];
+                if (last == width) near_row[width] = near_row[width - 1];
             }
             if (edge >= first && edge < last) {
                 const F bar = column_part * (all_here * far_here[edge] + row_part * far_ahead[edge]);

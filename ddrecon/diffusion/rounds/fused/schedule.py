@@ -9,7 +9,7 @@ from itertools import product
 from ddrecon.diffusion.rounds.characteristics import Course, Direction
 from ddrecon.grid import Grid
 
-PIECE = {True: 3, False: 9}
+PIECE = {True: 5, False: 9}
 """Directions at most that go side by side: fewer where I of all slices is kept for the adjoint."""
 EVEN = 1.05
 """A thread may have this many times the mean work."""

@@ -57,7 +57,10 @@ class _Sweep(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.saved_tensors)
-        found: list[Any] = _sum([part.transpose(bars) for part in _parts(ctx.plan, swept)])
+        varies_numbers = ctx.needs_input_grad[1]
+        found: list[Any] = _sum(
+            [part.transpose(bars, varies_numbers) for part in _parts(ctx.plan, swept)]
+        )
         if swept.scattering is None:
             found.insert(2, None)
         return None, *found
