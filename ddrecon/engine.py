@@ -2,8 +2,8 @@
 
 An engine is an implementation of the inner loops. `torch` is the readable definition and has them
 all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. Today warp has the view-ray integral; light and
-diffusion run in torch with either.
+same formulas, so their numbers agree to rounding. Today warp has the view-ray integral and the
+sweeps of transport rounds; light and diffusion run in torch with either.
 """
 
 from __future__ import annotations
@@ -18,7 +18,12 @@ ENGINES = ("torch", "warp")
 """The engines there are."""
 CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
-PARTS = {"view rays": ENGINES, "light": ("torch",), "diffusion": ("torch",)}
+PARTS = {
+    "view rays": ENGINES,
+    "transport rounds": ENGINES,
+    "light": ("torch",),
+    "diffusion": ("torch",),
+}
 """Which engines have which part of the renderer."""
 VARIABLE = "DDRECON_ENGINE"
 """The environment variable that chooses where `use_engine` was not called; `auto` without it."""

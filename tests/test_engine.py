@@ -98,7 +98,9 @@ def test_torch_has_every_part_and_runs_what_warp_has_not(installed: None) -> Non
     ddrecon.use_engine("torch")
     assert engine_of_parts() == dict.fromkeys(PARTS, "torch")
     ddrecon.use_engine("warp")
-    assert engine_of_parts() == dict.fromkeys(PARTS, "torch") | {"view rays": "warp"}
+    assert engine_of_parts() == dict.fromkeys(PARTS, "torch") | dict.fromkeys(
+        ("view rays", "transport rounds"), "warp"
+    )
 
 
 def test_versions(installed: None) -> None:

@@ -91,7 +91,9 @@ class Part:
             for first in range(0, len(items), self.colors):
                 piece = items[first : first + self.colors]
                 slices = range(-1, self._slices(piece[0]))
-                self._launch_piece(self.kernels(False).follow_cells, first, piece, [given, works[0]], slices)
+                self._launch_piece(
+                    self.kernels(False).follow_cells, first, piece, [given, works[0]], slices
+                )
         else:
             self._launch_items(self.kernels(False).follow_items, given, works, [], bounds)
         return [self.turn(moment) for moment in _add_up(sums)]
@@ -130,9 +132,7 @@ class Part:
                 slices = range(-1, self._slices(piece[0]))
                 self._launch_piece(kernels.keep_cells, first, piece, [given, works[0]], slices)
                 arguments = [given, works[0], bars_record]
-                self._launch_piece(
-                    kernels.return_cells, first, piece, arguments, slices[::-1]
-                )
+                self._launch_piece(kernels.return_cells, first, piece, arguments, slices[::-1])
         else:
             self._launch_items(kernels.return_items, given, works, [bars_record], bounds)
         field_bars = [
@@ -154,9 +154,14 @@ class Part:
         given = records(self.bits).Given()
         given.light = self._light(self.light)
         given.extinction, given.scattering = map(self._array, (self.fields[0], self.fields[-1]))
-        given.extinction_channels, given.scattering_channels = len(self.fields[0]), len(self.fields[-1])
+        given.extinction_channels, given.scattering_channels = (
+            len(self.fields[0]),
+            len(self.fields[-1]),
+        )
         given.numbers = self._array(self.swept.numbers)
-        directions, signs = _tables(self.schedule, self.plan.weighted, self.like.dtype, self.like.device)
+        directions, signs = _tables(
+            self.schedule, self.plan.weighted, self.like.dtype, self.like.device
+        )
         given.directions, given.signs = self._array(directions), self._array(signs)
         given.items = self._array(torch.tensor(items, dtype=torch.int32, device=self.like.device))
         given.depth, given.height, given.width = self.depth, self.height, self.width
@@ -199,7 +204,12 @@ class Part:
         launch(kernel, self.threads, lambda i: [given, works[i], *more, limits], self.like)
 
     def _launch_piece(
-        self, kernel: Any, first: int, piece: list[Item], arguments: list[Any], slices: Sequence[int]
+        self,
+        kernel: Any,
+        first: int,
+        piece: list[Item],
+        arguments: list[Any],
+        slices: Sequence[int],
     ) -> None:
         """Runs `kernel` slice by slice, for all cells and colors of each."""
         count = self.colors * self._cells // self._slices(piece[0])

@@ -13,7 +13,9 @@ slices only the last one is kept, with an empty cell before and behind each row:
 
 MARGIN = 16
 """Cells before each row, and at least so many behind it: rows begin where vectors do."""
-PLACES = f"const int MARGIN = {MARGIN};" + """
+PLACES = (
+    f"const int MARGIN = {MARGIN};"
+    + """
 const int* item = given.items.data + 6 * number;
 const int axis = item[0], forward = item[1], begin = item[2], count = item[3], color = item[4];
 const int width = given.width, wide = given.stretch;
@@ -39,6 +41,7 @@ const F* nothing = work.nothing.data + MARGIN;
 struct Whole { enum { value = 1 }; };
 struct Between { enum { value = 0 }; };
 """
+)
 # v where rays were, `here` and `behind` being the rows from which they come
 _UPSTREAM = """
 auto upstream = [&](auto whole, const F* here, const F* behind, int c) -> F {

@@ -55,7 +55,9 @@ def schedules(grid: Grid, directions: tuple[Direction, ...]) -> tuple[Schedule |
     courses = [Course.of(grid, direction) for direction in directions]
     axes = [course.order[0] - 1 for course in courses]
     return tuple(
-        _schedule(directions, courses, {i: a for i, a in enumerate(axes) if (a == 2) == is_across_x})
+        _schedule(
+            directions, courses, {i: a for i, a in enumerate(axes) if (a == 2) == is_across_x}
+        )
         for is_across_x in (False, True)
     )
 
@@ -112,9 +114,7 @@ def share_items(
 def _deal(
     pieces: list[Piece], colors: int, threads: int
 ) -> tuple[list[list[tuple[Piece, int]]], list[int]]:
-    """What each thread gets, the largest pieces first, each to who has least; and how much it is.
-
-    """
+    """What each thread gets, the largest pieces first, each to who has least; and how much it is."""
     shares: list[list[tuple[Piece, int]]] = [[] for _ in range(threads)]
     work = [0] * threads
     for piece in sorted(pieces, key=lambda piece: -piece.count):
