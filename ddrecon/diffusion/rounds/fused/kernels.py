@@ -9,7 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from ddrecon.diffusion.rounds.fused.rows import FOLLOW, RETURN
+from ddrecon.diffusion.rounds.fused.returning_rows import RETURN
+from ddrecon.diffusion.rounds.fused.rows import FOLLOW
 from ddrecon.kernels.native import number_type, program
 
 

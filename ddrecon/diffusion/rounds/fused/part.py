@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from ddrecon.diffusion.rounds.characteristics import Direction
 from ddrecon.diffusion.rounds.fused.kernels import records, sweep_kernels
 from ddrecon.diffusion.rounds.fused.rows import MARGIN
 from ddrecon.diffusion.rounds.fused.schedule import Item, Schedule, share_items
+from ddrecon.diffusion.rounds.fused.turning import turn
 from ddrecon.grid import Grid
 from ddrecon.kernels.launch import array, launch, thread_count
 
@@ -52,6 +54,10 @@ class Swept:
         return Swept(numbers, extinction, scattering, light)
 
 
+BUFFERS = "near", "radiance", "returning", "far_bar", "mass_bar", "scattering_mass_bar"
+"""What is kept of the last slice on the way back."""
+
+
 class Part:
     """One schedule of a sweep; where it `is_turned`, y and x are exchanged in all its arrays."""
 
@@ -75,18 +81,16 @@ class Part:
         ]
 
     def turn(self, cells: Tensor) -> Tensor:
-        """`cells` in the order of this part; and the other way round."""
-        return cells.transpose(-1, -2).contiguous() if self.is_turned else cells
+        """`cells` in the order of this part."""
+        return turn(cells) if self.is_turned else cells
 
-    def follow(self) -> list[Tensor]:
-        """The moments of radiance along the directions."""
+    def follow(self) -> Tensor:
+        """The moments [threads, M, C, z, y, x] of radiance along the directions, of each thread."""
         items, bounds, given = self._given(is_kept=False)
-        works = []
         sums = self._sums(items, bounds)
-        for moments in sums:
-            work = self._work(given, ("near", "radiance"))
+        works = [self._work(given, ("near", "radiance")) for _ in sums]
+        for work, moments in zip(works, sums, strict=True):
             work.light = self._light(moments)
-            works.append(work)
         if self.plan.by_cells:
             for first in range(0, len(items), self.colors):
                 piece = items[first : first + self.colors]
@@ -96,36 +100,25 @@ class Part:
                 )
         else:
             self._launch_items(self.kernels(False).follow_items, given, works, [], bounds)
-        return [self.turn(moment) for moment in _add_up(sums)]
+        return sums
 
     def transpose(self, bars: Sequence[Tensor], varies_numbers: bool) -> list[Tensor]:
-        """Cotangents of numbers, of fields and of moments, from those of moments."""
+        """Cotangents of numbers [threads, 3, C, ...], of moments and of fields, of each thread."""
         kernels = self.kernels(varies_numbers)
         items, bounds, given = self._given(is_kept=True)
         bars_record = self._light([self.turn(bar) for bar in bars])
-        sums, fields, numbers, works = self._sums(items, bounds), [], [], []
-        for moments in sums:
-            work = self._work(
-                given,
-                ("near", "radiance", "returning", "far_bar", "mass_bar", "scattering_mass_bar"),
-            )
-            work.light = self._light(moments)
+        sums, shape = self._sums(items, bounds), self.light[0].shape[1:]
+        numbers = self.like.new_zeros(self.threads, 3, self.colors, self.rows, self.width)
+        # Sums of fields are by color where colors go side by side.
+        channels = [self.colors if self.lanes > 1 else len(field) for field in self.fields]
+        fields = [self.like.new_zeros(self.threads, each, *shape) for each in channels]
+        works = [self._work(given, BUFFERS) for _ in sums]
+        for i, work in enumerate(works):
+            work.light, work.numbers = self._light(sums[i]), self._array(numbers[i])
+            work.extinction, work.scattering = (self._array(fields[j][i]) for j in (0, -1))
+            work.extinction_channels, work.scattering_channels = channels[0], channels[-1]
             kept = self.lanes * given.group * self._cells
             work.arriving = self._array(self.like.new_empty(kept))
-            # Sums of fields are by color where colors go side by side.
-            own = [
-                self.like.new_zeros(
-                    self.colors if self.lanes > 1 else field.shape[0], *self.light[0].shape[1:]
-                )
-                for field in self.fields
-            ]
-            fields.append(own)
-            work.extinction, work.scattering = (self._array(own[0]), self._array(own[-1]))
-            work.extinction_channels, work.scattering_channels = len(own[0]), len(own[-1])
-            own_numbers = self.like.new_zeros(3, self.colors, self.rows, self.width)
-            numbers.append(own_numbers)
-            work.numbers = self._array(own_numbers)
-            works.append(work)
         if self.plan.by_cells:
             for first in range(0, len(items), self.colors):
                 piece = items[first : first + self.colors]
@@ -135,12 +128,7 @@ class Part:
                 self._launch_piece(kernels.return_cells, first, piece, arguments, slices[::-1])
         else:
             self._launch_items(kernels.return_items, given, works, [bars_record], bounds)
-        field_bars = [
-            self.turn(bar.sum_to_size(len(field), *bar.shape[1:]))
-            for bar, field in zip(_add_up(fields), self.fields, strict=True)
-        ]
-        numbers_bar = _add_up([[n.double()] for n in numbers])[0].sum((2, 3)).to(self.like.dtype)
-        return [numbers_bar, *field_bars, *(self.turn(moment) for moment in _add_up(sums))]
+        return [numbers, sums, *fields]
 
     @property
     def _cells(self) -> int:
@@ -170,13 +158,12 @@ class Part:
         given.group = max(item[3] for item in items)
         return items, bounds, given
 
-    def _sums(self, items: list[Item], bounds: list[int]) -> list[list[Tensor]]:
+    def _sums(self, items: list[Item], bounds: list[int]) -> Tensor:
         """Of each thread empty moments, zero in colors of which it has no item."""
-        sums = [[torch.empty_like(moment) for moment in self.light] for _ in range(self.threads)]
-        for own, begin, end in zip(sums, bounds, bounds[1:], strict=False):
+        sums = self.like.new_empty(self.threads, len(self.light), *self.light[0].shape)
+        for own, (begin, end) in zip(sums, pairwise(bounds), strict=True):
             for color in set(range(self.colors)) - {item[4] for item in items[begin:end]}:
-                for moment in own:
-                    moment[color].zero_()
+                own[:, color].zero_()
         return sums
 
     def _work(self, given: Any, names: Sequence[str]) -> Any:
@@ -187,7 +174,7 @@ class Part:
         work.nothing = self._array(self.like.new_zeros(self.stretch))
         return work
 
-    def _light(self, moments: Sequence[Tensor]) -> Any:
+    def _light(self, moments: Sequence[Tensor] | Tensor) -> Any:
         light = records(self.bits).Light()
         for name, i in zip(("mean", "z", "y", "x"), range(4), strict=True):
             setattr(light, name, self._array(moments[i if len(moments) > 1 else 0]))
@@ -228,8 +215,3 @@ def _tables(
         torch.tensor(rows, dtype=dtype, device=device),
         torch.tensor(schedule.signs, dtype=torch.int32, device=device),
     )
-
-
-def _add_up(shares: list[list[Tensor]]) -> list[Tensor]:
-    """The sums over threads, in the tensors of the first."""
-    return [functools.reduce(Tensor.add_, tensors) for tensors in zip(*shares, strict=True)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 from ddrecon.diffusion.rounds.characteristics import Course, Direction
 from ddrecon.grid import Grid
@@ -44,30 +44,25 @@ class Schedule:
         for piece in self.pieces:
             parts = -(-piece.count // most)
             bounds = [i * piece.count // parts for i in range(parts + 1)]
-            for a, b in zip(bounds, bounds[1:], strict=False):
+            for a, b in pairwise(bounds):
                 found.append(Piece(piece.axis, piece.forward, piece.begin + a, b - a))
         return found
 
 
 @functools.cache
-def schedules(grid: Grid, directions: tuple[Direction, ...]) -> tuple[Schedule | None, ...]:
-    """The schedule across z and y, and that across x; None where there are no such directions."""
+def schedules(grid: Grid, directions: tuple[Direction, ...]) -> tuple[Schedule, ...]:
+    """The schedule across z and y, and that across x: a quadrature has directions of both."""
     courses = [Course.of(grid, direction) for direction in directions]
     axes = [course.order[0] - 1 for course in courses]
-    return tuple(
-        _schedule(
-            directions, courses, {i: a for i, a in enumerate(axes) if (a == 2) == is_across_x}
-        )
-        for is_across_x in (False, True)
-    )
+    across = ({i: a for i, a in enumerate(axes) if (a == 2) == is_x} for is_x in (False, True))
+    return tuple(_schedule(directions, courses, each) for each in across)
 
 
 def _schedule(
     directions: tuple[Direction, ...], courses: list[Course], axes: dict[int, int]
-) -> Schedule | None:
-    if not axes:
-        return None
-    order, pieces = [], []
+) -> Schedule:
+    order: list[int] = []
+    pieces = []
     for axis, forward in product((0, 1, 2), (1, -1)):
         group = [i for i, a in axes.items() if a == axis and courses[i].forward == forward]
         if group:
@@ -114,7 +109,7 @@ def share_items(
 def _deal(
     pieces: list[Piece], colors: int, threads: int
 ) -> tuple[list[list[tuple[Piece, int]]], list[int]]:
-    """What each thread gets, the largest pieces first, each to who has least; and how much it is."""
+    """What each thread gets, and how much: the largest pieces first, each to who has least."""
     shares: list[list[tuple[Piece, int]]] = [[] for _ in range(threads)]
     work = [0] * threads
     for piece in sorted(pieces, key=lambda piece: -piece.count):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.part import Part, Plan, Swept, Weighted
 from ddrecon.diffusion.rounds.fused.schedule import schedules
+from ddrecon.diffusion.rounds.fused.turning import add_up
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 
@@ -51,29 +51,29 @@ class _Sweep(torch.autograd.Function):
     def forward(ctx: Any, plan: Plan, *tensors: Any) -> tuple[Tensor, ...]:
         ctx.plan = plan
         ctx.save_for_backward(*tensors)
-        swept = Swept.of(*tensors)
-        return tuple(_sum([part.follow() for part in _parts(plan, swept)]))
+        parts = _parts(plan, Swept.of(*tensors))
+        return add_up(*(part.follow() for part in parts)).unbind(0)
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
-        swept = Swept.of(*ctx.saved_tensors)
         varies_numbers = ctx.needs_input_grad[1]
-        found: list[Any] = _sum(
-            [part.transpose(bars, varies_numbers) for part in _parts(ctx.plan, swept)]
-        )
-        if swept.scattering is None:
-            found.insert(2, None)
-        return None, *found
+        parts = _parts(ctx.plan, Swept.of(*ctx.saved_tensors))
+        (one, *cells), (other, *turned) = (part.transpose(bars, varies_numbers) for part in parts)
+        light_bars, *field_bars = (add_up(*each) for each in zip(cells, turned, strict=True))
+        numbers_bar = None
+        if varies_numbers:
+            sums = (part.double().sum((0, 3, 4)) for part in (one, other))
+            numbers_bar = functools.reduce(Tensor.add, sums).to(light_bars)
+        # A field of one channel for all colors, or none where extinction's serves scattering too.
+        of_fields = [
+            None if field is None or bar is None else bar.sum_to_size(field.shape)
+            for bar, field in zip((*field_bars, None), ctx.saved_tensors[1:3], strict=False)
+        ]
+        return None, numbers_bar, *of_fields, *light_bars.unbind(0)
 
 
 def _parts(plan: Plan, swept: Swept) -> list[Part]:
-    found = schedules(plan.grid, tuple(direction for direction, _ in plan.weighted))
-    return [
-        Part(plan, schedule, swept, is_turned)
-        for is_turned, schedule in zip((False, True), found, strict=True)
-        if schedule is not None
-    ]
-
-
-def _sum(parts: Sequence[list[Tensor]]) -> list[Tensor]:
-    return [functools.reduce(Tensor.add_, tensors) for tensors in zip(*parts, strict=True)]
+    """What crosses slices across z or y, and what crosses those across x."""
+    directions = tuple(direction for direction, _ in plan.weighted)
+    across = schedules(plan.grid, directions)
+    return [Part(plan, schedule, swept, bool(i)) for i, schedule in enumerate(across)]
