@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.rounds.sweep import _directions, sweep
+from ddrecon.diffusion.rounds.transport import _gain
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
@@ -20,6 +21,7 @@ from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 from ddrecon.renderer import solve_light
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.diffusion.rounds.fused.gains import gain_kernels  # noqa: E402
 from ddrecon.diffusion.rounds.fused.kernels import sweep_kernels  # noqa: E402
 from ddrecon.diffusion.rounds.fused.sweep import sweep_fused  # noqa: E402
 
@@ -197,6 +199,29 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
         assert_same(other, runs[0], 1e-13)
 
 
+def gains_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]:
+    """The source, and the gains from light to twice that light, as after a first or second round.
+
+    After the first the balance is off by as much as light is; `inflow` stands for a second round.
+    """
+    use_engine(engine)
+    medium, light, inflow = case.parts(values)
+    imbalance = None if inflow is None else inflow * light.mean
+    gain, source = _gain(medium, light.scaled(2.0, 3.0), light, imbalance, case.directions)
+    return [source, gain.mean, *(gain.flux or ())]
+
+
+@pytest.mark.parametrize("name", ["color", "gray", "gray-flux", "fields", "cell", "opaque"])
+def test_gains_and_their_gradients_are_those_of_torch(name: str):
+    one, other = (gradients(CASES[name], engine, gains_of) for engine in ("warp", "torch"))
+    assert_same(one, other, 1e-11)
+
+
+def test_gains_in_single_precision():
+    single = gradients(replace(CASES["color"], dtype=torch.float32), "warp", gains_of)
+    assert_same(single, gradients(CASES["color"], "torch", gains_of), 2e-6)
+
+
 @pytest.mark.parametrize("g", [0.0, 0.5])
 def test_light_after_rounds_is_that_of_torch(g: float):
     scene = make_scene(
@@ -224,7 +249,9 @@ def test_light_after_rounds_is_that_of_torch(g: float):
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
     kernels = sweep_kernels(32, True, False, True)
+    of_gains = gain_kernels(32, True, False, True)
     of_cells = [kernels.follow_cells, kernels.keep_cells, kernels.return_cells]
+    of_cells += [of_gains.gain, of_gains.transpose]
     for kernel in of_cells:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(of_cells)
