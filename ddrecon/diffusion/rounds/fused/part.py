@@ -70,6 +70,8 @@ class Part:
         self.rows = max(self.depth, self.height)
         self.stretch = -(-self.width // MARGIN) * MARGIN + 2 * MARGIN
         self.threads = 1 if plan.by_cells else thread_count(self.like)
+        # Few directions cross slices across x: sums for each thread would cost more than they.
+        self.is_apart = is_turned and self.threads <= self.colors
         self.lanes = self.colors if plan.by_cells else 1
         has_flux, shares_field = len(self.light) > 1, swept.scattering is None
         self.kernels = functools.partial(sweep_kernels, self.bits, has_flux, shares_field)
@@ -84,8 +86,8 @@ class Part:
         """`cells` in the order of this part."""
         return turn(cells) if self.is_turned else cells
 
-    def follow(self) -> Tensor:
-        """The moments [threads, M, C, z, y, x] of radiance along the directions, of each thread."""
+    def follow(self) -> list[Tensor]:
+        """Shares of the moments [M, C, z, y, x] of radiance along the directions."""
         items, bounds, given = self._given(is_kept=False)
         sums = self._sums(items, bounds)
         works = [self._work(given, ("near", "radiance")) for _ in sums]
@@ -100,10 +102,10 @@ class Part:
                 )
         else:
             self._launch_items(self.kernels(False).follow_items, given, works, [], bounds)
-        return sums
+        return self._distinct(sums)
 
-    def transpose(self, bars: Sequence[Tensor], varies_numbers: bool) -> list[Tensor]:
-        """Cotangents of numbers [threads, 3, C, ...], of moments and of fields, of each thread."""
+    def transpose(self, bars: Sequence[Tensor], varies_numbers: bool) -> list[list[Tensor]]:
+        """Shares of the cotangents of numbers [3, C, rows, x], of moments and of fields."""
         kernels = self.kernels(varies_numbers)
         items, bounds, given = self._given(is_kept=True)
         bars_record = self._light([self.turn(bar) for bar in bars])
@@ -128,7 +130,7 @@ class Part:
                 self._launch_piece(kernels.return_cells, first, piece, arguments, slices[::-1])
         else:
             self._launch_items(kernels.return_items, given, works, [bars_record], bounds)
-        return [numbers, sums, *fields]
+        return [list(numbers), self._distinct(sums), *map(list, fields)]
 
     @property
     def _cells(self) -> int:
@@ -138,7 +140,9 @@ class Part:
         return self.depth if item[0] == 0 else self.height
 
     def _given(self, is_kept: bool) -> tuple[list[Item], list[int], Any]:
-        items, bounds = share_items(self.schedule, self.colors, self.threads, is_kept)
+        items, bounds = share_items(
+            self.schedule, self.colors, self.threads, is_kept, self.is_apart
+        )
         given = records(self.bits).Given()
         given.light = self._light(self.light)
         given.extinction, given.scattering = map(self._array, (self.fields[0], self.fields[-1]))
@@ -158,13 +162,22 @@ class Part:
         given.group = max(item[3] for item in items)
         return items, bounds, given
 
-    def _sums(self, items: list[Item], bounds: list[int]) -> Tensor:
-        """Of each thread empty moments, zero in colors of which it has no item."""
-        sums = self.like.new_empty(self.threads, len(self.light), *self.light[0].shape)
+    def _sums(self, items: list[Item], bounds: list[int]) -> list[Tensor]:
+        """For each thread empty moments, zero in colors of which it has no item.
+
+        Where each color has one thread they are the same for all.
+        """
+        shape = len(self.light), *self.light[0].shape
+        if self.is_apart:
+            return [self.like.new_empty(shape)] * self.threads
+        sums = [self.like.new_empty(shape) for _ in range(self.threads)]
         for own, (begin, end) in zip(sums, pairwise(bounds), strict=True):
             for color in set(range(self.colors)) - {item[4] for item in items[begin:end]}:
                 own[:, color].zero_()
         return sums
+
+    def _distinct(self, sums: list[Tensor]) -> list[Tensor]:
+        return sums[:1] if self.is_apart else sums
 
     def _work(self, given: Any, names: Sequence[str]) -> Any:
         work = records(self.bits).Work()

@@ -120,7 +120,7 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                 const F own_part = F(1) - row_part;"""
     + UPSTREAM
     + """
-                auto pass = [&](auto whole, auto whole_far) {
+                auto pass = [&](auto whole) {
                     INDEPENDENT
                     for (int c = first; c < last; ++c) {
                         const F near = near_row[c], arriving = arriving_kept[c];
@@ -149,7 +149,7 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                             + (SHARES_FIELD ? scattering_mass_bar : F(0));
                         // By q at the near end, and by q where rays will be.
                         const F bar = line_bar * psi
-                            + downstream(whole_far, far_here, far_ahead, all_here, c);
+                            + downstream(whole, far_here, far_ahead, all_here, c);
                         q_bar[c] += bar;
                         if (HAS_FLUX) {
                             q_z_bar[c] += w_z * bar;
@@ -175,9 +175,7 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                         near_row[c] = light_along(q, q_z, q_y, q_x, c);
                     }
                 };
-                if (!signs[2]) pass(Between(), Between());
-                else if (is_edge) pass(Whole(), Between());
-                else pass(Whole(), Whole());
+                if (signs[2] && !is_edge) pass(Whole()); else pass(Between());
                 if (first == 0) near_row[-1] = near_row[0];
                 if (last == width) near_row[width] = near_row[width - 1];
             }

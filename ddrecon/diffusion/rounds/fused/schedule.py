@@ -84,15 +84,16 @@ Item = tuple[int, int, int, int, int, int]
 
 @functools.cache
 def share_items(
-    schedule: Schedule, colors: int, threads: int, is_kept: bool
+    schedule: Schedule, colors: int, threads: int, is_kept: bool, is_apart: bool
 ) -> tuple[list[Item], list[int]]:
     """Each piece in each color, in the order of threads, and where each thread's begin.
 
-    Pieces are cut until all threads have about as much to do.
+    Pieces are cut until all threads have about as much to do; where colors are kept `is_apart`,
+    each has one thread.
     """
     for most in range(PIECE[is_kept], 0, -1):
-        shares, work = _deal(schedule.cut(most), colors, threads)
-        if max(work) <= EVEN * sum(work) / threads:
+        shares, work = _deal(schedule.cut(most), colors, threads, is_apart)
+        if is_apart or max(work) <= EVEN * sum(work) / threads:
             break
     items: list[Item] = []
     bounds = [0]
@@ -107,14 +108,14 @@ def share_items(
 
 
 def _deal(
-    pieces: list[Piece], colors: int, threads: int
+    pieces: list[Piece], colors: int, threads: int, is_apart: bool
 ) -> tuple[list[list[tuple[Piece, int]]], list[int]]:
     """What each thread gets, and how much: the largest pieces first, each to who has least."""
     shares: list[list[tuple[Piece, int]]] = [[] for _ in range(threads)]
     work = [0] * threads
     for piece in sorted(pieces, key=lambda piece: -piece.count):
         for color in range(colors):
-            least = work.index(min(work))
+            least = color % threads if is_apart else work.index(min(work))
             shares[least].append((piece, color))
             work[least] += piece.count
     return shares, work

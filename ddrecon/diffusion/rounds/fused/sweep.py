@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.part import Part, Plan, Swept, Weighted
 from ddrecon.diffusion.rounds.fused.schedule import schedules
-from ddrecon.diffusion.rounds.fused.turning import add_up
+from ddrecon.diffusion.rounds.fused.turning import add_turned
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 
@@ -52,17 +52,17 @@ class _Sweep(torch.autograd.Function):
         ctx.plan = plan
         ctx.save_for_backward(*tensors)
         parts = _parts(plan, Swept.of(*tensors))
-        return add_up(*(part.follow() for part in parts)).unbind(0)
+        return _add_up(*(part.follow() for part in parts)).unbind(0)
 
     @staticmethod
     def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
         varies_numbers = ctx.needs_input_grad[1]
         parts = _parts(ctx.plan, Swept.of(*ctx.saved_tensors))
         (one, *cells), (other, *turned) = (part.transpose(bars, varies_numbers) for part in parts)
-        light_bars, *field_bars = (add_up(*each) for each in zip(cells, turned, strict=True))
+        light_bars, *field_bars = (_add_up(*each) for each in zip(cells, turned, strict=True))
         numbers_bar = None
         if varies_numbers:
-            sums = (part.double().sum((0, 3, 4)) for part in (one, other))
+            sums = (part.double().sum((2, 3)) for part in (*one, *other))
             numbers_bar = functools.reduce(Tensor.add, sums).to(light_bars)
         # A field of one channel for all colors, or none where extinction's serves scattering too.
         of_fields = [
@@ -70,6 +70,11 @@ class _Sweep(torch.autograd.Function):
             for bar, field in zip((*field_bars, None), ctx.saved_tensors[1:3], strict=False)
         ]
         return None, numbers_bar, *of_fields, *light_bars.unbind(0)
+
+
+def _add_up(shares: list[Tensor], turned: list[Tensor]) -> Tensor:
+    """The sum of threads' `shares` of both parts, in the memory of the first."""
+    return add_turned(*(functools.reduce(Tensor.add_, each) for each in (shares, turned)))
 
 
 def _parts(plan: Plan, swept: Swept) -> list[Part]:

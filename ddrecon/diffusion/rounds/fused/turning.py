@@ -18,7 +18,7 @@ TILE = 16
 """Rows and columns that are exchanged at a time."""
 _TILES = f"""
 const int TILE = {TILE};
-const long long size = (long long)height * width, at = plane * size, total = planes * size;
+const long long size = (long long)height * width, at = plane * size;
 for (int top = 0; top < height; top += TILE) {{
     const int bottom = top + TILE < height ? top + TILE : height;
     for (int left = 0; left < width; left += TILE) {{
@@ -35,24 +35,16 @@ _TURN = (
 }
 """
 )
-_ADD_UP = (
+_ADD = (
     _TILES
     + """
         F sum[TILE * TILE];
-        for (int i = 0; i < TILE * TILE; ++i) sum[i] = F(0);
-        for (int t = 0; t < turned_shares; ++t)
-            for (int x = left; x < right; ++x)
-                for (int y = top; y < bottom; ++y)
-                    sum[(y - top) * TILE + x - left]
-                        += turned.data[t * total + at + (long long)x * height + y];
-        for (int t = 0; t < shares; ++t)
+        for (int x = left; x < right; ++x)
             for (int y = top; y < bottom; ++y)
-                for (int x = left; x < right; ++x)
-                    sum[(y - top) * TILE + x - left]
-                        += cells.data[t * total + at + (long long)y * width + x];
+                sum[(y - top) * TILE + x - left] = turned.data[at + (long long)x * height + y];
         for (int y = top; y < bottom; ++y)
             for (int x = left; x < right; ++x)
-                out.data[at + (long long)y * width + x] = sum[(y - top) * TILE + x - left];
+                cells.data[at + (long long)y * width + x] += sum[(y - top) * TILE + x - left];
     }
 }
 """
@@ -67,21 +59,19 @@ def turn(cells: Tensor) -> Tensor:
     turned = cells.new_empty(*planes, width, height)
     count = turned.numel() // (height * width)
     kernel = _kernels(torch.finfo(cells.dtype).bits).turn_planes
-    launch(kernel, count, [*map(_flat, (cells, turned)), count, height, width], cells)
+    launch(kernel, count, [*map(_flat, (cells, turned)), height, width], cells)
     return turned
 
 
-def add_up(cells: Tensor, turned: Tensor) -> Tensor:
-    """The sum over the first dimension of `cells` [N, ..., y, x] and of `turned` [T, ..., x, y]."""
+def add_turned(cells: Tensor, turned: Tensor) -> Tensor:
+    """`cells` [..., y, x] with `turned` [..., x, y] added, in the same memory."""
     if cells.is_cuda:
-        return cells.sum(0) + turned.sum(0).transpose(-1, -2)
-    shares, *_, height, width = cells.shape
-    out = torch.empty_like(cells[0])
-    count = out.numel() // (height * width)
-    sizes = [shares, len(turned), count, height, width]
+        return cells.add_(turned.transpose(-1, -2))
+    *_, height, width = cells.shape
+    count = cells.numel() // (height * width)
     kernel = _kernels(torch.finfo(cells.dtype).bits).add_planes
-    launch(kernel, count, [*map(_flat, (cells, turned, out)), *sizes], cells)
-    return out
+    launch(kernel, count, [*map(_flat, (cells, turned)), height, width], cells)
+    return cells
 
 
 def _flat(tensor: Tensor) -> Any:
@@ -94,51 +84,24 @@ def _kernels(bits: int) -> SimpleNamespace:
 
     @wp.func_native(program(bits, _TURN))
     def turn_plane(
-        cells: wp.array(dtype=F),
-        turned: wp.array(dtype=F),
-        plane: int,
-        planes: int,
-        height: int,
-        width: int,
+        cells: wp.array(dtype=F), turned: wp.array(dtype=F), plane: int, height: int, width: int
     ): ...
 
-    @wp.func_native(program(bits, _ADD_UP))
+    @wp.func_native(program(bits, _ADD))
     def add_plane(
-        cells: wp.array(dtype=F),
-        turned: wp.array(dtype=F),
-        out: wp.array(dtype=F),
-        shares: int,
-        turned_shares: int,
-        plane: int,
-        planes: int,
-        height: int,
-        width: int,
+        cells: wp.array(dtype=F), turned: wp.array(dtype=F), plane: int, height: int, width: int
     ): ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def turn_planes(
-        first: int,
-        cells: wp.array(dtype=F),
-        turned: wp.array(dtype=F),
-        planes: int,
-        height: int,
-        width: int,
+        first: int, cells: wp.array(dtype=F), turned: wp.array(dtype=F), height: int, width: int
     ):
-        turn_plane(cells, turned, first + wp.tid(), planes, height, width)
+        turn_plane(cells, turned, first + wp.tid(), height, width)
 
     @wp.kernel(enable_backward=False, module="unique")
     def add_planes(
-        first: int,
-        cells: wp.array(dtype=F),
-        turned: wp.array(dtype=F),
-        out: wp.array(dtype=F),
-        shares: int,
-        turned_shares: int,
-        planes: int,
-        height: int,
-        width: int,
+        first: int, cells: wp.array(dtype=F), turned: wp.array(dtype=F), height: int, width: int
     ):
-        plane = first + wp.tid()
-        add_plane(cells, turned, out, shares, turned_shares, plane, planes, height, width)
+        add_plane(cells, turned, first + wp.tid(), height, width)
 
     return SimpleNamespace(turn_planes=turn_planes, add_planes=add_planes)
