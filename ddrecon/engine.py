@@ -18,7 +18,7 @@ ENGINES = ("torch", "warp")
 """The engines there are."""
 CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
-PARTS = {"view rays": ENGINES, "light": ENGINES, "diffusion": ENGINES}
+PARTS = {"view rays": ENGINES, "transport rounds": ENGINES, "light": ENGINES, "diffusion": ENGINES}
 """Which engines have which part of the renderer."""
 VARIABLE = "DDRECON_ENGINE"
 """The environment variable that chooses where `use_engine` was not called; `auto` without it."""

@@ -19,7 +19,11 @@ from typing import Any
 
 import warp as wp
 
+# Products are added in one instruction where the processor has one (on a GPU that is the rule).
 _TYPES = """
+#if defined(__clang__)
+#pragma clang fp contract(fast)
+#endif
 typedef {number} F;
 typedef {integer} Bits;
 """
@@ -41,13 +45,27 @@ auto decay = [](F depth) -> F {{
 #endif
 }};
 """
-# psi = 1/2 - depth / 6 + depth^2 / 24 - ... = (1 - phi) / depth (`numerics.decay`), depth >= 0
+# psi = 1/2 - depth / 6 + depth^2 / 24 - ... = (1 - phi) / depth (`numerics.decay`), depth >= 0, and
+# psi' = -1/6 + depth / 12 - depth^2 / 40 + ...
 _PSI = """
 auto psi_series = [](F depth) -> F {{
     F series = F(1);
     {series}
     return F(0.5) * series;
 }};
+auto psi_slope_series = [](F depth) -> F {{
+    F series = F(1);
+    {slopes}
+    return F({first_slope}) * series;
+}};
+"""
+# Before a loop: its turns do not touch what others write, which clang cannot see of many arrays.
+_LOOPS = """
+#if defined(__clang__) && !defined(__CUDA_ARCH__)
+#define INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
+#else
+#define INDEPENDENT
+#endif
 """
 
 TOTAL = """
@@ -74,23 +92,30 @@ def _polynomial(degree: int) -> dict[str, str]:
     return {"first": repr(coefficients[-1]), "horner": " ".join(lines)}
 
 
-def _series(terms: int) -> str:
-    return " ".join(
-        f"series = F(1) - depth * series * F({1 / (k + 2)!r});" for k in range(terms, 0, -1)
-    )
+def _series(terms: int) -> dict[str, str]:
+    """Horner's lines of psi and of psi', from the ratios of their coefficients."""
+
+    def lines(ratios: list[float]) -> str:
+        return " ".join(f"series = F(1) - depth * series * F({r!r});" for r in reversed(ratios))
+
+    return {
+        "series": lines([1 / (k + 3) for k in range(terms)]),
+        "slopes": lines([(k + 2) / ((k + 1) * (k + 4)) for k in range(terms)]),
+        "first_slope": repr(-1 / 6),
+    }
 
 
 _TEXT = {
-    32: (_TYPES + _DECAY + _PSI).format(
+    32: (_TYPES + _DECAY + _PSI + _LOOPS).format(
         number="float", integer="int", exp="expf", most="87.0", shift="12582912.0", digits=23,
         log2_high="0.693145751953125", log2_low="1.42860682030941723212e-6",
-        **_polynomial(7), series=_series(7),
+        **_polynomial(7), **_series(7),
     ),
-    64: (_TYPES + _DECAY + _PSI).format(
+    64: (_TYPES + _DECAY + _PSI + _LOOPS).format(
         number="double", integer="long long", exp="exp", most="700.0",
         shift="6755399441055744.0", digits=52,
         log2_high="0.693147180369123816490", log2_low="1.90821492927058770002e-10",
-        **_polynomial(13), series=_series(13),
+        **_polynomial(13), **_series(13),
     ),
 }  # fmt: skip
 
@@ -101,10 +126,11 @@ def number_type(bits: int) -> Any:
 
 
 def program(bits: int, body: str) -> str:
-    """C++ for `wp.func_native`: `body` behind the definitions of `F`, `decay` and `psi_series`.
+    """C++ for `wp.func_native`: `body` behind the definitions of `F`, of functions and of a word.
 
     `decay(depth)` is exp(-depth), of depths from about -87 to any size, exact to the last digit but
     one; where it is below about 1e-38 (1e-304 in 64 `bits`) it is that. `psi_series(depth)` is
-    (1 - (1 - exp(-depth)) / depth) / depth for depth from 0 to 1/2.
+    (1 - (1 - exp(-depth)) / depth) / depth for depth from 0 to 1/2, and `psi_slope_series(depth)`
+    its derivative. `INDEPENDENT` before a loop says that no turn reads what another writes.
     """
     return _TEXT[bits] + body

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
+from ddrecon.engine import current_engine
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.numerics.autodiff import is_forward
@@ -79,11 +80,15 @@ def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int
     the quadrature has.
     """
     parts = Parts.of(medium, light, inflow)
-    mean, *flux = (
-        _sum_over_directions(medium, directions, parts)
-        if is_forward()
-        else _Sweep.apply(medium, directions, *parts)
-    )
+    if is_forward():
+        mean, *flux = _sum_over_directions(medium, directions, parts)
+    elif current_engine() == "warp":
+        from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
+
+        weighted = tuple(_directions(directions, 1 if light.flux is None else 4))
+        mean, *flux = sweep_fused(medium, light, inflow, weighted)
+    else:
+        mean, *flux = _Sweep.apply(medium, directions, *parts)
     if not flux:
         return Moments(mean)
     z, y, x = flux

@@ -7,6 +7,7 @@ real geometry, and takes the moments of what arrives. What it changes is passed 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import torch
@@ -17,9 +18,11 @@ from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.sweep import sweep
+from ddrecon.engine import current_engine
+from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import is_varied, recompute
+from ddrecon.numerics.autodiff import is_forward, is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 
@@ -39,23 +42,38 @@ def run_rounds(
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
     is_lit_from_outside = is_varied(outside) or bool((outside != 0).any())
-    share = recompute(_transport_share, medium, directions)
     for round_index in range(1, rounds + 1):
         # E11 along every direction, of all light that scatters: q = L0 + Q0 and q1 = g L1 + Q1
         scatters = light.scaled(1.0, medium.mean_cosine).plus(problem.source)
         swept = sweep(medium, scatters, outside if is_lit_from_outside else None, directions)
-        # the gains of E12: theta (L0' - L0) and theta (L1' - 3 F(L0))
-        diffuse = Moments(light.mean, problem.flux(light.mean))
-        gain = swept.plus(diffuse.scaled(-1.0, -1.0)).scaled(share, share)
-        # E12's right side: S + kappa_s theta (L0' - L0) - theta (S - A L0); S = A L0 at the start
-        source = medium.remaining_scattering * gain.mean
+        # Light begins as diffusion's, L0 with 3 F(L0), where S - A L0 is zero.
+        diffuse, imbalance = light, None
         if round_index > 1:
-            source = source - share * recompute(_imbalance, operator, right, light.mean)
+            diffuse = Moments(light.mean, problem.flux(light.mean))
+            imbalance = recompute(_imbalance, operator, right, light.mean)
+        gain, source = _gain(medium, swept, diffuse, imbalance, directions)
         solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
         mean = solve_diffusion(solve_round, operator, right + source)
         # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
         light = Moments(mean, problem.flux(mean)).plus(gain)
     return light
+
+
+def _gain(
+    medium: Medium, swept: Moments, diffuse: Moments, imbalance: Tensor | None, directions: int
+) -> tuple[Moments, Tensor]:
+    """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E12, and what they add to S.
+
+    That is kappa_s theta (L0' - L0) - theta (S - A L0); `imbalance` is S - A L0, None for zero.
+    """
+    if current_engine() == "warp" and not is_forward():
+        from ddrecon.diffusion.rounds.fused.gain import gain_fused
+
+        return gain_fused(medium, swept, diffuse, imbalance, _mean_step(medium.grid, directions))
+    share = recompute(_transport_share, medium, directions)
+    gain = swept.plus(diffuse.scaled(-1.0, -1.0)).scaled(share, share)
+    source = medium.remaining_scattering * gain.mean
+    return gain, source if imbalance is None else source - share * imbalance
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
@@ -73,20 +91,25 @@ def _transport_share(medium: Medium, directions: int) -> Tensor:
     too much if its source is linear over steps of optical depth d; here d is that of the mean step.
     Returns `[C, z, y, x]` in (0, 1].
     """
+    # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
+    # 1e-6, theta is 1 already
+    half_depth = (0.5 * _mean_step(medium.grid, directions) * medium.extinction.value).clamp(
+        min=1e-3
+    )
+    rho = half_depth / torch.tanh(half_depth) - 1
+    return 1 / (1 + rho**2)
+
+
+@functools.cache
+def _mean_step(grid: Grid, directions: int) -> float:
+    """The mean length of a step along the directions of the quadrature [u]."""
     # the length of a step along each direction; along an axis of one cell nothing varies, so such
     # steps do not count
-    points, weights = sphere_quadrature(
-        medium.extinction.scale.new_zeros((), dtype=torch.float64), directions
-    )
-    courses = [Course.of(medium.grid, tuple(point)) for point in points.tolist()]
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
+    courses = [Course.of(grid, tuple(point)) for point in points.tolist()]
     step_lengths = weights.new_tensor(
-        [course.step if medium.grid.shape[course.order[0] - 1] > 1 else 0.0 for course in courses]
+        [course.step if grid.shape[course.order[0] - 1] > 1 else 0.0 for course in courses]
     )
     # their mean over directions; a grid of one cell has none, and then theta is 1
     weight_of_steps = weights[step_lengths > 0].sum().clamp(min=1e-9)
-    mean_length = float(weights @ step_lengths / weight_of_steps)
-    # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
-    # 1e-6, theta is 1 already
-    half_depth = (0.5 * mean_length * medium.extinction.value).clamp(min=1e-3)
-    rho = half_depth / torch.tanh(half_depth) - 1
-    return 1 / (1 + rho**2)
+    return float(weights @ step_lengths / weight_of_steps)

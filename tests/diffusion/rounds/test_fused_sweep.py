@@ -1,0 +1,257 @@
+"""The fused kernels of a sweep compute what PyTorch's operations compute, derivatives included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+import torch.autograd.forward_ad as forward
+from media import half_empty, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.rounds.sweep import _directions, sweep
+from ddrecon.diffusion.rounds.transport import _gain
+from ddrecon.engine import use_engine
+from ddrecon.grid import Grid
+from ddrecon.light.moments import Moments
+from ddrecon.medium.coefficients import Medium, Volume, scale_medium
+from ddrecon.renderer import solve_light
+
+wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.diffusion.rounds.fused.gains import gain_kernels  # noqa: E402
+from ddrecon.diffusion.rounds.fused.kernels import sweep_kernels  # noqa: E402
+from ddrecon.diffusion.rounds.fused.sweep import sweep_fused  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+CUBES, FLAT = (1.0, 1.0, 1.0), (0.2, 1.0, 3.0)
+"""Spacings [u]: along most of 26 directions rays then drift by whole cells, or by parts of them."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is swept: `depth` is that of the densest cells; fields `vary` by cell and color."""
+
+    shape: tuple[int, int, int] = (5, 7, 6)
+    spacing: tuple[float, float, float] = FLAT
+    colors: int = 3
+    has_flux: bool = True
+    is_lit: bool = True
+    varies: bool = False
+    directions: int = 26
+    depth: float = 3.0
+    dtype: torch.dtype = torch.float64
+
+    @property
+    def grid(self) -> Grid:
+        z, y, x = (n * step for n, step in zip(self.shape, self.spacing, strict=True))
+        return Grid(self.shape, (0.0, 0.0, 0.0), (z, y, x))
+
+    def values(self) -> dict[str, Tensor]:
+        """All that a sweep depends on, by name."""
+
+        def random(*shape: int, seed: int) -> Tensor:
+            return random_values(*shape, seed=seed, dtype=self.dtype)
+
+        found = {"density": self.depth * half_empty(*self.shape, dtype=self.dtype)}
+        per_cell = self.shape if self.varies else ()
+        found["sigma_a"] = 0.1 + random(self.colors, *per_cell, seed=1)
+        found["sigma_s"] = 0.5 + random(self.colors, *per_cell, seed=2)
+        found["g"] = torch.tensor(0.4, dtype=self.dtype)
+        found["mean"] = 1 + random(self.colors, *self.shape, seed=3)
+        if self.has_flux:
+            for seed, axis in enumerate("zyx", 4):
+                found[axis] = random(self.colors, *self.shape, seed=seed) - 0.5
+        if self.is_lit:
+            found["inflow"] = random(self.colors, 1, 1, 1, seed=7)
+        return found
+
+    def parts(self, values: dict[str, Tensor]) -> tuple[Medium, Moments, Tensor | None]:
+        names = "density", "sigma_a", "sigma_s", "g"
+        medium = scale_medium(Volume(self.grid, *(values[name] for name in names)))
+        flux = (values["z"], values["y"], values["x"]) if self.has_flux else None
+        return medium, Moments(values["mean"], flux), values.get("inflow")
+
+
+def moments_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]:
+    use_engine(engine)
+    swept = sweep(*case.parts(values), case.directions)
+    return [swept.mean, *(swept.flux or ())]
+
+
+def moments_by_cells(case: Case, values: dict[str, Tensor], _: str) -> list[Tensor]:
+    """As a GPU does it."""
+    weighted = tuple(_directions(case.directions, 4 if case.has_flux else 1))
+    return list(sweep_fused(*case.parts(values), weighted, by_cells=True))
+
+
+def gradients(
+    case: Case, engine: str, function=moments_of, varied: list[str] | None = None
+) -> tuple[list[Tensor], dict[str, Tensor]]:
+    """The moments, and the derivatives of a random functional of them, by name."""
+    leaves = case.values()
+    names = varied or list(leaves)
+    for name in names:
+        leaves[name] = leaves[name].requires_grad_()
+    moments = function(case, leaves, engine)
+    weights = [random_values(*m.shape, seed=9 + i).to(m) for i, m in enumerate(moments)]
+    total = sum((m * weight).sum() for m, weight in zip(moments, weights, strict=True))
+    found = torch.autograd.grad(total, [leaves[name] for name in names])
+    return [m.detach() for m in moments], dict(zip(names, found, strict=True))
+
+
+def assert_near(found: Tensor, known: Tensor, error: float) -> None:
+    assert bool(torch.isfinite(found).all())
+    assert float((found - known).abs().max()) <= error * float(known.abs().max())
+
+
+def assert_same(one: tuple, other: tuple, error: float) -> None:
+    """Moments agree to `error` of the mean, and derivatives to ten times that."""
+    bound = float(other[0][0].abs().max())
+    for found, known in zip(one[0], other[0], strict=True):
+        assert float((found - known).abs().max()) <= error * bound
+    for name, known in other[1].items():
+        assert_near(one[1][name], known, 10 * error)
+
+
+CASES = {
+    "color": Case(),
+    "cubes": Case(spacing=CUBES),
+    "gray": Case(colors=1, has_flux=False, is_lit=False),
+    "gray-flux": Case(colors=1, spacing=CUBES),
+    "fields": Case(varies=True),
+    "gray-fields": Case(varies=True, colors=1, has_flux=False, is_lit=False, spacing=CUBES),
+    "50": Case(directions=50, spacing=CUBES),
+    "86": Case(directions=86, colors=1, spacing=(1.0, 0.7, 0.9)),
+    "wide": Case((3, 4, 35), CUBES),
+    "line-x": Case((1, 1, 9)),
+    "line-y": Case((1, 9, 1), CUBES),
+    "line-z": Case((9, 1, 1), CUBES),
+    "sheet": Case((4, 1, 5), CUBES),
+    "cell": Case((1, 1, 1), CUBES),
+    "opaque": Case(depth=1e4, spacing=CUBES),
+    "empty": Case(depth=0.0),
+}
+each_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+
+
+@each_case
+def test_moments_and_gradients_are_those_of_torch(case: Case):
+    assert_same(gradients(case, "warp"), gradients(case, "torch"), 1e-12)
+
+
+@each_case
+def test_a_thread_a_cell_computes_the_same(case: Case):
+    assert_same(gradients(case, "warp", moments_by_cells), gradients(case, "torch"), 1e-12)
+
+
+@pytest.mark.parametrize("spacing", [CUBES, FLAT], ids=str)
+def test_single_precision(spacing: tuple[float, float, float]):
+    """Beside the same numbers in double precision."""
+    case = Case(spacing=spacing)
+    single = gradients(replace(case, dtype=torch.float32), "warp")
+    moments, found = gradients(case, "torch")
+    assert_same(single, (moments, found), 2e-6)
+
+
+@pytest.mark.parametrize("varied", [["mean"], ["density", "z"]], ids=str)
+def test_some_derivatives_are_asked_for(varied: list[str]):
+    assert_same(
+        gradients(Case(), "warp", varied=varied), gradients(Case(), "torch", varied=varied), 1e-12
+    )
+
+
+@pytest.mark.parametrize("name", ["color", "fields"])
+def test_the_adjoint_is_the_transpose_of_the_tangent(name: str):
+    """<J v, w> = <v, J^T w>."""
+    case = CASES[name]
+    _, found = gradients(case, "warp")
+    values = case.values()
+    changes = {n: random_values(*v.shape, seed=30).to(v) for n, v in values.items()}
+    with forward.dual_level():
+        duals = {n: forward.make_dual(v, changes[n]) for n, v in values.items()}
+        moments = moments_of(case, duals, "warp")
+        tangents = [forward.unpack_dual(moment).tangent for moment in moments]
+    along = sum(
+        float((t * random_values(*t.shape, seed=9 + i)).sum()) for i, t in enumerate(tangents)
+    )
+    back = sum(float((found[n] * changes[n]).sum()) for n in values)
+    assert along == pytest.approx(back, rel=1e-10)
+
+
+def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
+    case, threads = Case(directions=50), torch.get_num_threads()
+    runs = []
+    try:
+        for count in (2, 2, 1, 3):
+            torch.set_num_threads(count)
+            runs.append(gradients(case, "warp"))
+    finally:
+        torch.set_num_threads(threads)
+    for one, same in zip(runs[0][0], runs[1][0], strict=True):
+        assert torch.equal(one, same)
+    for name, one in runs[0][1].items():
+        assert torch.equal(one, runs[1][1][name])
+    for other in runs[2:]:
+        assert_same(other, runs[0], 1e-13)
+
+
+def gains_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]:
+    """The source, and the gains from light to twice that light, as after a first or second round.
+
+    After the first the balance is off by as much as light is; `inflow` stands for a second round.
+    """
+    use_engine(engine)
+    medium, light, inflow = case.parts(values)
+    imbalance = None if inflow is None else inflow * light.mean
+    gain, source = _gain(medium, light.scaled(2.0, 3.0), light, imbalance, case.directions)
+    return [source, gain.mean, *(gain.flux or ())]
+
+
+@pytest.mark.parametrize("name", ["color", "gray", "gray-flux", "fields", "cell", "opaque"])
+def test_gains_and_their_gradients_are_those_of_torch(name: str):
+    one, other = (gradients(CASES[name], engine, gains_of) for engine in ("warp", "torch"))
+    assert_same(one, other, 1e-11)
+
+
+def test_gains_in_single_precision():
+    single = gradients(replace(CASES["color"], dtype=torch.float32), "warp", gains_of)
+    assert_same(single, gradients(CASES["color"], "torch", gains_of), 2e-6)
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5])
+def test_light_after_rounds_is_that_of_torch(g: float):
+    scene = make_scene(
+        half_empty(6, 7, 5),
+        g=g,
+        directional=(3.0,),
+        ambient=(0.4,),
+        transport_rounds=2,
+        tolerance=1e-13,
+    )
+
+    def light(engine: str) -> tuple[Tensor, Tensor]:
+        use_engine(engine)
+        density = scene.volume.density.clone().requires_grad_()
+        world = replace(scene, volume=replace(scene.volume, density=density))
+        mean = solve_light(world, SolveMemory()).outgoing.mean
+        (gradient,) = torch.autograd.grad(mean.square().sum(), density)
+        return mean.detach(), gradient
+
+    for found, known in zip(light("warp"), light("torch"), strict=True):
+        assert_near(found, known, 1e-10)
+
+
+@pytest.mark.parametrize("architecture", [80, 90])
+def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
+    """For those that are not here as well."""
+    kernels = sweep_kernels(32, True, False, True)
+    of_gains = gain_kernels(32, True, False, True)
+    of_cells = [kernels.follow_cells, kernels.keep_cells, kernels.return_cells]
+    of_cells += [of_gains.gain, of_gains.transpose]
+    for kernel in of_cells:
+        wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(of_cells)
