@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ddrecon.engine import current_engine
+from ddrecon.numerics.autodiff import is_forward, is_varied
 from ddrecon.numerics.chebyshev import evaluate_positive, fit_chebyshev
 from ddrecon.numerics.decay import decay_mean
 
@@ -59,6 +61,10 @@ def peaked_phase_along(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
 
 def fit_peaked_phase(cosine: Tensor, g: Tensor) -> Tensor:
     """The polynomials [COEFFICIENTS, R] that stand for `peaked_phase` at each `cosine` [R]."""
+    if current_engine() == "warp" and not (is_varied(cosine) or is_varied(g) or is_forward()):
+        from ddrecon.medium.fused import peak as fused
+
+        return fused.fit_peaked_phase(cosine, g)
 
     def along_depth(depths: Tensor) -> Tensor:
         return _signed_peaked_phase(depths, cosine.double(), g.double())

@@ -37,8 +37,7 @@ def fit_chebyshev(function: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
     `[COEFFICIENTS, R]`, in double precision; coefficients have the precision and the device of
     `like`. Differentiable through the function's values.
     """
-    x, inverse = _interpolation()
-    depths = (SCALE * (1 + x) / (1 - x)).clamp(max=DEEPEST)
+    depths, inverse = extrema()
     coefficients: Tensor = inverse.to(like.device) @ function(depths.to(like.device)[:, None])
     return coefficients.to(like.dtype)
 
@@ -50,11 +49,12 @@ def evaluate_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
 
 
 @functools.cache
-def _interpolation() -> tuple[Tensor, Tensor]:
-    """Chebyshev's extrema in [-1, 1], and the matrix from values there to coefficients."""
+def extrema() -> tuple[Tensor, Tensor]:
+    """Depths [COEFFICIENTS] at Chebyshev's extrema, and the matrix from values to coefficients."""
     angle = torch.arange(COEFFICIENTS, dtype=torch.float64) * (math.pi / (COEFFICIENTS - 1))
     x = -torch.cos(angle)
-    return x, torch.linalg.inv(torch.linalg.vander(x))
+    depths = (SCALE * (1 + x) / (1 - x)).clamp(max=DEEPEST)
+    return depths, torch.linalg.inv(torch.linalg.vander(x))
 
 
 class _PositivePart(torch.autograd.Function):
