@@ -54,8 +54,7 @@ def cycle(operator: Operator, source: Tensor) -> Tensor:
     use_engine("warp")
     made = operator.once(Hierarchy.of)
     run = fused._Run(made, source / made.scale, None, -1.0)
-    for leg in (fused.DOWN, fused.COARSER, fused.UP):
-        run._cycle(leg, 0)
+    run.iterate(0, 1)
     return run.vectors[run.places[4] :][: source.numel()].view_as(source).clone()
 
 

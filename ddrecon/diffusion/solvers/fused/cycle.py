@@ -28,6 +28,7 @@ BODY = (
     ENUM
     + LEGS
     + LEVEL
+    + "const int color = item / parts, part = item - color * parts;"
     + sums.TEXT
     + f"const F STEP0 = F({STEPS[0]!r}), STEP1 = F({STEPS[1]!r});"
     + """
@@ -187,8 +188,8 @@ const auto go_up = [&](int s, int matrix, const F* source, const F* u, F* out, F
     return total;
 };
 
-const int color = item / parts, part = item - color * parts, matrix = matrices > 1 ? color : 0;
 if (is_done) return;
+const int matrix = matrices > 1 ? color : 0;
 const Size finest = at(0, NZ) * at(0, NY) * at(0, NX);
 F* const mine = &coarser.data[color * share];
 F* const W = &scratch.data[item * scratch_size];

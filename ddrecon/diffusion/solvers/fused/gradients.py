@@ -20,9 +20,10 @@ BODY = (
     + ACTS
     + VECTORS
     + LEVEL
+    + "const int color = item / shares, part = item - color * shares;"
     + sums.TEXT
     + """
-const int color = item / shares, part = item - color * shares, matrix = matrices > 1 ? color : 0;
+const int matrix = matrices > 1 ? color : 0;
 const Level l = level_of(0, matrix);
 const Size nx = l.nx, slice = l.slice, margin = (nx + 16) / 16 * 16,
     length = (slice + 15) / 16 * 16 + 2 * margin;
@@ -73,11 +74,11 @@ if (act == START) {
     }
     sum(SOURCE_NORM_ROW) = norm;
     sum(RESIDUAL_ODD_ROW) = has_guess ? square : norm;
-    if (item == 0) sums.data[COUNT_ROW * all_colors * shares] = 0.0;
+    sum(COUNT_ROW) = 0.0;
 }
 if (act == CHOOSE) {
     const bool helps = !has_guess
-        || sqrt(total_of(RESIDUAL_ODD_ROW, color)) < sqrt(total_of(SOURCE_NORM_ROW, color));
+        || sqrt(total_of(RESIDUAL_ODD_ROW)) < sqrt(total_of(SOURCE_NORM_ROW));
     if (!helps) {
         take(l.scale + first_cell, b + first_cell, r + first_cell, count);
         for (Size i = 0; i < count; ++i) y[first_cell + i] = F(0);
@@ -85,9 +86,9 @@ if (act == CHOOSE) {
     sum(RESIDUAL_ROW) = helps ? sum(RESIDUAL_ODD_ROW) : sum(SOURCE_NORM_ROW);
 }
 if (act == DIRECT && !is_done) {
-    const double square = total_of(CORRECTED_ROW + now, color);
+    const double square = total_of(CORRECTED_ROW + now);
     const F more = iteration == 0 ? F(0)
-        : (F)(square / above(total_of(CORRECTED_ROW + later, color), tiny));
+        : (F)(square / above(total_of(CORRECTED_ROW + later), tiny));
     // Where nothing is to be added of the direction before, it is not read: it may be anything.
     const F* const before = iteration == 0 ? p : d;
     for (Size i = 0; i < 4 * length; ++i) W[i] = F(0);
@@ -110,14 +111,11 @@ if (act == DIRECT && !is_done) {
     sum(CURVED_ROW) = curved;
 }
 if (act == ADVANCE) {
-    if (item == 0) {
-        double* counts = &sums.data[COUNT_ROW * all_colors * shares];
-        counts[later] = counts[now] + (is_done ? 0.0 : 1.0);
-    }
+    sum(COUNT_ROW + later) = sum(COUNT_ROW + now) + (is_done ? 0.0 : 1.0);
     if (is_done) sum(RESIDUAL_ROW + later) = sum(RESIDUAL_ROW + now);
     else {
-        const F step = (F)(total_of(CORRECTED_ROW + now, color)
-                           / above(total_of(CURVED_ROW, color), tiny));
+        const F step = (F)(total_of(CORRECTED_ROW + now)
+                           / above(total_of(CURVED_ROW), tiny));
         const F *__restrict v = d_new + first_cell, *__restrict product = q + first_cell;
         F *__restrict solution = y + first_cell, *__restrict left = r + first_cell;
         double square = 0.0;

@@ -1,8 +1,8 @@
 """Conjugate gradients preconditioned by multigrid, as launches of fused kernels.
 
-Every launch of an iteration finds out for itself whether the residual is small enough, and then
-does nothing. So iterations are launched ahead, as many as solves of this size took before, and the
-residual is looked at after them: results and counts are those of looking at it in every iteration.
+Every launch of an iteration finds out for itself which colors are as exact as asked for, and leaves
+them as they are. So iterations are launched ahead, as many as solves of this size took before, and
+the residual is looked at after them: no result depends on how many were.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class _Run:
         self.coarser = borrow(self.colors * stages.vectors, source).zero_()
         slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
         self.scratch = borrow(self.colors * self.shares * slots, source)
-        self.sums = source.new_empty(len(ROWS) * self.colors * self.shares + 2, dtype=torch.float64)
+        self.sums = source.new_empty(len(ROWS) * self.colors * self.shares, dtype=torch.float64)
         self.tiny = torch.finfo(source.dtype).tiny
         bits = source.element_size() * 8
         self.cycle, self.gradient = cycle_kernel(bits), gradient_kernel(bits)
@@ -129,11 +129,12 @@ class _Run:
             *rest,
         ]
         self.tolerance = tolerance
-        self._advance(START, 0)
-        self._advance(CHOOSE, 0)
 
     def iterate(self, first: int, last: int) -> None:
         """Launches these iterations."""
+        if first == 0:
+            self._advance(START, 0)
+            self._advance(CHOOSE, 0)
         for iteration in range(first, last):
             for leg in (DOWN, COARSER, UP):
                 self._cycle(leg, iteration)
@@ -155,7 +156,8 @@ class _Run:
         left, norm = norms(ROWS.index("RESIDUAL") + launched % 2), norms(ROWS.index("SOURCE_NORM"))
         relative = [a / max(b, self.tiny) for a, b in zip(left, norm, strict=True)]
         worst = math.nan if any(map(math.isnan, relative)) else max(relative)
-        count = found[ROWS.index("COUNT") * size + launched % 2]
+        begin = (ROWS.index("COUNT") + launched % 2) * size
+        count = max(found[begin : begin + size])
         return _Verdict(int(count), worst), found[len(self.sums) :]
 
     def value(self) -> Tensor:
