@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.closures import Closure
 from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers import SOLVERS
@@ -58,7 +58,7 @@ def system(density: Tensor, sigma_t: float, device: str) -> tuple[Operator, Tens
     outside = torch.zeros(1, 1, 1, 1, device=device)
     problem = DiffusionProblem(
         medium,
-        lambda extinction: CLOSURES["geometric"](extinction, grid, 1.0),
+        Closure("geometric", grid),
         source,
         outside,
         True,
