@@ -213,4 +213,7 @@ def is_shortage(error: BaseException) -> bool:
 
 def gibibytes(amount: int) -> str:
     """`amount` bytes in words."""
-    return f"{amount / 2**30:.3g} GiB" if amount >= 2**30 else f"{amount / 2**20:.0f} MiB"
+    size = amount / 2**30
+    if size >= 100:
+        return f"{size:.0f} GiB"
+    return f"{size:.3g} GiB" if size >= 1 else f"{amount / 2**20:.0f} MiB"

@@ -85,6 +85,7 @@ class DiffusionSettings:
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
     The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps along
     `transport_directions` directions take P1 towards transport (docs/theory.md, section 5).
+    Left out, it becomes one where there can be any.
     """
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
@@ -95,14 +96,22 @@ class DiffusionSettings:
     solver: str = one_of("multigrid", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
-    transport_rounds: int = bounded(0, minimum=0, maximum=16)
+    transport_rounds: int = optional(minimum=0, maximum=16)
     transport_directions: int = one_of(26, DEGREES)
+
+    def __post_init__(self) -> None:
+        if self.transport_rounds is None:
+            object.__setattr__(self, "transport_rounds", int(self._can_have_rounds))
+
+    @property
+    def _can_have_rounds(self) -> bool:
+        return (self.model, self.scheme) == ("p1", "conservative")
 
     def problems(self) -> Iterator[Problem]:
         """Settings that exclude each other."""
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
-        if self.transport_rounds > 0 and (self.model, self.scheme) != ("p1", "conservative"):
+        if self.transport_rounds > 0 and not self._can_have_rounds:
             yield (
                 "transport_rounds",
                 "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",

@@ -29,6 +29,8 @@ def needed_terms(scene: Scene) -> list[str]:
             f"{_count(settings.transport_rounds, 'transport round')} of sweeps along "
             f"{settings.transport_directions} directions, each with a diffusion solve"
         )
+    else:
+        terms.append("no transport rounds: diffusion alone")
     has_fluxes = medium.has_flux
     terms.append("fluxes Q1 and L1 (g is not 0)" if has_fluxes else "no fluxes Q1 and L1 (g = 0)")
     return terms

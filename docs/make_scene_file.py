@@ -235,8 +235,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tolerance": "Relative residual of a solve.",
             "warm_start": "Whether a solve begins at the last one's solution.",
             "transport_rounds": (
-                "Sweeps along rays that take diffusion towards the transport equation: 1 or 2 "
-                "bring images within 2 %."
+                "Sweeps along rays that take diffusion towards the transport equation. Left out, "
+                "it is 1, or 0 where there are none: without model `p1` or scheme `conservative`."
             ),
             "transport_directions": "Directions of such a sweep.",
         },

@@ -69,7 +69,7 @@ def make_scene(
     **diffusion: Any,
 ) -> Scene:
     """A scene in the precision of `density`, solved as closely as that precision allows; lights
-    that are None are left out.
+    that are None are left out. Without transport rounds, unless `diffusion` asks for some.
     """
     grid = grid or box_grid((density.shape[0], density.shape[1], density.shape[2]))
     tensor = density.new_tensor
@@ -81,7 +81,8 @@ def make_scene(
     )
     lights += [AmbientLight(tensor(ambient))] if ambient else []
     camera = camera or make_camera(dtype=density.dtype)
-    diffusion = {"tolerance": 1e-13 if density.dtype == torch.float64 else 1e-6} | diffusion
+    tolerance = 1e-13 if density.dtype == torch.float64 else 1e-6
+    diffusion = {"tolerance": tolerance, "transport_rounds": 0} | diffusion
     return Scene(
         Volume(grid, density, sigma_a, sigma_s, tensor(g)),
         lights,

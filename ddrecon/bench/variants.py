@@ -89,7 +89,7 @@ def _variants(sweep: Sweep) -> Iterator[Variant]:
     for closure in CLOSURES:
         yield _vary_diffusion("closure", closure, closure=closure)
     for model in sweep.models:
-        yield _vary_diffusion("model", model, model=model)
+        yield _vary_diffusion("model", model, model=model, transport_rounds=None)
     for rounds, directions in sweep.rounds:
         yield _vary_diffusion(
             "rounds",
