@@ -78,20 +78,23 @@ class Sum:
     """The mass of `laid`, a field as `shear` lays it, up to where a beam enters each cell.
 
     Row `light` of `numbers` [L, 4] holds the beam's slope by rows and by columns, its path in a
-    slice [u] and the bound of corrections. `entered` is laid out as the field is.
+    slice [u] and the bound of corrections. `entered` is laid out as the field is. Only where it
+    `has_adjoint` what that needs is kept.
     """
 
-    def __init__(self, shear: Shear, laid: Tensor, numbers: Tensor, light: int):
+    def __init__(
+        self, shear: Shear, laid: Tensor, numbers: Tensor, light: int, has_adjoint: bool = False
+    ):
         self.shear, self.laid = shear, laid
         self.kernels = shear_kernels(laid.element_size() * 8)
         self.entered = torch.empty_like(laid)
-        self.windows = laid.new_empty(2, len(laid) * shear.window)
+        self.windows = laid.new_empty(1 + has_adjoint, len(laid) * shear.window)
         self.beam = self.kernels.Beam()
         for name, number in shear.record.items():
             setattr(self.beam, name, number)
-        self.beam.light = light
+        self.beam.light, self.beam.has_refinements = light, has_adjoint
         self._give(numbers=numbers, field=laid, entered=self.entered)
-        self._give(masses=self.windows[0], refinements=self.windows[1])
+        self._give(masses=self.windows[0], refinements=self.windows[-1])
         rays, cells = shear.items(laid)
         launch(self.kernels.rays, rays, [self.beam], laid)
         launch(self.kernels.cells, cells, [self.beam], laid)
@@ -145,6 +148,7 @@ def shear_kernels(bits: int) -> SimpleNamespace:
         window_slice: int
         window_row: int
         is_slices_first: bool
+        has_refinements: bool
         light: int
         varies: bool
         numbers: wp.array(dtype=F)

@@ -132,7 +132,8 @@ for (int k = 0; k < N; ++k) {
     const bool is_kept = m >= 0 && m < H + 3;  // a ghost may not be, where its ray is
     const size_t at = is_kept ? window_row(channel, k, m) : 0;
     F* __restrict mass = is_kept ? &beam.masses.data[at + lo - c.n + 1] : unused;
-    F* __restrict refinement = is_kept ? &beam.refinements.data[at + lo - c.n + 1] : unused + BLOCK;
+    F* __restrict refinement = is_kept && beam.has_refinements
+        ? &beam.refinements.data[at + lo - c.n + 1] : unused + BLOCK;
     F* __restrict sum = passed + (lo - begin);
     F* __restrict bend = bends + (lo - begin);
     const F half = k > 0 ? F(0.5) : F(0), keep = k > 0 ? F(1) : F(0);

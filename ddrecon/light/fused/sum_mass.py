@@ -57,6 +57,8 @@ class _SumMass(torch.autograd.Function):
         shear, varies = ctx.shear, ctx.needs_input_grad[2]
         laid = shear.lay(field)
         field_bar = torch.zeros_like(laid)
-        found = Sum(shear, laid, numbers, 0).adjoint(shear.lay(entered_bar), field_bar, varies)
+        found = Sum(shear, laid, numbers, 0, True).adjoint(
+            shear.lay(entered_bar), field_bar, varies
+        )
         numbers_bar = None if found is None else found.to(numbers)[None]
         return None, shear.lift(field_bar), numbers_bar

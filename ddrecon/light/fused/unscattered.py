@@ -72,7 +72,9 @@ class Unscattered(torch.autograd.Function):
         weights_bar = torch.zeros_like(weights, dtype=torch.float64)
         for lights in _batches(len(ctx.shears), field):
             shears = [ctx.shears[light] for light in lights]
-            sums = [Sum(s, laid.of(s), numbers, i) for i, s in zip(lights, shears, strict=True)]
+            sums = [
+                Sum(s, laid.of(s), numbers, i, True) for i, s in zip(lights, shears, strict=True)
+            ]
             entered = torch.stack([each.shear.lift(each.entered) for each in sums])
             entered_bars, found = receiver.adjoint(
                 lights[0], entered, moments_bar, field_bar, varies
