@@ -37,6 +37,7 @@ from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
 from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
 
@@ -140,7 +141,7 @@ def multiply_scatters(medium: Medium, settings: DiffusionSettings) -> bool:
     It may where the model is not `none`, and sigma_s is not 0 or is being differentiated.
     """
     return settings.model != "none" and (
-        is_varied(medium.scattering.scale) or bool((medium.scattering.scale != 0).any())
+        is_varied(medium.scattering.scale) or is_any_nonzero(medium.scattering.scale)
     )
 
 

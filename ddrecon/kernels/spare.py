@@ -37,7 +37,8 @@ def give_back(*tensors: Tensor) -> None:
     with _lock:
         for tensor in tensors:
             if not tensor.is_cuda:
-                whole = tensor.untyped_storage()
-                _spare.append(torch.empty(0, dtype=torch.uint8).set_(whole))
+                # All of its storage, of which it may be a part: a view, which costs no operation.
+                count = tensor.untyped_storage().nbytes() // tensor.element_size()
+                _spare.append(tensor.detach().as_strided((count,), (1,), 0).view(torch.uint8))
         while sum(map(len, _spare)) > MOST_BYTES:
             del _spare[0]

@@ -47,7 +47,15 @@ class Beam:
 
     def cosine(self, direction: Tensor) -> Tensor:
         """Cosine [R] between the light and what leaves along view rays of `direction` [R, 3]."""
-        return -(direction @ self.direction)
+        return leaving_cosine(direction, self.direction)
+
+
+def leaving_cosine(direction: Tensor, travel: Tensor) -> Tensor:
+    """Cosine [R] between light that travels along `travel` [3] and what leaves along view rays.
+
+    These look along `direction` [R, 3].
+    """
+    return -(direction @ travel)
 
 
 def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:

@@ -19,6 +19,7 @@ from ddrecon.light.point_light import PointBeam, follow_point_light
 from ddrecon.light.shear import is_fused
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.remember import remember
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> R
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:
     """The radiance `[C, 1, 1, 1]` of all ambient `lights` together, the same from everywhere."""
     radiances = [light.radiance for light in lights if isinstance(light, AmbientLight)]
-    return (
-        torch.stack(torch.broadcast_tensors(*radiances, like.new_zeros(1))).sum(0).view(-1, 1, 1, 1)
-    )
+    return _add_radiances(like.dtype, like.device, *radiances)
+
+
+@remember
+def _add_radiances(dtype: torch.dtype, device: torch.device, *radiances: Tensor) -> Tensor:
+    zero = torch.zeros(1, dtype=dtype, device=device)
+    return torch.stack(torch.broadcast_tensors(*radiances, zero)).sum(0).view(-1, 1, 1, 1)

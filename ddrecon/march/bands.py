@@ -19,6 +19,7 @@ from ddrecon.grid import Grid
 from ddrecon.march.emission import Channels
 from ddrecon.march.lattice import Lattice
 from ddrecon.march.slices import Slices
+from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 from ddrecon.numerics.third_order import subdivide
 
@@ -42,19 +43,13 @@ class Bands:
     def order(self) -> Tensor:
         """Which slice of cells lies in each plane, before cells are subdivided."""
         count = self.grid.shape[self.axis]
-        device = self.channels.fields[0].device
-        index = torch.arange(-1, count + 1, device=device).clamp(0, count - 1)
-        return index.flip(0) if self.is_reversed else index
+        return _order(count, self.is_reversed, self.channels.fields[0].device)
 
     @functools.cached_property
     def planes(self) -> Tensor:
         """Planes [N] across the axis [u]: through all centers of cells, and both faces."""
         grid, axis, like = self.grid, self.axis, self.channels.fields[0]
-        count = grid.shape[axis]
-        # In cells: 0, 0.5, 1.5, ...
-        place = torch.arange(count + 2, dtype=like.dtype, device=like.device) - 0.5
-        planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
-        return subdivide(planes.flip(0) if self.is_reversed else planes, self.steps)
+        return _planes(grid, axis, self.is_reversed, self.steps, like.dtype, like.device)
 
     @functools.cached_property
     def slices(self) -> Slices:
@@ -142,6 +137,28 @@ class Bands:
             first_row=first * BAND,
             first_plane=begin,
         )
+
+
+@remember
+def _order(count: int, is_reversed: bool, device: torch.device) -> Tensor:
+    index = torch.arange(-1, count + 1, device=device).clamp(0, count - 1)
+    return index.flip(0) if is_reversed else index
+
+
+@remember
+def _planes(
+    grid: Grid,
+    axis: int,
+    is_reversed: bool,
+    steps: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:
+    # In cells: 0, 0.5, 1.5, ...
+    count = grid.shape[axis]
+    place = torch.arange(count + 2, dtype=dtype, device=device) - 0.5
+    planes = grid.lower[axis] + place.clamp(0, count) * grid.spacing[axis]
+    return subdivide(planes.flip(0) if is_reversed else planes, steps)
 
 
 def _spans(bands: tuple[Tensor, ...], matter: int) -> list[tuple[int, int] | None]:

@@ -15,6 +15,7 @@ from ddrecon.grid import Grid
 from ddrecon.medium.phase import forward_fraction, scaled_mean_cosine
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.decay import decay_mean
+from ddrecon.numerics.remember import is_any_nonzero, remember
 
 
 @dataclass(eq=False)
@@ -58,7 +59,7 @@ class Coefficient:
 
         That is half an optical depth, in the mean over colors.
         """
-        return 2 * self.scale.mean()
+        return _mass_bound(self.scale)
 
     def mean_transmittance(self, entered: Tensor, step: Tensor) -> Tensor:
         """exp(-depth) averaged over each cell, `[C, z, y, x]`.
@@ -105,7 +106,7 @@ class Medium:
     @property
     def has_flux(self) -> bool:
         """Whether light's direction matters to scattering: g is not 0, or is being varied."""
-        return is_varied(self.g) or bool(self.g.detach() != 0)
+        return is_varied(self.g) or is_any_nonzero(self.g)
 
 
 def scale_medium(volume: Volume) -> Medium:
@@ -113,7 +114,7 @@ def scale_medium(volume: Volume) -> Medium:
 
     f and g' are `forward_fraction` and `scaled_mean_cosine` of `phase.py`, where the source is.
     """
-    return _medium(volume, forward_fraction(volume.g), scaled_mean_cosine(volume.g))
+    return _medium(volume, *_scale_phase(volume.g))
 
 
 def keep_medium(volume: Volume) -> Medium:
@@ -133,7 +134,7 @@ def _medium(volume: Volume, fraction: Tensor, mean_cosine: Tensor) -> Medium:
             return Coefficient(sigma, density)
         return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * density)
 
-    extinction = sigma_a + (1 - fraction) * sigma_s
+    extinction, peak = _extinction_and_peak(sigma_a, sigma_s, fraction)
     return Medium(
         volume.grid,
         extinction=coefficient(extinction),
@@ -142,8 +143,38 @@ def _medium(volume: Volume, fraction: Tensor, mean_cosine: Tensor) -> Medium:
         g=volume.g,
         mean_cosine=mean_cosine,
         forward_fraction=fraction,
-        peak=_peak_per_mass(extinction, fraction * sigma_s) if bool(fraction > 0) else None,
+        peak=peak,
     )
+
+
+@remember
+def _mass_bound(scale: Tensor) -> Tensor:
+    return 2 * scale.mean()
+
+
+@remember
+def _scale_phase(g: Tensor) -> tuple[Tensor, Tensor]:
+    return forward_fraction(g), scaled_mean_cosine(g)
+
+
+def _extinction_and_peak(
+    sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor
+) -> tuple[Tensor, Tensor | None]:
+    """kappa_a + (1 - f) kappa_s per unit density, and what `Medium` has as `peak`."""
+    has_peak = is_any_nonzero(fraction)
+    is_small = max(sigma_a[0].numel(), sigma_s[0].numel()) == 1
+    find = _remember_scaled if is_small else _find_scaled
+    return find(sigma_a, sigma_s, fraction, has_peak)
+
+
+def _find_scaled(
+    sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor, has_peak: bool
+) -> tuple[Tensor, Tensor | None]:
+    extinction = sigma_a + (1 - fraction) * sigma_s
+    return extinction, _peak_per_mass(extinction, fraction * sigma_s) if has_peak else None
+
+
+_remember_scaled = remember(_find_scaled)
 
 
 def _peak_per_mass(extinction: Tensor, forward: Tensor) -> Tensor:
@@ -158,4 +189,11 @@ def _peak_per_mass(extinction: Tensor, forward: Tensor) -> Tensor:
 
 
 def _broadcast(sigma: Tensor) -> Tensor:
-    return sigma if sigma.ndim == 4 else sigma.view(-1, 1, 1, 1)
+    return sigma if sigma.ndim == 4 else along_colors(sigma)
+
+
+@remember
+def along_colors(sigma: Tensor) -> Tensor:
+    """Numbers of each color [C] as `[C, 1, 1, 1]`."""
+    # A tensor of its own, not a view: what depends on it is remembered as well.
+    return sigma.view(-1, 1, 1, 1) + 0

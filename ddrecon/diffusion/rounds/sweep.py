@@ -6,7 +6,7 @@ memory does not grow with their number.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -85,7 +85,7 @@ def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int
     elif current_engine() == "warp":
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
-        weighted = tuple(_directions(directions, 1 if light.flux is None else 4))
+        weighted = _directions(directions, 1 if light.flux is None else 4)
         mean, *flux = sweep_fused(medium, light, inflow, weighted)
     else:
         mean, *flux = _Sweep.apply(medium, directions, *parts)
@@ -145,12 +145,15 @@ def _sum_over_directions(medium: Medium, directions: int, parts: Parts) -> tuple
     return tuple(totals)
 
 
-def _directions(count: int, moments: int) -> Iterator[tuple[Direction, tuple[float, ...]]]:
+@functools.cache
+def _directions(count: int, moments: int) -> tuple[tuple[Direction, tuple[float, ...]], ...]:
     """Each direction w (array order) and the weights of its I in the moments of E12.
 
     They are W, 3 W w_z, 3 W w_y and 3 W w_x, W being the quadrature's weight, or the first
     `moments` of them.
     """
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
-    for (z, y, x), w in zip(points.tolist(), weights.tolist(), strict=True):
-        yield (z, y, x), (w, 3 * w * z, 3 * w * y, 3 * w * x)[:moments]
+    return tuple(
+        ((z, y, x), (w, 3 * w * z, 3 * w * y, 3 * w * x)[:moments])
+        for (z, y, x), w in zip(points.tolist(), weights.tolist(), strict=True)
+    )

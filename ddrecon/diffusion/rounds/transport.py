@@ -24,6 +24,7 @@ from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import is_forward, is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.numerics.remember import is_any_nonzero
 
 
 def run_rounds(
@@ -41,7 +42,7 @@ def run_rounds(
         return light
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
-    is_lit_from_outside = is_varied(outside) or bool((outside != 0).any())
+    is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     for round_index in range(1, rounds + 1):
         # E11 along every direction, of all light that scatters: q = L0 + Q0 and q1 = g L1 + Q1
         scatters = light.scaled(1.0, medium.mean_cosine).plus(problem.source)

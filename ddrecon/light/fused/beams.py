@@ -17,28 +17,40 @@ from ddrecon.light.fused.sum_mass import follow
 from ddrecon.light.fused.unscattered import Unscattered
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments
-from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.coefficients import Medium, along_colors
+from ddrecon.numerics.remember import remember
 
 
 def follow_beams(
     medium: Medium, lights: Sequence[DirectionalLight], has_flux: bool
 ) -> tuple[list[Beam], Moments]:
     """The beams of `lights` in `medium`, and Q0 and Q1 of all of them (E2); no Q1 without flux."""
-    directions = torch.stack(
-        [torch.nn.functional.normalize(array_order(light.direction), dim=0) for light in lights]
-    )
-    colors = torch.broadcast_tensors(*(light.irradiance for light in lights))
-    irradiance = torch.stack(colors)
-    weights = irradiance[:, None] / (4 * math.pi)
-    if has_flux:
-        flux = 3 * medium.mean_cosine * directions[..., None] * weights
-        weights = torch.cat([weights, flux], 1)
+    directions, *each = _directions(*(light.direction for light in lights))
+    cosine = medium.mean_cosine if has_flux else None
+    weights = _weights(directions, cosine, *(light.irradiance for light in lights))
     moments, masses = attenuate(medium, directions, weights, has_mass=True)
     beams = [
-        Beam(mass, direction, light.irradiance.view(-1, 1, 1, 1))
-        for mass, direction, light in zip(masses, directions, lights, strict=True)
+        Beam(mass, direction, along_colors(light.irradiance))
+        for mass, direction, light in zip(masses, each, lights, strict=True)
     ]
     return beams, moments
+
+
+@remember
+def _directions(*directions: Tensor) -> tuple[Tensor, ...]:
+    """Unit `directions` (z, y, x) beside each other, [L, 3], and one by one."""
+    each = [torch.nn.functional.normalize(array_order(one), dim=0) for one in directions]
+    return torch.stack(each), *each
+
+
+@remember
+def _weights(directions: Tensor, mean_cosine: Tensor | None, *irradiances: Tensor) -> Tensor:
+    """What `attenuate` is to weight beams by: E / (4 pi), and 3 g' w times that for the flux."""
+    weights = torch.stack(torch.broadcast_tensors(*irradiances))[:, None] / (4 * math.pi)
+    if mean_cosine is None:
+        return weights
+    flux = 3 * mean_cosine * directions[..., None] * weights
+    return torch.cat([weights, flux], 1)
 
 
 def attenuate(

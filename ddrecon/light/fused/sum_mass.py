@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.fused.shear import Shear, Sum
+from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
 
 
@@ -21,6 +22,7 @@ def sum_mass(
     return entered, numbers[0, 2]
 
 
+@remember
 def follow(
     grid: Grid, directions: Tensor, bound: Tensor | float
 ) -> tuple[tuple[Shear, ...], Tensor]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ddrecon.march.bands import Bands
 from ddrecon.march.equidistant import Equidistant
+from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
 
@@ -61,6 +62,11 @@ class Cells:
         return (1 + self.axis, 1 + row, 1 + column, 0)
 
 
+@remember
+def _short(order: Tensor) -> Tensor:
+    return order.int()
+
+
 def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
     """Where nodes lie for `sampler`, and the fields among whose cells that is."""
     fields = list(sampler.channels.fields)
@@ -69,7 +75,7 @@ def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
         planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
         return Cells(planes), fields
     if sampler.steps == 1:
-        return Cells(sampler.planes, sampler.axis, sampler.order.int()), fields
+        return Cells(sampler.planes, sampler.axis, _short(sampler.order)), fields
     # Slices between those of cells are interpolated beforehand.
     whole = sampler.slices
     order = torch.arange(sampler.nodes, dtype=torch.int32, device=whole.planes.device)

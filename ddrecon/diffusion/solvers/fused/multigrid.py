@@ -23,6 +23,7 @@ from ddrecon.diffusion.solvers.fused.sums import ROWS
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.kernels.launch import array, launch
 from ddrecon.kernels.spare import borrow, give_back
+from ddrecon.numerics.remember import remember
 
 DOWN, COARSER, UP = range(3)
 START, CHOOSE, DIRECT, ADVANCE = range(4)
@@ -31,6 +32,11 @@ MOST_AHEAD = 16
 """So many iterations are launched at most before the residual is looked at."""
 _counts: dict[torch.Size, deque[int]] = defaultdict(lambda: deque([3], maxlen=6))
 """How many iterations solves of a shape took: how many to launch ahead. No result depends on it."""
+
+
+@remember
+def _on_device(device: torch.device, *numbers: int) -> Tensor:
+    return torch.tensor(numbers, device=device)
 
 
 def solve(
@@ -118,7 +124,7 @@ class _Run:
             *rest,
         ]
         start = source if guess is None or guess.shape != source.shape else guess
-        places = torch.tensor(self.places, device=source.device)
+        places = _on_device(source.device, *self.places)
         self.for_gradient = [
             table,
             data,

@@ -1,0 +1,152 @@
+"""What kernels are given of rays and of beams, found once where neither is varied."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.light.beam import Beam, leaving_cosine
+from ddrecon.march.box import intersect_box
+from ddrecon.march.emission import Emission, is_field
+from ddrecon.march.lattice import Lattice
+from ddrecon.medium.phase import fit_peaked_phase, henyey_greenstein
+from ddrecon.numerics.chebyshev import COEFFICIENTS
+from ddrecon.numerics.remember import remember
+from ddrecon.numerics.slicing import across
+
+
+class Packed(NamedTuple):
+    """Rays: `bundle` [R, 8] as `rays.Bundle` has them; `origin` and `direction` [R, 3] in u."""
+
+    bundle: Tensor
+    origin: Tensor
+    direction: Tensor
+
+
+class Along(NamedTuple):
+    """Beams as rays see them.
+
+    `angles` [2 beams, R]: of each the foot, then of each the square distance, or cosine and 1;
+    `polynomials` of E13; `factors`: p of a beam whose phase function is the same all along a ray
+    [R], else None.
+    """
+
+    angles: Tensor
+    polynomials: Tensor
+    factors: tuple[Tensor | None, ...]
+
+
+@remember
+def pack_rays(
+    grid: Grid,
+    axis: int | None,
+    origin: Tensor,
+    direction: Tensor,
+    hit: Tensor,
+    near: Tensor,
+    far: Tensor,
+) -> Packed:
+    """Those rays that `hit` the box, by slices across `axis` unless that is None."""
+    origin, direction = origin[hit], direction[hit]
+    return Packed(_bundle(grid, axis, origin, direction, near, far), origin, direction)
+
+
+def pack_lattice(grid: Grid, axis: int, lattice: Lattice) -> Packed:
+    """All rays of `lattice`, by slices across `axis`."""
+    place = lattice.axis, lattice.middle, lattice.eye, lattice.direction
+    return _pack_lattice(grid, axis, *place, lattice.rows, lattice.columns)
+
+
+@remember
+def _pack_lattice(
+    grid: Grid,
+    axis: int,
+    across_axis: int,
+    middle: float,
+    eye: Tensor | None,
+    direction: Tensor,
+    rows: Tensor,
+    columns: Tensor,
+) -> Packed:
+    lattice = Lattice(across_axis, middle, eye, direction, rows, columns)
+    rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
+    near, far = intersect_box(grid, rays)
+    far = torch.maximum(near, far)
+    bundle = _bundle(grid, axis, rays.origin, rays.direction, near, far)
+    return Packed(bundle, rays.origin.clone(), rays.direction.clone())
+
+
+def _bundle(
+    grid: Grid, axis: int | None, origin: Tensor, direction: Tensor, near: Tensor, far: Tensor
+) -> Tensor:
+    """Origins and directions in cells, counted from cells' centers; `near` and `far` [u].
+
+    For slices the coordinate across them comes first, in u, then those of rows and columns.
+    """
+    spacing = origin.new_tensor(grid.spacing)
+    places = (origin - origin.new_tensor(grid.lower)) / spacing - 0.5
+    speeds = direction / spacing
+    if axis is not None:
+        order = list(across(axis))
+        places = torch.cat([origin[:, [axis]], places[:, order]], 1)
+        speeds = torch.cat([direction[:, [axis]], speeds[:, order]], 1)
+    return torch.cat([places, speeds, near[:, None], far[:, None]], 1)
+
+
+def see_beams(emission: Emission, packed: Packed) -> Along:
+    """The beams of `emission` along rays."""
+    has_peak = emission.peak is not None
+    towards = [beam.direction for beam in emission.beams if isinstance(beam, Beam)]
+    if len(towards) == len(emission.beams):
+        return _see_directional(packed.direction, emission.g, has_peak, *towards)
+    seen = []
+    for beam in emission.beams:
+        if isinstance(beam, Beam):
+            seen.append(_see_directional(packed.direction, emission.g, has_peak, beam.direction))
+        else:
+            angles = torch.stack(beam.passing(packed.origin, packed.direction))
+            unused = angles.new_zeros(COEFFICIENTS, angles.shape[1])
+            seen.append(Along(angles, unused, (None,)))
+    feet, squares = zip(*(each.angles.split(1) for each in seen), strict=True)
+    return Along(
+        torch.cat([*feet, *squares]),
+        torch.cat([each.polynomials for each in seen]),
+        sum((each.factors for each in seen), ()),
+    )
+
+
+@remember
+def _see_directional(direction: Tensor, g: Tensor, has_peak: bool, *towards: Tensor) -> Along:
+    """Beams that go `towards` what are unit vectors, along rays of `direction` [R, 3]."""
+    rays = len(direction)
+    cosines = [leaving_cosine(direction, each) for each in towards]
+    ones = direction.new_ones(len(towards), rays)
+    none = direction.new_zeros(0, rays)
+    if not has_peak:
+        unused = direction.new_zeros(len(towards) * COEFFICIENTS, rays)
+        factors = tuple(henyey_greenstein(cosine, g) for cosine in cosines)
+        return Along(torch.cat([none, *(c[None] for c in cosines), ones]), unused, factors)
+    fitted = [fit_peaked_phase(cosine, g) for cosine in cosines]
+    angles = torch.cat([none, *(cosine[None] for cosine in cosines), ones])
+    return Along(angles, torch.cat([none, *fitted]), (None,) * len(towards))
+
+
+def numbers_of(emission: Emission, bound: Tensor | float) -> Tensor:
+    """The scale and the peak of each color, g, and the `bound` of third-order corrections."""
+    peak = emission.peak
+    if peak is not None and is_field(peak):
+        peak = None
+    return _numbers(emission.colors, emission.extinction.scale, peak, emission.g, bound)
+
+
+@remember
+def _numbers(
+    colors: int, scale: Tensor, peak: Tensor | None, g: Tensor, bound: Tensor | float
+) -> Tensor:
+    scale = scale.view(-1).expand(colors)
+    peak = 0 * scale if peak is None else peak.view(-1).expand(colors)
+    return torch.cat([scale, peak, g.view(1), torch.as_tensor(bound).to(scale).view(1)])

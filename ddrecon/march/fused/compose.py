@@ -1,0 +1,114 @@
+"""What leaves a volume along rays, from the integrals along them, by fused kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.kernels.launch import array, launch
+from ddrecon.march.fused.compose_kernels import compose_kernel, decompose_kernel
+from ddrecon.numerics.autodiff import is_forward
+from ddrecon.numerics.remember import remember
+
+LENGTH = 2048
+"""Rays that an item of a launch does on a processor."""
+FEW = 1 << 16
+"""So many rays are not worth a second thread."""
+
+
+def compose(
+    out: Tensor,
+    masses: Tensor,
+    scale: Tensor,
+    scattering: Tensor,
+    irradiances: Sequence[Tensor],
+    factors: Sequence[Tensor | None],
+) -> Tensor:
+    """Scattered radiance and opacity [2 C, R].
+
+    `out` [C (1 + beams), R] and `masses` [K, R] are the integrals; `scale` and `scattering` [C or
+    1] those of both coefficients. What does not change along a ray is multiplied in here: the
+    `irradiances` of beams [C or 1], and p where it is one of the `factors` [R] (E2); the scale of
+    kappa_s; and E1's 1 - tau of what is behind.
+    """
+    fixed = [scale, scattering, *irradiances, *(each for each in factors if each is not None)]
+    colors = len(out) // (1 + len(irradiances))
+    if is_forward() or any(each.requires_grad for each in fixed):
+        return _compose(colors, out, masses, scale, scattering, irradiances, factors)
+    weights = _weights(colors, scale, scattering, *irradiances)
+    composed: Tensor = _Compose.apply(out, masses, weights, _phases(out.shape[1], *factors))
+    return composed
+
+
+def _compose(
+    colors: int,
+    out: Tensor,
+    masses: Tensor,
+    scale: Tensor,
+    scattering: Tensor,
+    irradiances: Sequence[Tensor],
+    factors: Sequence[Tensor | None],
+) -> Tensor:
+    """The same by torch's operations."""
+    scattered, *arriving = out.split(colors)
+    for irradiance, light, factor in zip(irradiances, arriving, factors, strict=True):
+        weighted = light if factor is None else light * factor
+        scattered = scattered + weighted * (irradiance.view(-1, 1) / (4 * math.pi))
+    opacity = -torch.expm1(-scale.view(-1, 1).expand(colors, 1) * masses)
+    return torch.cat([scattered * scattering.view(-1, 1), opacity])
+
+
+@remember
+def _weights(colors: int, scale: Tensor, scattering: Tensor, *irradiances: Tensor) -> Tensor:
+    """The weights [2 + beams, C]: extinction's scale, and what diffuse light and beams count."""
+    strengths = [each.view(-1) / (4 * math.pi) * scattering.view(-1) for each in irradiances]
+    rows = scale.view(-1), scattering.view(-1), *strengths
+    return torch.stack([row.expand(colors) for row in rows])
+
+
+@remember
+def _phases(rays: int, *factors: Tensor | None) -> Tensor | None:
+    """The `factors` [beams, R] as one tensor; None where there are none."""
+    known = [each for each in factors if each is not None]
+    if not known:
+        return None
+    return torch.stack([torch.ones_like(known[0]) if f is None else f for f in factors])
+
+
+class _Compose(torch.autograd.Function):
+    """Differentiable by the integrals."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, out: Tensor, masses: Tensor, weights: Tensor, phases: Tensor | None
+    ) -> Tensor:
+        ctx.save_for_backward(masses, weights, phases)
+        ctx.outputs = len(out)
+        composed = out.new_empty(2 * weights.shape[1], out.shape[1])
+        kernel = compose_kernel(torch.finfo(out.dtype).bits)
+        _launch(kernel, (out, masses, weights, phases, composed))
+        return composed
+
+    @staticmethod
+    def backward(ctx: Any, composed_bar: Tensor) -> tuple[Tensor | None, ...]:
+        masses, weights, phases = ctx.saved_tensors
+        out_bar, masses_bar = (
+            masses.new_empty(ctx.outputs, masses.shape[1]),
+            masses.new_empty(masses.shape),
+        )
+        kernel = decompose_kernel(torch.finfo(masses.dtype).bits)
+        _launch(kernel, (composed_bar, masses, weights, phases, out_bar, masses_bar))
+        return out_bar, masses_bar, None, None
+
+
+def _launch(kernel: Any, tensors: Sequence[Tensor | None]) -> None:
+    like = tensors[1]
+    assert like is not None
+    rays = like.shape[1]
+    length = 1 if like.is_cuda else LENGTH
+    given = [array(like[:0] if each is None else each) for each in tensors]
+    launch(kernel, -(-rays // length), [length, *given], like, 1 if rays < FEW else None)
