@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import threading
 from dataclasses import replace
@@ -17,6 +18,10 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.errors import SolveError
 from ddrecon.light.lights import EnvironmentLight, PointLight
+from ddrecon.light.reduced import reduced_light
+from ddrecon.light.sky import decompose_lights
+from ddrecon.light.skylight import sum_unscattered_sky
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
@@ -138,11 +143,30 @@ def test_a_density_that_is_no_number_is_seen(engine: str, model: str):
     density[2, 3, 4] = torch.nan
     scene = make_scene(density, g=0.4, model=model)
     if model == "p1":
-        with pytest.raises(SolveError, match="tolerance"):
+        with pytest.raises(SolveError, match="tolerance") as raised:
             render_each(scene, scene.views, SolveMemory())
+        assert math.isnan(raised.value.residual)
     else:
         (image,) = render_each(scene, scene.views, SolveMemory())
         assert not image.isfinite().all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_light_through_what_is_no_number_is_none(engine: str):
+    """Where the mass up to a cell is not a number, no kernel makes one of the light there."""
+    use_engine(engine)
+    scene = every_light()
+    scene.volume.density[1, 2, 3] = torch.nan
+    medium, lights = scale_medium(scene.volume), decompose_lights(scene.lights)
+    reduced = reduced_light(medium, lights, has_flux=True)
+    sky = sum_unscattered_sky(medium, lights, has_flux=True)
+    assert sky is not None and reduced.source.flux is not None
+    assert bool(sky.mean.isnan()[:, 1, 2, 3].all())
+    for beam in reduced.beams:
+        is_unknown = beam.mass.isnan()
+        assert 1 < is_unknown.sum() < is_unknown.numel()
+        for moment in (reduced.source.mean, *reduced.source.flux):
+            assert bool((moment.isnan() | ~is_unknown).all())
 
 
 def test_a_failing_share_waits_for_the_others(monkeypatch: pytest.MonkeyPatch):

@@ -49,7 +49,7 @@ class Integrate(torch.autograd.Function):
             kernel, count = packet_integral_kernel(layout), _packet_count(rays)
         else:
             given = _bundle(layout, cells.planes, cells.pack(fields), *varied)
-            kernel, count = integral_kernel(layout, False), len(rays)
+            kernel, count = integral_kernel(layout), len(rays)
         launch(kernel, count, [given, array(out), array(masses)], rays)
         return out, masses.to(rays.dtype, copy=True), masses
 
