@@ -2,13 +2,15 @@
 
 An engine is an implementation of the inner loops. `torch` is the readable definition and has them
 all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. Tangents in forward mode are torch's where a
-kernel has none, and so are the model `flux_limited` and the scheme `printed`.
+same formulas, so their numbers agree to rounding. Torch's are, with either engine: most tangents in
+forward mode, point lights but for the mass on the way to them, the scattering of skies towards a
+camera, the model `flux_limited`, the scheme `printed`, and solvers other than `multigrid`.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Collection
 from importlib.util import find_spec
 
 from ddrecon.errors import MissingExtraError, UsageError
@@ -18,8 +20,8 @@ ENGINES = ("torch", "warp")
 """The engines there are."""
 CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
-PARTS = {"view rays": ENGINES, "transport rounds": ENGINES, "light": ENGINES, "diffusion": ENGINES}
-"""Which engines have which part of the renderer."""
+PARTS = "view rays", "light", "diffusion", "transport rounds"
+"""The parts of the renderer, which every engine has."""
 VARIABLE = "DDRECON_ENGINE"
 """The environment variable that chooses where `use_engine` was not called; `auto` without it."""
 LOG = "ddrecon.engine"
@@ -52,10 +54,10 @@ def current_engine() -> str:
     return _engine
 
 
-def engine_of_parts() -> dict[str, str]:
-    """The engine that runs each part of the renderer: the current one where it has the part."""
+def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
+    """The engine that runs each part of the renderer: the current one, but for those `in_torch`."""
     engine = current_engine()
-    return {part: engine if engine in engines else "torch" for part, engines in PARTS.items()}
+    return {part: "torch" if part in in_torch else engine for part in PARTS}
 
 
 def engine_versions() -> dict[str, str]:

@@ -94,11 +94,12 @@ def test_an_environment_that_cannot_be_is_named(
     assert str(caught.value) == f"DDRECON_ENGINE=warp {ADVICE}"
 
 
-def test_torch_has_every_part_and_runs_what_warp_has_not(installed: None) -> None:
+def test_the_engine_runs_all_parts_but_those_that_are_in_torch(installed: None) -> None:
     ddrecon.use_engine("torch")
     assert engine_of_parts() == dict.fromkeys(PARTS, "torch")
     ddrecon.use_engine("warp")
     assert engine_of_parts() == dict.fromkeys(PARTS, "warp")
+    assert engine_of_parts(["light"]) == dict.fromkeys(PARTS, "warp") | {"light": "torch"}
 
 
 def test_versions(installed: None) -> None:

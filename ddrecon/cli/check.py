@@ -51,7 +51,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
-        "engine": engine_of_parts(),
+        "engine": engine_of_parts(_parts_in_torch(scene)),
         "memory_bytes": memory_estimate(scene),
     }
 
@@ -85,7 +85,15 @@ def _name_engines(engines: dict[str, str]) -> str:
     others = [part for part, engine in engines.items() if engine == "torch"]
     if not fused:
         return "torch"
-    return f"warp ({', '.join(fused)}); {' and '.join(others)} run in torch"
+    rest = f"; {' and '.join(others)} in torch" if others else ""
+    return f"warp ({', '.join(fused)}){rest}"
+
+
+def _parts_in_torch(scene: Scene) -> tuple[str, ...]:
+    """The parts that are torch's with every engine, for what `scene` asks of them."""
+    settings = scene.diffusion
+    is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
+    return () if is_fused and settings.solver == "multigrid" else ("diffusion",)
 
 
 def _count_entries(name: str, count: int) -> str:

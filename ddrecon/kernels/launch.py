@@ -11,7 +11,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from time import perf_counter
 from typing import Any
 
@@ -56,7 +56,7 @@ def launch(
     device = wp.device_from_torch(like.device)
     _load(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
-    stream = wp.stream_from_torch(torch.cuda.current_stream()) if like.is_cuda else None
+    stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
 
     def run(i: int) -> None:
         given = arguments(i) if callable(arguments) else arguments
@@ -65,7 +65,11 @@ def launch(
 
     # The thread that asks takes the first share itself.
     others = [_pool(threads).submit(run, i) for i in range(1, threads)]
-    run(0)
+    try:
+        run(0)
+    finally:
+        # No memory is given up that others still write to, whatever went wrong here.
+        wait(others)
     for other in others:
         other.result()
 
@@ -99,3 +103,7 @@ def _load(kernel: Any, device: str) -> None:
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "kernels")
+
+
+# Threads do not live on in a process forked from this one.
+os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -34,7 +34,8 @@ auto decay = [](F depth) -> F {{
 #if defined(__CUDA_ARCH__)
     return {exp}(-depth);
 #else
-    const F x = depth < F({most}) ? (depth > F(-{most}) ? -depth : F({most})) : F(-{most});
+    // What is not a number stays so.
+    const F x = depth > F({most}) ? F(-{most}) : (depth < F(-{most}) ? F({most}) : -depth);
     const F shifted = x * F(1.4426950408889634074) + F({shift});
     const F n = shifted - F({shift});
     const F r = (x - n * F({log2_high})) - n * F({log2_low});

@@ -85,7 +85,9 @@ struct P {{
     }}
     // exp(-depth) = 2^n e^r with n whole and |r| < log(2) / 2, as in `native`.
     INLINE V decay(V depth) {{
-        const V x = pick(depth < all(F({most})), -most(depth, all(F(-{most}))), all(F(-{most})));
+        const V end = all(F({most}));
+        // What is not a number stays so.
+        const V x = pick(depth > end, -end, pick(depth < -end, end, -depth));
         const V shifted = x * F(1.4426950408889634074) + F({shift});
         const V n = shifted - F({shift});
         const V r = (x - n * F({log2_high})) - n * F({log2_low});

@@ -7,6 +7,7 @@ on that. On a GPU torch keeps the memory itself.
 
 from __future__ import annotations
 
+import os
 import threading
 
 import torch
@@ -15,7 +16,8 @@ from torch import Tensor
 MOST_BYTES = 2**30
 """So much is kept unused at most."""
 _spare: list[Tensor] = []
-_lock = threading.Lock()
+# Reentrant: the collector of garbage, which may begin anywhere, gives memory back.
+_lock = threading.RLock()
 
 
 def borrow(count: int, like: Tensor) -> Tensor:
@@ -28,13 +30,15 @@ def borrow(count: int, like: Tensor) -> Tensor:
         best = min(fitting, key=len, default=None)
         if best is not None:
             _spare[:] = [memory for memory in _spare if memory is not best]
-    memory = like.new_empty(size, dtype=torch.uint8) if best is None else best
-    return memory[:size].view(like.dtype)
+    # Made in inference mode, it would be of no use outside.
+    with torch.inference_mode(False):
+        memory = like.new_empty(size, dtype=torch.uint8) if best is None else best
+        return memory[:size].view(like.dtype)
 
 
 def give_back(*tensors: Tensor) -> None:
     """Keeps the memory of `tensors`, which nobody uses any more, for those to come."""
-    with _lock:
+    with _lock, torch.inference_mode(False):
         for tensor in tensors:
             if not tensor.is_cuda:
                 # All of its storage, of which it may be a part: a view, which costs no operation.
@@ -42,3 +46,11 @@ def give_back(*tensors: Tensor) -> None:
                 _spare.append(tensor.detach().as_strided((count,), (1,), 0).view(torch.uint8))
         while sum(map(len, _spare)) > MOST_BYTES:
             del _spare[0]
+
+
+def _release_lock() -> None:
+    global _lock
+    _lock = threading.RLock()
+
+
+os.register_at_fork(after_in_child=_release_lock)

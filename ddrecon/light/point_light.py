@@ -23,10 +23,9 @@ from torch import Tensor
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import Moments, beam_moments
-from ddrecon.light.shear import is_fused
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import henyey_greenstein, peaked_phase
-from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.nodes import Nodes
 

@@ -16,9 +16,9 @@ from ddrecon.light.beam import Beam, follow_beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments
 from ddrecon.light.point_light import PointBeam, follow_point_light
-from ddrecon.light.shear import is_fused
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.remember import remember
 
 

@@ -13,18 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.numerics.autodiff import is_forward, recompute
+from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
-
-
-def is_fused() -> bool:
-    """Whether fused kernels follow light through cells; in forward mode torch does."""
-    return current_engine() == "warp" and not is_forward()
 
 
 def sum_mass_to_cells(

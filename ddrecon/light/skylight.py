@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.light.moments import Moments, Vector
-from ddrecon.light.shear import is_fused, sum_mass_to_cells
+from ddrecon.light.shear import sum_mass_to_cells
 from ddrecon.light.sky import Sky
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import henyey_greenstein
-from ddrecon.numerics.autodiff import is_varied, recompute
+from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 

@@ -93,8 +93,11 @@ _KEPT: WeakKeyDictionary[Camera, tuple[tuple[Any, ...], Tensor, Sight]] = WeakKe
 
 def _key(camera: Camera, grid: Grid, settings: RenderSettings) -> tuple[Any, ...]:
     values = (getattr(camera, part.name) for part in fields(camera) if part.name != "pose")
-    is_interpolated = settings.tolerance > 0
-    return (version_of(camera.pose), *values, grid, settings.samples_per_pixel, is_interpolated)
+    pose, is_interpolated = camera.pose, settings.tolerance > 0
+    # The numbers themselves, which NumPy may have changed; but a GPU would be waited for.
+    numbers = None if pose.is_cuda else pose.detach().numpy().tobytes()
+    version = version_of(pose), numbers
+    return (*version, *values, grid, settings.samples_per_pixel, is_interpolated)
 
 
 def _look(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:

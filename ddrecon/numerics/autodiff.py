@@ -5,6 +5,7 @@ Every name of torch that is private, or not documented, stands in this file.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -61,6 +62,29 @@ def keep(ctx: Any, *tensors: Tensor) -> None:
         ctx.save_for_forward(*tensors)
 
 
+def differentiate_once(backward: Callable[..., T]) -> Callable[..., T]:
+    """The `backward` pass of a custom function whose result cannot be differentiated again.
+
+    It raises NotImplementedError where that is asked for (`create_graph=True`). torch's
+    `once_differentiable` does so only where a cotangent varies, and not on the way to every input.
+    """
+
+    @functools.wraps(backward)
+    def run(ctx: Any, *bars: Tensor | None) -> T:
+        _refuse_graph()
+        return backward(ctx, *bars)
+
+    return run
+
+
+def _refuse_graph() -> None:
+    """Raises NotImplementedError in a backward pass that is to be differentiated itself."""
+    if torch.is_grad_enabled():
+        raise NotImplementedError(
+            "create_graph=True: only first derivatives of light are implemented"
+        )
+
+
 def grid_sample_adjoint(
     output_bar: Tensor, values: Tensor, points: Tensor, needs: tuple[bool, bool]
 ) -> tuple[Tensor, Tensor]:
@@ -104,6 +128,8 @@ class _Recomputation:
         return self.count - 1
 
     def unpack(self, number: int) -> Tensor:
+        # What is computed again has no graph that leads on to the arguments.
+        _refuse_graph()
         if number not in self.saved:
             self._run()
         return self.saved.pop(number)

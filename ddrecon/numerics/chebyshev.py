@@ -49,6 +49,7 @@ def evaluate_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
 
 
 @functools.cache
+@torch.inference_mode(False)
 def extrema() -> tuple[Tensor, Tensor]:
     """Depths [COEFFICIENTS] at Chebyshev's extrema, and the matrix from values to coefficients."""
     angle = torch.arange(COEFFICIENTS, dtype=torch.float64) * (math.pi / (COEFFICIENTS - 1))

@@ -54,16 +54,22 @@ def test_version_names_the_engine(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("name", "line"),
     [
-        ("warp", "engine: warp (view rays); light and diffusion run in torch"),
-        ("auto", "engine: warp (view rays); light and diffusion run in torch"),
+        ("warp", "engine: warp (view rays, light, diffusion, transport rounds)"),
+        ("auto", "engine: warp (view rays, light, diffusion, transport rounds)"),
         ("torch", "engine: torch"),
     ],
 )
 def test_check_names_it(succeed: Run, name: str, line: str) -> None:
     assert line in succeed("check", "scene.yaml", "--engine", name).stdout.splitlines()
     report = json.loads(succeed("check", "scene.yaml", "--engine", name, "--json").stdout)
-    rays = "torch" if name == "torch" else "warp"
-    assert report["engine"] == {"view rays": rays, "light": "torch", "diffusion": "torch"}
+    assert report["engine"] == dict.fromkeys(engine.PARTS, "torch" if name == "torch" else "warp")
+
+
+@pytest.mark.parametrize("change", ["solver=jacobi", "scheme=printed", "model=flux_limited"])
+def test_check_names_what_is_left_to_torch(succeed: Run, change: str) -> None:
+    found = succeed("check", "scene.yaml", "--engine", "warp", "-D", f"diffusion.{change}")
+    line = "engine: warp (view rays, light, transport rounds); diffusion in torch"
+    assert line in found.stdout.splitlines()
 
 
 def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,8 @@ def test_masses_and_their_derivatives_are_those_of_torch(direction: tuple[float,
 @pytest.mark.parametrize("shape", [(3, 300, 5), (3, 5, 300), (300, 3, 5)], ids=str)
 def test_rows_longer_than_a_block(shape: tuple[int, int, int]):
     grid = Grid(shape, (0, 0, 0), tuple(0.2 * cells for cells in shape))
-    for direction in ((0.8, 0.1, -0.2), (0.2, -0.7, 0.4), (0.3, 0.2, 0.9)):
+    # Slopes that no small fraction is: through a center of a cell derivatives have a kink.
+    for direction in ((0.8191, 0.1039, -0.2357), (0.2179, -0.7071, 0.4142), (0.3037, 0.2236, 0.9)):
         heading = torch.nn.functional.normalize(vector(*direction), dim=0)
         given = grid, random_values(1, *shape), heading, vector(0.5).squeeze()
         for found, known in zip(masses("warp", *given), masses("torch", *given), strict=True):

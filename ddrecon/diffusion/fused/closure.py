@@ -25,6 +25,7 @@ from ddrecon.diffusion.fused.colors import FieldBar, per_color, sum_colors, tota
 from ddrecon.grid import Grid
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once
 
 
 def close_medium(medium: Medium, closure: Closure) -> Tensor:
@@ -115,6 +116,7 @@ class _Geometric(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, diffusion_bar: Tensor) -> tuple[Tensor | None, ...]:
         inverse, *terms = ctx.saved_tensors
         inverse_bar = diffusion_bar.new_empty(diffusion_bar.shape)
@@ -140,6 +142,7 @@ class _Smooth(torch.autograd.Function):
         ctx.save_for_backward(*terms)
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, diffusion_bar: Tensor) -> tuple[Tensor | None, ...]:
         terms = ctx.saved_tensors
         kernel = functools.partial(smooth_adjoint_kernel, len(terms) > 2)

@@ -26,6 +26,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.light.moments import Vector
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once
 
 _NAMES = "light_z", "light_y", "light_x"
 
@@ -57,6 +58,7 @@ class _Flux(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         diffusion, scale, field, outside, mean, *flux = ctx.saved_tensors
         _, needs_scale, _, needs_outside = ctx.needs_input_grad[1:5]

@@ -26,6 +26,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once
 
 _NAMES = "conductance_z", "conductance_y", "conductance_x", "loss", "right"
 
@@ -75,6 +76,7 @@ class _System(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         diffusion, a_scale, a_field, s_scale, s_field, outside, mean, *flux = ctx.saved_tensors
         needs_a_scale, needs_a_field, needs_s_scale, _, needs_outside = ctx.needs_input_grad[3:8]

@@ -17,6 +17,7 @@ from ddrecon.kernels.rows import launch_rows
 from ddrecon.light.fused.outgoing_kernels import scatter_adjoint_kernel, scatter_kernel
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once
 
 _FLUX = "flux_z", "flux_y", "flux_x"
 
@@ -56,6 +57,7 @@ class _Scatter(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, radiance_bar: Tensor) -> tuple[Tensor | None, ...]:
         _, factors, mean, *flux = ctx.saved_tensors
         needs_point, needs_factors = ctx.needs_input_grad[2:4]

@@ -39,7 +39,7 @@ F* out = radiance + c * size + start;
 for (int i = begin; i < end; ++i) {
     const F even = isotropic * u[i];
     if (!DIRECTED) {
-        out[i] = even > F(0) ? even : F(0);
+        out[i] = even < F(0) ? F(0) : even;
     } else {
         const F dx = to_x(i);
         const F along = directed * shorten(dx) * (qz[i] * dz + qy[i] * dy + qx[i] * dx);

@@ -17,6 +17,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.launch import array, launch, thread_count
 from ddrecon.kernels.native import number_type, program
 from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
+from ddrecon.numerics.autodiff import differentiate_once
 
 BLOCK = 128
 """Ways that one item does on a processor; on a GPU it is one."""
@@ -54,12 +55,13 @@ class _Integral(torch.autograd.Function):
         return total
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor | None, ...]:
         field, first, last, length, fraction = ctx.saved_tensors
         varies = any(ctx.needs_input_grad[1:4])
-        bars = [torch.zeros_like(each if varies else each[:0]) for each in (first, last, length)]
+        bars = [each.new_zeros(each.shape if varies else 0) for each in (first, last, length)]
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        shares = [torch.zeros_like(field) for _ in range(thread_count(field))]
+        shares = [field.new_zeros(field.shape) for _ in range(thread_count(field))]
         names = "first_bar", "last_bar", "length_bar"
         given = dict(zip(names, bars, strict=True), total=total_bar)
         ways = [

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.fused.shear import Shear, Sum
+from ddrecon.numerics.autodiff import differentiate_once
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
 
@@ -54,6 +55,7 @@ class _SumMass(torch.autograd.Function):
         return shear.lift(Sum(shear, shear.lay(field.detach()), numbers, 0).entered)
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, entered_bar: Tensor) -> tuple[Tensor | None, ...]:
         field, numbers = ctx.saved_tensors
         shear, varies = ctx.shear, ctx.needs_input_grad[2]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ddrecon.light.fused.receive import Receiver
 from ddrecon.light.fused.shear import Shear, Sum
+from ddrecon.numerics.autodiff import differentiate_once
 
 MOST_BEAMS = 8
 MOST_NUMBERS = 1 << 22
@@ -60,13 +61,14 @@ class Unscattered(torch.autograd.Function):
         return *moments, *masses
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         field, scale, numbers, weights = ctx.saved_tensors
         varies = any(ctx.needs_input_grad[3:])
         receiver = Receiver(field, scale, numbers, weights)
         moments_bar, masses_bar = bars[: receiver.moments], bars[receiver.moments :]
-        laid, laid_bar = _Laid(field), _Laid(torch.zeros_like(field))
-        field_bar = torch.zeros_like(field)
+        laid, laid_bar = _Laid(field), _Laid(field.new_zeros(field.shape))
+        field_bar = field.new_zeros(field.shape)
         scale_bar = torch.zeros_like(scale, dtype=torch.float64)
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
         weights_bar = torch.zeros_like(weights, dtype=torch.float64)

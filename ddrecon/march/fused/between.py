@@ -11,7 +11,7 @@ from torch import Tensor
 from ddrecon.kernels.launch import array, launch, thread_count
 from ddrecon.march.fused.pixels import interpolation_kernel, judge_kernel, spread_kernel
 from ddrecon.march.lattice import DOUBT, interpolate
-from ddrecon.numerics.autodiff import keep
+from ddrecon.numerics.autodiff import differentiate_once, keep
 
 LENGTH = 256
 """Pixels that an item of a launch does on a processor."""
@@ -49,7 +49,7 @@ class _Interpolate(torch.autograd.Function):
         brightness = (squares.sum() / (channels // 2 * rows * columns)).sqrt()
         bound = (tolerance / DOUBT * brightness).to(values.dtype).view(1)
         out = values.new_zeros(channels, count)
-        is_rough = torch.empty_like(hit, dtype=torch.bool)
+        is_rough = hit.new_empty(hit.shape, dtype=torch.bool)
         arguments = [array(x) for x in (values, places, hit, uneven, bound, out, is_rough)]
         items, length = _shares(places)
         threads = _threads(places, channels)
@@ -63,10 +63,11 @@ class _Interpolate(torch.autograd.Function):
         ctx.count = inputs[3]
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, out_bar: Tensor, _: None) -> tuple[Tensor | None, ...]:
         values, places, hit = ctx.saved_tensors
         bits, threads = torch.finfo(values.dtype).bits, _threads(places, len(values))
-        shares = [torch.zeros_like(values) for _ in range(threads)]
+        shares = [values.new_zeros(values.shape) for _ in range(threads)]
         items, length = _shares(places)
         fixed = [length, *(array(x) for x in (values, places, hit, out_bar))]
         given = [[*fixed, array(share)] for share in shares]

@@ -21,7 +21,7 @@ from ddrecon.march.fused.packet_walks import (
 )
 from ddrecon.march.fused.rays import ray_types
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
-from ddrecon.numerics.autodiff import keep
+from ddrecon.numerics.autodiff import differentiate_once, keep
 
 
 class Integrate(torch.autograd.Function):
@@ -49,7 +49,7 @@ class Integrate(torch.autograd.Function):
             kernel, count = packet_integral_kernel(layout), _packet_count(rays)
         else:
             given = _bundle(layout, cells.planes, cells.pack(fields), *varied)
-            kernel, count = integral_kernel(layout, False), len(rays)
+            kernel, count = integral_kernel(layout), len(rays)
         launch(kernel, count, [given, array(out), array(masses)], rays)
         return out, masses.to(rays.dtype, copy=True), masses
 
@@ -60,6 +60,7 @@ class Integrate(torch.autograd.Function):
         keep(ctx, output[2], *inputs[2:])
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, out_bar: Tensor, masses_bar: Tensor, _: None) -> tuple[Any, ...]:
         needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
         varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))

@@ -16,10 +16,13 @@ from ddrecon.march.fused.segments import segments
 
 
 @functools.cache
-def integral_kernel(layout: Layout, is_sliced: bool) -> Any:
-    """The kernel of E1 to E3 along rays: outputs [outputs, R], and masses [K, R] of whole rays."""
-    types, records, step = vectors(layout), ray_types(layout), steps(layout, is_sliced)
-    cells = sampling(layout, is_sliced)
+def integral_kernel(layout: Layout) -> Any:
+    """The kernel of E1 to E3 along rays: outputs [outputs, R], and masses [K, R] of whole rays.
+
+    In equal steps: rays that meet slices go in packets.
+    """
+    types, records, step = vectors(layout), ray_types(layout), steps(layout, is_sliced=False)
+    cells = sampling(layout, is_sliced=False)
     F: Any = types.F
     Node, Total, Out, Bundle = types.Node, types.Total, types.Out, records.Bundle
     load_ray, place, hold = step.load_ray, step.place, step.hold

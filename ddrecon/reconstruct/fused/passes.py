@@ -10,6 +10,7 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.kernels.launch import array, launch, thread_count
 from ddrecon.losses import ROUNDING
+from ddrecon.numerics.autodiff import differentiate_once
 from ddrecon.reconstruct.fused.kernels import step_kernel, variation_kernel
 
 LENGTH = 4096
@@ -31,7 +32,7 @@ def step_adam(
     bounds: tuple[float, float],
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """The new value, within its bounds, and the new moments, after `steps` with this one."""
-    new = [torch.empty_like(value) for _ in range(3)]
+    new = [value.new_empty(value.shape) for _ in range(3)]
     weights = [1 - beta**steps for beta in betas]
     arrays = [array(tensor.contiguous().view(-1)) for tensor in (value, gradient, *moments)]
     arrays += [array(tensor.view(-1)) for tensor in new]
@@ -58,7 +59,7 @@ class _Variation(torch.autograd.Function):
     def forward(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
         side, columns = min(grid.extent), field.shape[-1]
         cells = field.reshape(-1, *field.shape[-3:]).contiguous()
-        slope = torch.empty_like(cells)
+        slope = cells.new_empty(cells.shape)
         length = PART if field.is_cuda else columns
         items = field.numel() // columns * -(-columns // length)
         totals = field.new_empty(items, dtype=torch.float64)
@@ -74,6 +75,7 @@ class _Variation(torch.autograd.Function):
         ctx.save_for_backward(output[1])
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, total_bar: Tensor, _: None) -> tuple[Tensor, None]:
         (slope,) = ctx.saved_tensors
         return (total_bar / slope.numel()) * slope, None

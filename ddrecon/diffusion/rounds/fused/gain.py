@@ -13,6 +13,7 @@ from ddrecon.diffusion.rounds.fused.kernels import records
 from ddrecon.kernels.launch import array, launch
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once
 
 LEAST = 2e-3
 """Depths of steps are at least that: theta is 1 there, but its formula 0 / 0 in empty cells."""
@@ -54,19 +55,20 @@ class _Gain(torch.autograd.Function):
         ctx.length = length
         ctx.save_for_backward(*tensors)
         cells = _Cells(length, *tensors)
-        source, *gains = (torch.empty_like(cells.like) for _ in range(1 + cells.moments))
+        source, *gains = (_room_for(cells.like) for _ in range(1 + cells.moments))
         found = cells.found(source, gains)
         cells.launch(cells.kernels.gain, [cells.given, found])
         return source, *gains
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, source_bar: Tensor, *gain_bars: Tensor) -> tuple[Any, ...]:
         cells = _Cells(ctx.length, *ctx.saved_tensors)
         _, extinction, scattering, imbalance, *light = ctx.saved_tensors
         found = cells.types.Bars()
-        light_bars = [torch.empty_like(moment) for moment in light]
-        imbalance_bar = None if imbalance is None else torch.empty_like(imbalance)
-        field_bars = [None if f is None else torch.zeros_like(f) for f in (extinction, scattering)]
+        light_bars = [_room_for(moment) for moment in light]
+        imbalance_bar = None if imbalance is None else _room_for(imbalance)
+        field_bars = [None if f is None else _room_for(f).zero_() for f in (extinction, scattering)]
         numbers_bar = light[0].new_empty(cells.items, 2, cells.colors, dtype=torch.float64)
         found.swept = cells.light(light_bars[: cells.moments])
         found.diffuse = cells.light(light_bars[cells.moments :])
@@ -134,6 +136,10 @@ class _Cells:
 
     def launch(self, kernel: Any, arguments: list[Any]) -> None:
         launch(kernel, self.items, [*arguments, self.size], self.like)
+
+
+def _room_for(tensor: Tensor) -> Tensor:
+    return tensor.new_empty(tensor.shape)
 
 
 def _flat(tensor: Tensor) -> Any:

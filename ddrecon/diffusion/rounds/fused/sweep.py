@@ -13,6 +13,7 @@ from ddrecon.diffusion.rounds.fused.schedule import schedules
 from ddrecon.diffusion.rounds.fused.turning import add_turned
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once
 
 
 def sweep_fused(
@@ -55,6 +56,7 @@ class _Sweep(torch.autograd.Function):
         return _add_up(*(part.follow() for part in parts)).unbind(0)
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
         varies_numbers = ctx.needs_input_grad[1]
         parts = _parts(ctx.plan, Swept.of(*ctx.saved_tensors))

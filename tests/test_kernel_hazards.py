@@ -1,0 +1,212 @@
+"""What could go wrong between kernels and tensors: layouts in memory, modes of torch, threads."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from media import half_empty, make_camera, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import ENGINES, use_engine
+from ddrecon.errors import SolveError
+from ddrecon.light.lights import EnvironmentLight, PointLight
+from ddrecon.light.reduced import reduced_light
+from ddrecon.light.sky import decompose_lights
+from ddrecon.light.skylight import sum_unscattered_sky
+from ddrecon.medium.coefficients import scale_medium
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.renderer import render_each
+from ddrecon.scene import Scene
+from ddrecon.settings import ParameterSettings, RenderSettings
+from ddrecon.variables.values import value_of, with_values
+
+pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.kernels import launch, spare
+
+pytestmark = pytest.mark.slow
+
+SHAPE = (5, 7, 9)
+PACKAGE = Path(__file__).parents[1] / "ddrecon"
+VARIED = "density", "sigma_a", "sigma_s", "g"
+
+
+def reorder(tensor: Tensor) -> Tensor:
+    """The same numbers, stored as Fortran would."""
+    axes = list(reversed(range(tensor.ndim)))
+    return tensor.permute(axes).contiguous().permute(axes)
+
+
+def every_light(is_cellwise: bool = False) -> Scene:
+    """A scene that needs all kernels: peaked scattering, a round, beam, point light and sky."""
+    density, sigma_s = 2 * half_empty(*SHAPE), random_values(3, *SHAPE, seed=1)
+    camera = make_camera((1.1, 0.5, 0.9), (12, 14), 0.9)
+    sections = {"sigma_s": 6 * sigma_s, "sigma_a": sigma_s.flip(0)} if is_cellwise else {}
+    scene = make_scene(density, g=0.4, camera=camera, transport_rounds=1, **sections)
+    tensor = density.new_tensor
+    scene.lights += [
+        PointLight(tensor([0.9, 0.7, 0.2]), tensor([1.0, 2.0, 0.5])),
+        EnvironmentLight(random_values(3, 4, 8, seed=3), tensor(0.5), tensor(20.0), 6),
+    ]
+    return replace(scene, render=RenderSettings(tolerance=1.0))
+
+
+def differentiate(scene: Scene, values: dict[str, Tensor], **options: Any) -> list[Tensor]:
+    """The image, and the derivatives of a weighted sum of it by `values`."""
+    leaves = {name: value.detach().requires_grad_() for name, value in values.items()}
+    changed = with_values(scene, leaves)
+    (image,) = render_each(changed, changed.views, SolveMemory())
+    total = (image * random_values(*image.shape, seed=9)).sum()
+    return [image.detach(), *torch.autograd.grad(total, list(leaves.values()), **options)]
+
+
+@pytest.mark.parametrize("is_cellwise", [False, True], ids=["constant", "cellwise"])
+def test_layout_in_memory_changes_nothing(is_cellwise: bool):
+    scene = every_light(is_cellwise)
+    values = {name: value_of(scene, name).detach() for name in VARIED}
+    use_engine("torch")
+    known = differentiate(scene, values)
+    use_engine("warp")
+    found = differentiate(scene, {name: reorder(value) for name, value in values.items()})
+    for one, other in zip(found, known, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-10 * float(other.norm()))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_step_takes_any_layout(engine: str):
+    use_engine(engine)
+    scene, gradient = every_light(), random_values(*SHAPE, seed=4) - 0.5
+
+    def step(value: Tensor, gradient: Tensor) -> Tensor:
+        parameter = Parameter("density", ParameterSettings(), 0.1, value, scene.volume.grid)
+        parameter.step(gradient, 1.0)
+        return parameter.value.detach()
+
+    known = step(scene.volume.density, gradient)
+    assert torch.equal(step(reorder(scene.volume.density), gradient), known)
+    assert torch.equal(step(scene.volume.density, reorder(gradient)), known)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_second_derivatives_are_refused(engine: str):
+    """Rather than that parts of them are missing, whether the cotangent varies or not."""
+    use_engine(engine)
+    scene = every_light()
+    density = scene.volume.density.clone().requires_grad_()
+    changed = with_values(scene, {"density": density})
+    (image,) = render_each(changed, changed.views, SolveMemory())
+    for loss in (image.square().sum(), image.sum()):
+        with pytest.raises(NotImplementedError, match="only first derivatives"):
+            torch.autograd.grad(loss, density, create_graph=True)
+
+
+def test_every_custom_function_of_kernels_refuses_them():
+    """Not only those that happen to come first on the way back."""
+    for path in sorted(PACKAGE.rglob("fused/*.py")):
+        text = path.read_text()
+        assert text.count("def backward(") == text.count("@differentiate_once\n"), path
+
+
+def test_a_graph_can_be_gone_back_through_twice():
+    use_engine("warp")
+    scene = every_light()
+    density = scene.volume.density.clone().requires_grad_()
+    changed = with_values(scene, {"density": density})
+    (image,) = render_each(changed, changed.views, SolveMemory(is_warm=False))
+    once, again = (
+        torch.autograd.grad(image.sum(), density, retain_graph=True)[0] for _ in range(2)
+    )
+    assert torch.equal(once, again)
+
+
+def test_what_inference_mode_made_serves_derivatives_later():
+    use_engine("warp")
+    scene = every_light()
+    values = {"density": scene.volume.density, "g": scene.volume.g}
+    with torch.inference_mode():
+        render_each(scene, scene.views, SolveMemory())
+    differentiate(scene, values)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("model", ["p1", "none"])
+def test_a_density_that_is_no_number_is_seen(engine: str, model: str):
+    use_engine(engine)
+    density = half_empty(*SHAPE)
+    density[2, 3, 4] = torch.nan
+    scene = make_scene(density, g=0.4, model=model)
+    if model == "p1":
+        with pytest.raises(SolveError, match="tolerance") as raised:
+            render_each(scene, scene.views, SolveMemory())
+        assert math.isnan(raised.value.residual)
+    else:
+        (image,) = render_each(scene, scene.views, SolveMemory())
+        assert not image.isfinite().all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_light_through_what_is_no_number_is_none(engine: str):
+    """Where the mass up to a cell is not a number, no kernel makes one of the light there."""
+    use_engine(engine)
+    scene = every_light()
+    scene.volume.density[1, 2, 3] = torch.nan
+    medium, lights = scale_medium(scene.volume), decompose_lights(scene.lights)
+    reduced = reduced_light(medium, lights, has_flux=True)
+    sky = sum_unscattered_sky(medium, lights, has_flux=True)
+    assert sky is not None and reduced.source.flux is not None
+    assert bool(sky.mean.isnan()[:, 1, 2, 3].all())
+    for beam in reduced.beams:
+        is_unknown = beam.mass.isnan()
+        assert 1 < is_unknown.sum() < is_unknown.numel()
+        for moment in (reduced.source.mean, *reduced.source.flux):
+            assert bool((moment.isnan() | ~is_unknown).all())
+
+
+def test_a_failing_share_waits_for_the_others(monkeypatch: pytest.MonkeyPatch):
+    like, started, done = torch.zeros(1), threading.Event(), threading.Event()
+
+    def fake(_kernel: object, _size: int, given: list[int], **_: object) -> None:
+        if given[0] == 0:
+            started.wait(10)
+            raise ValueError("no")
+        started.set()
+        threading.Event().wait(0.2)
+        done.set()
+
+    monkeypatch.setattr(launch.wp, "launch", fake)
+    monkeypatch.setattr(launch, "_load", lambda *_: None)
+    with pytest.raises(ValueError, match="no"):
+        launch.launch(None, 2, [], like, threads=2)
+    assert done.is_set()
+
+
+def test_memory_is_given_back_wherever_the_garbage_collector_begins():
+    """Also where this thread itself holds the list of spare memory."""
+
+    def collect() -> None:
+        with spare._lock:
+            spare.give_back(torch.empty(64))
+
+    collecting = threading.Thread(target=collect, daemon=True)
+    collecting.start()
+    collecting.join(10)
+    assert not collecting.is_alive()
+
+
+def test_threads_are_there_after_a_fork():
+    launch._pool(2).submit(int).result()
+    process = multiprocessing.get_context("fork").Process(target=_ask_thread, daemon=True)
+    process.start()
+    process.join(20)
+    assert process.exitcode == 0
+
+
+def _ask_thread() -> None:
+    launch._pool(2).submit(int).result(10)
