@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +15,10 @@ from ddrecon.march.integral import CHUNK_NODES
 
 GIVEN_BACK = 2**25
 """Arrays of more bytes leave the process when they are done with; smaller ones stay with glibc."""
+KEPT = 2**30
+"""So many bytes of smaller ones may lie unused at the end of glibc's heap."""
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Numbers of these options in glibc's malloc.h."""
 SHORTAGES = (
     "not enough memory",
     "out of memory",
@@ -200,6 +206,17 @@ def _left(root: Path, path: str, limit: str, usage: str, cached: str) -> Iterato
             pass
         if folder == root:
             return
+
+
+def keep_freed_memory() -> None:
+    """Has glibc, where that is in use, keep the memory of smaller arrays that are done with.
+
+    The system would clear each page anew, which takes up to a tenth of an iteration.
+    """
+    change = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if change is not None:
+        change(_MMAP_THRESHOLD, GIVEN_BACK)
+        change(_TRIM_THRESHOLD, KEPT)
 
 
 def is_shortage(error: BaseException) -> bool:

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
+from ddrecon.memory import keep_freed_memory
 from ddrecon.run.result import RESULT
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import build_scene
@@ -144,6 +145,7 @@ def open_session(
         torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else os.cpu_count() or 1
     )
     torch.set_num_threads(threads)
+    keep_freed_memory()
     torch.manual_seed(seed)
     return Session(overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -25,6 +26,10 @@ wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
 LOG = logging.getLogger(engine.LOG)
 COMPILED = 0.5
 """A kernel that takes longer to load [s] was compiled; others come from Warp's cache."""
+QUICK = 1.5e-4
+"""Handing a share to another thread takes about 50 microseconds; a launch, 20."""
+_seconds: dict[tuple[Any, int], float] = {}
+"""What a launch of a kernel for so many items takes in one thread [s]: the least that was seen."""
 
 
 def array(tensor: Tensor) -> Any:
@@ -47,9 +52,10 @@ def launch(
 ) -> None:
     """Runs `kernel` for `count` items where tensor `like` lies.
 
-    On a processor that is in so many `threads` (None: as many as torch has), each with its share of
-    the items; a function of the thread's number gives it `arguments` of its own. Handing a share to
-    a thread takes about 50 microseconds: what takes less is better done in one.
+    On a processor the items are cut into so many shares as there are `threads` (None: as many as
+    torch has); a function of a share's number gives it `arguments` of its own. Which thread does a
+    share is left to chance, and changes no result: the one that asks does all where that is quick,
+    and those that no other has begun by the time it has done its own.
     """
     _start()
     threads = thread_count(like) if threads is None else threads
@@ -63,15 +69,28 @@ def launch(
         size = bounds[i + 1] - bounds[i]
         wp.launch(kernel, size, [bounds[i], *given], device=device, stream=stream)
 
+    # What was seen to be quick is not worth another thread.
+    if threads > 1 and _seconds.get((kernel, count), math.inf) < QUICK:
+        for i in range(threads):
+            run(i)
+        return
     # The thread that asks takes the first share itself.
     others = [_pool(threads).submit(run, i) for i in range(1, threads)]
+    start = perf_counter()
     try:
         run(0)
+        seconds = (perf_counter() - start) * threads
+        _seconds[kernel, count] = min(seconds, _seconds.get((kernel, count), math.inf))
+        # And those not begun by now: other programs may have the processor's other cores.
+        for i, other in enumerate(others, 1):
+            if other.cancel():
+                run(i)
     finally:
         # No memory is given up that others still write to, whatever went wrong here.
-        wait(others)
+        wait([other for other in others if not other.cancel()])
     for other in others:
-        other.result()
+        if not other.cancelled():
+            other.result()
 
 
 @functools.cache

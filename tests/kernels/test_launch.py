@@ -1,0 +1,65 @@
+"""Shares of a launch: each is done once, whichever thread does it."""
+
+from collections.abc import Iterator
+from threading import Event
+
+import pytest
+import torch
+
+pytest.importorskip("warp")
+
+from ddrecon.kernels import launch as launching
+
+COUNT = 101
+HERE = torch.zeros(1)
+
+
+@pytest.fixture
+def done(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
+    """What launches did: first item, number of items, and the arguments."""
+    seen: list[tuple[int, ...]] = []
+
+    def note(kernel: object, size: int, given: list[int], **_: object) -> None:
+        seen.append((given[0], size, *given[1:]))
+
+    monkeypatch.setattr(launching.wp, "launch", note)
+    monkeypatch.setattr(launching, "_load", lambda kernel, device: None)
+    return seen
+
+
+@pytest.fixture
+def busy() -> Iterator[None]:
+    """While it lasts, no thread but that of the test does anything."""
+    free = Event()
+    waiting = [launching._pool(2).submit(free.wait) for _ in range(2)]
+    yield
+    free.set()
+    for one in waiting:
+        one.result()
+
+
+SHARES = [(0, 50, 0), (50, 51, 1)]
+
+
+def test_shares_that_no_thread_begins_are_done_by_the_one_that_asks(done, busy):
+    launching.launch(object(), COUNT, lambda i: [i], HERE, threads=2)
+    assert sorted(done) == SHARES
+
+
+def test_quick_launches_have_the_same_shares(done, monkeypatch):
+    kernel = object()
+    monkeypatch.setattr(launching, "_seconds", _Seconds(2 * launching.QUICK))
+    launching.launch(kernel, COUNT, lambda i: [i], HERE, threads=2)
+    monkeypatch.setattr(launching, "_seconds", _Seconds(launching.QUICK / 2))
+    launching.launch(kernel, COUNT, lambda i: [i], HERE, threads=2)
+    assert sorted(done[:2]) == done[2:] == SHARES
+
+
+class _Seconds(dict):
+    """That every launch takes so many seconds."""
+
+    def __init__(self, seconds: float):
+        self.seconds = seconds
+
+    def get(self, key: object, default: float = 0.0) -> float:
+        return self.seconds
