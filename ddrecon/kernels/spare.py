@@ -12,8 +12,8 @@ import threading
 import torch
 from torch import Tensor
 
-MOST_BYTES = 2**30
-"""So much is kept unused at most."""
+MOST_BYTES = 2**28
+"""So much is kept unused at most: of large volumes little, whose memory is needed elsewhere."""
 _spare: list[Tensor] = []
 _lock = threading.Lock()
 
@@ -37,7 +37,8 @@ def give_back(*tensors: Tensor) -> None:
     with _lock:
         for tensor in tensors:
             if not tensor.is_cuda:
-                whole = tensor.untyped_storage()
-                _spare.append(torch.empty(0, dtype=torch.uint8).set_(whole))
+                whole = torch.empty(0, dtype=torch.uint8).set_(tensor.untyped_storage())
+                if len(whole) <= MOST_BYTES:
+                    _spare.append(whole)
         while sum(map(len, _spare)) > MOST_BYTES:
             del _spare[0]
