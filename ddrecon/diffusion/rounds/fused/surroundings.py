@@ -51,7 +51,7 @@ def surround(fields: Sequence[Tensor], stretch: int) -> tuple[list[Tensor], Tens
     rows = (depth + 2) * (height + 2)
     ends = torch.tensor([width, 0], dtype=torch.int32, device=fields[0].device)
     occupied = ends.repeat(rows)
-    kernel = _copy_kernel(torch.finfo(fields[0].dtype).bits)
+    kernel = copy_kernel(torch.finfo(fields[0].dtype).bits)
     larger = [f.new_empty(len(f), depth + 2, height + 2, stretch) for f in fields]
     for field, result in zip(fields, larger, strict=True):
         arrays = [array(each.detach().reshape(-1)) for each in (field, result, occupied)]
@@ -60,7 +60,8 @@ def surround(fields: Sequence[Tensor], stretch: int) -> tuple[list[Tensor], Tens
 
 
 @functools.cache
-def _copy_kernel(bits: int) -> Any:
+def copy_kernel(bits: int) -> Any:
+    """The kernel that copies a row and finds where it is not empty."""
     F: Any = number_type(bits)
 
     @wp.func_native(program(bits, _COPY))
