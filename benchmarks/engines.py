@@ -40,16 +40,24 @@ class Case:
 
 LARGE = "views.0.image=null", "views.0.camera.resolution=[512, 512]"
 GRAY = "volume.albedo=0.95", *LARGE
+NONE, ONE, TWO = (f"diffusion.transport_rounds={rounds}" for rounds in (0, 1, 2))
 CASES = (
-    Case("RGB, g 0.3, three views of 128 x 128", 3, ()),
-    Case("gray, g 0.5, 512 x 512", 1, ("volume.g=0.5", *GRAY)),
-    Case("gray, g 0, 512 x 512", 1, ("volume.g=0", *GRAY)),
+    Case("RGB, g 0.3, three views of 128 x 128, no rounds", 3, (NONE,)),
+    Case("the same with one round", 3, (ONE,)),
+    Case("the same with two", 3, (TWO,)),
+    Case("gray, g 0.5, 512 x 512, no rounds", 1, ("volume.g=0.5", NONE, *GRAY)),
+    Case("the same with one round", 1, ("volume.g=0.5", ONE, *GRAY)),
+    Case("gray, g 0, 512 x 512, no rounds", 1, ("volume.g=0", NONE, *GRAY)),
     Case(
-        "gray, g 0.5, 512 x 512, each pixel its ray",
+        "gray, g 0.5, 512 x 512, each pixel its ray, no rounds",
         1,
-        ("volume.g=0.5", "render.tolerance=0", *GRAY),
+        ("volume.g=0.5", "render.tolerance=0", NONE, *GRAY),
     ),
-    Case("RGB, g 0.3, 512 x 512, each pixel its ray", 1, ("render.tolerance=0", *LARGE)),
+    Case(
+        "RGB, g 0.3, 512 x 512, each pixel its ray, no rounds",
+        1,
+        ("render.tolerance=0", NONE, *LARGE),
+    ),
 )
 
 
