@@ -13,8 +13,8 @@ import threading
 import torch
 from torch import Tensor
 
-MOST_BYTES = 2**30
-"""So much is kept unused at most."""
+MOST_BYTES = 2**28
+"""So much is kept unused at most: of large volumes little, whose memory is needed elsewhere."""
 _spare: list[Tensor] = []
 # Reentrant: the collector of garbage, which may begin anywhere, gives memory back.
 _lock = threading.RLock()
@@ -42,8 +42,10 @@ def give_back(*tensors: Tensor) -> None:
         for tensor in tensors:
             if not tensor.is_cuda:
                 # All of its storage, of which it may be a part: a view, which costs no operation.
-                count = tensor.untyped_storage().nbytes() // tensor.element_size()
-                _spare.append(tensor.detach().as_strided((count,), (1,), 0).view(torch.uint8))
+                size = tensor.untyped_storage().nbytes()
+                if size <= MOST_BYTES:
+                    count = size // tensor.element_size()
+                    _spare.append(tensor.detach().as_strided((count,), (1,), 0).view(torch.uint8))
         while sum(map(len, _spare)) > MOST_BYTES:
             del _spare[0]
 

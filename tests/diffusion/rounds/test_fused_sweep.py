@@ -23,6 +23,7 @@ from ddrecon.renderer import solve_light
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.rounds.fused.gains import gain_kernels  # noqa: E402
 from ddrecon.diffusion.rounds.fused.kernels import sweep_kernels  # noqa: E402
+from ddrecon.diffusion.rounds.fused.surroundings import copy_kernel  # noqa: E402
 from ddrecon.diffusion.rounds.fused.sweep import sweep_fused  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -33,7 +34,10 @@ CUBES, FLAT = (1.0, 1.0, 1.0), (0.2, 1.0, 3.0)
 
 @dataclass(frozen=True)
 class Case:
-    """What is swept: `depth` is that of the densest cells; fields `vary` by cell and color."""
+    """What is swept: `depth` is that of the densest cells; fields `vary` by cell and color.
+
+    An island has a medium in a few cells amid empty ones.
+    """
 
     shape: tuple[int, int, int] = (5, 7, 6)
     spacing: tuple[float, float, float] = FLAT
@@ -44,6 +48,7 @@ class Case:
     directions: int = 26
     depth: float = 3.0
     dtype: torch.dtype = torch.float64
+    is_island: bool = False
 
     @property
     def grid(self) -> Grid:
@@ -57,6 +62,10 @@ class Case:
             return random_values(*shape, seed=seed, dtype=self.dtype)
 
         found = {"density": self.depth * half_empty(*self.shape, dtype=self.dtype)}
+        if self.is_island:
+            island = torch.zeros_like(found["density"])
+            island[3:5, 2:5, self.shape[2] // 2 :][..., :4] = self.depth
+            found["density"] = island
         per_cell = self.shape if self.varies else ()
         found["sigma_a"] = 0.1 + random(self.colors, *per_cell, seed=1)
         found["sigma_s"] = 0.5 + random(self.colors, *per_cell, seed=2)
@@ -134,6 +143,9 @@ CASES = {
     "cell": Case((1, 1, 1), CUBES),
     "opaque": Case(depth=1e4, spacing=CUBES),
     "empty": Case(depth=0.0),
+    "island": Case((7, 8, 70), CUBES, colors=1, is_island=True),
+    "island-slanted": Case((7, 8, 70), FLAT, colors=1, is_island=True),
+    "island-high": Case((5, 70, 7), colors=1, has_flux=False, is_island=True),
 }
 each_case = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 
@@ -251,7 +263,7 @@ def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     kernels = sweep_kernels(32, True, False, True)
     of_gains = gain_kernels(32, True, False, True)
     of_cells = [kernels.follow_cells, kernels.keep_cells, kernels.return_cells]
-    of_cells += [of_gains.gain, of_gains.transpose]
+    of_cells += [of_gains.gain, of_gains.transpose, copy_kernel(32)]
     for kernel in of_cells:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(of_cells)

@@ -33,7 +33,8 @@ def records(bits: int) -> SimpleNamespace:
         """What is swept, all arrays flat.
 
         `light`: what scatters; `extinction` and `scattering`: fields [K, z + 2, y + 2, stretch],
-        empty around the box; `numbers` [3, C]: scale of extinction and of scattering, inflow;
+        empty around the box; `occupied` [z + 2, y + 2, 2]: from and to where their rows are not
+        empty; `numbers` [3, C]: scale of extinction and of scattering, inflow;
         `directions` [D, 10]: half a step [u], drift along rows and columns, w, weights in the
         moments; `signs` [D, 3]: signs of the drifts, and whether both are of whole cells; `items`
         [N, 6]: axis, way, first direction, how many, color, whether its moments are the first.
@@ -44,6 +45,7 @@ def records(bits: int) -> SimpleNamespace:
         light: Light
         extinction: wp.array(dtype=F)
         scattering: wp.array(dtype=F)
+        occupied: wp.array(dtype=wp.int32)
         numbers: wp.array(dtype=F)
         directions: wp.array(dtype=F)
         signs: wp.array(dtype=wp.int32)
@@ -63,25 +65,22 @@ def records(bits: int) -> SimpleNamespace:
     class Work:
         """What a thread has of its own; see `rows.py`.
 
-        `light`: its sum of moments, or of their cotangents; `arriving`: I where rays were, of all
-        slices; `nothing`: an empty row; `extinction` and `scattering`: its sums
-        of cotangents of fields, and `numbers` [3, C, rows, x] of those numbers.
+        `light`: its sum of moments, or of their cotangents; `buffers`: `slots` rows for each
+        direction and row of two slices; `arriving`: I where rays were, of all slices; `nothing`: an
+        empty row; `extinction` and `scattering`: its sums of cotangents of fields, and `numbers`
+        [3, C, rows, x] of those numbers.
         """
 
         light: Light
-        near: wp.array(dtype=F)
-        radiance: wp.array(dtype=F)
+        buffers: wp.array(dtype=F)
         arriving: wp.array(dtype=F)
         nothing: wp.array(dtype=F)
-        returning: wp.array(dtype=F)
-        far_bar: wp.array(dtype=F)
-        mass_bar: wp.array(dtype=F)
-        scattering_mass_bar: wp.array(dtype=F)
         extinction: wp.array(dtype=F)
         scattering: wp.array(dtype=F)
         numbers: wp.array(dtype=F)
         extinction_channels: int
         scattering_channels: int
+        slots: int
 
     return SimpleNamespace(Light=Light, Given=Given, Work=Work)
 

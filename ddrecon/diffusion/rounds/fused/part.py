@@ -13,15 +13,16 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from ddrecon.diffusion.rounds.characteristics import Direction
 from ddrecon.diffusion.rounds.fused.kernels import records, sweep_kernels
 from ddrecon.diffusion.rounds.fused.rows import MARGIN
 from ddrecon.diffusion.rounds.fused.schedule import Item, Schedule, share_items
+from ddrecon.diffusion.rounds.fused.surroundings import surround
 from ddrecon.diffusion.rounds.fused.turning import turn
 from ddrecon.grid import Grid
 from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.spare import borrow, give_back
 
 Weighted = tuple[tuple[Direction, tuple[float, ...]], ...]
 """Directions, and the weights of their radiance in the moments."""
@@ -54,16 +55,12 @@ class Swept:
         return Swept(numbers, extinction, scattering, light)
 
 
-BUFFERS = "near", "radiance", "returning", "far_bar", "mass_bar", "scattering_mass_bar"
-"""What is kept of the last slice on the way back."""
-
-
 class Part:
     """One schedule of a sweep; where it `is_turned`, y and x are exchanged in all its arrays."""
 
     def __init__(self, plan: Plan, schedule: Schedule, swept: Swept, is_turned: bool):
         self.plan, self.schedule, self.swept, self.is_turned = plan, schedule, swept, is_turned
-        self.like = swept.light[0]
+        self.like, self.borrowed = swept.light[0], list[Tensor]()
         self.bits = torch.finfo(self.like.dtype).bits
         self.light = [self.turn(moment) for moment in swept.light]
         self.colors, self.depth, self.height, self.width = self.light[0].shape
@@ -75,22 +72,29 @@ class Part:
         self.lanes = self.colors if plan.by_cells else 1
         has_flux, shares_field = len(self.light) > 1, swept.scattering is None
         self.kernels = functools.partial(sweep_kernels, self.bits, has_flux, shares_field)
-        margins = MARGIN, self.stretch - self.width - MARGIN
-        self.fields = [
-            pad(self.turn(field.detach()), (*margins, 1, 1, 1, 1))
-            for field in (swept.extinction, swept.scattering)
-            if field is not None
-        ]
+        fields = (swept.extinction, swept.scattering)
+        self.fields, self.occupied = surround(
+            [self.turn(field.detach()) for field in fields if field is not None], self.stretch
+        )
 
     def turn(self, cells: Tensor) -> Tensor:
-        """`cells` in the order of this part."""
-        return turn(cells) if self.is_turned else cells
+        """`cells` in the order of this part, in memory that is given back with `done`."""
+        if not self.is_turned:
+            return cells
+        turned = turn(cells)
+        self.borrowed.append(turned)
+        return turned
+
+    def done(self) -> None:
+        """Gives back the memory that was computed in; the sums are not in it."""
+        give_back(*self.borrowed)
+        self.borrowed = []
 
     def follow(self) -> list[Tensor]:
         """Shares of the moments [M, C, z, y, x] of radiance along the directions."""
         items, bounds, given = self._given(is_kept=False)
         sums = self._sums(items, bounds)
-        works = [self._work(given, ("near", "radiance")) for _ in sums]
+        works = [self._work(given, 2) for _ in sums]
         for work, moments in zip(works, sums, strict=True):
             work.light = self._light(moments)
         if self.plan.by_cells:
@@ -102,6 +106,7 @@ class Part:
                 )
         else:
             self._launch_items(self.kernels(False).follow_items, given, works, [], bounds)
+        self.done()
         return self._distinct(sums)
 
     def transpose(self, bars: Sequence[Tensor], varies_numbers: bool) -> list[list[Tensor]]:
@@ -114,13 +119,13 @@ class Part:
         # Sums of fields are by color where colors go side by side.
         channels = [self.colors if self.lanes > 1 else len(field) for field in self.fields]
         fields = [self.like.new_zeros(self.threads, each, *shape) for each in channels]
-        works = [self._work(given, BUFFERS) for _ in sums]
+        works = [self._work(given, 3 + len(self.fields)) for _ in sums]
         for i, work in enumerate(works):
             work.light, work.numbers = self._light(sums[i]), self._array(numbers[i])
             work.extinction, work.scattering = (self._array(fields[j][i]) for j in (0, -1))
             work.extinction_channels, work.scattering_channels = channels[0], channels[-1]
             kept = self.lanes * given.group * self._cells
-            work.arriving = self._array(self.like.new_empty(kept))
+            work.arriving = self._array(self._borrow(kept))
         if self.plan.by_cells:
             for first in range(0, len(items), self.colors):
                 piece = items[first : first + self.colors]
@@ -130,6 +135,7 @@ class Part:
                 self._launch_piece(kernels.return_cells, first, piece, arguments, slices[::-1])
         else:
             self._launch_items(kernels.return_items, given, works, [bars_record], bounds)
+        self.done()
         return [list(numbers), self._distinct(sums), *map(list, fields)]
 
     @property
@@ -146,6 +152,7 @@ class Part:
         given = records(self.bits).Given()
         given.light = self._light(self.light)
         given.extinction, given.scattering = map(self._array, (self.fields[0], self.fields[-1]))
+        given.occupied = self._array(self.occupied)
         given.extinction_channels, given.scattering_channels = (
             len(self.fields[0]),
             len(self.fields[-1]),
@@ -168,22 +175,30 @@ class Part:
         Where each color has one thread they are the same for all.
         """
         shape = len(self.light), *self.light[0].shape
+        count = len(self.light) * self.light[0].numel()
         if self.is_apart:
-            return [self.like.new_empty(shape)] * self.threads
-        sums = [self.like.new_empty(shape) for _ in range(self.threads)]
+            return [borrow(count, self.like).view(shape)] * self.threads
+        # The first becomes the result.
+        sums = [] if self.is_turned else [self.like.new_empty(shape)]
+        while len(sums) < self.threads:
+            sums.append(borrow(count, self.like).view(shape))
         for own, (begin, end) in zip(sums, pairwise(bounds), strict=True):
             for color in set(range(self.colors)) - {item[4] for item in items[begin:end]}:
                 own[:, color].zero_()
         return sums
 
+    def _borrow(self, count: int) -> Tensor:
+        memory = borrow(count, self.like)
+        self.borrowed.append(memory)
+        return memory
+
     def _distinct(self, sums: list[Tensor]) -> list[Tensor]:
         return sums[:1] if self.is_apart else sums
 
-    def _work(self, given: Any, names: Sequence[str]) -> Any:
+    def _work(self, given: Any, slots: int) -> Any:
         work = records(self.bits).Work()
         size = 2 * self.lanes * given.group * self.rows * self.stretch
-        for name in names:
-            setattr(work, name, self._array(self.like.new_zeros(size)))
+        work.buffers, work.slots = self._array(self._borrow(slots * size).zero_()), slots
         work.nothing = self._array(self.like.new_zeros(self.stretch))
         return work
 

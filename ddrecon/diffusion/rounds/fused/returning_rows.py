@@ -6,7 +6,8 @@ Of all slices only the last one is kept, which is the next one that light crosse
     returning            exp(-depth) source_bar, which P^T takes to the slice before
     far_bar, mass_bar    cotangents of q and of the field where rays were one slice earlier
 
-I of all slices was kept by `rows.FOLLOW`. `upstream` is P, `downstream` its transpose P^T.
+I of all slices was kept by `rows.FOLLOW`. `upstream` is P, `downstream` its transpose P^T. Where
+neither this step nor the next meets a medium, nothing returns to what scatters.
 """
 
 from ddrecon.diffusion.rounds.fused.rows import DIRECTION, PLACES, STEP, UPSTREAM
@@ -68,14 +69,14 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
             // Rows to which rays went on; the last slice has none.
             const int next = r + row_sign;
             const bool is_last = s == slices - 1, is_inside = next >= 0 && next < rows && !is_last;
-            auto here_of = [&](const wp::array_t<F>& buffer) -> const F* {
-                return is_last ? nothing : row_of(buffer, s + 1, j, r);
+            auto here_of = [&](int which) -> const F* {
+                return is_last ? nothing : row_of(which, s + 1, j, r);
             };
-            auto ahead_of = [&](const wp::array_t<F>& buffer) -> const F* {
-                return is_inside ? row_of(buffer, s + 1, j, next) : nothing;
+            auto ahead_of = [&](int which) -> const F* {
+                return is_inside ? row_of(which, s + 1, j, next) : nothing;
             };
-            const F* far_here = here_of(work.far_bar);
-            const F* far_ahead = ahead_of(work.far_bar);
+            const F* far_here = here_of(FAR_BAR);
+            const F* far_ahead = ahead_of(FAR_BAR);
             // q at an edge stands for what is beyond it as well.
             const bool is_edge = r == (row_sign > 0 ? 0 : rows - 1);
             const int edge = column_sign > 0 ? 0 : width - 1;
@@ -92,16 +93,16 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                     }
                 }
             } else {
-                const F* back_here = here_of(work.returning);
-                const F* back_ahead = ahead_of(work.returning);
-                const F* mass_here = here_of(work.mass_bar);
-                const F* mass_ahead = ahead_of(work.mass_bar);
-                const F* scattered_here = here_of(work.scattering_mass_bar);
-                const F* scattered_ahead = ahead_of(work.scattering_mass_bar);
-                F* __restrict returning_row = row_of(work.returning, s, j, r);
-                F* __restrict far_bar_row = row_of(work.far_bar, s, j, r);
-                F* __restrict mass_bar_row = row_of(work.mass_bar, s, j, r);
-                F* __restrict scattered_row = row_of(work.scattering_mass_bar, s, j, r);
+                const F* back_here = here_of(RETURNING);
+                const F* back_ahead = ahead_of(RETURNING);
+                const F* mass_here = here_of(MASS_BAR);
+                const F* mass_ahead = ahead_of(MASS_BAR);
+                const F* scattered_here = here_of(SCATTERED_BAR);
+                const F* scattered_ahead = ahead_of(SCATTERED_BAR);
+                F* __restrict returning_row = row_of(RETURNING, s, j, r);
+                F* __restrict far_bar_row = row_of(FAR_BAR, s, j, r);
+                F* __restrict mass_bar_row = row_of(MASS_BAR, s, j, r);
+                F* __restrict scattered_row = row_of(SCATTERED_BAR, s, j, r);
                 const long long there = (k + 1) * far_slice + (r + 1) * far_row + MARGIN;
                 const long long before = there - forward * far_slice;
                 const F* __restrict e = extinction + there;
@@ -110,19 +111,26 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                 const F* __restrict sc = scattering + there;
                 const F* sc_here = scattering + before;
                 const F* sc_behind = sc_here - row_sign * far_row;
-                const long long kept = (kept_rows + (long long)s * rows + r) * width;
-                F* __restrict near_row = row_of(work.near, s, j, r);
+                F* __restrict near_row = row_of(NEAR, s, j, r);
                 const int behind = r - row_sign;
-                const F* near_here = row_of(work.near, s - 1, j, r);
+                const F* near_here = row_of(NEAR, s - 1, j, r);
                 const F* near_behind = behind >= 0 && behind < rows
-                    ? row_of(work.near, s - 1, j, behind) : near_here;
-                const F* __restrict arriving_kept = work.arriving.data + kept;
+                    ? row_of(NEAR, s - 1, j, behind) : near_here;
+                const F* __restrict arriving_kept = work.arriving.data + kept_of(s, r);
                 const F own_part = F(1) - row_part;"""
     + UPSTREAM
     + """
-                auto pass = [&](auto whole) {
+                Range met = {width, 0};
+                for (int ahead = -1; ahead <= 1; ++ahead) {
+                    include(met, k + ahead * forward, r);
+                    if (ahead <= 0) include(met, k + ahead * forward, behind);
+                    if (ahead >= 0) include(met, k + ahead * forward, next);
+                }
+                met = widen(met, 2);
+                auto pass = [&](auto whole, auto empty, int from, int to) {
+                    constexpr bool is_empty = decltype(empty)::value;
                     INDEPENDENT
-                    for (int c = first; c < last; ++c) {
+                    for (int c = from; c < to; ++c) {
                         const F near = near_row[c], arriving = arriving_kept[c];
                         const F far = upstream(whole, near_here, near_behind, c);
                         const F mass = half * (e[c] + upstream(whole, e_here, e_behind, c));
@@ -142,19 +150,22 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                         const F line_bar = source_bar * (scattering_mass * strength);
                         const F lost_bar = -source_bar * (arriving + inflow);
                         const F line_slope = far * (psi - phi) + (near - far) * psi_slope;
-                        const F depth_bar = line_bar * line_slope + lost_bar * passed;
+                        const F depth_bar
+                            = is_empty ? lost_bar : line_bar * line_slope + lost_bar * passed;
                         const F scattering_depth_bar = source_bar * line;
                         const F scattering_mass_bar = half * (scattering_depth_bar * strength);
                         const F mass_bar = half * (depth_bar * scale)
                             + (SHARES_FIELD ? scattering_mass_bar : F(0));
                         // By q at the near end, and by q where rays will be.
-                        const F bar = line_bar * psi
-                            + downstream(whole, far_here, far_ahead, all_here, c);
-                        q_bar[c] += bar;
-                        if (HAS_FLUX) {
-                            q_z_bar[c] += w_z * bar;
-                            q_y_bar[c] += w_y * bar;
-                            q_x_bar[c] += w_x * bar;
+                        if (!is_empty) {
+                            const F bar = line_bar * psi
+                                + downstream(whole, far_here, far_ahead, all_here, c);
+                            q_bar[c] += bar;
+                            if (HAS_FLUX) {
+                                q_z_bar[c] += w_z * bar;
+                                q_y_bar[c] += w_y * bar;
+                                q_x_bar[c] += w_x * bar;
+                            }
                         }
                         // By the fields, likewise.
                         e_bar[c] += mass_bar
@@ -169,13 +180,18 @@ for (int s = slice_last - 1; s >= slice_first; --s) {
                             strength_bar[c] += scattering_depth_bar * scattering_mass;
                             inflow_bar[c] += radiance_bar - source_bar * lost;
                         }
-                        returning_row[c] = passed * source_bar;
-                        far_bar_row[c] = line_bar * (phi - psi);
+                        returning_row[c] = is_empty ? source_bar : passed * source_bar;
+                        far_bar_row[c] = is_empty ? F(0) : line_bar * (phi - psi);
                         mass_bar_row[c] = mass_bar;
                         near_row[c] = light_along(q, q_z, q_y, q_x, c);
                     }
                 };
-                if (signs[2] && !is_edge) pass(Whole()); else pass(Between());
+                auto pass_all = [&](auto whole) {
+                    pass(whole, Empty(), first, met.from);
+                    pass(whole, Filled(), met.from, met.to);
+                    pass(whole, Empty(), met.to, last);
+                };
+                if (signs[2] && !is_edge) pass_all(Whole()); else pass_all(Between());
                 if (first == 0) near_row[-1] = near_row[0];
                 if (last == width) near_row[width] = near_row[width - 1];
             }

@@ -3,7 +3,8 @@
 Slices lie across z or y, so that rows lie along x. Directions that cross the same slices the same
 way are a piece; they go through a row one after another, while what they share is at hand. Of all
 slices only the last one is kept: `near`, what scatters along a direction, and `radiance`, I less
-the light from outside. `upstream` is P, the move from one slice to the next.
+the light from outside. `upstream` is P, the move from one slice to the next. Where a step meets no
+medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row.
 """
 
 MARGIN = 16
@@ -28,13 +29,32 @@ const F scale = given.numbers.data[color];
 const F strength = given.numbers.data[given.colors + color];
 const F inflow = given.numbers.data[2 * given.colors + color];
 const int lane = given.lanes > 1 ? color : 0;
-auto row_of = [&](const wp::array_t<F>& buffer, int slice, int j, int row) -> F* {
-    const long long line = ((lane * 2LL + (slice & 1)) * given.group + j) * given.rows + row;
-    return buffer.data + line * wide + MARGIN;
+// What goes together lies together: rows of many arrays would take each other's cache lines.
+enum { NEAR, RADIANCE, RETURNING = RADIANCE, FAR_BAR, MASS_BAR, SCATTERED_BAR };
+auto row_of = [&](int which, int slice, int j, int row) -> F* {
+    const long long line = ((lane * 2LL + (slice & 1)) * given.rows + row) * given.group + j;
+    return work.buffers.data + (line * work.slots + which) * wide + MARGIN;
 };
 const F* nothing = work.nothing.data + MARGIN;
 struct Whole { enum { value = 1 }; };
 struct Between { enum { value = 0 }; };
+struct Filled { enum { value = 0 }; };
+struct Empty { enum { value = 1 }; };
+// cells of rows that have a medium, `wider` by so many cells, from and to where vectors begin
+struct Range { int from, to; };
+const int wider_slice = axis == 0 ? given.height + 2 : 1;
+const int wider_row = axis == 0 ? 1 : given.height + 2;
+auto include = [&](Range& range, int k, int row) {
+    const int* own = given.occupied.data + 2 * ((k + 1) * wider_slice + (row + 1) * wider_row);
+    range.from = own[0] < range.from ? own[0] : range.from;
+    range.to = own[1] > range.to ? own[1] : range.to;
+};
+auto clamp = [&](int c) { return c < first ? first : c > last ? last : c; };
+auto widen = [&](Range range, int by) -> Range {
+    if (range.from >= range.to) return {first, first};
+    const int end = range.to + by + MARGIN - 1;
+    return {clamp((range.from - by) & -MARGIN), clamp(end & -MARGIN)};
+};
 """
 )
 # v where rays were, `here` and `behind` being the rows from which they come
@@ -62,15 +82,17 @@ auto light_along = [&](const F* q, const F* q_z, const F* q_y, const F* q_x, int
     return HAS_FLUX ? q[c] + w_z * q_z[c] + w_y * q_y[c] + w_x * q_x[c] : q[c];
 };
 // where I of a slice and row is kept
-const long long kept_rows = (lane * (long long)given.group + j) * slices * rows;
+auto kept_of = [&](int s, int r) -> long long {
+    return (((lane * (long long)slices + s) * rows + r) * given.group + j) * width;
+};
 """
 # phi, psi and what is lost, of the depth of a step
 STEP = """
-const F depth = scale * mass, passed = decay(depth);
-const bool is_thin = depth < F(0.5);
+const F depth = is_empty ? F(0) : scale * mass, passed = is_empty ? F(1) : decay(depth);
+const bool is_thin = is_empty || depth < F(0.5);
 const F inverse = F(1) / (is_thin ? F(0.5) : depth), series = psi_series(is_thin ? depth : F(0));
-const F phi = is_thin ? F(1) - depth * series : (F(1) - passed) * inverse;
-const F psi = is_thin ? series : (F(1) - phi) * inverse;
+const F phi = is_empty ? F(1) : is_thin ? F(1) - depth * series : (F(1) - passed) * inverse;
+const F psi = is_empty ? F(0.5) : is_thin ? series : (F(1) - phi) * inverse;
 const F lost = depth * phi;
 const F line = far * phi + (near - far) * psi;
 """
@@ -100,8 +122,8 @@ for (int s = slice_first; s < slice_last; ++s) {
     + DIRECTION
     + UPSTREAM
     + """
-            F* __restrict near_row = row_of(work.near, s, j, r);
-            F* __restrict radiance_row = row_of(work.radiance, s, j, r);
+            F* __restrict near_row = row_of(NEAR, s, j, r);
+            F* __restrict radiance_row = row_of(RADIANCE, s, j, r);
             if (s < 0) {
                 INDEPENDENT
                 for (int c = first; c < last; ++c) {
@@ -112,11 +134,11 @@ for (int s = slice_first; s < slice_last; ++s) {
                 // Beyond the faces of the box are neither medium nor I; q is repeated there.
                 const int behind = r - row_sign;
                 const bool is_inside = behind >= 0 && behind < rows;
-                const F* near_here = row_of(work.near, s - 1, j, r);
-                const F* near_behind = is_inside ? row_of(work.near, s - 1, j, behind) : near_here;
-                const F* radiance_here = row_of(work.radiance, s - 1, j, r);
+                const F* near_here = row_of(NEAR, s - 1, j, r);
+                const F* near_behind = is_inside ? row_of(NEAR, s - 1, j, behind) : near_here;
+                const F* radiance_here = row_of(RADIANCE, s - 1, j, r);
                 const F* radiance_behind
-                    = is_inside ? row_of(work.radiance, s - 1, j, behind) : nothing;
+                    = is_inside ? row_of(RADIANCE, s - 1, j, behind) : nothing;
                 const long long there = (k + 1) * far_slice + (r + 1) * far_row + MARGIN;
                 const long long before = there - forward * far_slice;
                 const F* __restrict e = extinction + there;
@@ -125,11 +147,17 @@ for (int s = slice_first; s < slice_last; ++s) {
                 const F* __restrict sc = scattering + there;
                 const F* sc_here = scattering + before;
                 const F* sc_behind = sc_here - row_sign * far_row;
-                const long long kept = KEEPS ? (kept_rows + (long long)s * rows + r) * width : 0;
+                const long long kept = KEEPS ? kept_of(s, r) : 0;
                 F* __restrict arriving_kept = work.arriving.data + kept;
-                auto pass = [&](auto whole) {
+                Range met = {width, 0};
+                include(met, k, r);
+                include(met, k - forward, r);
+                include(met, k - forward, behind);
+                met = widen(met, 1);
+                auto pass = [&](auto whole, auto empty, int from, int to) {
+                    constexpr bool is_empty = decltype(empty)::value;
                     INDEPENDENT
-                    for (int c = first; c < last; ++c) {
+                    for (int c = from; c < to; ++c) {
                         const F near = light_along(q, q_z, q_y, q_x, c);
                         const F far = upstream(whole, near_here, near_behind, c);
                         const F arriving = upstream(whole, radiance_here, radiance_behind, c);
@@ -140,7 +168,7 @@ for (int s = slice_first; s < slice_last; ++s) {
     + """
                         // Light from outside is there without a medium; I is what differs from it.
                         const F source = line * (scattering_mass * strength) - inflow * lost;
-                        const F radiance = passed * arriving + source;
+                        const F radiance = is_empty ? arriving : passed * arriving + source;
                         near_row[c] = near;
                         radiance_row[c] = radiance;
                         if (KEEPS) {
@@ -156,7 +184,12 @@ for (int s = slice_first; s < slice_last; ++s) {
                         }
                     }
                 };
-                if (signs[2]) pass(Whole()); else pass(Between());
+                auto pass_all = [&](auto whole) {
+                    pass(whole, Empty(), first, met.from);
+                    pass(whole, Filled(), met.from, met.to);
+                    pass(whole, Empty(), met.to, last);
+                };
+                if (signs[2]) pass_all(Whole()); else pass_all(Between());
             }
             if (first == 0) near_row[-1] = near_row[0];
             if (last == width) near_row[width] = near_row[width - 1];

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.fused.part import Part, Plan, Swept, Weighted
 from ddrecon.diffusion.rounds.fused.schedule import schedules
 from ddrecon.diffusion.rounds.fused.turning import add_turned
+from ddrecon.kernels.spare import give_back
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once
@@ -53,7 +55,10 @@ class _Sweep(torch.autograd.Function):
         ctx.plan = plan
         ctx.save_for_backward(*tensors)
         parts = _parts(plan, Swept.of(*tensors))
-        return _add_up(*(part.follow() for part in parts)).unbind(0)
+        shares, turned = (part.follow() for part in parts)
+        moments = _add_up(shares, turned)
+        give_back(*shares[1:], *turned)
+        return moments.unbind(0)
 
     @staticmethod
     @differentiate_once
@@ -61,7 +66,9 @@ class _Sweep(torch.autograd.Function):
         varies_numbers = ctx.needs_input_grad[1]
         parts = _parts(ctx.plan, Swept.of(*ctx.saved_tensors))
         (one, *cells), (other, *turned) = (part.transpose(bars, varies_numbers) for part in parts)
-        light_bars, *field_bars = (_add_up(*each) for each in zip(cells, turned, strict=True))
+        light_bars = _add_up(cells[0], turned[0])
+        give_back(*cells[0][1:], *turned[0])
+        field_bars = [_add_up(*each) for each in zip(cells[1:], turned[1:], strict=True)]
         numbers_bar = None
         if varies_numbers:
             sums = (part.double().sum((2, 3)) for part in (*one, *other))
@@ -79,8 +86,8 @@ def _add_up(shares: list[Tensor], turned: list[Tensor]) -> Tensor:
     return add_turned(*(functools.reduce(Tensor.add_, each) for each in (shares, turned)))
 
 
-def _parts(plan: Plan, swept: Swept) -> list[Part]:
-    """What crosses slices across z or y, and what crosses those across x."""
+def _parts(plan: Plan, swept: Swept) -> Iterator[Part]:
+    """What crosses slices across z or y, and what crosses those across x: one after the other."""
     directions = tuple(direction for direction, _ in plan.weighted)
-    across = schedules(plan.grid, directions)
-    return [Part(plan, schedule, swept, bool(i)) for i, schedule in enumerate(across)]
+    for i, schedule in enumerate(schedules(plan.grid, directions)):
+        yield Part(plan, schedule, swept, bool(i))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import array, launch
 from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.spare import borrow
 
 TILE = 16
 """Rows and columns that are exchanged at a time."""
@@ -52,11 +53,11 @@ _ADD = (
 
 
 def turn(cells: Tensor) -> Tensor:
-    """`cells` [..., y, x] as [..., x, y]."""
+    """`cells` [..., y, x] as [..., x, y], in borrowed memory."""
     if cells.is_cuda:
         return cells.transpose(-1, -2).contiguous()
     *planes, height, width = cells.shape
-    turned = cells.new_empty(*planes, width, height)
+    turned = borrow(cells.numel(), cells).view(*planes, width, height)
     count = turned.numel() // (height * width)
     kernel = _kernels(torch.finfo(cells.dtype).bits).turn_planes
     launch(kernel, count, [*map(_flat, (cells, turned)), height, width], cells)
