@@ -86,9 +86,11 @@ class ScaledSystem:
 
         0 for a color without source.
         """
-        return float(
-            (norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)).max()
-        )
+        return float(self.relative_by_color(residual).max())
+
+    def relative_by_color(self, residual: Tensor) -> Tensor:
+        """The same of each color, `[C, 1, 1, 1]`."""
+        return norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)
 
     def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
         """The solution that y is."""
