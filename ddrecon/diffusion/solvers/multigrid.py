@@ -1,7 +1,8 @@
 """Conjugate gradients preconditioned by a V-cycle of multigrid (Tatebe 1993, NASA CP-3224).
 
-All colors at once, each with its own scalars and its own end. About ten iterations, whatever the size of the
-volume. The residual is looked at in each: next to a cycle, waiting for a GPU is nothing.
+All colors at once, each with its own scalars and its own end. About ten iterations, whatever the
+size of the volume. The residual is looked at in each: next to a cycle, waiting for a GPU is
+nothing.
 """
 
 from __future__ import annotations
