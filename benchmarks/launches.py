@@ -16,8 +16,8 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
@@ -26,7 +26,6 @@ from unittest.mock import patch
 
 import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import ddrecon
@@ -42,8 +41,11 @@ HELPERS = "kernels", "numerics"
 """Rooms whose calls count for whoever asked."""
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_dim"}
 """Operations of torch whose result a processor waits for."""
-METHODS = {Tensor.tolist: "read", Tensor.numpy: "read", Tensor.__array__: "read"}
-FACTORIES = {Tensor.new_tensor: "write", torch.tensor: "write", torch.as_tensor: "write"}
+CONVERSIONS = (
+    *((Tensor, name, "read") for name in ("tolist", "numpy", "__array__")),
+    *((torch, name, "write") for name in ("tensor", "as_tensor")),
+    (Tensor, "new_tensor", "write"),
+)
 """The same by functions that reach no operation of torch."""
 WARM_UP = 2
 """Iterations before the one that is counted."""
@@ -85,22 +87,26 @@ class Operations(TorchDispatchMode):
         return function(*arguments, **(options or {}))
 
 
-class Conversions(TorchFunctionMode):
-    """Counts tensors that become Python's numbers, and numbers that become tensors."""
+@contextmanager
+def conversions_counted(counts: Counts) -> Iterator[None]:
+    """Counts tensors that become Python's numbers, and numbers that become tensors.
 
-    def __init__(self, counts: Counts):
-        super().__init__()
-        self.counts = counts
+    In backward passes as well, where torch's modes do not see them.
+    """
 
-    def __torch_function__(
-        self, function: Any, types: Any, arguments: Any = (), options: Any = None
-    ) -> Any:
-        kind = METHODS.get(function)
-        if function in FACTORIES and not isinstance(arguments[-1], Tensor):
-            kind = FACTORIES[function]
-        if kind is not None:
-            self.counts.add(kind)
-        return function(*arguments, **(options or {}))
+    def counted(function: Callable[..., Any], kind: str) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            if kind == "read" or not isinstance(arguments[-1], Tensor):
+                counts.add(kind)
+            return function(*arguments, **options)
+
+        return call
+
+    with ExitStack() as stack:
+        for owner, name, kind in CONVERSIONS:
+            function = counted(getattr(owner, name), kind)
+            stack.enter_context(patch.object(owner, name, function))
+        yield
 
 
 def is_view(function: Any) -> bool:
@@ -182,7 +188,7 @@ def count(scene: Scene) -> Counts:
     for _ in range(WARM_UP):
         run.step()
     remembered = torch.autograd.set_detect_anomaly(True, check_nan=False)
-    with remembered, launches_counted(counts), Conversions(counts), Operations(counts):
+    with remembered, launches_counted(counts), conversions_counted(counts), Operations(counts):
         run.step()
     return counts
 
