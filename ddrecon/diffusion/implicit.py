@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.numerics.autodiff import differentiate_once, keep
+from ddrecon.numerics.autodiff import keep
 
 
 class DifferentiableOperator(Protocol):
@@ -134,7 +134,6 @@ class ImplicitSolve(torch.autograd.Function):
         keep(ctx, output, *tensors)
 
     @staticmethod
-    @differentiate_once
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, *tensors = ctx.saved_tensors
         # E9: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:

@@ -118,14 +118,20 @@ def test_the_direction_of_a_light() -> None:
 
 
 def test_a_phase_function_that_scatters_backward() -> None:
-    """The paper's cloud: started at 0.67, the truth being -0.802 (it found -0.813)."""
+    """The paper's cloud: started at 0.67, the truth being -0.802 (it found -0.813).
+
+    By diffusion alone, as the paper's. With a transport round there is another minimum, at 0.71:
+    two moments in angle do not describe such scattering.
+    """
     volume = replace(
         cloud(12),
         sigma_a=torch.full((3,), 0.1),
         sigma_s=torch.full((3,), 40.0),
         g=torch.tensor(-0.802),
     )
-    scene = photographed(scene_of(volume, 3, 16))
+    scene = scene_of(volume, 3, 16)
+    scene.diffusion = replace(scene.diffusion, transport_rounds=0)
+    scene = photographed(scene)
     assert (
         abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 140), "g")) + 0.802) < 0.02
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import array, launch
 from ddrecon.march.fused.compose_kernels import compose_kernel, decompose_kernel
-from ddrecon.numerics.autodiff import is_forward
+from ddrecon.numerics.autodiff import differentiate_once, is_forward
 from ddrecon.numerics.remember import remember
 
 LENGTH = 2048
@@ -94,6 +94,7 @@ class _Compose(torch.autograd.Function):
         return composed
 
     @staticmethod
+    @differentiate_once
     def backward(ctx: Any, composed_bar: Tensor) -> tuple[Tensor | None, ...]:
         masses, weights, phases = ctx.saved_tensors
         out_bar, masses_bar = (
