@@ -28,6 +28,8 @@ COMPILED = 0.5
 """A kernel that takes longer to load [s] was compiled; others come from Warp's cache."""
 QUICK = 1.5e-4
 """Handing a share to another thread takes about 50 microseconds; a launch, 20."""
+_compiled: list[float] = []
+"""How long each took to load [s]; a line says so of the first."""
 _seconds: dict[tuple[Any, int], float] = {}
 """What a launch of a kernel for so many items takes in one thread [s]: the least that was seen."""
 
@@ -116,7 +118,9 @@ def _load(kernel: Any, device: str) -> None:
     start = perf_counter()
     wp.load_module(kernel.module, device=device)
     if (seconds := perf_counter() - start) > COMPILED:
-        LOG.info("compiling kernels, once: %.1f s", seconds)
+        if not _compiled:
+            LOG.info("compiling kernels, once: %.1f s for the first of them", seconds)
+        _compiled.append(seconds)
 
 
 @functools.cache
