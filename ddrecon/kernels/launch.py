@@ -31,7 +31,10 @@ QUICK = 1.5e-4
 _compiled: list[float] = []
 """How long each took to load [s]; a line says so of the first."""
 _seconds: dict[tuple[Any, int], float] = {}
-"""What a launch of a kernel for so many items takes in one thread [s]: the least that was seen."""
+"""What a launch of a kernel takes in one thread [s], by the digits of its items' number in base 2.
+
+It is the least that was seen. Numbers of rays differ from view to view: the table stays small.
+"""
 
 
 def array(tensor: Tensor) -> Any:
@@ -68,11 +71,12 @@ def launch(
 
     def run(i: int) -> None:
         given = arguments(i) if callable(arguments) else arguments
-        size = bounds[i + 1] - bounds[i]
-        wp.launch(kernel, size, [bounds[i], *given], device=device, stream=stream)
+        items = bounds[i + 1] - bounds[i]
+        wp.launch(kernel, items, [bounds[i], *given], device=device, stream=stream)
 
     # What was seen to be quick is not worth another thread.
-    if threads > 1 and _seconds.get((kernel, count), math.inf) < QUICK:
+    size = kernel, count.bit_length()
+    if threads > 1 and _seconds.get(size, math.inf) < QUICK:
         for i in range(threads):
             run(i)
         return
@@ -82,7 +86,7 @@ def launch(
     try:
         run(0)
         seconds = (perf_counter() - start) * threads
-        _seconds[kernel, count] = min(seconds, _seconds.get((kernel, count), math.inf))
+        _seconds[size] = min(seconds, _seconds.get(size, math.inf))
         # And those not begun by now: other programs may have the processor's other cores.
         for i, other in enumerate(others, 1):
             if other.cancel():
