@@ -143,7 +143,7 @@ class Rows:
     def _given(self, lines: Tensor) -> dict[str, Tensor | int]:
         """What all kernels are given, by its names; `found`, `jobs` and cotangents are missing."""
         tables, like = self.tables, self.like
-        scratch_rows = 2 * POINTERS + 5 + tables.most
+        scratch_rows = 3 * POINTERS + 5 + tables.most
         return {
             "moments": like.contiguous(), "extinction": self.fields[0],
             "scattering": self.fields[-1], "scales": self.swept.scales, "parts": tables.parts,

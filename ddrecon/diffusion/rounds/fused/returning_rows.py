@@ -50,6 +50,7 @@ F* e_bars = e_bar + job[9] * cells;
 F* sc_bars = sc_bar + job[10] * cells;
 for (int s = slice_to - 1; s >= slice_from; --s) for (int g = group_to - 1; g >= group_from; --g) {"""
     + GROUP
+    + "const int ahead = -y_way * width;"
     + MULTIPLY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
@@ -64,16 +65,16 @@ for (int t = height - 1; t >= 0; --t) {
         const int place = (height - 1 - turn + 2LL * slice) % (height + 2);
         return own_back + place * back_stride + (kinds * (before + j) + which) * (long long)pitch;
     };
-    const int first_row = 2 * POINTERS + 5;
-    auto bar_of = [&](int j) -> F* { return scratch_row(first_row + j); };
+    const int own = 3 * POINTERS;
+    auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
     to_directions(to_weighted_light, bars + color * cells + at, bar_of, 0, width);
     const int* range = ranges + 4 * (k * height + r);
     const int from = range[0], to = range[1];
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
-    F *__restrict source_bars = scratch_row(0), *__restrict passing = scratch_row(1);
-    F *__restrict scale_bar = scratch_row(2), *__restrict strength_bar = scratch_row(3);
-    F* __restrict inflow_bar = scratch_row(4);
+    F *__restrict source_bars = scratch_row(own + 0), *__restrict passing = scratch_row(own + 1);
+    F *__restrict scale_bar = scratch_row(own + 2), *__restrict strength_bar = scratch_row(own + 3);
+    F* __restrict inflow_bar = scratch_row(own + 4);
     if (VARIES_NUMBERS)
         for (int c = 0; c < width; ++c) scale_bar[c] = strength_bar[c] = inflow_bar[c] = F(0);
     for (int j = 0; j < members; ++j) {"""
