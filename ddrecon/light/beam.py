@@ -58,8 +58,10 @@ def leaving_cosine(direction: Tensor, travel: Tensor) -> Tensor:
     return -(direction @ travel)
 
 
-def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
+def follow_beam(medium: Medium, light: DirectionalLight, degree: int) -> tuple[Beam, Moments]:
     """The beam of `light` in `medium`, and the moments of E tau / (4 pi) at cells (E2).
+
+    They go up to `degree`, and are those of radiance that all travels with the beam.
 
     tau is averaged over each cell along the beam, so that the energy taken from the beam is what
     cells receive, however thick they are.
@@ -72,4 +74,4 @@ def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tupl
     )
     received = irradiance / (4 * math.pi) * recompute(extinction.mean_transmittance, entered, step)
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
-    return beam, beam_moments(received, direction, has_flux)
+    return beam, beam_moments(received, direction, degree)

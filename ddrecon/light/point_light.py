@@ -83,9 +83,11 @@ class PointBeam:
 
 
 def follow_point_light(
-    medium: Medium, light: PointLight, has_flux: bool
+    medium: Medium, light: PointLight, degree: int
 ) -> tuple[PointBeam, Moments]:
     """The beam of `light` in `medium`, and the moments of I tau / (4 pi r^2) at cells (E2).
+
+    They go up to `degree`, and are those of radiance that all travels away from the light.
 
     tau is averaged over each cell along the light's ray.
     """
@@ -116,7 +118,7 @@ def follow_point_light(
 
     received = irradiance / (4 * math.pi) / square * extinction.mean_transmittance(entered, step)
     beam = PointBeam(mass, position, irradiance, least_square)
-    return beam, beam_moments(received, direction.movedim(-1, 0), has_flux)
+    return beam, beam_moments(received, direction.movedim(-1, 0), degree)
 
 
 def _least_square(grid: Grid) -> float:

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import forward_fraction, scaled_mean_cosine
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
@@ -109,12 +108,12 @@ class Medium:
         return is_varied(self.g) or is_any_nonzero(self.g)
 
 
-def scale_medium(volume: Volume) -> Medium:
+def scale_medium(volume: Volume, degree: int = 1) -> Medium:
     """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
 
     f and g' are `forward_fraction` and `scaled_mean_cosine` of `phase.py`, where the source is.
     """
-    return _medium(volume, *_scale_phase(volume.g))
+    return _medium(volume, *_scale_phase(volume.g, degree))
 
 
 def keep_medium(volume: Volume) -> Medium:
@@ -153,8 +152,9 @@ def _mass_bound(scale: Tensor) -> Tensor:
 
 
 @remember
-def _scale_phase(g: Tensor) -> tuple[Tensor, Tensor]:
-    return forward_fraction(g), scaled_mean_cosine(g)
+def _scale_phase(g: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    f = g.clamp(min=0) ** (degree + 1)
+    return f, (g - f) / (1 - f)
 
 
 def _extinction_and_peak(
