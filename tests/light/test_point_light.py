@@ -82,7 +82,7 @@ def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: 
     flux = torch.stack(received.flux, -1)[0]
     torch.testing.assert_close(
         flux[is_apart],
-        (expected / distance)[is_apart][:, None] * offset[is_apart],
+        3 * (expected / distance)[is_apart][:, None] * offset[is_apart],
         rtol=1e-12,
         atol=1e-16,
     )
