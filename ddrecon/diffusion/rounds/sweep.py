@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
 from ddrecon.engine import current_engine
-from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.numerics.autodiff import is_forward
 from ddrecon.numerics.harmonics import harmonics
@@ -24,8 +23,6 @@ from ddrecon.numerics.quadrature import sphere_quadrature
 
 DIRECTIONS = {3: 26, 5: 50, 7: 86}
 """By the degree to which angles are kept, directions of a rule that is exact to twice that."""
-MOST_FUSED = 1
-"""Fused kernels sweep so many moments; more are swept by torch."""
 
 
 class Parts(NamedTuple):
@@ -87,11 +84,10 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
     parts = Parts.of(medium, source, inflow)
     if is_forward():
         return _sum_over_directions(medium, degree, parts)
-    if current_engine() == "warp" and len(source) <= MOST_FUSED:
+    if current_engine() == "warp":
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
-        weighted = tuple((r.direction, (r.weight,)) for r in _rays(degree, source))
-        return torch.stack(sweep_fused(medium, Moments(source[0]), inflow, weighted))
+        return sweep_fused(medium, source, inflow, DIRECTIONS[degree])
     moments: Tensor = _Sweep.apply(medium, degree, *parts)
     return moments
 

@@ -118,7 +118,7 @@ def round_by_loops(problem: DiffusionProblem, light: Moments, g: float, degree: 
     directions, angles = {3: 26, 5: 50}[degree], degree if problem.has_flux else 0
     matrix, theta = dense_matrix(operator)[0], share_by_loops(medium, degree)
     p = remaining_by_formula(g, angles)
-    each = torch.tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)]).double()
+    each = light.mean.new_tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)])
     source = each.view(-1, 1, 1, 1, 1) * light.harmonics(angles) + problem.source.harmonics(angles)
     swept = Moments.of_harmonics(sweep_by_loops(medium, source, float(problem.outside), directions))
     gain = theta * (swept.mean - light.mean)
