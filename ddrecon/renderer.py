@@ -129,7 +129,7 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     if any(isinstance(part, AmbientLight) for part in parts):
         skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
-    if medium.has_flux:
+    if medium.is_anisotropic:
         return LightField(medium, beams, nothing, skies)
     sky = sum_unscattered_sky(medium, skies, has_flux=False)
     return LightField(medium, beams, nothing if sky is None else sky)
@@ -237,7 +237,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.scattering,
         light_field.beams,
         diffuse,
-        medium.g,
+        medium.seen,
         medium.peak,
     )
 

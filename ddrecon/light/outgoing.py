@@ -24,7 +24,7 @@ def scatter_towards(medium: Medium, light: Moments, rays: Rays) -> Tensor:
 
     As `Moments.positive_along` has it.
     """
-    if is_fused():
+    if is_fused() and medium.mean_cosine.ndim == 0:
         from ddrecon.light.fused.outgoing import scatter_fused
 
         return scatter_fused(medium, light, rays)
