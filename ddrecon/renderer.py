@@ -50,21 +50,19 @@ class LightField:
 
     `beams` are those of directional and point lights (E2). `diffuse` is the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew. `degree`: that to which angles are kept; `turned`: light that backward peaks
-    have turned (E20).
+    camera's rays anew. `turned` is light that backward peaks have turned (E20).
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Moments
     skies: tuple[Sky, ...] = ()
-    degree: int = 1
     turned: tuple[TurnedBeam, ...] = ()
 
     @property
     def outgoing(self) -> Moments:
         """What one more scattering makes of `diffuse`, per unit length and kappa_s (E3)."""
-        return scatter_once_more(self.medium, self.diffuse, self.degree)
+        return scatter_once_more(self.medium, self.diffuse)
 
 
 @dataclass(frozen=True)
@@ -105,25 +103,23 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
 
     Reduced light alone where nothing scatters twice.
     """
-    degree, has_rounds = scene.diffusion.angles, scene.diffusion.transport_rounds > 0
-    medium = scale_medium(scene.volume, degree)
+    medium = scale_medium(scene.volume, scene.diffusion.angles)
     if not multiply_scatters(medium, scene.diffusion):
         return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
     lights = decompose_lights(scene.lights)
-    angles = degree if medium.has_flux else 0
-    has_pairs = has_rounds and has_backward_peak(medium, degree)
-    reduced = reduced_light(medium, lights, angles, has_pairs)
-    sky = sum_unscattered_sky(medium, lights, angles)
+    has_pairs = scene.diffusion.transport_rounds > 0 and has_backward_peak(medium)
+    reduced = reduced_light(medium, lights, medium.degree, has_pairs)
+    sky = sum_unscattered_sky(medium, lights, medium.degree)
     source = reduced.source
     if sky is not None:
-        source = source.plus(sky.weighted(remaining_moments(medium, angles)))
+        source = source.plus(sky.weighted(remaining_moments(medium)))
     outside = ambient_radiance(lights, medium.g)
     # L0 and L1: E4 to E6.
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
     # Skies scatter by E3 as well; beams by E2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
-    return LightField(medium, reduced.beams, light, degree=degree, turned=reduced.turned)
+    return LightField(medium, reduced.beams, light, turned=reduced.turned)
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
@@ -137,7 +133,7 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     if any(isinstance(part, AmbientLight) for part in parts):
         skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
-    if medium.has_flux:
+    if medium.is_anisotropic:
         return LightField(medium, beams, nothing, skies)
     sky = sum_unscattered_sky(medium, skies, 0)
     return LightField(medium, beams, nothing if sky is None else sky)
@@ -176,7 +172,7 @@ def solve_diffuse(
             medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux
         )
     closure = Closure(settings.closure, medium.grid, settings.floor)
-    problem = DiffusionProblem(medium, closure, source, outside, medium.has_flux)
+    problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
     return run_rounds(problem, light, solve, settings.transport_rounds, settings.degree)
 
@@ -233,9 +229,7 @@ def _image(emission: Emission, scene: Scene, sight: Sight) -> Tensor:
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to (E2, E3)."""
     medium = light_field.medium
-    diffuse = scatter_towards(
-        medium, light_field.diffuse, bundle, light_field.degree, light_field.turned
-    )
+    diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
         diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
@@ -245,7 +239,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.scattering,
         light_field.beams,
         diffuse,
-        medium.g,
+        medium.seen,
         medium.peak,
     )
 

@@ -18,7 +18,9 @@ from ddrecon.diffusion.rounds.characteristics import Course, follow, radiance_al
 from ddrecon.diffusion.rounds.sweep import sweep
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Coefficient, Medium
-from ddrecon.numerics.chebyshev import SCALE, evaluate_positive
+from ddrecon.medium.phase import HenyeyGreenstein
+from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.numerics.chebyshev import COEFFICIENTS, SCALE, evaluate_positive
 from ddrecon.numerics.decay import decay_mean, decayed_line, decayed_sum
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
@@ -101,7 +103,7 @@ def plain_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
 
 def polynomials(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
     nodes, colors, rows, columns = shape
-    coefficients = random_values(10, rows * columns, seed=1, dtype=dtype) - 0.45
+    coefficients = random_values(COEFFICIENTS, rows * columns, seed=1, dtype=dtype) - 0.45
     return coefficients, depths(nodes, colors, rows * columns, seed=2, dtype=dtype)
 
 
@@ -151,7 +153,8 @@ def scattering_light(
     g = scale.new_tensor(0.3)
     scattering, absorption = scale * albedo, scale * (1 - albedo)
     coefficients = (Coefficient(s, field) for s in (scale, scattering, absorption))
-    return Medium(grid, *coefficients, g, g, scale.new_tensor(0.0), None), source
+    seen = SeenPhase(HenyeyGreenstein(g), 1)
+    return Medium(grid, *coefficients, g, g, scale.new_tensor(0.0), None, seen), source
 
 
 def swept(*inputs: Tensor) -> Tensor:

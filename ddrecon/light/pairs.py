@@ -59,11 +59,11 @@ class Pair:
     along: Tensor
     against: Tensor
 
-    def source(self, medium: Medium, degree: int) -> Moments:
-        """What both scatter but for their backward peak, to `degree` (E20)."""
-        factors = unturned_moments(medium, degree)
+    def source(self, medium: Medium) -> Moments:
+        """What both scatter but for their backward peak (E20)."""
+        factors = unturned_moments(medium)
         both = [
-            beam_moments(radiance, direction, degree).weighted(factors)
+            beam_moments(radiance, direction, medium.degree).weighted(factors)
             for radiance, direction in (
                 (self.along, self.direction),
                 (self.against, -self.direction),
@@ -80,8 +80,8 @@ class Pair:
         )
 
 
-def follow_pair(medium: Medium, light: DirectionalLight, degree: int) -> tuple[Beam, Pair]:
-    """The beam of `light` in `medium`, and the pair that it becomes where light has `degree`."""
+def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
+    """The beam of `light` in `medium`, and the pair that it becomes."""
     extinction = medium.extinction
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
@@ -90,7 +90,7 @@ def follow_pair(medium: Medium, light: DirectionalLight, degree: int) -> tuple[B
         for way in (direction, -direction)
     )
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
-    shares = recompute(_pair, medium, entered, behind, step, backward_fraction(medium, degree))
+    shares = recompute(_pair, medium, entered, behind, step, backward_fraction(medium))
     received, along, against = (irradiance / (4 * math.pi) * share for share in shares)
     return beam, Pair(direction, received, along, against)
 

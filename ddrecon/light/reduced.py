@@ -51,13 +51,13 @@ def reduced_light(
     beams, sources, turned = [], [], []
     for light in lights:
         if isinstance(light, DirectionalLight) and has_pairs:
-            beam, pair = follow_pair(medium, light, degree)
-            sources.append(pair.source(medium, degree))
+            beam, pair = follow_pair(medium, light)
+            sources.append(pair.source(medium))
             turned += pair.turned
         elif isinstance(light, DirectionalLight | PointLight):
             follow = follow_beam if isinstance(light, DirectionalLight) else follow_point_light
             beam, received = follow(medium, light, degree)
-            sources.append(received.weighted(remaining_moments(medium, degree)))
+            sources.append(received.weighted(remaining_moments(medium)))
         else:
             continue
         beams.append(beam)

@@ -15,7 +15,6 @@ from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.shear import sum_mass_to_cells
 from ddrecon.light.sky import Sky
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
@@ -108,7 +107,7 @@ def _scatter_direction(
     """p E tau at cells: what the light going along `travel` scatters `towards` a camera."""
     visible = _attenuate_direction(medium, travel, irradiance[None])[0]
     z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
-    return visible * henyey_greenstein(z + y + x, medium.g)
+    return visible * medium.seen.value(z + y + x)
 
 
 def _attenuate_direction(medium: Medium, direction: Tensor, weights: Tensor) -> Tensor:

@@ -141,7 +141,7 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
     beams = reduced_light(medium, [light_at(position)], False).beams
     dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
     emission = Emission(
-        grid, medium.extinction, medium.scattering, beams, dark, medium.g, medium.peak
+        grid, medium.extinction, medium.scattering, beams, dark, medium.seen, medium.peak
     )
     radiance = march_rays(emission, bundle, RenderSettings())[0][0]
     light = array_order(torch.tensor(position, dtype=torch.float64))

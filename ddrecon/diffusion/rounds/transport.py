@@ -41,14 +41,12 @@ def run_rounds(
 ) -> Moments:
     """Light after `rounds` of sweeps, its angles kept to `degree` (E12, E17).
 
-    `light`: the solution of `problem` by `solve`, where the first round begins. Only the mean is
-    kept where light's direction does not matter.
+    `light`: the solution of `problem` by `solve`, where the first round begins; `degree`: that of
+    the quadrature. Only the mean is kept where light's direction does not matter.
     """
     if rounds == 0:
         return light
-    angles = degree if problem.has_flux else 0
-    moments = remaining_moments(problem.medium, angles)
-    for round_index, factor in enumerate(_blending(moments, rounds), 1):
+    for round_index, factor in enumerate(_blending(problem.medium, rounds), 1):
         new = _round(problem, light, solve, degree, round_index)
         # E19: from what was to what the round makes of it, and by `factor` as far
         light = new if factor is None else light.plus(_times(new.plus(_times(light, -1)), factor))
@@ -65,11 +63,10 @@ def _round(
     """What one round makes of `light` (E12)."""
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
-    angles = degree if problem.has_flux else 0
-    moments = remaining_moments(medium, angles)
+    moments = remaining_moments(medium)
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E11 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
-    scatters = light.weighted(moments).plus(problem.source).harmonics(angles)
+    scatters = light.weighted(moments).plus(problem.source).harmonics(medium.degree)
     swept = Moments.of_harmonics(
         sweep(medium, scatters, outside if is_lit_from_outside else None, degree)
     )
@@ -102,15 +99,16 @@ def _times(light: Moments, factor: Tensor | float) -> Moments:
     return light.scaled(factor, factor, factor)
 
 
-def _blending(moments: Tensor, rounds: int) -> list[Tensor | None]:
+def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
     """The factors o = 1 / (1 - nu) of E19, one for each round, largest first.
 
     nu are Chebyshev's nodes of the interval from p_3, where that is negative, to p_2: by about so
     much a round multiplies what is left in the moments that diffusion lacks. None where light's
     direction does not matter.
     """
-    if len(moments) < 4:
+    if medium.degree < 2:
         return [None] * rounds
+    moments = remaining_moments(medium)
     high, low = SPECTRUM * moments[2], SPECTRUM * moments[3].clamp(max=0)
     nodes = [math.cos(math.pi * (2 * k + 1) / (2 * rounds)) for k in range(rounds)]
     return [1 / (1 - ((low + high) / 2 + (high - low) / 2 * node)) for node in nodes]
