@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
-from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.coefficients import Medium, scale_medium
 from ddrecon.renderer import multiply_scatters
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
@@ -21,8 +21,8 @@ def needed_terms(scene: Scene) -> list[str]:
     terms += _light_terms(scene.lights, is_diffuse)
     if not is_diffuse:
         return [*terms, "no multiple scattering: no diffusion solve"]
-    if bool(medium.g > 0):
-        terms.append("delta-Eddington scaling of the forward peak (g > 0)")
+    if bool((medium.forward_fraction > 0).any()):
+        terms.append(_peak_term(medium))
     terms.append(f"multiple scattering by {settings.model} diffusion, {_method(settings)}")
     if settings.transport_rounds:
         terms.append(
@@ -34,6 +34,13 @@ def needed_terms(scene: Scene) -> list[str]:
     has_fluxes = medium.has_flux
     terms.append("fluxes Q1 and L1 (g is not 0)" if has_fluxes else "no fluxes Q1 and L1 (g = 0)")
     return terms
+
+
+def _peak_term(medium: Medium) -> str:
+    """What part of scattering counts as not scattered."""
+    fractions = medium.forward_fraction.flatten().tolist()
+    parts = ", ".join(f"{fraction:.3g}" for fraction in fractions)
+    return f"delta-Eddington scaling of the forward peak, {parts} of scattering"
 
 
 def _method(settings: DiffusionSettings) -> str:
