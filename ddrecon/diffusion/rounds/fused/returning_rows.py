@@ -11,11 +11,13 @@ Where a step meets no medium, nothing returns to what scatters.
 """
 
 from ddrecon.diffusion.rounds.fused.rows import (
+    DECAYED,
     DIRECTION,
+    ENDS,
     GROUP,
     MULTIPLY,
     PLACES,
-    STEP,
+    SLOPES,
     UPSTREAM,
 )
 
@@ -104,26 +106,21 @@ for (int t = height - 1; t >= 0; --t) {
             constexpr bool is_empty = decltype(empty)::value;
             INDEPENDENT
             for (int c = from; c < to; ++c) {"""
-    + STEP
+    + ENDS
+    + DECAYED
     + """
                 const F arriving = gather(points, light_from, part, c);
-                const F slope_series = psi_slope_series(is_thin ? depth : F(0));
-                const F psi_slope = is_thin ? slope_series : (phi - F(2) * psi) * inverse;
                 const F radiance_bar = bar[c];
                 // That of the source: what goes on, returns.
                 F source_bar;
                 if constexpr (decltype(along)::value) source_bar = source_bars[c];
                 else source_bar = radiance_bar + gather(points, back_from, part, c);
-                // E11 transposed: the source is line times scattering depth.
-                const F line_bar = source_bar * (scattering_mass * strength);
-                const F lost_bar = -source_bar * (arriving + inflow);
-                const F line_slope = far * (psi - phi) + (near - far) * psi_slope;
-                const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * passed;
-                const F scattering_depth_bar = source_bar * line_mean;
-                const F scattering_mass_bar = half_step * (scattering_depth_bar * strength);
+"""
+    + SLOPES
+    + """
                 mass_row[c] = half_step * (depth_bar * scale)
-                    + (SHARES_FIELD ? scattering_mass_bar : F(0));
-                if (!SHARES_FIELD) scattered_row[c] = scattering_mass_bar;
+                    + (SHARES_FIELD ? scattered : F(0));
+                if (!SHARES_FIELD) scattered_row[c] = scattered;
                 returning_row[c] = is_empty ? source_bar : passed * source_bar;
                 far_row[c] = is_empty ? F(0) : line_bar * (phi - psi);
                 bar[c] = is_empty ? F(0) : line_bar * psi;
@@ -173,12 +170,12 @@ for (int t = height - 1; t >= 0; --t) {
             if (target.shift) bar[edge] += target.part * far[edge - target.shift];
             if (!target.is_real) continue;
             const F* mass = back(target.s, target.t, MASS, j) + target.shift;
-            const F* scattered
+            const F* scattered_from
                 = back(target.s, target.t, SHARES_FIELD ? MASS : SCATTERED, j) + target.shift;
             INDEPENDENT
             for (int c = 0; c < width; ++c) {
                 e_bar_row[c] += target.part * mass[c];
-                if (!SHARES_FIELD) sc_bar_row[c] += target.part * scattered[c];
+                if (!SHARES_FIELD) sc_bar_row[c] += target.part * scattered_from[c];
             }
         }
     }

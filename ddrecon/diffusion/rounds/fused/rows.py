@@ -208,19 +208,35 @@ for (int i = 0; i < 4; ++i) {
     sc_from[i] = sc - back;
 }
 """
-# phi, psi and what is lost, of the depth of a step
-STEP = """
-const F near = near_row[c], far = gather(points, near_from, part, c);
+# The two ends of a step.
+ENDS = """
+const F near_here = near_row[c], far = gather(points, near_from, part, c);
 const F mass = half_step * (e[c] + gather(points, e_from, part, c));
 const F scattering_mass
     = SHARES_FIELD ? mass : half_step * (sc[c] + gather(points, sc_from, part, c));
-const F depth = is_empty ? F(0) : scale * mass, passed = is_empty ? F(1) : decay(depth);
-const bool is_thin = is_empty || depth < F(0.5);
-const F inverse = F(1) / (is_thin ? F(0.5) : depth), series = psi_series(is_thin ? depth : F(0));
-const F phi = is_empty ? F(1) : is_thin ? F(1) - depth * series : (F(1) - passed) * inverse;
+"""
+# phi, psi and what is lost, of the depth of a step; and what of its source reaches its end.
+DECAYED = """
+const F depth_of_step = is_empty ? F(0) : scale * mass;
+const F passed = is_empty ? F(1) : decay(depth_of_step);
+const bool is_thin = is_empty || depth_of_step < F(0.5);
+const F inverse = F(1) / (is_thin ? F(0.5) : depth_of_step);
+const F series = psi_series(is_thin ? depth_of_step : F(0));
+const F phi = is_empty ? F(1) : is_thin ? F(1) - depth_of_step * series : (F(1) - passed) * inverse;
 const F psi = is_empty ? F(0.5) : is_thin ? series : (F(1) - phi) * inverse;
-const F lost = depth * phi;
-const F line_mean = far * phi + (near - far) * psi;
+const F lost = depth_of_step * phi;
+const F line_mean = far * phi + (near_here - far) * psi;
+"""
+# E11 transposed, the source being line times scattering depth: cotangents of the step's numbers.
+SLOPES = """
+const F slope_series = psi_slope_series(is_thin ? depth_of_step : F(0));
+const F psi_slope = is_thin ? slope_series : (phi - F(2) * psi) * inverse;
+const F line_bar = source_bar * (scattering_mass * strength);
+const F lost_bar = -source_bar * (arriving + inflow);
+const F line_slope = far * (psi - phi) + (near_here - far) * psi_slope;
+const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * passed;
+const F scattering_depth_bar = source_bar * line_mean;
+const F scattered = half_step * (scattering_depth_bar * strength);
 """
 FOLLOW = (
     PLACES
@@ -270,7 +286,8 @@ for (int t = 0; t < height; ++t) {
                     light_row[c] = arriving;
                     if (decltype(along)::value) carried[c] = part[0];
                 } else {"""
-    + STEP
+    + ENDS
+    + DECAYED
     + """
                     // Light from outside is there without a medium; I is what differs from it.
                     const F source = line_mean * (scattering_mass * strength) - inflow * lost;
