@@ -11,7 +11,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, ClassVar, TypedDict, Unpack
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.limiters import LIMITERS
@@ -87,6 +87,12 @@ class DiffusionSettings:
     P1 towards transport, and keep angles to `degree` (docs/theory.md, section 5). Left out, there
     is one where there can be any.
     """
+
+    RETIRED: ClassVar[Mapping[str, str]] = {
+        "transport_directions": "directions follow from diffusion.degree: write degree: 3 for 26, "
+        "5 for 50 or 7 for 86"
+    }
+    """Keys of old scene files, and what to write instead."""
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
     scheme: str = one_of("conservative", ("conservative", "printed"))

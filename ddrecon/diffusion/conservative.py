@@ -89,10 +89,11 @@ class DiffusionProblem:
 
     def spread(self, flux: Vector) -> Tensor:
         """- div(D kappa_s `flux`), what a source of that flux adds to the right side of E4."""
-        total: Tensor | float = 0.0
-        for axis, along in zip(AXES, flux, strict=True):
-            total = total - recompute(_divergence, self.medium, self.diffusion, along, axis)
-        return total
+        z, y, x = (
+            recompute(_divergence, self.medium, self.diffusion, along, axis)
+            for axis, along in zip(AXES, flux, strict=True)
+        )
+        return -(z + y + x)
 
     def _source_flux(self) -> dict[int, Tensor | None]:
         return dict(zip(AXES, self.source.flux or (None, None, None), strict=True))

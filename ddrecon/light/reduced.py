@@ -48,19 +48,19 @@ def reduced_light(
     """
     if degree <= 1 and not has_pairs:
         return _to_first_order(medium, lights, degree)
-    beams, sources, turned = [], [], []
+    beams: list[Beam | PointBeam] = []
+    sources: list[Moments] = []
+    turned: list[TurnedBeam] = []
     for light in lights:
         if isinstance(light, DirectionalLight) and has_pairs:
             beam, pair = follow_pair(medium, light)
+            beams.append(beam)
             sources.append(pair.source(medium))
             turned += pair.turned
         elif isinstance(light, DirectionalLight | PointLight):
-            follow = follow_beam if isinstance(light, DirectionalLight) else follow_point_light
-            beam, received = follow(medium, light, degree)
+            one, received = _follow(medium, light, degree)
+            beams.append(one)
             sources.append(received.weighted(remaining_moments(medium)))
-        else:
-            continue
-        beams.append(beam)
     nothing = Moments(torch.zeros_like(medium.extinction.value))
     source = reduce(Moments.plus, sources) if sources else nothing
     return ReducedLight(tuple(beams), source, tuple(turned))
@@ -81,14 +81,21 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
         parts.append(moments)
     for i, light in enumerate(lights):
         if i not in beams and isinstance(light, DirectionalLight | PointLight):
-            follow = follow_beam if isinstance(light, DirectionalLight) else follow_point_light
-            beams[i], moments = follow(medium, light, degree)
+            beams[i], moments = _follow(medium, light, degree)
             received.append(moments)
     if received:
         parts.append(reduce(Moments.plus, received).scaled(1.0, medium.mean_cosine))
     elif not parts:
         parts.append(Moments(torch.zeros_like(medium.extinction.value)))
     return ReducedLight(tuple(beams[i] for i in sorted(beams)), reduce(Moments.plus, parts))
+
+
+def _follow(
+    medium: Medium, light: DirectionalLight | PointLight, degree: int
+) -> tuple[Beam | PointBeam, Moments]:
+    if isinstance(light, DirectionalLight):
+        return follow_beam(medium, light, degree)
+    return follow_point_light(medium, light, degree)
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:

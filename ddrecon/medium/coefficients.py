@@ -55,7 +55,6 @@ class Volume:
                 "cells [z, y, x]"
             )
 
-
     @property
     def g(self) -> Tensor:
         """The mean cosine of Henyey and Greenstein's phase function.

@@ -67,9 +67,7 @@ def _backward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor)
 
 
 @remember
-def _turned_phase(
-    kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor
-) -> Tensor:
+def _turned_phase(kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor) -> Tensor:
     phase = kind(*numbers)
     count = phase.length()
     tail = phase.backward_tail(degree, count - degree - 1).double()

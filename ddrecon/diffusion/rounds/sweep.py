@@ -54,8 +54,8 @@ class Parts(NamedTuple):
             source,
         )
 
-    def radiance(self, medium: Medium, ray: Ray) -> Tensor:
-        """I along `ray` (E11), these parts standing for those of `medium`."""
+    def radiance(self, medium: Medium, scatters: Tensor, direction: Direction) -> Tensor:
+        """I along `direction` of what `scatters` (E11), these parts standing for the `medium`'s."""
         field = self.extinction_field if self.scattering_field is None else self.scattering_field
         medium = replace(
             medium,
@@ -63,8 +63,7 @@ class Parts(NamedTuple):
             scattering=Coefficient(self.scattering_scale, field),
             forward_fraction=self.forward_fraction,
         )
-        scatters = torch.tensordot(ray.harmonics, self.source, 1)
-        return radiance_along(medium, scatters, self.inflow, ray.direction)
+        return radiance_along(medium, scatters, self.inflow, direction)
 
 
 class Ray(NamedTuple):
@@ -109,6 +108,7 @@ class _Sweep(torch.autograd.Function):
             part if part is None else part.detach().requires_grad_(need)
             for part, need in zip(others, ctx.needs_input_grad[2:-1], strict=True)
         ]
+        parts = Parts(*leaves, source)
         varied = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
         totals = [torch.zeros_like(leaf) for leaf in varied]
         source_bar = torch.zeros_like(source) if ctx.needs_input_grad[-1] else None
@@ -117,9 +117,8 @@ class _Sweep(torch.autograd.Function):
             scatters = torch.tensordot(ray.harmonics, source, 1)
             scatters.requires_grad_(source_bar is not None)
             # I along this direction once more (E11), with the graph of this direction alone
-            one = ray._replace(harmonics=torch.ones_like(ray.harmonics[:1]))
             with torch.enable_grad():
-                radiance = Parts(*leaves, scatters[None]).radiance(ctx.medium, one)
+                radiance = parts.radiance(ctx.medium, scatters, ray.direction)
             # E17 transposed: I_bar is the sum over moments of weight times moment_bar
             radiance_bar = torch.tensordot(ray.weight * ray.harmonics, moments_bar, 1)
             # E11 transposed, by autograd: what each part receives from this direction
@@ -141,7 +140,9 @@ def _sum_over_directions(medium: Medium, degree: int, parts: Parts) -> Tensor:
     """The means over the sphere of I Y_k (E17)."""
     moments = torch.zeros_like(parts.source)
     for ray in _rays(degree, parts.source):
-        moments = add_outer(moments, ray.weight * ray.harmonics, parts.radiance(medium, ray))
+        scatters = torch.tensordot(ray.harmonics, parts.source, 1)
+        radiance = parts.radiance(medium, scatters, ray.direction)
+        moments = add_outer(moments, ray.weight * ray.harmonics, radiance)
     return moments
 
 

@@ -149,9 +149,7 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
     """
     # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
     # 1e-6, theta is 1 already
-    half_depth = (0.5 * _mean_step(medium.grid, degree) * medium.extinction.value).clamp(
-        min=1e-3
-    )
+    half_depth = (0.5 * _mean_step(medium.grid, degree) * medium.extinction.value).clamp(min=1e-3)
     rho = half_depth / torch.tanh(half_depth) - 1
     return 1 / (1 + rho**2)
 

@@ -130,7 +130,9 @@ def round_by_loops(problem: DiffusionProblem, light: Moments, g: float, degree: 
         theta * p[1] * (new - old) for new, old in zip(swept.flux, light.flux, strict=True)
     )
     # the same problem with this flux as its only source: what E4 adds to the right side
-    alone = replace(problem, source=Moments(torch.zeros_like(gain), turned), outside=0 * problem.outside)
+    alone = replace(
+        problem, source=Moments(torch.zeros_like(gain), turned), outside=0 * problem.outside
+    )
     total = total + alone.system[1]
     u = torch.linalg.solve(matrix, total.flatten()).view_as(right)
     parts = zip(
