@@ -18,7 +18,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_scattered
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector
@@ -66,10 +66,8 @@ def _round(
     moments = remaining_moments(medium)
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E11 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
-    scatters = light.weighted(moments).plus(problem.source).harmonics(medium.degree)
-    swept = Moments.of_harmonics(
-        sweep(medium, scatters, outside if is_lit_from_outside else None, degree)
-    )
+    inflow = outside if is_lit_from_outside else None
+    swept = sweep_scattered(medium, light, problem.source, inflow, degree)
     # Light begins as diffusion's, L0 with 3 F(L0), where S - A L0 is zero.
     diffuse, imbalance = light, None
     if round_index > 1:

@@ -32,8 +32,8 @@ class Cells:
     """The arrays of a sweep on a GPU, and the launches of kernels on them."""
 
     def __init__(self, swept: Swept):
-        self.swept, self.like = swept, swept.moments
-        _, self.colors, *self.shape = swept.moments.shape
+        self.swept, self.like = swept, swept.total()
+        _, self.colors, *self.shape = self.like.shape
         self.kernels = functools.partial(
             cell_kernels, torch.finfo(self.like.dtype).bits, swept.scattering is None
         )
