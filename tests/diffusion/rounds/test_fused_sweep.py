@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_scattered
-from ddrecon.diffusion.rounds.transport import _gain
+from ddrecon.diffusion.rounds.transport import _blend, _gain
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
@@ -23,8 +23,9 @@ from ddrecon.medium.remaining import remaining_moments
 from ddrecon.renderer import solve_light
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.diffusion.rounds.fused.blend import blend_adjoint_kernel, blend_kernel  # noqa: E402
 from ddrecon.diffusion.rounds.fused.by_cells import cell_kernels  # noqa: E402
-from ddrecon.diffusion.rounds.fused.gains import gain_kernels  # noqa: E402
+from ddrecon.diffusion.rounds.fused.gain import gain_adjoint_kernel, gain_kernel  # noqa: E402
 from ddrecon.diffusion.rounds.fused.sweep import sweep_fused  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -121,7 +122,7 @@ def gradients(
     moments = function(case, leaves, engine)
     weights = [random_values(*m.shape, seed=9 + i).to(m) for i, m in enumerate(moments)]
     total = sum((m * weight).sum() for m, weight in zip(moments, weights, strict=True))
-    found = torch.autograd.grad(total, [leaves[name] for name in names])
+    found = torch.autograd.grad(total, [leaves[name] for name in names], materialize_grads=True)
     return [m.detach() for m in moments], dict(zip(names, found, strict=True))
 
 
@@ -235,10 +236,20 @@ def gains_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]
     use_engine(engine)
     medium, inflow = case.medium(values), values.get("inflow")
     swept, light = (Moments.of_harmonics(values[name]) for name in ("source", "light"))
-    light = replace(light, higher=None)
     imbalance = None if inflow is None else inflow * light.mean
-    gain, source = _gain(medium, swept, light, imbalance, case.degree)
-    return [source, gain.mean, *(gain.flux or ())]
+    diffuse = light.scaled(1.5, 0.5)
+    gain, source, turned = _gain(medium, swept, light, diffuse, imbalance, case.degree)
+    return [source, gain.mean, *(gain.flux or ()), *(turned or ())]
+
+
+def blended(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]:
+    """Light after a round."""
+    use_engine(engine)
+    medium, factor = case.medium(values), 0.4 + values["inflow"]
+    swept, light = (Moments.of_harmonics(values[name]) for name in ("source", "light"))
+    one, other = Moments.of_harmonics(values["source"][:4]), replace(swept, higher=None)
+    new = _blend(medium, light, one, other.scaled(0.3, 0.2), swept, factor, case.degree)
+    return [new.harmonics(medium.degree)]
 
 
 @pytest.mark.parametrize("name", ["color", "gray", "gray-4", "fields", "cell", "opaque"])
@@ -250,6 +261,13 @@ def test_gains_and_their_gradients_are_those_of_torch(name: str):
 def test_gains_in_single_precision():
     single = gradients(replace(CASES["color"], dtype=torch.float32), "warp", gains_of)
     assert_same(single, gradients(CASES["color"], "torch", gains_of), 2e-6)
+
+
+@pytest.mark.parametrize("name", ["color", "begun", "fields", "50", "opaque", "empty"])
+def test_blended_light_and_its_gradients_are_those_of_torch(name: str):
+    case = CASES[name] if CASES[name].moments > 4 else replace(CASES[name], moments=16)
+    one, other = (gradients(case, engine, blended) for engine in ("warp", "torch"))
+    assert_same(one, other, 1e-11)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])
@@ -279,8 +297,8 @@ def test_light_after_rounds_is_that_of_torch(g: float):
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
     kernels = [*cell_kernels(32, False, True)]
-    of_gains = gain_kernels(32, True, False, True)
-    kernels += [of_gains.gain, of_gains.transpose]
+    kernels += [gain_kernel((True, False, True), 32), gain_adjoint_kernel((True, False, True), 32)]
+    kernels += [blend_kernel(32), blend_adjoint_kernel(32)]
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)

@@ -16,8 +16,8 @@ from ddrecon.diffusion.rounds.fused.cells import (
     FOLLOW_CELL,
     RETURN_CELL,
 )
-from ddrecon.diffusion.rounds.fused.kernels import constants
 from ddrecon.diffusion.rounds.fused.schedule import POINTS, Step, steps_of
+from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.records import launch_record, record_kernel
 from ddrecon.numerics.harmonics import harmonics
