@@ -221,12 +221,6 @@ def packet_kernel(name: str, layout: Layout, walk: str, given: str) -> TextKerne
 
 def _constants(layout: Layout) -> str:
     """Where in a node the channels of color c are: the first of a kind plus c times its step."""
-    mass_step = int(layout.extinction > 1)
-    first_scattering, scattering_step = (
-        (layout.first_scattering, int(layout.scattering > 1))
-        if layout.scattering
-        else (0, mass_step)
-    )
     numbers = {
         "MOST_RUNS": 5,
         "C": layout.colors,
@@ -235,16 +229,16 @@ def _constants(layout: Layout) -> str:
         "MASSES": layout.masses,
         "CHANNELS": layout.channels,
         "OUT": layout.outputs,
-        "MASS_STEP": mass_step,
+        "MASS_STEP": layout.mass_step,
         "FIRST_DIFFUSE": layout.extinction,
-        "DIFFUSE_STEP": int(layout.diffuse > 1),
+        "DIFFUSE_STEP": layout.diffuse_step,
         "FIRST_MASS": layout.first_mass,
-        "FIRST_SCATTERING": first_scattering,
-        "SCATTERING_STEP": scattering_step,
+        "FIRST_SCATTERING": layout.scattering_from,
+        "SCATTERING_STEP": layout.scattering_step,
         "SCATTERING": layout.scattering,
         "FIRST_OWN_SCATTERING": layout.first_scattering,
         "FIRST_PEAK": layout.first_peak,
-        "PEAK_STEP": int((layout.peak or 0) > 1),
+        "PEAK_STEP": layout.peak_step,
         "HAS_PEAK": int(layout.peak is not None),
         "IS_PEAK_FIELD": int(bool(layout.peak)),
     }
