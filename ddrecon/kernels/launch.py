@@ -67,26 +67,12 @@ def launch(
     threads = thread_count(like) if threads is None else threads
     device = _device(like.device)
     _load(kernel, device.alias)
-    calls = _calls(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
     stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
 
     def run(i: int) -> None:
-        items = bounds[i + 1] - bounds[i]
-        if not items:
-            return
-        given = [bounds[i], *(arguments(i) if callable(arguments) else arguments)]
-        try:
-            call = calls.pop()
-        except IndexError:
-            call = wp.launch(kernel, items, given, device=device, record_cmd=True)
-        if call.bounds.size != items:
-            call.set_dim(items)
-        for place, value in enumerate(given):
-            ready = value.__ctype__() if hasattr(value, "__ctype__") else value
-            call.set_param_at_index_from_ctype(place, ready)
-        call.launch(stream)
-        calls.append(call)
+        given = arguments(i) if callable(arguments) else arguments
+        _call(kernel, device, bounds[i + 1] - bounds[i], [bounds[i], *given], stream)
 
     # What was seen to be quick is not worth another thread.
     size = kernel, count.bit_length()
@@ -134,6 +120,24 @@ def _start() -> None:
 def _device(device: torch.device) -> Any:
     _start()
     return wp.device_from_torch(device)
+
+
+def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -> None:
+    """Runs `kernel` for `items` in this thread, with all it is `given`."""
+    if not items:
+        return
+    calls = _calls(kernel, device.alias)
+    try:
+        call = calls.pop()
+    except IndexError:
+        call = wp.launch(kernel, items, given, device=device, record_cmd=True)
+    if call.bounds.size != items:
+        call.set_dim(items)
+    for place, value in enumerate(given):
+        ready = value.__ctype__() if hasattr(value, "__ctype__") else value
+        call.set_param_at_index_from_ctype(place, ready)
+    call.launch(stream)
+    calls.append(call)
 
 
 @functools.cache

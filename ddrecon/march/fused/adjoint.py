@@ -65,15 +65,9 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
             if step > 0:
                 if n >= 0:
                     ray_bar, a_bar, b_bar = arrive_adjoint(ray, a, b, bar, ray_bar, a_bar, b_bar)
+                mass = passed.mass_of(behind)
                 ray_bar, b_bar, m_bar = emit_adjoint(
-                    ray,
-                    b,
-                    passed.mass_of(behind),
-                    given.coefficients,
-                    ray_bar,
-                    b_bar,
-                    m_bar,
-                    bars.coefficients,
+                    ray, b, mass, given.coefficients, ray_bar, b_bar, m_bar, bars.coefficients
                 )
                 if n >= 0:
                     a_bar, b_bar = mass_adjoint(a, b, m_bar, a_bar, b_bar)
