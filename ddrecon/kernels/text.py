@@ -10,6 +10,7 @@ a launch takes the same few microseconds, however much that is.
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -89,18 +90,23 @@ class TextKernel:
 
         Those that are made are contiguous. A thread has what is in its own of `shares` as well.
         """
-        given = {name: self._ready(name, value) for name, value in self._entries(given)}
-        made = dict(self._entries(made))
-        record = self._filled(self.new_record(), given | made)
-        like = next(value for value in made.values() if value is not None)
+        bound = self.bind(given, made)
         if not shares:
-            launch(self.kernel, count, [record], like, threads)
+            bound.launch(count, threads)
             return
-        own = [
-            self._filled(self.new_record.from_buffer_copy(record), dict(self._entries(share)))
-            for share in shares
-        ]
-        launch(self.kernel, count, lambda i: [own[i]], like, len(own))
+        own = []
+        for share in shares:
+            own.append(self.new_record.from_buffer_copy(bound.record))
+            self.fill(own[-1], dict(self._entries(share)))
+        launch(self.kernel, count, lambda i: [own[i]], bound.like, len(own))
+
+    def bind(self, given: Mapping[str, Any], made: Mapping[str, Any]) -> "Bound":
+        """The kernel with all that `launch` is given, for many launches."""
+        held = {name: self._ready(name, value) for name, value in self._entries(given)}
+        held |= dict(self._entries(made))
+        record = self.new_record()
+        self.fill(record, held)
+        return Bound(self, record, held, next(each for each in made.values() if is_tensor(each)))
 
     def _entries(self, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         """Names and values, those of lists one by one."""
@@ -114,8 +120,8 @@ class TextKernel:
         """A value as the text reads it; what is kept of it, its address is valid with."""
         return value.to(self.arrays[name]).contiguous() if is_tensor(value) else value
 
-    def _filled(self, record: Any, values: Mapping[str, Any]) -> Any:
-        """`record` with numbers, and with addresses of arrays; 0 of those that are None."""
+    def fill(self, record: Any, values: Mapping[str, Any]) -> None:
+        """Writes numbers into `record`, and addresses of arrays; 0 of those that are None."""
         for name, value in values.items():
             if name not in self.names:
                 raise ValueError(f"the kernel declares no {name}")
@@ -124,7 +130,21 @@ class TextKernel:
                     raise ValueError(f"{name} is to be contiguous, of type {self.arrays[name]}")
                 value = value.data_ptr()
             setattr(record, name, 0 if value is None else value)
-        return record
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A kernel with the `record` it is given, and what this points to."""
+
+    kernel: TextKernel
+    record: Any
+    held: Mapping[str, Any]
+    like: Tensor
+
+    def launch(self, count: int, threads: int | None = None, **numbers: float) -> None:
+        """Does `count` items, with these `numbers` changed."""
+        self.kernel.fill(self.record, numbers)
+        launch(self.kernel.kernel, count, [self.record], self.like, threads)
 
 
 def _declared(given: str) -> Iterator[tuple[str, bool, str, int]]:
