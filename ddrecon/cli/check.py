@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from ddrecon.engine import engine_of_parts
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
@@ -25,7 +26,7 @@ def memory_estimate(scene: Scene) -> int:
         max(volume.sigma_a.shape[0], volume.sigma_s.shape[0]),
         torch.finfo(volume.density.dtype).bits // 8,
         sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
-        has_flux=bool(volume.g != 0) or "g" in scene.starts,
+        has_flux=scale_medium(volume).has_flux,
         has_rounds=scene.diffusion.transport_rounds > 0,
         is_limited=scene.diffusion.model == "flux_limited",
         varied=None

@@ -54,13 +54,15 @@ def launch(
     arguments: Sequence[Any] | Callable[[int], Sequence[Any]],
     like: Tensor,
     threads: int | None = None,
+    work: int | None = None,
 ) -> None:
     """Runs `kernel` for `count` items where tensor `like` lies.
 
     On a processor the items are cut into so many shares as there are `threads` (None: as many as
     torch has); a function of a share's number gives it `arguments` of its own. Which thread does a
     share is left to chance, and changes no result: the one that asks does all where that is quick,
-    and those that no other has begun by the time it has done its own.
+    and those that no other has begun by the time it has done its own. `work`: a number that tells
+    how long it takes, where that of items does not.
     """
     if not count:
         return
@@ -75,7 +77,7 @@ def launch(
         _call(kernel, device, bounds[i + 1] - bounds[i], [bounds[i], *given], stream)
 
     # What was seen to be quick is not worth another thread.
-    size = kernel, count.bit_length()
+    size = kernel, (count if work is None else work).bit_length()
     if threads > 1 and _seconds.get(size, math.inf) < QUICK:
         for i in range(threads):
             run(i)

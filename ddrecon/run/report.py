@@ -30,7 +30,7 @@ from ddrecon.report.pictures import comparison, find_white, pixels, projections,
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
-from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.kinds import FIELDS
 from ddrecon.variables.values import value_of
 
 SHOWN = 12
@@ -149,7 +149,7 @@ def _volumes(scene: Scene) -> list[str]:
             "Across z, x and y from left to right; y, or z, is up. The largest value is white."
         )
     ]
-    for name in VOLUME:
+    for name in FIELDS:
         value = value_of(scene, name)
         if value.ndim >= 3:
             largest = f"(the largest value of a cell is {float(value.max()):.4g})"

@@ -8,7 +8,7 @@ from typing import Any
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import PAIRS, VOLUME
+from ddrecon.variables.kinds import PAIRS, PHASE, VOLUME
 
 RESULT = "result.yaml"
 """What the file is called in a run's folder."""
@@ -43,7 +43,8 @@ def describe_result(
         name for pair in PAIRS if set(pair) & set(volume) for name in (*PAIRS[0], *PAIRS[1])
     }
     kept = {name: value for name, value in described["volume"].items() if name not in replaced}
-    described["volume"] = kept | box | volume
+    numbers = {name: volume.pop(name) for name in [*volume] if name == "g" or PHASE in name}
+    described["volume"] = _with_phase(kept | box | volume, numbers)
     # The lights, an attribute at a time: `lights.0.irradiance`.
     for name, value in values.items():
         if name.startswith("lights."):
@@ -57,6 +58,18 @@ def describe_result(
             camera = _move_camera(camera, view.camera.pose.tolist())
         section["camera"] = camera
     return described
+
+
+def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `volume` with reconstructed `numbers` of its phase function."""
+    if "phase" not in volume or not numbers:
+        return volume | numbers
+    found = {name.removeprefix(PHASE): number for name, number in numbers.items()}
+    if "coefficients" in found:
+        # They count from chi_1 on, and replace those of a file.
+        found["coefficients"] = [1.0, *found["coefficients"]]
+        volume["phase"].pop("file", None)
+    return volume | {"phase": volume["phase"] | found}
 
 
 def _move_camera(camera: dict[str, Any], pose: list[list[float]]) -> dict[str, Any]:

@@ -32,12 +32,13 @@ def compose(
 
     `out` [C (1 + beams), R] and `masses` [K, R] are the integrals; `scale` and `scattering` [C or
     1] those of both coefficients. What does not change along a ray is multiplied in here: the
-    `irradiances` of beams [C or 1], and p where it is one of the `factors` [R] (E2); the scale of
+    `irradiances` of beams [C or 1], and p where it is one of the `factors` [1 or C, R] (E2); the scale of
     kappa_s; and E1's 1 - tau of what is behind.
     """
     fixed = [scale, scattering, *irradiances, *(each for each in factors if each is not None)]
     colors = len(out) // (1 + len(irradiances))
-    if is_forward() or any(each.requires_grad for each in fixed):
+    has_colors = any(each is not None and len(each) > 1 for each in factors)
+    if has_colors or is_forward() or any(each.requires_grad for each in fixed):
         return _compose(colors, out, masses, scale, scattering, irradiances, factors)
     weights = _weights(colors, scale, scattering, *irradiances)
     composed: Tensor = _Compose.apply(out, masses, weights, _phases(out.shape[1], *factors))
@@ -76,7 +77,7 @@ def _phases(rays: int, *factors: Tensor | None) -> Tensor | None:
     known = [each for each in factors if each is not None]
     if not known:
         return None
-    return torch.stack([torch.ones_like(known[0]) if f is None else f for f in factors])
+    return torch.cat([torch.ones_like(known[0]) if f is None else f for f in factors])
 
 
 class _Compose(torch.autograd.Function):
