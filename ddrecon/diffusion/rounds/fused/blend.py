@@ -95,7 +95,7 @@ for (int i = begin; i < end; ++i) {"""
     depth_sum += depth_bar * e;
 }
 sums[item] = depth_sum;
-sums[(long long)rows * cells.parts * colors + item] = far_sum;
+sums[(long long)rows * parts * colors + item] = far_sum;
 }
 """
 )
