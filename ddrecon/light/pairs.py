@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Rays
 from ddrecon.grid import array_order
 from ddrecon.light.beam import Beam
 from ddrecon.light.lights import DirectionalLight

@@ -47,7 +47,8 @@ def turned_phase(medium: Medium, turns: int) -> Tensor:
     """How light that a backward peak has turned scatters once more, towards a camera (E21).
 
     A table [C, steps + 1, 2, 1] for `look_up` over the angle from the way that light goes. Its
-    moments are chi_l up to the medium's degree and chi_l r_l^turns beyond, r_l being the backward peak's.
+    moments are chi_l up to the degree of the medium, and chi_l r_l^turns beyond, where r_l are the
+    backward peak's.
     """
     phase = medium.seen.phase
     return _turned_phase(type(phase), medium.seen.degree, turns, *phase.numbers)

@@ -108,7 +108,7 @@ class _Sweep(torch.autograd.Function):
             part if part is None else part.detach().requires_grad_(need)
             for part, need in zip(others, ctx.needs_input_grad[2:-1], strict=True)
         ]
-        parts = Parts(*leaves, source)
+        parts = Parts._make([*leaves, source])
         varied = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
         totals = [torch.zeros_like(leaf) for leaf in varied]
         source_bar = torch.zeros_like(source) if ctx.needs_input_grad[-1] else None

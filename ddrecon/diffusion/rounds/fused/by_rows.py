@@ -17,28 +17,13 @@ from ddrecon.diffusion.rounds.fused.kernels import follow_kernel, return_kernel
 from ddrecon.diffusion.rounds.fused.rows import MARGIN, POINTERS
 from ddrecon.diffusion.rounds.fused.schedule import Tables, make_tables
 from ddrecon.diffusion.rounds.fused.surroundings import surround
-from ddrecon.grid import Grid
+from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.records import launch_record
 from ddrecon.kernels.spare import borrow, give_back
 
 FOLLOWED, KEPT = 16, 8
 """Directions at most that go through the cells together, if lines of few or of all are kept."""
-
-
-@dataclass(frozen=True)
-class Swept:
-    """What is swept: `scales` [3, C] of extinction and of scattering, and inflow; fields [K, ...].
-
-    `scattering` is None where it has the field of extinction; `moments` [K, C, z, y, x].
-    """
-
-    grid: Grid
-    directions: int
-    scales: Tensor
-    extinction: Tensor
-    scattering: Tensor | None
-    moments: Tensor
 
 
 @dataclass(frozen=True)
@@ -143,7 +128,7 @@ class Rows:
     def _given(self, lines: Tensor) -> dict[str, Tensor | int]:
         """What all kernels are given, by its names; `found`, `jobs` and cotangents are missing."""
         tables, like = self.tables, self.like
-        scratch_rows = 2 * POINTERS + 5 + tables.most
+        scratch_rows = 3 * POINTERS + 5 + tables.most
         return {
             "moments": like.contiguous(), "extinction": self.fields[0],
             "scattering": self.fields[-1], "scales": self.swept.scales, "parts": tables.parts,

@@ -15,17 +15,18 @@ def follow_kernel(bits: int, shares_field: bool, keeps: bool) -> Any:
 
     `shares_field`: whether extinction and scattering have the same field.
     """
-    text = _constants(SHARES_FIELD=shares_field, KEEPS=keeps) + FOLLOW
+    text = constants(SHARES_FIELD=shares_field, KEEPS=keeps) + FOLLOW
     return record_kernel("follow_rows", bits, text, GIVEN + "found", NUMBERS)
 
 
 @functools.cache
 def return_kernel(bits: int, shares_field: bool, varies_numbers: bool) -> Any:
     """The kernel that follows it back; `varies_numbers`: derivatives by scales are asked for."""
-    text = _constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers) + TOTAL + RETURN
+    text = constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers) + TOTAL + RETURN
     arrays = GIVEN + "found bars returning e_bar sc_bar double:sums"
     return record_kernel("return_rows", bits, text, arrays, NUMBERS)
 
 
-def _constants(**is_so: bool) -> str:
+def constants(**is_so: bool) -> str:
+    """C++ that declares constants of these names."""
     return "".join(f"const bool {name} = {str(so).lower()};\n" for name, so in is_so.items())

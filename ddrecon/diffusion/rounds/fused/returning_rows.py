@@ -11,11 +11,13 @@ Where a step meets no medium, nothing returns to what scatters.
 """
 
 from ddrecon.diffusion.rounds.fused.rows import (
+    DECAYED,
     DIRECTION,
+    ENDS,
     GROUP,
     MULTIPLY,
     PLACES,
-    STEP,
+    SLOPES,
     UPSTREAM,
 )
 
@@ -50,6 +52,7 @@ F* e_bars = e_bar + job[9] * cells;
 F* sc_bars = sc_bar + job[10] * cells;
 for (int s = slice_to - 1; s >= slice_from; --s) for (int g = group_to - 1; g >= group_from; --g) {"""
     + GROUP
+    + "const int ahead = -y_way * width;"
     + MULTIPLY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
@@ -64,16 +67,16 @@ for (int t = height - 1; t >= 0; --t) {
         const int place = (height - 1 - turn + 2LL * slice) % (height + 2);
         return own_back + place * back_stride + (kinds * (before + j) + which) * (long long)pitch;
     };
-    const int first_row = 2 * POINTERS + 5;
-    auto bar_of = [&](int j) -> F* { return scratch_row(first_row + j); };
+    const int own = 3 * POINTERS;
+    auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
     to_directions(to_weighted_light, bars + color * cells + at, bar_of, 0, width);
     const int* range = ranges + 4 * (k * height + r);
     const int from = range[0], to = range[1];
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
-    F *__restrict source_bars = scratch_row(0), *__restrict passing = scratch_row(1);
-    F *__restrict scale_bar = scratch_row(2), *__restrict strength_bar = scratch_row(3);
-    F* __restrict inflow_bar = scratch_row(4);
+    F *__restrict source_bars = scratch_row(own + 0), *__restrict passing = scratch_row(own + 1);
+    F *__restrict scale_bar = scratch_row(own + 2), *__restrict strength_bar = scratch_row(own + 3);
+    F* __restrict inflow_bar = scratch_row(own + 4);
     if (VARIES_NUMBERS)
         for (int c = 0; c < width; ++c) scale_bar[c] = strength_bar[c] = inflow_bar[c] = F(0);
     for (int j = 0; j < members; ++j) {"""
@@ -103,26 +106,21 @@ for (int t = height - 1; t >= 0; --t) {
             constexpr bool is_empty = decltype(empty)::value;
             INDEPENDENT
             for (int c = from; c < to; ++c) {"""
-    + STEP
+    + ENDS
+    + DECAYED
     + """
                 const F arriving = gather(points, light_from, part, c);
-                const F slope_series = psi_slope_series(is_thin ? depth : F(0));
-                const F psi_slope = is_thin ? slope_series : (phi - F(2) * psi) * inverse;
                 const F radiance_bar = bar[c];
                 // That of the source: what goes on, returns.
                 F source_bar;
                 if constexpr (decltype(along)::value) source_bar = source_bars[c];
                 else source_bar = radiance_bar + gather(points, back_from, part, c);
-                // E11 transposed: the source is line times scattering depth.
-                const F line_bar = source_bar * (scattering_mass * strength);
-                const F lost_bar = -source_bar * (arriving + inflow);
-                const F line_slope = far * (psi - phi) + (near - far) * psi_slope;
-                const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * passed;
-                const F scattering_depth_bar = source_bar * line_mean;
-                const F scattering_mass_bar = half_step * (scattering_depth_bar * strength);
+"""
+    + SLOPES
+    + """
                 mass_row[c] = half_step * (depth_bar * scale)
-                    + (SHARES_FIELD ? scattering_mass_bar : F(0));
-                if (!SHARES_FIELD) scattered_row[c] = scattering_mass_bar;
+                    + (SHARES_FIELD ? scattered : F(0));
+                if (!SHARES_FIELD) scattered_row[c] = scattered;
                 returning_row[c] = is_empty ? source_bar : passed * source_bar;
                 far_row[c] = is_empty ? F(0) : line_bar * (phi - psi);
                 bar[c] = is_empty ? F(0) : line_bar * psi;
@@ -172,12 +170,12 @@ for (int t = height - 1; t >= 0; --t) {
             if (target.shift) bar[edge] += target.part * far[edge - target.shift];
             if (!target.is_real) continue;
             const F* mass = back(target.s, target.t, MASS, j) + target.shift;
-            const F* scattered
+            const F* scattered_from
                 = back(target.s, target.t, SHARES_FIELD ? MASS : SCATTERED, j) + target.shift;
             INDEPENDENT
             for (int c = 0; c < width; ++c) {
                 e_bar_row[c] += target.part * mass[c];
-                if (!SHARES_FIELD) sc_bar_row[c] += target.part * scattered[c];
+                if (!SHARES_FIELD) sc_bar_row[c] += target.part * scattered_from[c];
             }
         }
     }

@@ -60,19 +60,19 @@ auto gather = [](auto points, const F* const* from, const F* part, int c) -> F {
 };
 """
 )
-# Sums of rows: out_i = sum_j matrix_ij in_j, or added to it, from one cell to another.
+# Sums of rows: out_i = sum_j matrix_ij in_j, from one cell to another.
 MULTIPLY = """
 typedef F V __attribute__((vector_size(64), aligned(sizeof(F))));
 const int LANES = 64 / sizeof(F);
 auto multiply_block = [&](auto tall, auto wide, const F* matrix, int ins, F* const* out,
-                          const F* const* in, bool is_adding, int c) {
+                          const F* const* in, int c) {
     constexpr int R = decltype(tall)::value, N = decltype(wide)::value;
     V sum[R][N];
 #pragma clang loop unroll(full)
     for (int a = 0; a < R; ++a)
 #pragma clang loop unroll(full)
         for (int b = 0; b < N; ++b)
-            sum[a][b] = is_adding ? *(const V*)(out[a] + c + b * LANES) : V{};
+            sum[a][b] = V{};
     for (int j = 0; j < ins; ++j) {
         const F* from = in[j] + c;
 #pragma clang loop unroll(full)
@@ -87,41 +87,57 @@ auto multiply_block = [&](auto tall, auto wide, const F* matrix, int ins, F* con
         for (int b = 0; b < N; ++b) *(V*)(out[a] + c + b * LANES) = sum[a][b];
 };
 auto multiply_rows = [&](auto tall, const F* matrix, int ins, F* const* out, const F* const* in,
-                         bool is_adding, int from, int to) {
+                         int from, int to) {
     int c = from;
     for (; c + 4 * LANES <= to; c += 4 * LANES)
-        multiply_block(tall, Four(), matrix, ins, out, in, is_adding, c);
+        multiply_block(tall, Four(), matrix, ins, out, in, c);
     for (; c + LANES <= to; c += LANES)
-        multiply_block(tall, One(), matrix, ins, out, in, is_adding, c);
+        multiply_block(tall, One(), matrix, ins, out, in, c);
     for (; c < to; ++c)
         for (int a = 0; a < decltype(tall)::value; ++a) {
-            F sum = is_adding ? out[a][c] : F(0);
+            F sum = F(0);
             for (int j = 0; j < ins; ++j) sum += matrix[a * ins + j] * in[j][c];
             out[a][c] = sum;
         }
 };
 auto multiply = [&](const F* matrix, int outs, int ins, F* const* out, const F* const* in,
-                    bool is_adding, int from, int to) {
+                    int from, int to) {
     int i = 0;
     for (; i + 4 <= outs; i += 4)
-        multiply_rows(Four(), matrix + i * ins, ins, out + i, in, is_adding, from, to);
+        multiply_rows(Four(), matrix + i * ins, ins, out + i, in, from, to);
     for (; i + 2 <= outs; i += 2)
-        multiply_rows(Two(), matrix + i * ins, ins, out + i, in, is_adding, from, to);
+        multiply_rows(Two(), matrix + i * ins, ins, out + i, in, from, to);
     for (; i < outs; ++i)
-        multiply_rows(One(), matrix + i * ins, ins, out + i, in, is_adding, from, to);
+        multiply_rows(One(), matrix + i * ins, ins, out + i, in, from, to);
+};
+// Rows of moments, which lie far apart, are copied to where they do not take each other's places in
+// a processor's cache; the next row is asked for in time.
+auto moment_row = [&](int k) -> F* { return scratch_row(k); };
+auto pair_row = [&](int i) -> F* { return scratch_row(POINTERS + i); };
+auto ask_for = [&](const F* begin, int from, int to) {
+    for (int k = 0; k < count; ++k)
+        for (int c = from; c < to; c += 64 / (int)sizeof(F))
+            __builtin_prefetch(begin + k * all + ahead + c);
 };
 // Radiance of a group's directions, `light(j)`, from a row of moments that `begin` at a cell.
 auto to_directions = [&](const F* matrix, const F* begin, auto light, int from, int to) {
     const F* in[POINTERS];
     F* out[POINTERS];
-    for (int k = 0; k < count; ++k) in[k] = begin + order[k] * all;
+    for (int k = 0; k < count; ++k) {
+        const F* moment = begin + order[k] * all;
+        F* row = moment_row(k);
+        INDEPENDENT
+        for (int c = from; c < to; ++c) row[c] = moment[c];
+        in[k] = row;
+    }
+    ask_for(begin, from, to);
     for (int p = 0; p < pair_count; ++p)
-        out[p] = p < odd_count ? scratch_row(2 * p) : light(pair[2 * p]);
-    multiply(matrix, pair_count, even, out, in, false, from, to);
-    for (int p = 0; p < odd_count; ++p) out[p] = scratch_row(2 * p + 1);
-    multiply(matrix + pair_count * even, odd_count, odd, out, in + even, false, from, to);
+        out[p] = p < odd_count ? pair_row(2 * p) : light(pair[2 * p]);
+    multiply(matrix, pair_count, even, out, in, from, to);
+    for (int p = 0; p < odd_count; ++p) out[p] = pair_row(2 * p + 1);
+    multiply(matrix + pair_count * even, odd_count, odd, out, in + even, from, to);
     for (int p = 0; p < odd_count; ++p) {
-        const F *sum = scratch_row(2 * p), *difference = scratch_row(2 * p + 1);
+        const F *sum = pair_row(2 * p), *difference = pair_row(2 * p + 1);
         F *one = light(pair[2 * p]), *other = pair[2 * p + 1] < 0 ? one : light(pair[2 * p + 1]);
         INDEPENDENT
         for (int c = from; c < to; ++c) {
@@ -135,12 +151,13 @@ auto to_directions = [&](const F* matrix, const F* begin, auto light, int from, 
 auto to_moments = [&](const F* matrix, F* begin, auto light, bool is_adding, int from, int to) {
     const F *sums[POINTERS], *differences[POINTERS];
     F* out[POINTERS];
+    if (is_adding) ask_for(begin, from, to);
     for (int p = 0; p < pair_count; ++p) {
         const F* one = light(pair[2 * p]);
         sums[p] = differences[p] = one;
         if (pair[2 * p + 1] < 0) continue;
         const F* other = light(pair[2 * p + 1]);
-        F *sum = scratch_row(2 * p), *difference = scratch_row(2 * p + 1);
+        F *sum = pair_row(2 * p), *difference = pair_row(2 * p + 1);
         sums[p] = sum, differences[p] = difference;
         INDEPENDENT
         for (int c = from; c < to; ++c) {
@@ -149,10 +166,15 @@ auto to_moments = [&](const F* matrix, F* begin, auto light, bool is_adding, int
             difference[c] = a - b;
         }
     }
-    for (int k = 0; k < count; ++k) out[k] = begin + order[k] * all;
-    multiply(matrix, even, pair_count, out, sums, is_adding, from, to);
-    multiply(matrix + even * pair_count, odd, odd_count, out + even, differences, is_adding,
-             from, to);
+    for (int k = 0; k < count; ++k) out[k] = moment_row(k);
+    multiply(matrix, even, pair_count, out, sums, from, to);
+    multiply(matrix + even * pair_count, odd, odd_count, out + even, differences, from, to);
+    for (int k = 0; k < count; ++k) {
+        F* moment = begin + order[k] * all;
+        const F* row = moment_row(k);
+        INDEPENDENT
+        for (int c = from; c < to; ++c) moment[c] = is_adding ? moment[c] + row[c] : row[c];
+    }
 };
 """
 # The group of which rows are gone through.
@@ -186,19 +208,35 @@ for (int i = 0; i < 4; ++i) {
     sc_from[i] = sc - back;
 }
 """
-# phi, psi and what is lost, of the depth of a step
-STEP = """
-const F near = near_row[c], far = gather(points, near_from, part, c);
+# The two ends of a step.
+ENDS = """
+const F near_here = near_row[c], far = gather(points, near_from, part, c);
 const F mass = half_step * (e[c] + gather(points, e_from, part, c));
 const F scattering_mass
     = SHARES_FIELD ? mass : half_step * (sc[c] + gather(points, sc_from, part, c));
-const F depth = is_empty ? F(0) : scale * mass, passed = is_empty ? F(1) : decay(depth);
-const bool is_thin = is_empty || depth < F(0.5);
-const F inverse = F(1) / (is_thin ? F(0.5) : depth), series = psi_series(is_thin ? depth : F(0));
-const F phi = is_empty ? F(1) : is_thin ? F(1) - depth * series : (F(1) - passed) * inverse;
+"""
+# phi, psi and what is lost, of the depth of a step; and what of its source reaches its end.
+DECAYED = """
+const F depth_of_step = is_empty ? F(0) : scale * mass;
+const F passed = is_empty ? F(1) : decay(depth_of_step);
+const bool is_thin = is_empty || depth_of_step < F(0.5);
+const F inverse = F(1) / (is_thin ? F(0.5) : depth_of_step);
+const F series = psi_series(is_thin ? depth_of_step : F(0));
+const F phi = is_empty ? F(1) : is_thin ? F(1) - depth_of_step * series : (F(1) - passed) * inverse;
 const F psi = is_empty ? F(0.5) : is_thin ? series : (F(1) - phi) * inverse;
-const F lost = depth * phi;
-const F line_mean = far * phi + (near - far) * psi;
+const F lost = depth_of_step * phi;
+const F line_mean = far * phi + (near_here - far) * psi;
+"""
+# E11 transposed, the source being line times scattering depth: cotangents of the step's numbers.
+SLOPES = """
+const F slope_series = psi_slope_series(is_thin ? depth_of_step : F(0));
+const F psi_slope = is_thin ? slope_series : (phi - F(2) * psi) * inverse;
+const F line_bar = source_bar * (scattering_mass * strength);
+const F lost_bar = -source_bar * (arriving + inflow);
+const F line_slope = far * (psi - phi) + (near_here - far) * psi_slope;
+const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * passed;
+const F scattering_depth_bar = source_bar * line_mean;
+const F scattered = half_step * (scattering_depth_bar * strength);
 """
 FOLLOW = (
     PLACES
@@ -208,6 +246,7 @@ const long long stride = 2LL * most * pitch, places = KEEPS ? (long long)depth *
 F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
 for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_to; ++g) {"""
     + GROUP
+    + "const int ahead = y_way * width;"
     + MULTIPLY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
@@ -228,7 +267,7 @@ for (int t = 0; t < height; ++t) {
     const int near_begin = KEEPS ? 0 : range[2], near_end = KEEPS ? width : range[3];
     to_directions(to_light, moments + color * cells + at, near_of, near_begin, near_end);
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
-    F* __restrict carried = scratch_row(0);
+    F* __restrict carried = scratch_row(3 * POINTERS);
     for (int j = 0; j < members; ++j) {"""
     + DIRECTION
     + """
@@ -247,7 +286,8 @@ for (int t = 0; t < height; ++t) {
                     light_row[c] = arriving;
                     if (decltype(along)::value) carried[c] = part[0];
                 } else {"""
-    + STEP
+    + ENDS
+    + DECAYED
     + """
                     // Light from outside is there without a medium; I is what differs from it.
                     const F source = line_mean * (scattering_mass * strength) - inflow * lost;

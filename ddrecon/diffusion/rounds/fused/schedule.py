@@ -21,19 +21,21 @@ from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
-AXIS, X = 1, 2
+X = 2
 POINTS = 4
+"""Cells at most where a step begins."""
 
 
 @dataclass(frozen=True)
 class Step:
     """The step to a cell along a direction: from a mean of up to four cells, of given `weights`.
 
-    Each of `points` tells how many cells it lies before the cell along z, y and x, none or one, of
+    Slices lie across `axis`. Each of `points` tells how many cells it lies before the cell along z, y and x, none or one, of
     light with the `signs`. Where `is_along` the first lies in the same row: a recurrence in x.
     """
 
     direction: Direction
+    axis: int
     half: float
     signs: tuple[int, int, int]
     points: tuple[tuple[int, int, int], ...]
@@ -58,7 +60,7 @@ class Step:
         kept = {point: weight for point, weight in found.items() if weight > 0}
         signs = tuple(1 if m > 0 else -1 if m < 0 else 0 for m in moved)
         points, weights = tuple(kept), tuple(kept.values())
-        return Step(direction, 0.5 * course.step, signs, points, weights, is_along)
+        return Step(direction, axis, 0.5 * course.step, signs, points, weights, is_along)
 
     @property
     def is_up(self) -> bool:
@@ -153,7 +155,11 @@ class _Maker:
         is_odd = (harmonics(point, self.degree) * harmonics(image, self.degree) < 0).tolist()
         self.order = sorted(range(moments), key=lambda k: is_odd[k])
         self.odd, self.most = sum(is_odd), 0
-        self.groups, self.points, self.pairs = list[list[int]](), list[list[int]](), list[list[int]]()
+        self.groups, self.points, self.pairs = (
+            list[list[int]](),
+            list[list[int]](),
+            list[list[int]](),
+        )
         self.parts, self.matrices = list[list[float]](), list[Tensor]()
 
     def add_way(
@@ -169,9 +175,7 @@ class _Maker:
             done += len(unit)
         ranges = [self._add_chunk(chunk) for chunk in chunks if chunk]
         per_piece = -(-len(ranges) // pieces)
-        return tuple(
-            tuple(ranges[i : i + per_piece]) for i in range(0, len(ranges), per_piece)
-        )
+        return tuple(tuple(ranges[i : i + per_piece]) for i in range(0, len(ranges), per_piece))
 
     def _add_chunk(self, units: list[Unit]) -> tuple[int, int]:
         begin, before = len(self.groups), 0
@@ -212,6 +216,12 @@ class _Maker:
         fill = POINTS - len(step.points)
         points = step.points + step.points[:1] * fill
         self.points.append(
-            [len(step.points), step.signs[2], step.is_along, *(n for point in points for n in point), 0]
+            [
+                len(step.points),
+                step.signs[2],
+                step.is_along,
+                *(n for point in points for n in point),
+                0,
+            ]
         )
         self.parts.append([step.half, *step.weights, *[0.0] * fill])

@@ -13,7 +13,9 @@ from ddrecon.kernels.records import launch_record, record_kernel
 
 FAR = 64
 """Cells beyond the ends of a row, where an empty one ends and begins."""
-_COPY = f"const int FAR = {FAR};" + """
+_COPY = (
+    f"const int FAR = {FAR};"
+    + """
 const int z = item / (height + 2) - 1, y = item % (height + 2) - 1;
 const bool is_inside = z >= 0 && z < depth && y >= 0 && y < height;
 const long long rows = (long long)(depth + 2) * (height + 2);
@@ -36,6 +38,7 @@ if (is_inside) {
     occupied[all + row] = to > occupied[all + row] ? to : occupied[all + row];
 }
 """
+)
 
 
 def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor]:
