@@ -18,7 +18,7 @@ from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile, ParameterSettings
 from ddrecon.variables.kinds import Kind, kind_of
-from ddrecon.variables.values import value_of, variable_names
+from ddrecon.variables.values import component_names, value_of, variable_names
 
 
 def require_start_files(scene_file: SceneFile, problems: Problems) -> None:
@@ -56,7 +56,7 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
         read = _read_cells if kind.is_cellwise else _read_pixels
         value = read(scene_file, f"{key}.init.file", name, settings.init, value)
     elif settings.init is not None:
-        value = _fill(scene_file, f"{key}.init", kind, settings.init, value)
+        value = _fill(scene_file, f"{key}.init", name, settings.init, value)
     if kind.is_cellwise:
         value = _spread(scene_file, key, kind, settings, value, scene.volume.grid.shape)
     if not bool(((value >= kind.low) & (value <= kind.high)).all()):
@@ -103,10 +103,11 @@ def _size(pixels: Tensor) -> str:
 
 
 def _fill(
-    scene_file: SceneFile, key: str, kind: Kind, init: float | tuple[float, ...], value: Tensor
+    scene_file: SceneFile, key: str, name: str, init: float | tuple[float, ...], value: Tensor
 ) -> Tensor:
     """`value` with every entry `init`, or every color or component its own."""
-    count = len(kind.components)
+    kind = kind_of(name)
+    count = len(component_names(name, value)) if kind.components else 0
     if isinstance(init, float) and not count:
         return torch.full_like(value, init)
     if isinstance(init, tuple) and kind.is_color and len(init) == 3:

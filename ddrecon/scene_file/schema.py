@@ -175,12 +175,42 @@ def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
         yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
 
+@dataclass(frozen=True)
+class OpencvSection:
+    """A lens of OpenCV's model, as COLMAP and nerfstudio have it: see `ddrecon.lenses`."""
+
+    type: ClassVar[str] = "opencv"
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+@dataclass(frozen=True)
+class FisheyeSection:
+    """A lens of OpenCV's fisheye model."""
+
+    type: ClassVar[str] = "fisheye"
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+
+LensSection = OpencvSection | FisheyeSection
+
+
 @dataclass(frozen=True, kw_only=True)
 class PerspectiveSection(PoseSection):
     """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
 
     The axis meets the image at `principal_point`, parts of its width and height from the top left.
-    `pixel_aspect`: height of a pixel over its width.
+    `pixel_aspect`: height of a pixel over its width. With `distortion`, all this is said of the
+    pinhole camera that is left without it.
     """
 
     type: ClassVar[str] = "perspective"
@@ -188,6 +218,7 @@ class PerspectiveSection(PoseSection):
     fov: float = limited(above=0, below=180)
     principal_point: Pair = (0.5, 0.5)
     pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
+    distortion: LensSection | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
