@@ -59,9 +59,7 @@ def true_cameras() -> dict[str, Camera]:
     """The five cameras as they stand, in float64."""
     generator = np.random.default_rng(SEED)
     cameras = {}
-    for (name, angle), height, distance in zip(
-        ANGLES.items(), HEIGHTS, DISTANCES, strict=True
-    ):
+    for (name, angle), height, distance in zip(ANGLES.items(), HEIGHTS, DISTANCES, strict=True):
         turn = np.radians(angle)
         eye = (distance * np.sin(turn), height, distance * np.cos(turn))
         target = (generator.normal(0, 0.02), 0.74 + generator.normal(0, 0.02), 0.0)
@@ -152,7 +150,8 @@ def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) ->
 def exposures() -> dict[str, tuple[np.ndarray, float]]:
     """The gain by color and the black level of each camera.
 
-    Gains have a mean of 1 over the training cameras in each color: the light has the rest.
+    Gains have a mean of 1 over the training cameras in each color: the light has the rest. The
+    held-out camera is the ruler, and has neither.
     """
     generator = np.random.default_rng(SEED + 1)
     gains = generator.uniform(0.7, 1.3, (len(ANGLES), 1)) * generator.uniform(
@@ -160,6 +159,7 @@ def exposures() -> dict[str, tuple[np.ndarray, float]]:
     )
     gains /= gains[:4].mean(0)
     blacks = generator.uniform(0.0005, 0.0025, len(ANGLES))
+    gains[-1], blacks[-1] = 1, 0
     return {name: (gains[i], blacks[i]) for i, name in enumerate(ANGLES)}
 
 
@@ -205,7 +205,9 @@ def main() -> None:
             np.savez(given.keep, **kept)
     (folder / "clean").mkdir(parents=True, exist_ok=True)
     box = np.array(BOX)
-    np.savez_compressed(folder / "density.npz", density=kept["density"].astype(np.float16), bounds=box)
+    np.savez_compressed(
+        folder / "density.npz", density=kept["density"].astype(np.float16), bounds=box
+    )
     told, truth, wrong = told_cameras(cameras), [], []
     for seed, (name, (exposure, black)) in enumerate(exposures().items()):
         (folder / f"{name}.jpg").write_bytes(spoil(kept[name], exposure, black, seed))

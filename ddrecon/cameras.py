@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid, Triple, array_order
-from ddrecon.lenses import ray_through
+from ddrecon.lenses import distort, ray_through
 
 
 @dataclass(eq=False)
@@ -196,3 +196,29 @@ def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Te
         indexing="ij",
     )
     return torch.stack([x, y], -1).view(-1, 2)
+
+
+def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Where `points` [N, 3] (x, y, z) [u] are seen, `[N, 2]`, and how far away, `[N]`.
+
+    In columns and rows from the image's top left corner; NaN where they are not: behind a
+    perspective camera, or beyond the corners of its image, where distortion may have folded over.
+    """
+    right, up, backward, origin = camera.pose.detach().unbind(1)
+    away = points - origin
+    ray = torch.stack([away @ right, -(away @ up), -(away @ backward)], 1)
+    height, width = camera.size
+    if not camera.is_perspective:
+        places, is_seen = ray[:, :2], torch.ones_like(ray[:, 2], dtype=torch.bool)
+    else:
+        places = ray[:, :2] / ray[:, 2:]
+        if camera.lens is not None and camera.distortion is not None:
+            places = distort(camera.lens, camera.distortion.detach(), ray)
+        cosine = -(cast_rays(camera).direction.flip(1) @ backward)
+        is_seen = ray[:, 2] / away.norm(dim=1) >= cosine.min() - 1e-6
+    step = 2 * float(camera.half_width) / width
+    x, y = places.unbind(1)
+    column = x / step + float(camera.principal_point[0]) * width
+    row = y / (step * camera.pixel_aspect) + float(camera.principal_point[1]) * height
+    seen = torch.stack([column, row], 1)
+    return seen.where(is_seen[:, None], torch.nan), away.norm(dim=1)

@@ -27,7 +27,15 @@ from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.ring import ring_views
 from ddrecon.scene_file.schema import Constant, Density, Quantity, ViewSection, ViewSource
 from ddrecon.scene_file.transforms import read_transforms
-from ddrecon.settings import FieldFile, ParameterSettings, Start
+from ddrecon.settings import (
+    AUTO,
+    MASKS,
+    FieldFile,
+    ParameterSettings,
+    Start,
+    Support,
+    Weight,
+)
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
@@ -169,9 +177,10 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
         with problems.collecting():
             if (kind := KINDS.get(pattern_of(name))) is None:
                 raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
-            parameters[name] = _require_legal(
-                child, read_record(child, ParameterSettings, rule.folder), kind
-            )
+            settings = read_record(child, ParameterSettings, rule.folder)
+            if settings.support is not None and name != "density":
+                raise _mapping(child)["support"].refused("is for density alone")
+            parameters[name] = _require_legal(child, settings, kind)
     problems.raise_any()
     if not parameters:
         raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
@@ -222,6 +231,22 @@ def _read_start(node: Node, rule: Rule) -> Any:
     )
 
 
+def _read_weight(node: Node, rule: Rule) -> float | str:
+    """A number, or `auto`."""
+    if isinstance(node.value, str):
+        return read_text(node, Rule(str, {"choices": (AUTO,)}, rule.folder))
+    return read_number(node, rule)
+
+
+def _read_support(node: Node, rule: Rule) -> float | str | FieldFile:
+    """`masks`, a displayed value, or `{file: path}`."""
+    if isinstance(node.value, dict):
+        return read_record(node, FieldFile, rule.folder)
+    if isinstance(node.value, str):
+        return read_text(node, Rule(str, {"choices": (MASKS,)}, rule.folder))
+    return read_number(node, rule)
+
+
 def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
     """A list of views with names of their own, or the views of a ring or of transforms."""
     if isinstance(node.value, dict):
@@ -257,6 +282,8 @@ READERS: dict[Any, Callable[[Node, Rule], Any]] = {
     Density: _read_density,
     Quantity: _read_quantity,
     Start: _read_start,
+    Weight: _read_weight,
+    Support: _read_support,
     Mapping[str, ParameterSettings]: _read_parameters,
     tuple[ViewSection, ...]: _read_views,
 }
