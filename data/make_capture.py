@@ -48,7 +48,7 @@ FOCAL = 368.0
 """Focal length [pixels], but for a percent from camera to camera."""
 LENS = (-0.25, 0.08, 0.0, 0.0, 0.001, -0.0015)
 TURNED, MOVED = 0.3, 0.003
-"""Errors of calibration: degrees about each axis, and meters per meter of distance."""
+"""Errors of calibration: degrees, and meters per meter of distance."""
 PHOTONS = 8000
 """Electrons of a pixel that is just white."""
 SUBPIXELS = 16
@@ -85,10 +85,9 @@ def told_cameras(cameras: dict[str, Camera]) -> dict[str, Camera]:
     names = [name for name in cameras if name != "held_out"]
     turns, shifts, arms = [], [], []
     for name in names:
-        axes, arm = cameras[name].pose[:, :3], cameras[name].pose[:, 3] - center
-        turn = axes @ torch.randn(3, generator=generator, dtype=torch.float64)
-        turn *= np.radians(TURNED)
-        shift = torch.randn(3, generator=generator, dtype=torch.float64) * MOVED * arm.norm()
+        arm = cameras[name].pose[:, 3] - center
+        turn = np.radians(TURNED) * _random_way(generator)
+        shift = MOVED * arm.norm() * _random_way(generator)
         # A turn about the camera is one about the center, and a shift back.
         turns.append(turn)
         shifts.append(shift - torch.linalg.cross(turn, arm))
@@ -102,6 +101,12 @@ def told_cameras(cameras: dict[str, Camera]) -> dict[str, Camera]:
         change = torch.cat([axes.T @ turn[index], axes.T @ shift[index]])
         told[name] = twist(cameras[name], change, tuple(center.tolist()))
     return told
+
+
+def _random_way(generator: torch.Generator) -> Tensor:
+    """A vector of unit length."""
+    vector = torch.randn(3, generator=generator, dtype=torch.float64)
+    return vector / vector.norm()
 
 
 def scene_of(density: Tensor, cameras: dict[str, Camera]) -> Scene:

@@ -13,6 +13,7 @@ from operator import or_
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
+from ddrecon.scene_file.colmap import read_colmap
 from ddrecon.scene_file.leaves import (
     LEAVES,
     Rule,
@@ -253,6 +254,9 @@ def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
         source = read_record(node, ViewSource, rule.folder)
         if source.ring is not None:
             return ring_views(node, source.ring, source.images, rule.folder)
+        if source.colmap is not None:
+            images = (rule.folder / (source.images or "")).absolute()
+            return read_colmap(node.value["colmap"], source.colmap, images, source.test_every)
         return read_transforms(node.value["transforms"], source.transforms or (), source.test_every)
     entries = read_list(node)
     for index, entry in enumerate(entries):
