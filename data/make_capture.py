@@ -3,10 +3,10 @@
     python data/make_capture.py [--paths 256] [--keep TRACED.npz] [-o FOLDER]
 
 The smoke is that of `make_smoke.py`; Mitsuba 3 traces its pictures along ddrecon's own view rays,
-`--paths` a pixel; `--keep` is where they are kept, and taken from when they are there. DRJIT_LIBLLVM_PATH
-makes Mitsuba some ten times faster. Then each picture is spoiled: exposure, white balance, black
-level, shot noise, sRGB of 8 bits, JPEG; and each training camera is told a little wrong. What is true
-stands in truth.json and density.npz.
+`--paths` a pixel; `--keep` is where they are kept, and taken from where they are there (with
+DRJIT_LIBLLVM_PATH Mitsuba is some ten times faster). Then each picture is spoiled: exposure, white
+balance, black level, shot noise, sRGB of 8 bits, JPEG; and each training camera is told a little
+wrong. What is true stands in truth.json and density.npz.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import io
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio

@@ -30,7 +30,8 @@ class Parameter:
     """The value of one variable, and the optimizer that moves it within its bounds.
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
-    every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer is Adam (Kingma and Ba 2015, arXiv:1412.6980).
+    every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
+    is Adam (Kingma and Ba 2015, arXiv:1412.6980).
     """
 
     def __init__(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from ddrecon.cameras import Camera, cast_rays, project
+from ddrecon.cameras import Camera, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.reconstruct.levels import resample
@@ -111,8 +111,8 @@ def _linear(displayed: float) -> float:
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
     """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
 
-    What it does not see may. `shown` [h, w] is whether a pixel shows something; a cell may hold it where a pixel does within
-    `margin` pixels of those that the cell covers.
+    What it does not see may. `shown` [h, w] is whether a pixel shows something; a cell may hold it
+    where a pixel does within `margin` pixels of those that the cell covers.
     """
     z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
     places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))

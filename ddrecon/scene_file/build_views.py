@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -33,13 +34,35 @@ def build_views(
     problems, views = Problems(), []
     for index in range(len(scene_file.tree.views)):
         with problems.collecting():
-            views.append(_build_view(scene_file, index, grid, dtype, device))
+            views.append(_build_view(scene_file, index, dtype, device))
+    if grid is not None:
+        _note_blind(scene_file, views, grid, problems)
     problems.raise_any()
     return views
 
 
+def _note_blind(
+    scene_file: SceneFile, views: Sequence[View], grid: Grid, problems: Problems
+) -> None:
+    """Notes the `views` that do not see the box of `grid`: one by one, or all in one line."""
+    blind = [view for view in views if not sees_box(view.camera, grid)]
+    if len(blind) > 1 and len(blind) == len(scene_file.tree.views):
+        why = explain_blindness([view.camera for view in blind], grid)
+        problems.note(scene_file.refused("views", f"none looks through the volume; {why}"))
+        return
+    for view in blind:
+        index = [section.name for section in scene_file.tree.views].index(view.name)
+        problems.note(
+            scene_file.refused(
+                f"views.{index}.camera",
+                f"no pixel of view {view.name!r} looks through the volume;"
+                f" {explain_blindness([view.camera], grid)}",
+            )
+        )
+
+
 def _build_view(
-    scene_file: SceneFile, index: int, grid: Grid | None, dtype: torch.dtype, device: torch.device
+    scene_file: SceneFile, index: int, dtype: torch.dtype, device: torch.device
 ) -> View:
     key, section, problems = f"views.{index}", scene_file.tree.views[index], Problems()
     image = mask = None
@@ -66,12 +89,6 @@ def _build_view(
         with problems.collecting():
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
             _require_unfolded(scene_file, f"{key}.camera", camera)
-            if grid is not None and not sees_box(camera, grid):
-                raise scene_file.refused(
-                    f"{key}.camera",
-                    f"no pixel of view {section.name!r} looks through the volume;"
-                    f" {explain_blindness(camera, grid)}",
-                )
     problems.raise_any()
     lens = camera.distortion
     camera = replace(

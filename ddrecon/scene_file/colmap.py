@@ -127,7 +127,7 @@ def _camera(
     focal_x = given.get("fx", given.get("f", 0.0))
     focal_y = given.get("fy", focal_x)
     if not (all(map(math.isfinite, parameters)) and focal_x > 0 and focal_y > 0):
-        raise FormatError(path, f"{where}: its parameters must be finite, its focal lengths positive")
+        raise FormatError(path, f"{where}: its focal lengths must be above 0, all finite")
     return PerspectiveSection(
         matrix=None,
         resolution=size,

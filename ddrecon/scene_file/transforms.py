@@ -20,8 +20,8 @@ from ddrecon.scene_file.leaves import Rule, read_each, read_list, read_path, rea
 from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import ViewSection
-from ddrecon.scene_file.view_names import name_views
 from ddrecon.scene_file.transforms_camera import Entries, read_camera
+from ddrecon.scene_file.view_names import name_views
 
 MAX_BYTES = 64 * 2**20
 TEST_NAME = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)

@@ -13,7 +13,7 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import twist
+from ddrecon.cameras import Camera, twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import torch
 from media import box_grid, make_camera
 
-from ddrecon.cameras import Camera, cast_rays, project
+from ddrecon.cameras import cast_rays, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import write_field
@@ -94,7 +95,7 @@ def test_a_hull_grows_with_margin_and_with_cells() -> None:
     shown[15, 18] = True
     grids = [box_grid((8, 8, 8)), box_grid((4, 4, 4))]
     hulls = [hull_of(camera, shown, grids[0], margin)[0] for margin in (0.0, 1.0, 4.0)]
-    for small, large in zip(hulls, hulls[1:], strict=False):
+    for small, large in pairwise(hulls):
         assert bool((large | ~small).all()) and large.sum() > small.sum()
     coarse, _ = hull_of(camera, shown, grids[1], 0.0)
     fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)

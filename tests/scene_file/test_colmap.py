@@ -37,9 +37,7 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
     """By the sandwich q v q*, vector by vector."""
     w, *axis = quaternion / np.linalg.norm(quaternion)
     u = np.array(axis)
-    columns = [
-        2 * (u @ v) * u + (w * w - u @ u) * v + 2 * w * np.cross(u, v) for v in np.eye(3)
-    ]
+    columns = [2 * (u @ v) * u + (w * w - u @ u) * v + 2 * w * np.cross(u, v) for v in np.eye(3)]
     return np.stack(columns, 1)
 
 
@@ -140,8 +138,8 @@ def test_what_is_no_model_is_refused(
         ("cameras.txt", " 3.1", "", "camera 7: PINHOLE has 4 parameters, fx, fy, cx, cy"),
         ("cameras.txt", "8 6", "8 x", "line 2: expected CAMERA_ID MODEL WIDTH"),
         ("cameras.txt", "8 6", "8 0", "camera 7: 8 x 0 is no size of an image"),
-        ("cameras.txt", "20.0", "-20", "its focal lengths positive"),
-        ("cameras.txt", "20.0", "nan", "must be finite"),
+        ("cameras.txt", "20.0", "-20", "its focal lengths must be above 0"),
+        ("cameras.txt", "20.0", "nan", "all finite"),
         ("images.txt", " 7 b", " 8 b", "image 'b c.png': there is no camera 8"),
         ("images.txt", "3 0.2", "3 x", "line 2: expected IMAGE_ID QW QX"),
         ("images.txt", "0.2 0.9 -0.3 0.1 0.1", "0 0 0 0 0.1", "not finite, or no rotation"),
