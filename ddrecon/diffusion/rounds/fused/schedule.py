@@ -39,7 +39,7 @@ class Step:
     axis: int
     half: float
     signs: tuple[int, int, int]
-    points: tuple[tuple[int, int, int], ...]
+    points: tuple[tuple[int, ...], ...]
     weights: tuple[float, ...]
     is_along: bool
 
@@ -53,7 +53,7 @@ class Step:
         for drift, dim in zip(course.drift, course.order[2:], strict=True):
             moved[dim - 1] = drift
         # The cells around where light was, first that on the row itself where it goes along x.
-        found: dict[tuple[int, int, int], float] = {}
+        found: dict[tuple[int, ...], float] = {}
         for point in product(*((1,) if i == axis else (0, 1) for i in range(3))):
             parts = (abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True))
             found[point] = math.prod(parts)
