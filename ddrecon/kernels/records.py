@@ -1,50 +1,35 @@
-"""Kernels that are given one record: the addresses of arrays, and whole numbers, by name.
+"""Kernels in a text whose arrays and whole numbers are named one by one (`TextKernel`)."""
 
-The text of such a kernel names each array once, where the record is declared; making Warp's own
-arrays takes longer than handing over their addresses.
-"""
+from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Any
 
-import warp as wp
-from torch import Tensor, is_tensor
+from torch import Tensor
 
 from ddrecon.kernels.launch import launch
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.text import TextKernel
 
-_TYPES = {"real": "F", "whole": "int", "double": "double"}
+_TYPES = {"": "F", "real": "F", "whole": "int", "double": "double"}
 
 
 @functools.cache
-def record_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") -> Any:
+def record_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") -> TextKernel:
     """The kernel `name` that does `text`, C++ as of `program`, for each `item`.
 
     The text has pointers called as the `arrays`, of numbers `F` or, where it says so
     (`whole:items double:sums`), of whole ones or of double precision; and whole `numbers`.
     """
-    types = dict(
-        (one.partition(":")[::-2] if ":" in one else (one, "real")) for one in arrays.split()
-    )
-    fields = dict.fromkeys(types, wp.uint64) | dict.fromkeys(numbers.split(), int)
-    Record = wp.struct(type("Record", (), {"__annotations__": fields, "__module__": __name__}))
-    given = [f"{_TYPES[t]}* const {one} = ({_TYPES[t]}*)record.{one};" for one, t in types.items()]
-    given += [f"const int {one} = record.{one};" for one in numbers.split()]
-
-    @wp.func_native(program(bits, "\n".join(given) + text))
-    def do_item(item: int, record: Record): ...
-
-    @wp.kernel(enable_backward=False, module="unique", name=name)
-    def do_items(first: int, record: Record):
-        do_item(first + wp.tid(), record)
-
-    do_items.Record, do_items.names = Record, tuple(fields)
-    return do_items
+    given = ""
+    for one in arrays.split():
+        kind, _, array = one.rpartition(":")
+        given += f"{_TYPES[kind]} *{array};"
+    given += "".join(f"int {one};" for one in numbers.split())
+    return TextKernel(name, bits, text, given)
 
 
 def launch_record(
-    kernel: Any,
+    kernel: TextKernel,
     count: int,
     values: Mapping[str, Tensor | int],
     like: Tensor,
@@ -55,10 +40,7 @@ def launch_record(
 
     `threads` and `work` as of `launch`.
     """
-    record = kernel.Record()
+    record = kernel.new_record()
     for name in kernel.names:
-        value = values[name]
-        if is_tensor(value) and not value.is_contiguous():
-            raise ValueError("arrays that kernels are given are contiguous")
-        setattr(record, name, value.data_ptr() if is_tensor(value) else value)
-    launch(kernel, count, [record], like, threads, work)
+        kernel.write(record, name, values[name])
+    launch(kernel.kernel, count, [record], like, threads, work)

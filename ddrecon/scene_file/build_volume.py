@@ -60,10 +60,7 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     density = (
         density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
     )
-    tensors = [
-        tensor.to(device, dtype)
-        for tensor in (density, sigma_a, sigma_s)
-    ]
+    tensors = [tensor.to(device, dtype) for tensor in (density, sigma_a, sigma_s)]
     return Volume(grid, *tensors, phase)
 
 

@@ -172,7 +172,10 @@ def test_along_rays_a_spread_peak_is_nearly_the_same(g: float, degree: int):
     cosine = torch.linspace(-1, 1, 41, dtype=torch.float64)
     depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 400)]).double().view(-1, 1, 1)
     seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
-    along, exact = seen.along(depth.expand(-1, 1, 41), cosine)[:, 0], seen.at(depth.movedim(1, 0), cosine)[0]
+    along, exact = (
+        seen.along(depth.expand(-1, 1, 41), cosine)[:, 0],
+        seen.at(depth.movedim(1, 0), cosine)[0],
+    )
     torch.testing.assert_close(along[0], exact[0], rtol=1e-5, atol=1e-6)
     assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
 
@@ -187,7 +190,11 @@ def test_along_rays_all_derivatives_agree_with_differences(name: str):
     def found(depth: Tensor, cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
         seen = SeenPhase(kind(*numbers), 1)
         angles = cosine.acos().expand(3, 4)
-        return seen.along(depth, cosine), seen.at_angles(depth, angles), seen.at_angles(None, angles)
+        return (
+            seen.along(depth, cosine),
+            seen.at_angles(depth, angles),
+            seen.at_angles(None, angles),
+        )
 
     assert torch.autograd.gradcheck(found, (depth, cosine, *numbers), check_forward_ad=True)
 
