@@ -77,8 +77,8 @@ class Legendre(_Given):
 class Tabulated(_Given):
     """A smooth curve through `values` at even angles from 0 to pi, divided by its integral.
 
-    `values` >= 0: [C, steps + 1] with C = 1 or 3, of any scale; `numerics.angle_table.at_even_angles`
-    makes them from uneven angles.
+    `values` >= 0: [C, steps + 1] with C = 1 or 3, of any scale. `at_even_angles` makes them from
+    uneven ones (`numerics.angle_table`).
     """
 
     NAME = "table"

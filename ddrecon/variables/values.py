@@ -1,8 +1,8 @@
 """The numbers of a scene by name, read out of a scene and put back into it.
 
-`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's; `lights.0.irradiance`
-is any number of the first light; `views.front.camera` is the twist of a camera. Vectors are (x, y,
-z), colors lead.
+`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's;
+`lights.0.irradiance` is any number of the first light; `views.front.camera` is the twist of a
+camera. Vectors are (x, y, z), colors lead.
 """
 
 from __future__ import annotations
@@ -28,7 +28,11 @@ def variable_names(scene: Scene) -> list[str]:
         for index, light in enumerate(scene.lights)
         for name in _tensors(light)
     ]
-    return [*_volume_names(scene.volume), *lights, *(f"views.{view.name}.camera" for view in scene.views)]
+    return [
+        *_volume_names(scene.volume),
+        *lights,
+        *(f"views.{view.name}.camera" for view in scene.views),
+    ]
 
 
 def value_of(scene: Scene, name: str) -> Tensor:
@@ -146,7 +150,7 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
     if numbers:
         parts = {name.removeprefix(PHASE): number for name, number in numbers.items()}
-        phase = replace(phase, **parts)  # type: ignore[arg-type]
+        phase = replace(phase, **parts)
     changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
 
