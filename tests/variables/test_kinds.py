@@ -41,7 +41,8 @@ PHASES = {
 def scenes() -> dict[str, Scene]:
     """Scenes with every kind of light, in which all kinds of variables occur, by phase function."""
     phases = {"": ["volume.g=0.3"]}
-    phases |= {phase: ["volume.g=0", f"volume.phase={phase}"] for phase in PHASES.values()}
+    others = ["volume.g=0", "optimize.parameters={density: {}}"]
+    phases |= {phase: [*others, f"volume.phase={phase}"] for phase in PHASES.values()}
     return {
         phase: load_scene(CONFIG, overrides=[*SMALL, *changes], dtype=torch.float64)
         for phase, changes in phases.items()
