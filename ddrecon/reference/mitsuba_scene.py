@@ -193,9 +193,11 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
                 f"view {view.name!r}: Mitsuba's pixels are square, "
                 f"those of this camera {camera.pixel_aspect:.6g} times as high as wide"
             )
+        if camera.lens is not None:
+            raise SceneError(f"view {view.name!r}: Mitsuba's cameras have no lens distortion")
         fov = 2 * math.degrees(math.atan(camera.half_width))
         offsets = {
-            f"principal_point_offset_{axis}": 0.5 - place
+            f"principal_point_offset_{axis}": 0.5 - float(place)
             for axis, place in zip("xy", camera.principal_point, strict=True)
         }
         return {
@@ -206,7 +208,8 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
             "to_world": matrix,
             **sensor,
         }
-    scale = np.diag([camera.half_width, camera.half_width, 1.0, 1.0])
+    half_width = float(camera.half_width)
+    scale = np.diag([half_width, half_width, 1.0, 1.0])
     return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
 
 
