@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from ddrecon.grid import Triple
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.settings import Problem, limited
 
-Color = float | Triple
 Pair = tuple[float, float]
 
 

@@ -17,12 +17,11 @@ from typing import ClassVar
 import numpy as np
 
 from ddrecon.grid import Triple
-from ddrecon.scene_file.phase_schema import (
+from ddrecon.scene_file.light_schema import (
     Color,
-    HenyeyGreensteinSection,
-    Pair,
-    PhaseSection,
+    LightSection,
 )
+from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, Pair, PhaseSection
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
@@ -93,59 +92,6 @@ class VolumeSection:
         x, y, z = self.resolution or (1, 1, 1)
         if x * y * z > MAX_CELLS:
             yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
-
-
-@dataclass(frozen=True)
-class DirectionalSection:
-    """`direction`: the way the light travels; `irradiance` on a plane facing it."""
-
-    type: ClassVar[str] = "directional"
-
-    direction: Triple
-    irradiance: Color = limited(minimum=0)
-
-    def problems(self) -> Iterator[Problem]:
-        if not any(self.direction):
-            yield "direction", "must not be zero"
-
-
-@dataclass(frozen=True)
-class AmbientSection:
-    """The same radiance from everywhere."""
-
-    type: ClassVar[str] = "ambient"
-
-    radiance: Color = limited(minimum=0)
-
-
-@dataclass(frozen=True)
-class EnvironmentSection:
-    """A latitude-longitude map, +y up.
-
-    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about +y.
-
-    `directions`: how many directions its light on the volume is gathered into.
-    """
-
-    type: ClassVar[str] = "environment"
-
-    file: Path
-    scale: float = bounded(1.0, minimum=0)
-    rotation: float = 0.0
-    directions: int = bounded(48, minimum=1, maximum=1024)
-
-
-@dataclass(frozen=True)
-class PointSection:
-    """Light from one point, inside or outside the box; `intensity`: power per solid angle."""
-
-    type: ClassVar[str] = "point"
-
-    position: Triple
-    intensity: Color = limited(minimum=0)
-
-
-LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 
 from ddrecon import settings
-from ddrecon.scene_file import schema
+from ddrecon.scene_file import light_schema, phase_schema, schema
 
 DOCS = Path(__file__).parents[2] / "docs"
 ELSEWHERE = {schema.Constant, schema.Bounds, schema.PoseSection, schema.SceneTree}
@@ -33,7 +33,8 @@ def test_the_page_is_what_the_schema_makes_of_it(manual: ModuleType) -> None:
 
 
 def test_every_key_of_every_record_is_explained(manual: ModuleType) -> None:
-    names = [*vars(schema).values(), *vars(settings).values()]
+    modules = schema, light_schema, phase_schema, settings
+    names = [value for module in modules for value in vars(module).values()]
     records = {value for value in names if isinstance(value, type) and is_dataclass(value)}
     explained = {record: set(texts) for _, record, _, texts in manual.SECTIONS}
     assert set(explained) == records - ELSEWHERE
