@@ -56,6 +56,9 @@ def describe_result(
         if f"views.{view.name}.camera" in values:
             camera = _move_camera(camera, view.camera.pose.tolist())
         section["camera"] = camera
+        for key in ("exposure", "offset"):
+            if (value := values.get(f"views.{view.name}.{key}")) is not None:
+                section[key] = value
     return described
 
 

@@ -7,8 +7,9 @@ z), colors lead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +20,13 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, VOLUME, kind_of
 
+VIEW: Mapping[str, Callable[[View], Tensor]] = {
+    "camera": lambda view: view.camera.pose.new_zeros(6),
+    "exposure": lambda view: _or_fill(view.exposure, view, 1.0),
+    "offset": lambda view: _or_fill(view.offset, view, 0.0),
+}
+"""The variables of a view, and what reads each."""
+
 
 def variable_names(scene: Scene) -> list[str]:
     """The name of every variable of `scene`."""
@@ -27,7 +35,8 @@ def variable_names(scene: Scene) -> list[str]:
         for index, light in enumerate(scene.lights)
         for name in _tensors(light)
     ]
-    return [*VOLUME, *lights, *(f"views.{view.name}.camera" for view in scene.views)]
+    views = [f"views.{view.name}.{key}" for view in scene.views for key in VIEW]
+    return [*VOLUME, *lights, *views]
 
 
 def value_of(scene: Scene, name: str) -> Tensor:
@@ -35,7 +44,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
 
     `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
     that light holds them; a camera's twist is the change of its pose, [6] and zero: see
-    `ddrecon.cameras.twist`.
+    `ddrecon.cameras.twist`; exposure and offset [1] or [3].
     """
     if name not in variable_names(scene):
         raise KeyError(name)
@@ -43,7 +52,8 @@ def value_of(scene: Scene, name: str) -> Tensor:
         return _volume_value(scene.volume, name)
     section, _, path = name.partition(".")
     if section == "views":
-        return scene.view(path.removesuffix(".camera")).camera.pose.new_zeros(6)
+        owner, _, key = path.rpartition(".")
+        return VIEW[key](scene.view(owner))
     index, _, attribute = path.partition(".")
     value: Tensor = getattr(scene.lights[int(index)], attribute)
     return value
@@ -64,9 +74,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     lights = [
         _replace_light(light, f"lights.{index}", values) for index, light in enumerate(scene.lights)
     ]
-    views = [
-        _replace_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views
-    ]
+    views = [_replace_view(view, values, scene) for view in scene.views]
     volume = _replace_volume(
         scene.volume, {name: values[name] for name in VOLUME if name in values}
     )
@@ -93,6 +101,10 @@ def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
     if one.ndim == other.ndim:
         return one, other
     return (one, other.view(-1, 1, 1, 1)) if one.ndim == 4 else (one.view(-1, 1, 1, 1), other)
+
+
+def _or_fill(value: Tensor | None, view: View, default: float) -> Tensor:
+    return view.camera.pose.new_full((1,), default) if value is None else value
 
 
 def _tensors(light: Light) -> list[str]:
@@ -131,7 +143,9 @@ def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Lig
     return changed
 
 
-def _replace_view(view: View, change: Tensor | None, scene: Scene) -> View:
-    if change is None:
-        return view
-    return replace(view, camera=twist(view.camera, change, scene.volume.grid.center_xyz))
+def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
+    names = {key: f"views.{view.name}.{key}" for key in VIEW}
+    changes: dict[str, Any] = {key: values[name] for key, name in names.items() if name in values}
+    if "camera" in changes:
+        changes["camera"] = twist(view.camera, changes["camera"], scene.volume.grid.center_xyz)
+    return replace(view, **changes) if changes else view
