@@ -86,6 +86,7 @@ class Reconstruction:
         self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
         self.parameters = setup.start_parameters(scene, self.settings)
         self.gauges = find_gauges(self.train, self.parameters)
+        self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
         self.total = NO_ROWS
         self.misfit = 1.0
@@ -203,6 +204,8 @@ class Reconstruction:
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
+            if parameter.name == "density" and self.support is not None:
+                parameter.restrict(self.support.on(grid))
         self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
 
     def _views(self) -> list[View]:

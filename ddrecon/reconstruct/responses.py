@@ -16,7 +16,7 @@ from torch import Tensor
 from ddrecon.losses import Target
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
-from ddrecon.variables.values import VIEW
+from ddrecon.variables.values import RESPONSE
 
 LARGEST_STEP = 2.0
 """An exposure changes at most by this factor in a step: a volume may still be nearly empty."""
@@ -76,8 +76,10 @@ def step_responses(
     if not fitted:
         return
     keys = {parameter.name.rpartition(".")[2]: parameter for parameter in fitted}
+    like = view.camera.pose
     exposure, offset = (
-        keys[key].value if key in keys else VIEW[key](view) for key in ("exposure", "offset")
+        keys[key].value if key in keys else _value(getattr(view, key), default, like)
+        for key, default in RESPONSE.items()
     )
     response = Response(exposure, offset, "exposure" in keys, "offset" in keys)
     found = fit_response(picture, target, response)
@@ -85,6 +87,10 @@ def step_responses(
         before, after = parameter.value.detach(), getattr(found, key)
         value = before.lerp(after, PART).clamp(parameter.low, parameter.high)
         parameter.value = value.requires_grad_()
+
+
+def _value(value: Tensor | None, default: float, like: Tensor) -> Tensor:
+    return like.new_full((1,), default) if value is None else value
 
 
 def _quotient(above: Tensor, below: Tensor, like: Tensor, otherwise: Tensor) -> Tensor:

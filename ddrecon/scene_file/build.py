@@ -11,7 +11,11 @@ import torch
 from ddrecon.light.lights import Light
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
-from ddrecon.scene_file.build_starts import build_starts, require_start_files
+from ddrecon.scene_file.build_starts import (
+    build_starts,
+    build_support,
+    require_start_files,
+)
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_volume
 from ddrecon.scene_file.load import SceneFile, read_scene
@@ -55,5 +59,8 @@ def build_scene(
     optimize = tree.optimize
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    scene = Scene(volume, lights, views, tree.render, tree.diffusion, optimize, {}, scene_file.path)
-    return replace(scene, starts=build_starts(scene_file, scene))
+    scene = Scene(
+        volume, lights, views, tree.render, tree.diffusion, optimize, path=scene_file.path
+    )
+    support = build_support(scene_file, volume.density)
+    return replace(scene, starts=build_starts(scene_file, scene), support=support)
