@@ -25,6 +25,7 @@ from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, Pair, Phase
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
+    NoiseSettings,
     OptimizeSettings,
     Problem,
     RenderSettings,
@@ -38,6 +39,7 @@ from ddrecon.variables.kinds import PAIRS
 Count = tuple[int, int, int]
 Size = tuple[int, int]
 Paths = tuple[Path, ...]
+Backdrop = Color | Path
 Row = tuple[float, float, float, float]
 Matrix = tuple[Row, Row, Row, Row]
 
@@ -190,7 +192,8 @@ CameraSection = PerspectiveSection | OrthographicSection
 class ViewSection:
     """One view; its camera's `resolution` may be left out where there is an image.
 
-    `weight`: how much it counts in the loss.
+    `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
+    `offset`; `background` is what it shows where the volume is empty.
     """
 
     name: str
@@ -199,6 +202,10 @@ class ViewSection:
     mask: Path | None = None
     split: str = one_of("train", ("train", "test"))
     weight: float = bounded(1.0, above=0)
+    exposure: Color = bounded(1.0, minimum=1e-3)
+    offset: Color = 0.0
+    background: Backdrop | None = None
+    noise: NoiseSettings | None = None
 
     def problems(self) -> Iterator[Problem]:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
