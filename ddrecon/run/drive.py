@@ -164,7 +164,18 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     lines = [line, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))
+    if "smoothing" in summary:
+        lines.insert(1, smoothing_text(summary["smoothing"]))
     return lines
+
+
+def smoothing_text(smoothing: dict[str, Any]) -> str:
+    """What was found for `tv: auto`, as a line."""
+    tried = ", ".join(f"{weight}: {psnr:.1f}" for weight, psnr in smoothing["tried"].items())
+    return (
+        f"tv: {smoothing['weight']:.3g} shows view {smoothing['view']!r} best where it is left out"
+        f" (PSNR in dB by weight: {tried})"
+    )
 
 
 def support_text(support: dict[str, float]) -> str:

@@ -155,6 +155,8 @@ def _volumes(scene: Scene, summary: Mapping[str, Any]) -> list[str]:
     ]
     if "support" in summary:
         parts.append(paragraph(f"Left out by the support: {_left_out(summary)} % of the cells."))
+    if "smoothing" in summary:
+        parts.append(paragraph(smoothing_text(summary["smoothing"])))
     for name in VOLUME:
         value = value_of(scene, name)
         if value.ndim >= 3:

@@ -14,10 +14,10 @@ from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image, read_mask
 from ddrecon.lenses import MODELS, is_folded
 from ddrecon.scene import View
+from ddrecon.scene_file.camera_schema import CameraSection, LensSection, PerspectiveSection
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.schema import CameraSection, LensSection, PerspectiveSection
 from ddrecon.scene_file.sight import explain_blindness, sees_box
 
 LATTICE = 33

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ddrecon.grid import Triple
+from ddrecon.scene_file.camera_schema import Matrix, Pair, Row, Size
 from ddrecon.scene_file.nodes import Node, describe_found, show_value
 from ddrecon.scene_file.problems import Problems, suggestion
-from ddrecon.scene_file.schema import Color, Count, Matrix, Pair, Paths, Row, Size
+from ddrecon.scene_file.schema import Color, Count, Paths
 
 T = TypeVar("T")
 
