@@ -28,6 +28,7 @@ from ddrecon.light.environment import environment_radiance
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments
 from ddrecon.light.outgoing import scatter_once_more, scatter_towards
+from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import Sky, decompose_lights
@@ -36,6 +37,7 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
+from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
@@ -48,13 +50,14 @@ class LightField:
 
     `beams` are those of directional and point lights (E2). `diffuse` is the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew.
+    camera's rays anew. `turned` is light that backward peaks have turned (E20).
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Moments
     skies: tuple[Sky, ...] = ()
+    turned: tuple[TurnedBeam, ...] = ()
 
     @property
     def outgoing(self) -> Moments:
@@ -100,22 +103,23 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
 
     Reduced light alone where nothing scatters twice.
     """
-    medium = scale_medium(scene.volume)
+    medium = scale_medium(scene.volume, scene.diffusion.angles)
     if not multiply_scatters(medium, scene.diffusion):
         return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
     lights = decompose_lights(scene.lights)
-    reduced = reduced_light(medium, lights, medium.has_flux)
-    sky = sum_unscattered_sky(medium, lights, medium.has_flux)
+    has_pairs = scene.diffusion.transport_rounds > 0 and has_backward_peak(medium)
+    reduced = reduced_light(medium, lights, medium.degree, has_pairs)
+    sky = sum_unscattered_sky(medium, lights, medium.degree)
     source = reduced.source
     if sky is not None:
-        source = source.plus(sky.scaled(1.0, medium.mean_cosine))
+        source = source.plus(sky.weighted(remaining_moments(medium)))
     outside = ambient_radiance(lights, medium.g)
     # L0 and L1: E4 to E6.
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
     # Skies scatter by E3 as well; beams by E2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
-    return LightField(medium, reduced.beams, light)
+    return LightField(medium, reduced.beams, light, turned=reduced.turned)
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
@@ -124,14 +128,14 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     Beams, and by quadrature over directions ambient light and skies.
     """
     parts = decompose_lights(lights)
-    beams = reduced_light(medium, parts, False).beams
+    beams = reduced_light(medium, parts, 0).beams
     skies = tuple(part for part in parts if isinstance(part, Sky))
     if any(isinstance(part, AmbientLight) for part in parts):
         skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
-    if medium.has_flux:
+    if medium.is_anisotropic:
         return LightField(medium, beams, nothing, skies)
-    sky = sum_unscattered_sky(medium, skies, has_flux=False)
+    sky = sum_unscattered_sky(medium, skies, 0)
     return LightField(medium, beams, nothing if sky is None else sky)
 
 
@@ -168,11 +172,9 @@ def solve_diffuse(
             medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux
         )
     closure = Closure(settings.closure, medium.grid, settings.floor)
-    problem = DiffusionProblem(medium, closure, source, outside, medium.has_flux)
+    problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    return run_rounds(
-        problem, light, solve, settings.transport_rounds, settings.transport_directions
-    )
+    return run_rounds(problem, light, solve, settings.transport_rounds, settings.degree)
 
 
 def view_image(
@@ -187,7 +189,7 @@ def view_image(
         sight = look_through(camera, scene.volume.grid, scene.render)
         return _image(_emission(light_field, sight.rays), scene, sight).unflatten(-1, camera.size)
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
-    single = replace(light_field, diffuse=nothing), scene
+    single = replace(light_field, diffuse=nothing, turned=()), scene
     diffusion = replace(light_field, beams=(), skies=()), _without_background(scene)
     varied, fixed = {"single": (single, diffusion), "diffusion": (diffusion, single)}[derivatives]
     with torch.no_grad():
@@ -227,7 +229,7 @@ def _image(emission: Emission, scene: Scene, sight: Sight) -> Tensor:
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to (E2, E3)."""
     medium = light_field.medium
-    diffuse = scatter_towards(medium, light_field.diffuse, bundle)
+    diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
         diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
@@ -237,7 +239,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.scattering,
         light_field.beams,
         diffuse,
-        medium.g,
+        medium.seen,
         medium.peak,
     )
 

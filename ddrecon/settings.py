@@ -11,13 +11,13 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, ClassVar, TypedDict, Unpack
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.limiters import LIMITERS
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.losses import LOSSES
-from ddrecon.numerics.quadrature import DEGREES
 
 DERIVATIVES = ("all", "single", "diffusion")
 """Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the
@@ -83,10 +83,16 @@ class DiffusionSettings:
 
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
-    The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps along
-    `transport_directions` directions take P1 towards transport (docs/theory.md, section 5).
-    Left out, it becomes one where there can be any.
+    The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
+    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 5). Left out, there
+    is one where there can be any.
     """
+
+    RETIRED: ClassVar[Mapping[str, str]] = {
+        "transport_directions": "directions follow from diffusion.degree: write degree: 3 for 26, "
+        "5 for 50 or 7 for 86"
+    }
+    """Keys of old scene files, and what to write instead."""
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
     scheme: str = one_of("conservative", ("conservative", "printed"))
@@ -97,11 +103,16 @@ class DiffusionSettings:
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
     transport_rounds: int = optional(minimum=0, maximum=16)
-    transport_directions: int = one_of(26, DEGREES)
+    degree: int = one_of(3, DIRECTIONS)
 
     def __post_init__(self) -> None:
         if self.transport_rounds is None:
             object.__setattr__(self, "transport_rounds", int(self._can_have_rounds))
+
+    @property
+    def angles(self) -> int:
+        """The degree to which light's angles are kept: 1 by diffusion alone."""
+        return self.degree if self.transport_rounds else 1
 
     @property
     def _can_have_rounds(self) -> bool:

@@ -256,7 +256,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
                 "it is 1, or 0 where there are none: without model `p1` or scheme `conservative`."
             ),
-            "transport_directions": "Directions of such a sweep.",
+            "degree": (
+                "Degree to which such sweeps keep light's angles, along 26, 50 or 86 directions."
+            ),
         },
     ),
     (

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 
 from ddrecon.engine import engine_of_parts
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views, start_support
-from ddrecon.reconstruct.support import describe_support
-from ddrecon.run.drive import support_text
+from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.variables.values import with_values
@@ -28,7 +28,7 @@ def memory_estimate(scene: Scene) -> int:
         max(volume.sigma_a.shape[0], volume.sigma_s.shape[0]),
         torch.finfo(volume.density.dtype).bits // 8,
         sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
-        has_flux=bool(volume.g != 0) or "g" in scene.starts,
+        has_flux=scale_medium(volume).has_flux,
         has_rounds=scene.diffusion.transport_rounds > 0,
         is_limited=scene.diffusion.model == "flux_limited",
         varied=None

@@ -43,7 +43,7 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
     sigma_a, sigma_s = (
         _resample_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s)
     )
-    coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, volume.g)
+    coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, volume.phase)
     return replace(
         scene, volume=coarse, views=[_view_at_level(view, factor) for view in scene.views]
     )

@@ -45,10 +45,20 @@ class Smoothing:
         return asdict(self)
 
 
+def smoothing_text(smoothing: dict[str, Any]) -> str:
+    """What was found for `tv: auto`, as a line."""
+    tried = ", ".join(f"{weight}: {psnr:.1f}" for weight, psnr in smoothing["tried"].items())
+    return (
+        f"tv: {smoothing['weight']:.3g} shows view {smoothing['view']!r} best where it is left out"
+        f" (PSNR in dB by weight: {tried})"
+    )
+
+
 class Run(Protocol):
     """What is needed of a reconstruction."""
 
-    test_targets: Mapping[str, Target]
+    @property
+    def test_targets(self) -> Mapping[str, Target]: ...
 
     @property
     def is_done(self) -> bool: ...

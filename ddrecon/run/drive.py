@@ -17,6 +17,8 @@ from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.smoothing import smoothing_text
+from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
@@ -167,18 +169,3 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     if "smoothing" in summary:
         lines.insert(1, smoothing_text(summary["smoothing"]))
     return lines
-
-
-def smoothing_text(smoothing: dict[str, Any]) -> str:
-    """What was found for `tv: auto`, as a line."""
-    tried = ", ".join(f"{weight}: {psnr:.1f}" for weight, psnr in smoothing["tried"].items())
-    return (
-        f"tv: {smoothing['weight']:.3g} shows view {smoothing['view']!r} best where it is left out"
-        f" (PSNR in dB by weight: {tried})"
-    )
-
-
-def support_text(support: dict[str, float]) -> str:
-    """What `describe_support` says, as a line."""
-    part = 100 * support["cells"]
-    return f"support: density in {part:.3g} % of the cells, where every view may show some"

@@ -14,6 +14,7 @@ from torch import Tensor
 from ddrecon.io.images.movies import animation_of, encode_frames
 from ddrecon.io.images.table import png_of
 from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.renderer import LightField, view_image
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
@@ -30,7 +31,7 @@ from ddrecon.report.pictures import comparison, find_white, pixels, projections,
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
-from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.kinds import FIELDS
 from ddrecon.variables.values import value_of
 
 SHOWN = 12
@@ -157,7 +158,7 @@ def _volumes(scene: Scene, summary: Mapping[str, Any]) -> list[str]:
         parts.append(paragraph(f"Left out by the support: {_left_out(summary)} % of the cells."))
     if "smoothing" in summary:
         parts.append(paragraph(smoothing_text(summary["smoothing"])))
-    for name in VOLUME:
+    for name in FIELDS:
         value = value_of(scene, name)
         if value.ndim >= 3:
             largest = f"(the largest value of a cell is {float(value.max()):.4g})"

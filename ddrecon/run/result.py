@@ -10,7 +10,7 @@ from ddrecon.lenses import MODELS
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import PAIRS, VOLUME
+from ddrecon.variables.kinds import PAIRS, PHASE, VOLUME
 
 LENS = ("focal", "principal_point", "distortion")
 RESULT = "result.yaml"
@@ -46,7 +46,8 @@ def describe_result(
         name for pair in PAIRS if set(pair) & set(volume) for name in (*PAIRS[0], *PAIRS[1])
     }
     kept = {name: value for name, value in described["volume"].items() if name not in replaced}
-    described["volume"] = kept | box | volume
+    numbers = {name: volume.pop(name) for name in [*volume] if name == "g" or PHASE in name}
+    described["volume"] = _with_phase(kept | box | volume, numbers)
     # The lights, an attribute at a time: `lights.0.irradiance`.
     for name, value in values.items():
         if name.startswith("lights."):
@@ -61,6 +62,18 @@ def describe_result(
         camera |= _lens({name: values.get(f"views.{view.name}.{name}") for name in LENS}, camera)
         section["camera"] = camera
     return described
+
+
+def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `volume` with reconstructed `numbers` of its phase function."""
+    if "phase" not in volume or not numbers:
+        return volume | numbers
+    found = {name.removeprefix(PHASE): number for name, number in numbers.items()}
+    if "coefficients" in found:
+        # They count from chi_1 on, and replace those of a file.
+        found["coefficients"] = [1.0, *found["coefficients"]]
+        volume["phase"].pop("file", None)
+    return volume | {"phase": volume["phase"] | found}
 
 
 def _lens(values: Mapping[str, Any], camera: dict[str, Any]) -> dict[str, Any]:

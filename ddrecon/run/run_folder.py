@@ -29,7 +29,7 @@ from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.kinds import CROSS_SECTIONS, FIELDS, VOLUME
 from ddrecon.variables.values import value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
@@ -131,7 +131,7 @@ class RunFolder:
         value = value_of(scene, name)
         if value.ndim < 3:
             return _plain(value)
-        if name not in VOLUME and value.ndim == 3:
+        if name not in FIELDS and value.ndim == 3:
             return self._write_map(name, value)
         array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
         file, box = Path("volumes", f"{name}.npz"), np.array(scene.volume.grid.bounds_xyz)
@@ -144,8 +144,9 @@ class RunFolder:
         Maps become files of their own, but for those that are `stored`.
         """
         parameters: dict[str, Any] = {}
-        for name in ("sigma_a", "sigma_s", "g"):
-            if (value := value_of(scene, name)).ndim < 2:
+        for name in variable_names(scene):
+            is_number = name in VOLUME and name not in FIELDS
+            if (is_number or name in CROSS_SECTIONS) and (value := value_of(scene, name)).ndim < 2:
                 parameters[name] = value.tolist()
         for name in variable_names(scene):
             if name.startswith("lights."):
@@ -167,7 +168,7 @@ class RunFolder:
     def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> dict[str, Any]:
         """The split and PSNR of each view with a target; writes pictures of views and fields."""
         folder, quality = self.path / "previews", {}
-        for name in VOLUME:
+        for name in FIELDS:
             if (value := value_of(scene, name)).ndim >= 3:
                 write_preview(folder / f"{name}.slices{mark}.png", slices(value))
         for view in scene.views:

@@ -132,6 +132,8 @@ def _fill(
         return colors.expand(3, *value.shape[1:]).clone()
     if isinstance(init, tuple) and count and len(init) == count:
         return value.new_tensor(init)
+    if isinstance(init, tuple) and value.ndim == 1 and not count and len(init) == len(value):
+        return value.new_tensor(init)
     expected = f"a list of {count} numbers" if count else "one number"
     if kind.is_color:
         expected += " or [r, g, b]"

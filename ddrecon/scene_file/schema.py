@@ -10,12 +10,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
 from ddrecon.grid import Triple
 from ddrecon.scene_file.camera_schema import CameraSection, Size
+from ddrecon.scene_file.phase_schema import (
+    Color,
+    HenyeyGreensteinSection,
+    PhaseSection,
+)
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
@@ -31,7 +36,6 @@ from ddrecon.variables.kinds import PAIRS
 
 Count = tuple[int, int, int]
 Paths = tuple[Path, ...]
-Color = float | Triple
 
 MAX_CELLS = 2**30
 TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
@@ -76,8 +80,11 @@ class VolumeSection:
     sigma_t: Quantity | None = optional(minimum=0)
     albedo: Quantity | None = optional(minimum=0, maximum=1)
     g: float = bounded(0.0, above=-1, below=1)
+    phase: PhaseSection | None = None
 
     def problems(self) -> Iterator[Problem]:
+        if self.phase is not None and self.g != 0:
+            yield "phase", "g is the short form of a phase function: give only one of g or phase"
         x, y, z = self.resolution or (1, 1, 1)
         if x * y * z > MAX_CELLS:
             yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
@@ -229,3 +236,19 @@ class SceneTree:
     render: RenderSettings = field(default_factory=RenderSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
+
+    def __post_init__(self) -> None:
+        parameters = self.optimize.parameters if self.optimize else {}
+        if self.optimize and self._has_one_g and "phase.g" in parameters and "g" not in parameters:
+            named = {"g" if name == "phase.g" else name: what for name, what in parameters.items()}
+            object.__setattr__(self, "optimize", replace(self.optimize, parameters=named))
+
+    @property
+    def _has_one_g(self) -> bool:
+        """Whether `g` and `phase.g` are the same number, that of Henyey and Greenstein."""
+        return isinstance(self.volume.phase, HenyeyGreensteinSection | None)
+
+    def problems(self) -> Iterator[Problem]:
+        parameters = self.optimize.parameters if self.optimize else {}
+        if self._has_one_g and {"g", "phase.g"} <= set(parameters):
+            yield "optimize", "g and phase.g are the same number: name it once"

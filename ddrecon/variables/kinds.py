@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ddrecon.lenses import MODELS
 from ddrecon.variables.default_rates import (
@@ -57,6 +57,9 @@ class Kind:
 
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
+_MEAN_COSINE = Kind(
+    fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
+)
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True)
 
 KINDS: Mapping[str, Kind] = {
@@ -65,7 +68,11 @@ KINDS: Mapping[str, Kind] = {
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
-    "g": Kind(fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS),
+    "g": _MEAN_COSINE,
+    "phase.g": replace(_MEAN_COSINE, is_color=True),
+    "phase.weight": Kind(fixed_rate(0.05), low=0, high=1, is_color=True),
+    "phase.alpha": Kind(fixed_rate(0.05), low=0, is_color=True),
+    "phase.coefficients": Kind(fixed_rate(0.02), low=-1, high=1),
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
@@ -93,8 +100,12 @@ KINDS: Mapping[str, Kind] = {
 }
 """Every kind of variable, by its pattern."""
 
-VOLUME = tuple(pattern for pattern in KINDS if "." not in pattern)
+VOLUME = tuple(pattern for pattern in KINDS if not pattern.startswith(("lights.", "views.")))
 """The variables of the volume."""
+FIELDS = tuple(name for name in VOLUME if KINDS[name].is_cellwise)
+"""Those that may differ from cell to cell."""
+PHASE = "phase."
+"""What variables of a phase function begin with; `phase.g` of Henyey and Greenstein's is `g`."""
 CROSS_SECTIONS = ("sigma_a", "sigma_s")
 EXTINCTION_AND_ALBEDO = ("sigma_t", "albedo")
 PAIRS = (CROSS_SECTIONS, EXTINCTION_AND_ALBEDO)

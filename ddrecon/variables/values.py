@@ -1,8 +1,9 @@
 """The numbers of a scene by name, read out of a scene and put back into it.
 
-`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo` and `g` are the volume's; `lights.0.irradiance`
-is any number of the first light; `views.front.camera` is the twist of a camera, `.focal`,
-`.principal_point` and `.distortion` are its lens. Vectors are (x, y, z), colors lead.
+`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's;
+`lights.0.irradiance` is any number of the first light; `views.front.camera` is the twist of a
+camera, `.focal`, `.principal_point` and `.distortion` are its lens. Vectors are (x, y, z), colors
+lead.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from torch import Tensor
 from ddrecon.cameras import Camera, twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, VOLUME, kind_of
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, VOLUME, kind_of
 
 
 def variable_names(scene: Scene) -> list[str]:
@@ -30,7 +32,7 @@ def variable_names(scene: Scene) -> list[str]:
     views = [
         f"views.{view.name}.{part}" for view in scene.views for part in _camera_parts(view.camera)
     ]
-    return [*VOLUME, *lights, *views]
+    return [*_volume_names(scene.volume), *lights, *views]
 
 
 def value_of(scene: Scene, name: str) -> Tensor:
@@ -40,10 +42,10 @@ def value_of(scene: Scene, name: str) -> Tensor:
     that light holds them; a camera's twist is the change of its pose, [6] and zero: see
     `ddrecon.cameras.twist`. Its focal length [] is in widths of its image.
     """
-    if name not in variable_names(scene):
+    if (known := _own_name(scene.volume, name)) not in variable_names(scene):
         raise KeyError(name)
-    if name in VOLUME:
-        return _volume_value(scene.volume, name)
+    if known in VOLUME:
+        return _volume_value(scene.volume, known)
     section, _, path = name.partition(".")
     if section == "views":
         view, _, part = path.rpartition(".")
@@ -61,6 +63,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     Raises KeyError for a name that is none, ValueError for a density of another shape than the
     grid's.
     """
+    values = {_own_name(scene.volume, name): value for name, value in values.items()}
     known = variable_names(scene)
     unknown = [name for name in values if name not in known]
     if unknown:
@@ -104,7 +107,24 @@ def _tensors(light: Light) -> list[str]:
     return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
 
 
+def _volume_names(volume: Volume) -> list[str]:
+    """The variables of `volume`: its phase function has its own numbers, or g alone."""
+    known = [name for name in VOLUME if name != "g" and not name.startswith(PHASE)]
+    if isinstance(volume.phase, HenyeyGreenstein):
+        return [*known, "g"]
+    return [*known, *(PHASE + name for name in volume.phase.VARIABLES)]
+
+
+def _own_name(volume: Volume, name: str) -> str:
+    """`name`, or `g` for `phase.g` where both are the same."""
+    is_short = name == f"{PHASE}g" and isinstance(volume.phase, HenyeyGreenstein)
+    return "g" if is_short else name
+
+
 def _volume_value(volume: Volume, name: str) -> Tensor:
+    if name.startswith(PHASE):
+        number: Tensor = getattr(volume.phase, name.removeprefix(PHASE))
+        return number
     if name not in EXTINCTION_AND_ALBEDO:
         value: Tensor = getattr(volume, name)
         return value
@@ -125,7 +145,14 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)
     if "density" in stored and stored["density"].ndim == 0:
         stored["density"] = stored["density"].expand(volume.grid.shape)
-    changed: Volume = replace(volume, **stored)  # type: ignore[arg-type]
+    phase = volume.phase
+    if "g" in stored:
+        phase = HenyeyGreenstein(stored.pop("g"))
+    numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
+    if numbers:
+        parts = {name.removeprefix(PHASE): number for name, number in numbers.items()}
+        phase = replace(phase, **parts)  # type: ignore[arg-type]
+    changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
 
 

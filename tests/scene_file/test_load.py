@@ -247,8 +247,12 @@ ONE_FAULT = [
         "diffusion.scheme: 'printed' is for diffusion.model p1; flux_limited needs 'conservative'",
     ),
     (
-        "diffusion.transport_directions=48",
-        "diffusion.transport_directions: expected one of 26, 50, 86, found 48",
+        "diffusion.transport_directions=50",
+        "diffusion.transport_directions: directions follow from diffusion.degree: write degree: 3",
+    ),
+    (
+        "diffusion.degree=4",
+        "diffusion.degree: expected one of 3, 5, 7, found 4",
     ),
     ("diffusion.transport_rounds=17", "diffusion.transport_rounds: must be at most 16"),
     (

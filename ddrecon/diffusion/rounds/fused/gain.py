@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.gains import gain_kernels, gain_records
-from ddrecon.diffusion.rounds.fused.kernels import records
 from ddrecon.kernels.launch import array, launch
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
@@ -124,7 +123,7 @@ class _Cells:
         self.given = given
 
     def light(self, moments: Sequence[Tensor]) -> Any:
-        light = records(self.bits).Light()
+        light = self.types.Light()
         for i, name in enumerate(("mean", "z", "y", "x")):
             setattr(light, name, _flat(moments[i if len(moments) > 1 else 0]))
         return light

@@ -9,7 +9,6 @@ from typing import Any
 
 import warp as wp
 
-from ddrecon.diffusion.rounds.fused.kernels import records
 from ddrecon.kernels.native import number_type, program
 
 # Pointers to `size` cells of a color; those of moments that light has not, stay unused.
@@ -130,9 +129,17 @@ _ADJOINT = (
 
 @functools.cache
 def gain_records(bits: int) -> SimpleNamespace:
-    """The records `Given`, `Found` and `Bars` of numbers of so many `bits`."""
+    """The records `Light`, `Given`, `Found` and `Bars` of numbers of so many `bits`."""
     F: Any = number_type(bits)
-    Light = records(bits).Light
+
+    @wp.struct
+    class Light:
+        """Two moments [C, z, y, x], or their cotangents."""
+
+        mean: wp.array(dtype=F)
+        z: wp.array(dtype=F)
+        y: wp.array(dtype=F)
+        x: wp.array(dtype=F)
 
     @wp.struct
     class Given:
@@ -173,7 +180,7 @@ def gain_records(bits: int) -> SimpleNamespace:
         scattering: wp.array(dtype=F)
         numbers: wp.array(dtype=wp.float64)
 
-    return SimpleNamespace(Given=Given, Found=Found, Bars=Bars)
+    return SimpleNamespace(Light=Light, Given=Given, Found=Found, Bars=Bars)
 
 
 @functools.cache

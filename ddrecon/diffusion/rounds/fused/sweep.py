@@ -2,92 +2,74 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.part import Part, Plan, Swept, Weighted
-from ddrecon.diffusion.rounds.fused.schedule import schedules
-from ddrecon.diffusion.rounds.fused.turning import add_turned
-from ddrecon.kernels.spare import give_back
-from ddrecon.light.moments import Moments
+from ddrecon.diffusion.rounds.fused.by_cells import Cells
+from ddrecon.diffusion.rounds.fused.by_rows import Rows
+from ddrecon.diffusion.rounds.fused.swept import Swept
+from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once
 
 
 def sweep_fused(
     medium: Medium,
-    light: Moments,
+    source: Tensor,
     inflow: Tensor | None,
-    weighted: Weighted,
+    directions: int,
     by_cells: bool | None = None,
-) -> tuple[Tensor, ...]:
-    """The moments of E12 of radiance along `weighted` directions, as `sweep` returns them.
+) -> Tensor:
+    """The moments [K, C, z, y, x] of radiance, as `sweep` returns them, by fused kernels.
 
-    `by_cells`: whether a thread does a cell of a slice, not directions; None: on a GPU.
+    `source` [K, C, z, y, x]: the moments of what scatters; `directions`: of the quadrature;
+    `by_cells`: whether a thread does a cell of a slice, not rows of directions; None: on a GPU.
     """
-    colors = light.mean.shape[0]
+    colors = source.shape[1]
     strength = (1 - medium.forward_fraction) * medium.scattering.scale
-    entering = light.mean.new_zeros(1) if inflow is None else inflow
-    numbers = torch.stack(
+    entering = source.new_zeros(1) if inflow is None else inflow
+    scales = torch.stack(
         [each.reshape(-1).expand(colors) for each in (medium.extinction.scale, strength, entering)]
     )
     shares_field = medium.scattering.field is medium.extinction.field
-    moments: tuple[Tensor, ...] = _Sweep.apply(
-        Plan(medium.grid, weighted, light.mean.is_cuda if by_cells is None else by_cells),
-        numbers,
+    moments: Tensor = _Sweep.apply(
+        source.is_cuda if by_cells is None else by_cells,
+        medium.grid,
+        directions,
+        scales,
         medium.extinction.field,
         None if shares_field else medium.scattering.field,
-        light.mean,
-        *(light.flux or ()),
+        source,
     )
     return moments
 
 
 class _Sweep(torch.autograd.Function):
-    """The moments of light, and their derivatives by `numbers` [3, C], fields and light."""
+    """The moments of light, and their derivatives by `scales` [3, C], fields and source."""
 
     @staticmethod
-    def forward(ctx: Any, plan: Plan, *tensors: Any) -> tuple[Tensor, ...]:
-        ctx.plan = plan
+    def forward(ctx: Any, by_cells: bool, grid: Grid, directions: int, *tensors: Any) -> Tensor:
+        ctx.by_cells, ctx.of = by_cells, (grid, directions)
         ctx.save_for_backward(*tensors)
-        parts = _parts(plan, Swept.of(*tensors))
-        shares, turned = (part.follow() for part in parts)
-        moments = _add_up(shares, turned)
-        give_back(*shares[1:], *turned)
-        return moments.unbind(0)
+        swept = Swept(grid, directions, *tensors)
+        return Cells(swept).follow() if by_cells else Rows(swept, is_kept=False).follow()
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
-        varies_numbers = ctx.needs_input_grad[1]
-        parts = _parts(ctx.plan, Swept.of(*ctx.saved_tensors))
-        (one, *cells), (other, *turned) = (part.transpose(bars, varies_numbers) for part in parts)
-        light_bars = _add_up(cells[0], turned[0])
-        give_back(*cells[0][1:], *turned[0])
-        field_bars = [_add_up(*each) for each in zip(cells[1:], turned[1:], strict=True)]
-        numbers_bar = None
-        if varies_numbers:
-            sums = (part.double().sum((2, 3)) for part in (*one, *other))
-            numbers_bar = functools.reduce(Tensor.add, sums).to(light_bars)
-        # A field of one channel for all colors, or none where extinction's serves scattering too.
-        of_fields = [
-            None if field is None or bar is None else bar.sum_to_size(field.shape)
-            for bar, field in zip((*field_bars, None), ctx.saved_tensors[1:3], strict=False)
-        ]
-        return None, numbers_bar, *of_fields, *light_bars.unbind(0)
-
-
-def _add_up(shares: list[Tensor], turned: list[Tensor]) -> Tensor:
-    """The sum of threads' `shares` of both parts, in the memory of the first."""
-    return add_turned(*(functools.reduce(Tensor.add_, each) for each in (shares, turned)))
-
-
-def _parts(plan: Plan, swept: Swept) -> Iterator[Part]:
-    """What crosses slices across z or y, and what crosses those across x: one after the other."""
-    directions = tuple(direction for direction, _ in plan.weighted)
-    for i, schedule in enumerate(schedules(plan.grid, directions)):
-        yield Part(plan, schedule, swept, bool(i))
+    def backward(ctx: Any, bars: Tensor) -> tuple[Any, ...]:
+        swept = Swept(*ctx.of, *ctx.saved_tensors)
+        sweep = Cells(swept) if ctx.by_cells else Rows(swept, is_kept=True)
+        varies_scales = ctx.needs_input_grad[3]
+        scales_bar, source_bar, fields = sweep.transpose(bars, varies_scales)
+        extinction_bar, *scattering_bar = fields
+        return (
+            None,
+            None,
+            None,
+            scales_bar if varies_scales else None,
+            extinction_bar,
+            scattering_bar[0] if scattering_bar else None,
+            source_bar,
+        )
