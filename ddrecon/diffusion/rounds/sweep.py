@@ -67,7 +67,7 @@ class Parts(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """A `direction` of the quadrature (array order), its `weight`, and `harmonics` Y_k [K] there."""
+    """A `direction` of the quadrature (array order), its `weight`, and Y_k [K] there."""
 
     direction: Direction
     weight: float
