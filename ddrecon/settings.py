@@ -140,6 +140,13 @@ class FieldFile:
 Start = float | tuple[float, ...] | FieldFile
 """Where a parameter starts: the same number everywhere, a vector or color, or a file's values."""
 
+Weight = float | str
+"""A weight, or `auto`: it is found."""
+AUTO = "auto"
+Support = float | str | FieldFile
+"""Where medium may be: `masks`, the displayed value above which a pixel shows some, or a field."""
+MASKS = "masks"
+
 
 @dataclass(frozen=True)
 class ParameterSettings:
@@ -150,16 +157,21 @@ class ParameterSettings:
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
     always does). `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as
-    the whole brightness of the targets.
+    the whole brightness of the targets; `auto` finds the weight by leaving views out.
+
+    `support`: where density may be above 0, by what pictures show, widened by `support_margin`
+    pixels; None is anywhere.
     """
 
     init: Start | None = None
     lr: float | None = optional(above=0)
     min: float | None = None
     max: float | None = None
-    tv: float | None = optional(minimum=0)
+    tv: Weight | None = optional(minimum=0)
     l1: float = bounded(0.0, minimum=0)
     field: bool | None = None
+    support: Support | None = optional(minimum=0, below=1)
+    support_margin: float = bounded(2.0, minimum=0, maximum=1000)
 
     def problems(self) -> Iterator[Problem]:
         low = -math.inf if self.min is None else self.min

@@ -23,6 +23,8 @@ KIND_NAMES = {
     schema.Quantity: "number, [r, g, b] or {file: ...}",
     schema.Density: "number or {file: ...}",
     settings.Start: "number, list or {file: ...}",
+    settings.Weight: "number or `auto`",
+    settings.Support: "`masks`, number or {file: ...}",
     schema.Triple: "[x, y, z]",
     schema.Count: "[nx, ny, nz]",
     schema.Size: "[width, height]",
@@ -146,19 +148,20 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
-        "views: {ring: ...} or {transforms: ...}",
+        "views: {ring: ...}, {transforms: ...} or {colmap: ...}",
         schema.ViewSource,
         "Views that are not listed one by one.",
         {
             "ring": "Cameras in a circle; see below.",
             "transforms": "`transforms.json` of NeRF, instant-ngp or nerfstudio, read as it is.",
+            "colmap": "Folder of COLMAP's sparse model, such as `sparse/0`; text or binary.",
             "images": (
                 "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted, "
-                "belong to the cameras in turn."
+                "belong to the cameras in turn. For COLMAP: the folder of its pictures."
             ),
             "test_every": (
-                "For transforms without splits: one view in this many, the first of them, is a "
-                "test view."
+                "For transforms without splits and COLMAP: one view in this many, the first of "
+                "them, is a test view."
             ),
         },
     ),
@@ -187,6 +190,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "left."
             ),
             "pixel_aspect": "Height of a pixel over its width.",
+            "distortion": "Of its lens; see below. Left out, there is none.",
             "origin": "Where the camera stands [u].",
             "target": "A point on its axis [u].",
             "up": "The direction that is up in the image.",
@@ -195,6 +199,20 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "resolution": "Pixels; left out where the view has an image.",
         },
+    ),
+    (
+        "distortion: {type: opencv}",
+        schema.OpencvSection,
+        "A lens as OpenCV and COLMAP calibrate it, with nerfstudio's k4.\n"
+        "Everything else that is said of the camera holds for the pinhole that would be left.",
+        dict.fromkeys(("k1", "k2", "k3", "k4"), "Radial: of r^2, r^4, r^6 and r^8 in turn.")
+        | dict.fromkeys(("p1", "p2"), "Tangential."),
+    ),
+    (
+        "distortion: {type: fisheye}",
+        schema.FisheyeSection,
+        "A fisheye as OpenCV and COLMAP calibrate it.",
+        dict.fromkeys(("k1", "k2", "k3", "k4"), "Of the angle's powers 3, 5, 7 and 9 in turn."),
     ),
     (
         "camera: {type: orthographic}",
@@ -274,13 +292,19 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density and 0 for others."
+                " density and 0 for others. `auto` finds it by leaving a view out."
             ),
             "l1": "Weight of its mean, which empties what no picture needs.",
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "
                 "always does."
             ),
+            "support": (
+                "For density: where it may be above 0. `masks`: nowhere that a view sees and its "
+                "mask, or alpha, says is empty; a number: nor where it displays no more than that "
+                "(sRGB, 0 to 1); or a field that is above 0 there. Left out: anywhere."
+            ),
+            "support_margin": "Pixels by which what a view shows is widened for that.",
         },
     ),
 ]

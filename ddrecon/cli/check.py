@@ -9,6 +9,9 @@ import torch
 from ddrecon.engine import engine_of_parts
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
+from ddrecon.reconstruct.setup import select_views, start_support
+from ddrecon.reconstruct.support import describe_support
+from ddrecon.run.drive import support_text
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms
 from ddrecon.variables.values import with_values
@@ -52,6 +55,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
+        "support": _describe_support(scene),
         "engine": engine_of_parts(_parts_in_torch(scene)),
         "memory_bytes": memory_estimate(scene),
     }
@@ -69,9 +73,19 @@ def lines(report: dict[str, Any]) -> list[str]:
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(parameters) or 'nothing'}",
+        *([support_text(report["support"])] if report["support"] else []),
         f"engine: {_name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
+
+
+def _describe_support(scene: Scene) -> dict[str, float] | None:
+    """Which part of the cells density may be in; None where that is all of them."""
+    if scene.optimize is None:
+        return None
+    train = select_views(scene, is_test=False)
+    support = start_support(train, scene.optimize)
+    return describe_support(support, scene.volume.grid)
 
 
 def _view_line(view: dict[str, Any]) -> str:

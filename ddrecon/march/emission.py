@@ -25,7 +25,7 @@ class Emission:
     Emission per unit length is kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2 and E3.
     `diffuse` [C, z, y, x] is the radiance that scatters into the camera's rays from all light but
     beams; `seen` is p. Point lights have E = I / r^2. `peak` is the medium's: what its forward peak
-    does to p (E25).
+    does to p (E13).
     """
 
     grid: Grid

@@ -162,7 +162,7 @@ def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> Tensor:
     scattered = decayed_sum(emitted, begin, end, scale)
     passed = torch.cat([torch.zeros_like(end[:1]), end])
     for beam, to_light in zip(emission.beams, at_nodes.masses, strict=True):
-        # E25: the depth of the forward peak, from where the light enters to the camera.
+        # E13: the depth of the forward peak, from where the light enters to the camera.
         depth = None if at_nodes.peak is None else at_nodes.peak * (passed + to_light)
         # E2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
         weight, phase = beam.scatter(at_nodes.scattering, nodes, emission.seen, depth)

@@ -3,7 +3,7 @@
 `march_plainly` is what `ddrecon.march.integral.march` computes, at equal steps along every ray and
 differentiated by autograd alone. The renderer takes the other, which is faster and needs less
 memory; tests hold the two side by side. They differ in two details: `march` interpolates masses to
-third order, and it takes E25 from a table of polynomials.
+third order, and it takes E13 from a table of polynomials.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
         if emission.peak is None:
             phase = emission.seen.value(cosine)
         else:
-            # E25: the forward peak spreads the light on its way to the node and to the camera.
+            # E13: the forward peak spreads the light on its way to the node and to the camera.
             depth = _interpolate(grid, emission.peak, points) * (passed + mass)
             phase = emission.seen.at(depth, cosine)
         radiance = radiance + phase * irradiance / (4 * math.pi) * torch.exp(-scale * mass)

@@ -107,7 +107,7 @@ class Medium:
     kappa_s, by which beams scatter with the exact phase function `seen`, of mean cosine `g`.
     `extinction` is kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that
     remains. These three are scalars, or [3, 1, 1, 1] where colors differ. `peak` is f kappa_s per
-    unit of the extinction's field: times a mass, it is the depth x of E25. It is [C, 1, 1, 1], or
+    unit of the extinction's field: times a mass, it is the depth x of E13. It is [C, 1, 1, 1], or
     [C, z, y, x] where cross sections vary, and None without a peak.
     """
 

@@ -50,7 +50,7 @@ class PhaseFunction(ABC):
         """The moments f r_l of the forward peak for `count` degrees l > `degree`, [C, count].
 
         The first is f, the part of scattering that counts as not scattered where light is known to
-        `degree` (docs/theory.md E23). f is 0 without a forward peak, and the others are at most f.
+        `degree` (docs/theory.md E16). f is 0 without a forward peak, and the others are at most f.
         """
 
     @abstractmethod

@@ -1,7 +1,7 @@
 """What replaces the phase function for a beam seen along a view ray, whose peak was scaled out.
 
 Light that the forward peak alone has scattered, often or once, is still on its way; at a depth x of
-the peak it has spread (docs/theory.md E24, E25). Along a ray only x changes: the function is a
+the peak it has spread (docs/theory.md E13, E15). Along a ray only x changes: the function is a
 polynomial in (x - s) / (x + s), whose coefficients are kept over the angle.
 """
 
@@ -46,7 +46,7 @@ class SeenPhase:
         return self.phase.value(cosine)
 
     def at(self, depth: Tensor, cosine: Tensor) -> Tensor:
-        """S(x, w) of E25, [C, ...], summed term by term.
+        """S(x, w) of E13, [C, ...], summed term by term.
 
         `depth` x [C or 1, ...] >= 0: f times the optical depth of scattering from where the light
         enters, by the point where it turns, to where the view ray leaves; at 0 this is p.
@@ -82,7 +82,7 @@ class SeenPhase:
 
 
 def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
-    """(2 l + 1) times the moments s_l of S at `depth` [C or 1, ..., 1], [C, ..., count] (E24)."""
+    """(2 l + 1) times the moments s_l of S at `depth` [C or 1, ..., 1], [C, ..., count] (E15)."""
     count = phase.length()
     shape = (-1, *[1] * (depth.ndim - 2), count)
     chi = phase.moments(count).double()

@@ -22,7 +22,7 @@ COEFFICIENTS = 12
 SCALE = 8.0
 """The depth s, taken to the middle of the polynomial's interval, x = 0.
 
-It suits the one function that is fitted, the phase function E25: at g = 0.95 that is off by 0.0064
+It suits the one function that is fitted, the phase function E13: at g = 0.95 that is off by 0.0064
 with 8, by 0.010 with 6 or 12, by 0.04 with 2 or 20.
 """
 DEEPEST = 1e6

@@ -81,6 +81,7 @@ class Reconstruction:
         setup.require_usable(self.train, self.settings)
         self.power = setup.mean_power(self.train)
         self.parameters = setup.start_parameters(scene, self.settings)
+        self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
         self.total = NO_ROWS
         self.misfit = 1.0
@@ -197,6 +198,8 @@ class Reconstruction:
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
+            if parameter.name == "density" and self.support is not None:
+                parameter.restrict(self.support.on(grid))
         self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
 
     def _views(self) -> list[View]:

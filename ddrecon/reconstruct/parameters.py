@@ -30,7 +30,8 @@ class Parameter:
     """The value of one variable, and the optimizer that moves it within its bounds.
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
-    every resolution. The optimizer is Adam (Kingma and Ba 2015, arXiv:1412.6980).
+    every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
+    is Adam (Kingma and Ba 2015, arXiv:1412.6980).
     """
 
     def __init__(
@@ -45,6 +46,7 @@ class Parameter:
         self.tv = (kind.tv if settings.tv is None else settings.tv) if self.is_field else 0.0
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
+        self.support: Tensor | None = None
         self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
@@ -74,6 +76,8 @@ class Parameter:
         value, self.moments = self._step(before, gradient, rate * self.rate)
         if self.is_direction:
             value.mul_(before.norm() / value.norm())
+        if self.support is not None:
+            value.mul_(self.support)
         self.value = value.requires_grad_()
 
     def _step(
@@ -112,6 +116,13 @@ class Parameter:
         self.value = self.value_on(grid).requires_grad_()
         first, second = (resample(moment, grid) for moment in self.moments)
         self.moments = first * volume_ratio, second * volume_ratio**2
+
+    def restrict(self, support: Tensor) -> None:
+        """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
+        self.support = support.to(self.value.dtype)
+        self.value = (self.value.detach() * self.support).requires_grad_()
+        first, second = self.moments
+        self.moments = first * self.support, second * self.support
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it; further steps make new tensors."""

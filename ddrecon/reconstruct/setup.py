@@ -11,6 +11,7 @@ from ddrecon.reconstruct.divergence import describe_flaw
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate
+from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings
 from ddrecon.variables.values import value_of, variable_names
@@ -71,3 +72,15 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         rate = wanted.lr or default_rate(scene, name, start)
         parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid))
     return parameters
+
+
+def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
+    """Where density may be, by the views of `train` or a file; None is anywhere.
+
+    Raises SceneError where that is nowhere.
+    """
+    density = settings.parameters.get("density")
+    support = None if density is None else find_support(train.views, density, train.support)
+    if support is not None:
+        support.on(train.volume.grid)
+    return support

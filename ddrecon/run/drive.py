@@ -161,4 +161,13 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     )
     if summary["test_psnr"] is not None:
         line += f", test PSNR {summary['test_psnr']:.2f} dB"
-    return [line, f"density and all else written to {folder}"]
+    lines = [line, f"density and all else written to {folder}"]
+    if "support" in summary:
+        lines.insert(1, support_text(summary["support"]))
+    return lines
+
+
+def support_text(support: dict[str, float]) -> str:
+    """What `describe_support` says, as a line."""
+    part = 100 * support["cells"]
+    return f"support: density in {part:.3g} % of the cells, where every view may show some"

@@ -72,7 +72,7 @@ def write_run_report(path: Path, findings: Findings) -> None:
     sections = [
         section("Loss", side_by_side(*_curves(findings.rows))),
         section("Views", *_comparisons(findings), _view_table(findings)),
-        section("Volumes", *_volumes(scene)),
+        section("Volumes", *_volumes(scene, findings.summary)),
         section("Turntable", _turntable(findings)),
         section("Timings", _timings(findings.rows)),
         section("Physics", paragraph(needs), items(needed_terms(scene))),
@@ -142,13 +142,19 @@ def _view_table(findings: Findings) -> str:
     return table(["view", "split", "pixels", "weight", "PSNR [dB]"], rows)
 
 
-def _volumes(scene: Scene) -> list[str]:
+def _left_out(summary: Mapping[str, Any]) -> str:
+    return f"{100 * (1 - summary['support']['cells']):.3g}"
+
+
+def _volumes(scene: Scene, summary: Mapping[str, Any]) -> list[str]:
     """Slices and projections of every field."""
     parts = [
         paragraph(
             "Across z, x and y from left to right; y, or z, is up. The largest value is white."
         )
     ]
+    if "support" in summary:
+        parts.append(paragraph(f"Left out by the support: {_left_out(summary)} % of the cells."))
     for name in FIELDS:
         value = value_of(scene, name)
         if value.ndim >= 3:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+from ddrecon.lenses import MODELS
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.variables.kinds import PAIRS, PHASE, VOLUME
 
+LENS = ("focal", "principal_point", "distortion")
 RESULT = "result.yaml"
 """What the file is called in a run's folder."""
 
@@ -56,6 +59,7 @@ def describe_result(
         camera = section["camera"] | {"resolution": [width, height]}
         if f"views.{view.name}.camera" in values:
             camera = _move_camera(camera, view.camera.pose.tolist())
+        camera |= _lens({name: values.get(f"views.{view.name}.{name}") for name in LENS}, camera)
         section["camera"] = camera
     return described
 
@@ -70,6 +74,20 @@ def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str,
         found["coefficients"] = [1.0, *found["coefficients"]]
         volume["phase"].pop("file", None)
     return volume | {"phase": volume["phase"] | found}
+
+
+def _lens(values: Mapping[str, Any], camera: dict[str, Any]) -> dict[str, Any]:
+    """The keys of the section `camera` that say what was found of its lens; None was not sought."""
+    found: dict[str, Any] = {}
+    if values["focal"] is not None:
+        found["fov"] = 2 * math.degrees(math.atan(0.5 / values["focal"]))
+    if values["principal_point"] is not None:
+        found["principal_point"] = values["principal_point"]
+    if values["distortion"] is not None:
+        model = camera["distortion"]["type"]
+        coefficients = zip(MODELS[model], values["distortion"], strict=True)
+        found["distortion"] = {"type": model} | dict(coefficients)
+    return found
 
 
 def _move_camera(camera: dict[str, Any], pose: list[list[float]]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.losses import psnr
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.support import describe_support
 from ddrecon.renderer import LightField, solve_light, view_image
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
@@ -203,4 +204,6 @@ def _plain(value: Tensor) -> Any:
 
 def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
-    return {"iterations": total.pop("iteration"), **total}
+    summary = {"iterations": total.pop("iteration"), **total}
+    support = describe_support(run.support, run.scene.volume.grid)
+    return summary if support is None else summary | {"support": support}

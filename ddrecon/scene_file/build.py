@@ -11,7 +11,11 @@ import torch
 from ddrecon.light.lights import Light
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
-from ddrecon.scene_file.build_starts import build_starts, require_start_files
+from ddrecon.scene_file.build_starts import (
+    build_starts,
+    build_support,
+    require_start_files,
+)
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_volume
 from ddrecon.scene_file.load import SceneFile, read_scene
@@ -52,6 +56,13 @@ def build_scene(
     require_start_files(scene_file, problems)
     problems.raise_any()
     scene = Scene(
-        volume, lights, views, tree.render, tree.diffusion, tree.optimize, {}, scene_file.path
+        volume,
+        lights,
+        views,
+        tree.render,
+        tree.diffusion,
+        tree.optimize,
+        path=scene_file.path,
     )
-    return replace(scene, starts=build_starts(scene_file, scene))
+    support = build_support(scene_file, volume.density)
+    return replace(scene, starts=build_starts(scene_file, scene), support=support)

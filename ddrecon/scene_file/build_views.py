@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, look_at
+from ddrecon.cameras import Camera, image_places, look_at
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import read_image, read_mask
+from ddrecon.lenses import MODELS, is_folded
 from ddrecon.scene import View
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.schema import CameraSection, PerspectiveSection
+from ddrecon.scene_file.schema import CameraSection, LensSection, PerspectiveSection
 from ddrecon.scene_file.sight import explain_blindness, sees_box
+
+LATTICE = 33
+"""Pixels along each side of an image at which its distortion is checked."""
 
 
 def build_views(
@@ -29,13 +34,35 @@ def build_views(
     problems, views = Problems(), []
     for index in range(len(scene_file.tree.views)):
         with problems.collecting():
-            views.append(_build_view(scene_file, index, grid, dtype, device))
+            views.append(_build_view(scene_file, index, dtype, device))
+    if grid is not None:
+        _note_blind(scene_file, views, grid, problems)
     problems.raise_any()
     return views
 
 
+def _note_blind(
+    scene_file: SceneFile, views: Sequence[View], grid: Grid, problems: Problems
+) -> None:
+    """Notes the `views` that do not see the box of `grid`: one by one, or all in one line."""
+    blind = [view for view in views if not sees_box(view.camera, grid)]
+    if len(blind) > 1 and len(blind) == len(scene_file.tree.views):
+        why = explain_blindness([view.camera for view in blind], grid)
+        problems.note(scene_file.refused("views", f"none looks through the volume; {why}"))
+        return
+    for view in blind:
+        index = [section.name for section in scene_file.tree.views].index(view.name)
+        problems.note(
+            scene_file.refused(
+                f"views.{index}.camera",
+                f"no pixel of view {view.name!r} looks through the volume;"
+                f" {explain_blindness([view.camera], grid)}",
+            )
+        )
+
+
 def _build_view(
-    scene_file: SceneFile, index: int, grid: Grid | None, dtype: torch.dtype, device: torch.device
+    scene_file: SceneFile, index: int, dtype: torch.dtype, device: torch.device
 ) -> View:
     key, section, problems = f"views.{index}", scene_file.tree.views[index], Problems()
     image = mask = None
@@ -61,14 +88,14 @@ def _build_view(
     if size is not None:
         with problems.collecting():
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
-            if grid is not None and not sees_box(camera, grid):
-                raise scene_file.refused(
-                    f"{key}.camera",
-                    f"no pixel of view {section.name!r} looks through the volume;"
-                    f" {explain_blindness(camera, grid)}",
-                )
+            _require_unfolded(scene_file, f"{key}.camera", camera)
     problems.raise_any()
-    camera = replace(camera, pose=camera.pose.to(device, dtype))
+    lens = camera.distortion
+    camera = replace(
+        camera,
+        pose=camera.pose.to(device, dtype),
+        distortion=None if lens is None else lens.to(device, dtype),
+    )
     return View(section.name, camera, image, mask, section.split == "test", section.weight)
 
 
@@ -95,8 +122,34 @@ def _build_camera(
             True,
             section.principal_point,
             section.pixel_aspect,
+            *_lens(section.distortion),
         )
     return Camera(pose, size, section.width / 2, is_perspective=False)
+
+
+def _lens(section: LensSection | None) -> tuple[str | None, Tensor | None]:
+    """The model of a lens and its coefficients, float64."""
+    if section is None:
+        return None, None
+    coefficients = [getattr(section, name) for name in MODELS[section.type]]
+    return section.type, torch.tensor(coefficients, dtype=torch.float64)
+
+
+def _require_unfolded(scene_file: SceneFile, key: str, camera: Camera) -> None:
+    """Raises SceneError where the distortion of `camera` folds over within the image."""
+    if camera.lens is None or camera.distortion is None:
+        return
+    # The corners of a coarse lattice of pixels, those of the image among them.
+    rows, columns = (torch.linspace(0, side - 1, LATTICE).long() for side in camera.size)
+    places = image_places(camera).view(*camera.size, 2)[rows][:, columns].flatten(0, 1)
+    folded = is_folded(camera.lens, camera.distortion, places)
+    if bool(folded.any()):
+        y, x = divmod(int(folded.nonzero()[0]), LATTICE)
+        raise scene_file.refused(
+            f"{key}.distortion",
+            f"folds over within the image: no one direction is seen at pixel ({int(columns[x])},"
+            f" {int(rows[y])}); check its coefficients and the focal length, or crop the picture",
+        )
 
 
 def _pose(section: CameraSection) -> Tensor:

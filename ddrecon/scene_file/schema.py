@@ -182,12 +182,42 @@ def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
         yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
 
+@dataclass(frozen=True)
+class OpencvSection:
+    """A lens of OpenCV's model, as COLMAP and nerfstudio have it: see `ddrecon.lenses`."""
+
+    type: ClassVar[str] = "opencv"
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+@dataclass(frozen=True)
+class FisheyeSection:
+    """A lens of OpenCV's fisheye model."""
+
+    type: ClassVar[str] = "fisheye"
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+
+LensSection = OpencvSection | FisheyeSection
+
+
 @dataclass(frozen=True, kw_only=True)
 class PerspectiveSection(PoseSection):
     """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
 
     The axis meets the image at `principal_point`, parts of its width and height from the top left.
-    `pixel_aspect`: height of a pixel over its width.
+    `pixel_aspect`: height of a pixel over its width. With `distortion`, all this is said of the
+    pinhole camera that is left without it.
     """
 
     type: ClassVar[str] = "perspective"
@@ -195,6 +225,7 @@ class PerspectiveSection(PoseSection):
     fov: float = limited(above=0, below=180)
     principal_point: Pair = (0.5, 0.5)
     pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
+    distortion: LensSection | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,30 +289,34 @@ class RingSection:
 
 @dataclass(frozen=True)
 class ViewSource:
-    """Views that are not listed one by one: those of a ring, or of transforms.json files.
+    """Views not listed one by one: of a ring, of transforms.json files, or of a COLMAP model.
 
-    Such files are written by NeRF, instant-ngp or nerfstudio.
+    Such files are written by NeRF, instant-ngp or nerfstudio; the model is a folder.
 
-    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every
-    `test_every` views of files that say nothing of it, the first is a test view.
+    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn, or the
+    folder of COLMAP's pictures. Of every `test_every` views of files that say nothing of it, the
+    first is a test view.
     """
 
-    ALTERNATIVES: ClassVar = (("ring",), ("transforms",))
+    ALTERNATIVES: ClassVar = (("ring",), ("transforms",), ("colmap",))
 
     ring: RingSection | None = None
     transforms: Paths | None = None
+    colmap: Path | None = None
     images: str | None = None
     test_every: int | None = optional(minimum=2)
 
     def problems(self) -> Iterator[Problem]:
         if self.ring is not None and self.images is None and self.ring.resolution is None:
             yield "ring", "missing key 'resolution'; only views with images can go without"
-        if self.ring is None and self.images is not None:
-            yield "images", "is for a ring; transforms name their images themselves"
+        if self.transforms is not None and self.images is not None:
+            yield "images", "is for a ring or COLMAP; transforms name their images themselves"
+        if self.colmap is not None and self.images is None:
+            yield "colmap", "missing key 'images', the folder of its pictures"
         if self.ring is not None and self.test_every is not None:
             yield (
                 "test_every",
-                "is for transforms; list the views of a ring to keep some as test views",
+                "is for transforms and COLMAP; list the views of a ring to keep some as test views",
             )
 
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from ddrecon.lenses import MODELS
 from ddrecon.variables.default_rates import (
     Rate,
     brightness_rate,
@@ -88,6 +89,14 @@ KINDS: Mapping[str, Kind] = {
         components=("rotation_x", "rotation_y", "rotation_z", *XYZ),
         difference_steps=SHORT_STEPS,
     ),
+    # of a perspective camera: its focal length in widths of the image, and the rest of its lens
+    "views.NAME.focal": Kind(fixed_rate(1e-3), low=1e-3, difference_steps=SHORT_STEPS),
+    "views.NAME.principal_point": Kind(
+        fixed_rate(1e-3), components=("x", "y"), difference_steps=SHORT_STEPS
+    ),
+    "views.NAME.distortion": Kind(
+        fixed_rate(1e-3), components=MODELS["opencv"], difference_steps=SHORT_STEPS
+    ),
 }
 """Every kind of variable, by its pattern."""
 
@@ -110,6 +119,6 @@ def kind_of(name: str) -> Kind:
 
 def pattern_of(name: str) -> str:
     """The pattern in `KINDS` that `name` follows, or `name` itself where it follows none."""
-    if re.fullmatch(r"views\..+\.camera", name):
-        return "views.NAME.camera"
+    if name.startswith("views.") and (view := re.fullmatch(r"views\.(.+)\.(\w+)", name)):
+        return f"views.NAME.{view[2]}"
     return re.sub(r"^lights\.[0-9]{1,9}\.", "lights.N.", name)

@@ -1,8 +1,9 @@
 """The numbers of a scene by name, read out of a scene and put back into it.
 
-`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's; `lights.0.irradiance`
-is any number of the first light; `views.front.camera` is the twist of a camera. Vectors are (x, y,
-z), colors lead.
+`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's;
+`lights.0.irradiance` is any number of the first light; `views.front.camera` is the twist of a
+camera, `.focal`, `.principal_point` and `.distortion` are its lens. Vectors are (x, y, z), colors
+lead.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import twist
+from ddrecon.cameras import Camera, twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein
@@ -28,7 +29,10 @@ def variable_names(scene: Scene) -> list[str]:
         for index, light in enumerate(scene.lights)
         for name in _tensors(light)
     ]
-    return [*_volume_names(scene.volume), *lights, *(f"views.{view.name}.camera" for view in scene.views)]
+    views = [
+        f"views.{view.name}.{part}" for view in scene.views for part in _camera_parts(view.camera)
+    ]
+    return [*_volume_names(scene.volume), *lights, *views]
 
 
 def value_of(scene: Scene, name: str) -> Tensor:
@@ -36,7 +40,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
 
     `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
     that light holds them; a camera's twist is the change of its pose, [6] and zero: see
-    `ddrecon.cameras.twist`.
+    `ddrecon.cameras.twist`. Its focal length [] is in widths of its image.
     """
     if (known := _own_name(scene.volume, name)) not in variable_names(scene):
         raise KeyError(name)
@@ -44,7 +48,8 @@ def value_of(scene: Scene, name: str) -> Tensor:
         return _volume_value(scene.volume, known)
     section, _, path = name.partition(".")
     if section == "views":
-        return scene.view(path.removesuffix(".camera")).camera.pose.new_zeros(6)
+        view, _, part = path.rpartition(".")
+        return _camera_value(scene.view(view).camera, part)
     index, _, attribute = path.partition(".")
     value: Tensor = getattr(scene.lights[int(index)], attribute)
     return value
@@ -66,9 +71,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     lights = [
         _replace_light(light, f"lights.{index}", values) for index, light in enumerate(scene.lights)
     ]
-    views = [
-        _replace_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views
-    ]
+    views = [_replace_view(view, values, scene) for view in scene.views]
     volume = _replace_volume(
         scene.volume, {name: values[name] for name in VOLUME if name in values}
     )
@@ -81,7 +84,9 @@ def component_names(name: str, value: Tensor) -> tuple[str, ...]:
     Raises KeyError for a name of no variable.
     """
     kind = kind_of(name)
-    return ("r", "g", "b") if kind.is_color and value.shape[:1] == (3,) else kind.components
+    if kind.is_color and value.shape[:1] == (3,):
+        return ("r", "g", "b")
+    return kind.components[: len(value)] if kind.components else ()
 
 
 def cross_sections(sigma_t: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,7 +162,33 @@ def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Lig
     return changed
 
 
-def _replace_view(view: View, change: Tensor | None, scene: Scene) -> View:
-    if change is None:
+def _camera_parts(camera: Camera) -> list[str]:
+    """What of `camera` can be varied."""
+    lens = ["focal", "principal_point"] if camera.is_perspective else []
+    return ["camera", *lens, *(["distortion"] if camera.distortion is not None else [])]
+
+
+def _camera_value(camera: Camera, part: str) -> Tensor:
+    pose = camera.pose
+    if part == "camera":
+        return pose.new_zeros(6)
+    if part == "focal":
+        return 1 / (2 * torch.as_tensor(camera.half_width, dtype=pose.dtype, device=pose.device))
+    value = getattr(camera, part)
+    return torch.as_tensor(value, dtype=pose.dtype, device=pose.device)
+
+
+def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
+    given = {
+        part: values[f"views.{view.name}.{part}"]
+        for part in _camera_parts(view.camera)
+        if f"views.{view.name}.{part}" in values
+    }
+    if not given:
         return view
-    return replace(view, camera=twist(view.camera, change, scene.volume.grid.center_xyz))
+    camera = view.camera
+    if "camera" in given:
+        camera = twist(camera, given.pop("camera"), scene.volume.grid.center_xyz)
+    if "focal" in given:
+        given["half_width"] = 1 / (2 * given.pop("focal"))
+    return replace(view, camera=replace(camera, **given))  # type: ignore[arg-type]

@@ -67,7 +67,7 @@ each_view = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
 
 @pytest.fixture
 def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Masses are interpolated linearly, and E25 is summed itself, in the fast march as well."""
+    """Masses are interpolated linearly, and E13 is summed itself, in the fast march as well."""
 
     def along(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
         return seen.at(depth.movedim(1, 0), cosine).movedim(0, 1)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given
@@ -10,7 +13,7 @@ from hypothesis import strategies as st
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
-from ddrecon.scene_file.sight import sees_box
+from ddrecon.scene_file.sight import explain_blindness, sees_box
 
 GRID = Grid.from_xyz(
     (1, 1, 1), (-1, -2, -3), (1, 2, 3)
@@ -81,3 +84,58 @@ def test_one_pixel_suffices():
         torch.tensor([0.0, 1.0, 0.0]),
     )
     assert sees_box(Camera(pose, (1, 501), 0.15), GRID)
+
+
+def seeing_cameras() -> list[Camera]:
+    origins = ([9.0, 1.0, 20.0], [-8.0, 3.0, 19.0], [18.0, -4.0, 6.0])
+    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    return [
+        Camera(
+            look_at(torch.tensor(eye, dtype=torch.float64), torch.zeros_like(up), up), (9, 9), 0.2
+        )
+        for eye in origins
+    ]
+
+
+def as_opencv(pose: torch.Tensor) -> torch.Tensor:
+    return pose * torch.tensor([1.0, -1, -1, 1])
+
+
+def inverse(pose: torch.Tensor) -> torch.Tensor:
+    whole = torch.eye(4, dtype=pose.dtype)
+    whole[:3] = pose
+    return torch.linalg.inv(whole)[:3]
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (as_opencv, "OpenCV axes (right, down, forward): negate"),
+        (inverse, "world to camera: give the inverse"),
+        (lambda pose: inverse(as_opencv(pose)), "world to camera with OpenCV axes"),
+        (lambda pose: pose + 50 * torch.eye(3, 4)[:, [3, 3, 3, 0]], "the cameras look at about"),
+    ],
+)
+def test_the_mistake_is_named_that_blinds_all_cameras(
+    mistake: Callable[[torch.Tensor], torch.Tensor], words: str
+) -> None:
+    seeing = seeing_cameras()
+    assert all(sees_box(camera, GRID) for camera in seeing)
+    blind = [replace(camera, pose=mistake(camera.pose)) for camera in seeing]
+    assert words in explain_blindness(blind, GRID)
+
+
+@pytest.mark.parametrize("is_y_up", [True, False])
+def test_the_other_axis_that_is_up_is_named(is_y_up: bool) -> None:
+    """The world turned by 90 degrees about x takes the box's place above or beside the origin."""
+    box = ((-1, -2, 9), (1, 2, 12)) if is_y_up else ((-1, 9, -2), (1, 12, 2))
+    grid = Grid.from_xyz((1, 1, 1), *box)
+    center = torch.tensor(grid.center_xyz, dtype=torch.float64)
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    cameras = []
+    for eye in ([20.0, 3.0, 3.0], [-15.0, 9.0, 9.0]):
+        up = torch.tensor([0.0, 0.0, 1.0] if is_y_up else [0.0, 1.0, 0.0], dtype=torch.float64)
+        pose = look_at(center + torch.tensor(eye, dtype=torch.float64), center, up)
+        cameras.append(Camera((turn.T if is_y_up else turn) @ pose, (9, 9), 0.05))
+    words = "y up in a scene with z up" if is_y_up else "z up, as in Blender, in a scene with y up"
+    assert words in explain_blindness(cameras, grid)

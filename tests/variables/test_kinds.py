@@ -21,7 +21,7 @@ SMALL = [
     "volume.density=0.7",
     "volume.sigma_a=[0.3, 0.4, 0.5]",
     "lights.0.irradiance=[3, 2, 1]",
-    *(f"views.{index}.camera.resolution=[7, 6]" for index in (0, 1)),
+    *(f"views.{index}.camera.resolution=[7, 6]" for index in range(4)),
 ]
 
 

@@ -98,7 +98,7 @@ def radiance_along(
     depth = mass * _scale(medium.extinction)
     # what scatters along the step and reaches its end, and the part of I that is lost on it
     line, lost = decayed_line(scatters, course.before(scatters, is_repeated=True), depth)
-    scattering_scale = (1 - medium.forward_fraction) * _scale(medium.scattering)
+    scattering_scale = (1 - medium.forward_fraction.view(1, -1, 1, 1)) * _scale(medium.scattering)
     source = line * (scattering_mass * scattering_scale)
     if inflow is None:
         return course.lift(follow(1 - lost, source, course))

@@ -32,7 +32,7 @@ class Along(NamedTuple):
     """Beams as rays see them.
 
     `angles` [2 beams, R]: of each the foot, then of each the square distance, or cosine and 1;
-    `polynomials` of E25; `factors`: p of a beam whose phase function is the same all along a ray
+    `polynomials` of E13; `factors`: p of a beam whose phase function is the same all along a ray
     [C, R], else None.
     """
 
