@@ -14,7 +14,7 @@ from torch import Tensor, is_tensor
 from ddrecon.kernels.launch import launch
 from ddrecon.kernels.native import number_type, program
 
-_TYPES = {"real": "F", "whole": "int", "double": "double"}
+_TYPES = {"real": "F", "whole": "int", "long": "long long", "double": "double"}
 
 
 @functools.cache
@@ -22,7 +22,8 @@ def record_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "
     """The kernel `name` that does `text`, C++ as of `program`, for each `item`.
 
     The text has pointers called as the `arrays`, of numbers `F` or, where it says so
-    (`whole:items double:sums`), of whole ones or of double precision; and whole `numbers`.
+    (`whole:items long:addresses double:sums`), of whole ones or of double precision; and whole
+    `numbers`.
     """
     types = dict(
         (one.partition(":")[::-2] if ":" in one else (one, "real")) for one in arrays.split()

@@ -16,8 +16,8 @@ from ddrecon.diffusion.rounds.fused.cells import (
     FOLLOW_CELL,
     RETURN_CELL,
 )
-from ddrecon.diffusion.rounds.fused.kernels import constants
 from ddrecon.diffusion.rounds.fused.schedule import POINTS, Step, steps_of
+from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.records import launch_record, record_kernel
 from ddrecon.numerics.harmonics import harmonics
@@ -32,8 +32,8 @@ class Cells:
     """The arrays of a sweep on a GPU, and the launches of kernels on them."""
 
     def __init__(self, swept: Swept):
-        self.swept, self.like = swept, swept.moments
-        _, self.colors, *self.shape = swept.moments.shape
+        self.swept, self.like = swept, swept.total()
+        _, self.colors, *self.shape = self.like.shape
         self.kernels = functools.partial(
             cell_kernels, torch.finfo(self.like.dtype).bits, swept.scattering is None
         )

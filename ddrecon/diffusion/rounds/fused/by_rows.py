@@ -47,8 +47,15 @@ class Rows:
     """The arrays of a sweep on a processor, and the launches of kernels on them."""
 
     def __init__(self, swept: Swept, is_kept: bool):
-        self.swept, self.like = swept, swept.moments
-        self.count, self.colors, self.depth, self.height, self.width = swept.moments.shape
+        self.swept, self.like = swept, swept.like
+        self.count, self.colors = swept.factors.shape[1:]
+        self.depth, self.height, self.width = self.like.shape[1:]
+        # Moments lie in memory of their own; 0 is the address of none.
+        self.moments = [
+            one if one is None else one.contiguous() for pair in swept.moments for one in pair
+        ]
+        addresses = [0 if one is None else one.data_ptr() for one in self.moments]
+        self.addresses = torch.tensor(addresses, dtype=torch.int64)
         self.bits = torch.finfo(self.like.dtype).bits
         self.pitch = -(-(self.width + 2) // MARGIN) * MARGIN
         threads = thread_count(self.like)
@@ -122,7 +129,7 @@ class Rows:
 
     def _sums(self) -> Tensor:
         """Moments for each piece; of a piece without directions they stay zero."""
-        shape = self.pieces, *self.like.shape
+        shape = self.pieces, self.count, *self.like.shape
         return self.like.new_empty(shape) if self.pieces == 1 else self.like.new_zeros(shape)
 
     def _given(self, lines: Tensor) -> dict[str, Tensor | int]:
@@ -130,7 +137,8 @@ class Rows:
         tables, like = self.tables, self.like
         scratch_rows = 3 * POINTERS + 5 + tables.most
         return {
-            "moments": like.contiguous(), "extinction": self.fields[0],
+            "addresses": self.addresses, "factors": self.swept.factors.contiguous(),
+            "extinction": self.fields[0],
             "scattering": self.fields[-1], "scales": self.swept.scales, "parts": tables.parts,
             "matrices": tables.matrices, "lines": lines, "ranges": self.ranges,
             "scratch": like.new_zeros(self.lanes * scratch_rows * self.pitch),

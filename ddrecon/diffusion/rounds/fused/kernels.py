@@ -5,6 +5,7 @@ from typing import Any
 
 from ddrecon.diffusion.rounds.fused.returning_rows import RETURN
 from ddrecon.diffusion.rounds.fused.rows import FOLLOW, GIVEN, NUMBERS
+from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.kernels.native import TOTAL
 from ddrecon.kernels.records import record_kernel
 
@@ -25,8 +26,3 @@ def return_kernel(bits: int, shares_field: bool, varies_numbers: bool) -> Any:
     text = constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers) + TOTAL + RETURN
     arrays = GIVEN + "found bars returning e_bar sc_bar double:sums"
     return record_kernel("return_rows", bits, text, arrays, NUMBERS)
-
-
-def constants(**is_so: bool) -> str:
-    """C++ that declares constants of these names."""
-    return "".join(f"const bool {name} = {str(so).lower()};\n" for name, so in is_so.items())
