@@ -85,14 +85,16 @@ class TextKernel:
         made: Mapping[str, Any],
         threads: int | None = None,
         shares: Sequence[Mapping[str, Any]] = (),
+        work: int | None = None,
     ) -> None:
         """Does `count` items with arrays and numbers `given`, and writes to arrays `made`.
 
         Those that are made are contiguous. A thread has what is in its own of `shares` as well.
+        `work` as of `launch.launch`.
         """
         bound = self.bind(given, made)
         if not shares:
-            bound.launch(count, threads)
+            bound.launch(count, threads, work)
             return
         own = []
         for share in shares:
@@ -141,10 +143,12 @@ class Bound:
     held: Mapping[str, Any]
     like: Tensor
 
-    def launch(self, count: int, threads: int | None = None, **numbers: float) -> None:
+    def launch(
+        self, count: int, threads: int | None = None, work: int | None = None, **numbers: float
+    ) -> None:
         """Does `count` items, with these `numbers` changed."""
         self.kernel.fill(self.record, numbers)
-        launch(self.kernel.kernel, count, [self.record], self.like, threads)
+        launch(self.kernel.kernel, count, [self.record], self.like, threads, work)
 
 
 def _declared(given: str) -> Iterator[tuple[str, bool, str, int]]:

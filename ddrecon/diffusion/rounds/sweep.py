@@ -68,7 +68,7 @@ class Parts(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """A `direction` of the quadrature (array order), its `weight`, and Y_k [K] there."""
+    """A `direction` of the quadrature (array order), its `weight`, and its `harmonics` Y_k [K]."""
 
     direction: Direction
     weight: float

@@ -61,7 +61,6 @@ def _round(
     """What one round makes of `light` (E12); with a `factor`, `factor` as far from light (E19)."""
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
-    moments = remaining_moments(medium)
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E11 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
@@ -80,7 +79,7 @@ def _round(
     new = Moments(mean, problem.flux(mean, turned))
     if swept.higher is None or factor is None:
         return new.plus(gain)
-    return _blend(medium, light, new, gain, swept, factor, degree)
+    return _blend(medium, light, new, gain, swept.higher, factor, degree)
 
 
 def _blend(
@@ -88,13 +87,13 @@ def _blend(
     light: Moments,
     diffuse: Moments,
     gain: Moments,
-    swept: Moments,
+    swept: Tensor,
     factor: Tensor,
     degree: int,
 ) -> Moments:
     """Light by `factor` as far from what was as to what a round makes of it (E19).
 
-    That is what is now `diffuse`, plus its gain, and of what is higher theta times what was swept.
+    That is what is now `diffuse`, plus its gain, and theta times what was `swept` of higher degree.
     """
     if is_fused():
         from ddrecon.diffusion.rounds.fused.blend import blend_fused
@@ -102,7 +101,7 @@ def _blend(
         length = _mean_step(medium.grid, degree)
         return blend_fused(medium, light, diffuse, gain, swept, factor, length)
     share = recompute(_transport_share, medium, degree)
-    new = replace(diffuse.plus(gain), higher=share * swept.higher)
+    new = replace(diffuse.plus(gain), higher=share * swept)
     return light.plus(_times(new.plus(_times(light, -1)), factor))
 
 

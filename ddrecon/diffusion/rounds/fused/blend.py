@@ -95,7 +95,7 @@ for (int i = begin; i < end; ++i) {"""
     depth_sum += depth_bar * e;
 }
 sums[item] = depth_sum;
-sums[(long long)rows * cells.parts * colors + item] = far_sum;
+sums[(long long)rows * parts * colors + item] = far_sum;
 }
 """
 )
@@ -116,7 +116,7 @@ def blend_fused(
     light: Moments,
     diffuse: Moments,
     gain: Moments,
-    swept: Moments,
+    swept: Tensor,
     factor: Tensor,
     length: float,
 ) -> Moments:
@@ -128,7 +128,7 @@ def blend_fused(
     numbers = numbers.expand(-1, len(light.mean))
     first = (part for one in (light, diffuse, gain) for part in (one.mean, *(one.flux or ())))
     mean, z, y, x, higher = _Blend.apply(
-        medium.grid, numbers, medium.extinction.field, light.higher, swept.higher, *first
+        medium.grid, numbers, medium.extinction.field, light.higher, swept, *first
     )
     return Moments(mean, (z, y, x), higher)
 

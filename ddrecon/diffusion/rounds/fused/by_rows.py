@@ -19,8 +19,8 @@ from ddrecon.diffusion.rounds.fused.schedule import Tables, make_tables
 from ddrecon.diffusion.rounds.fused.surroundings import surround
 from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.records import launch_record
 from ddrecon.kernels.spare import borrow, give_back
+from ddrecon.kernels.text import TextKernel
 
 FOLLOWED, KEPT = 16, 8
 """Directions at most that go through the cells together, if lines of few or of all are kept."""
@@ -132,7 +132,7 @@ class Rows:
         shape = self.pieces, self.count, *self.like.shape
         return self.like.new_empty(shape) if self.pieces == 1 else self.like.new_zeros(shape)
 
-    def _given(self, lines: Tensor) -> dict[str, Tensor | int]:
+    def _given(self, lines: Tensor) -> dict[str, Any]:
         """What all kernels are given, by its names; `found`, `jobs` and cotangents are missing."""
         tables, like = self.tables, self.like
         scratch_rows = 3 * POINTERS + 5 + tables.most
@@ -183,17 +183,12 @@ class Rows:
         middle = self.depth - self.depth // 2 if way else self.depth // 2
         return (0, middle) if (phase == 0) != is_backward else (middle, self.depth)
 
-    def _launch(self, kernel: Any, jobs: list[Job], values: dict[str, Tensor | int]) -> None:
+    def _launch(self, kernel: TextKernel, jobs: list[Job], values: dict[str, Any]) -> None:
         rows = [self._row(job) for job in jobs]
         work = self.depth * self.height * self.width * self.tables.most * self.count
-        launch_record(
-            kernel,
-            len(jobs),
-            values | {"jobs": torch.tensor(rows, dtype=torch.int32)},
-            self.like,
-            threads=min(self.threads, len(jobs)),
-            work=work,
-        )
+        given = values | {"jobs": torch.tensor(rows, dtype=torch.int32)}
+        made = {"found": given.pop("found")}
+        kernel.launch(len(jobs), given, made, min(self.threads, len(jobs)), work=work)
 
     def _row(self, job: Job) -> list[int]:
         """The numbers of a job, `rows.JOB` of them."""

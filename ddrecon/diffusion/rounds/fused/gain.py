@@ -102,7 +102,7 @@ for (int i = begin; i < end; ++i) {"""
     depth_sum += depth_bar * e;
     strength_sum += scattering_bar * s;
 }
-const long long items = (long long)rows * cells.parts * colors;
+const long long items = (long long)rows * parts * colors;
 sums[item] = depth_sum;
 sums[items + item] = strength_sum;
 sums[2 * items + item] = cosine_sum;

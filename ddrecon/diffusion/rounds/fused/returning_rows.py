@@ -50,7 +50,8 @@ F* own_back = returning + lane * ((height + 2) * back_stride + MARGIN) + MARGIN;
 double* own_sums = sums + 3 * job[8];
 F* e_bars = e_bar + job[9] * cells;
 F* sc_bars = sc_bar + job[10] * cells;
-for (int s = slice_to - 1; s >= slice_from; --s) for (int g = group_to - 1; g >= group_from; --g) {"""
+for (int s = slice_to - 1; s >= slice_from; --s)
+for (int g = group_to - 1; g >= group_from; --g) {"""
     + GROUP
     + "const int ahead = -y_way * width;"
     + MULTIPLY

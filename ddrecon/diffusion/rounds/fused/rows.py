@@ -17,15 +17,14 @@ POINTERS = 64
 """Moments and pairs of a group at most: so many rows are multiplied at once."""
 JOB = 12
 """Whole numbers of a job: see `by_rows.py`."""
-GIVEN = (
-    "long:addresses factors extinction scattering scales parts matrices lines scratch nothing "
-    "whole:ranges whole:jobs whole:groups whole:points whole:pairs whole:order "
-)
-"""Arrays that all kernels of rows are given."""
-NUMBERS = (
-    "depth height width pitch colors count even most extinction_channels scattering_channels "
-    "scratch_rows"
-)
+GIVEN = """
+    F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
+    F *found, *bars, *returning, *e_bar, *sc_bar; double *sums; long *addresses;
+    int *ranges, *jobs, *groups, *points, *pairs, *order;
+    int depth, height, width, pitch, colors, count, even, most, scratch_rows;
+    int extinction_channels, scattering_channels
+"""
+"""What kernels of rows are given; what is not used, is none."""
 
 PLACES = (
     f"const int MARGIN = {MARGIN}, POINTERS = {POINTERS}, JOB = {JOB};"
@@ -251,7 +250,8 @@ FOLLOW = (
     PLACES
     + """
 enum { NEAR, LIGHT };
-const long long stride = 2LL * most * pitch, places = KEEPS ? (long long)depth * height : height + 2;
+const long long stride = 2LL * most * pitch;
+const long long places = KEEPS ? (long long)depth * height : height + 2;
 F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
 for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_to; ++g) {"""
     + GROUP

@@ -47,11 +47,18 @@ class Swept:
     source: Parts
 
     @staticmethod
-    def of(grid: Grid, directions: int, *tensors: Tensor) -> Swept:
-        """From tensors in the order of fields, as autograd must be given them: one by one."""
-        *others, factors = tensors[:4]
-        parts = tensors[4:]
-        return Swept(grid, directions, *others, factors, parts[:PARTS], parts[PARTS:])
+    def of(
+        grid: Grid,
+        directions: int,
+        scales: Tensor,
+        extinction: Tensor,
+        scattering: Tensor | None,
+        factors: Tensor,
+        *parts: Tensor | None,
+    ) -> Swept:
+        """From tensors as autograd must be given them: one by one."""
+        light, source = parts[:PARTS], parts[PARTS:]
+        return Swept(grid, directions, scales, extinction, scattering, factors, light, source)
 
     @property
     def like(self) -> Tensor:
@@ -75,7 +82,7 @@ class Swept:
         return found
 
     def part_bars(self, which: int, bar: Tensor, needs: Sequence[bool]) -> list[Tensor | None]:
-        """Cotangents of the parts of light (0) or source (1) that need them, of `bar` of moments."""
+        """Cotangents of parts of light (0) or source (1) that need them, of `bar` of moments."""
         factors = self.factors[which].view(*self.factors.shape[1:], 1, 1, 1)
         found: list[Tensor | None] = []
         for part, need in zip(range(PARTS), needs, strict=True):
@@ -88,9 +95,9 @@ class Swept:
         found = torch.zeros_like(self.factors, dtype=torch.float64)
         for k, pair in enumerate(self.moments):
             for which, moment in enumerate(pair):
-                for color in range(bar.shape[1]) if moment is not None else ():
-                    one, other = moment[color].reshape(-1), bar[k, color].reshape(-1)
-                    found[which, k, color] = torch.dot(one, other)
+                if moment is not None:
+                    terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
+                    found[which, k] = torch.stack([torch.dot(*each) for each in terms])
         return found.to(bar.dtype)
 
 
