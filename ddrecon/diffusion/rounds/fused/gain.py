@@ -118,7 +118,7 @@ def gain_fused(
     diffuse: Moments,
     imbalance: Tensor | None,
     cosine: Tensor,
-    length: float,
+    length: Tensor,
 ) -> tuple[Moments, Tensor, Vector | None]:
     """theta (`swept` - `diffuse`), what diffusion receives of it, and by how much flux is turned.
 
