@@ -6,7 +6,7 @@ other has found. So both ways share one sum, and no moment is read but to be add
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from ddrecon.diffusion.rounds.fused.kernels import follow_kernel, return_kernel
 from ddrecon.diffusion.rounds.fused.rows import MARGIN, POINTERS
 from ddrecon.diffusion.rounds.fused.schedule import Tables, make_tables
 from ddrecon.diffusion.rounds.fused.surroundings import surround
-from ddrecon.diffusion.rounds.fused.swept import Swept
+from ddrecon.diffusion.rounds.fused.swept import Parts, Swept, moment_of
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.spare import borrow, give_back
 from ddrecon.kernels.text import TextKernel
@@ -50,12 +50,7 @@ class Rows:
         self.swept, self.like = swept, swept.like
         self.count, self.colors = swept.factors.shape[1:]
         self.depth, self.height, self.width = self.like.shape[1:]
-        # Moments lie in memory of their own; 0 is the address of none.
-        self.moments = [
-            one if one is None else one.contiguous() for pair in swept.moments for one in pair
-        ]
-        addresses = [0 if one is None else one.data_ptr() for one in self.moments]
-        self.addresses = torch.tensor(addresses, dtype=torch.int64)
+        self.held: list[Tensor] = []
         self.bits = torch.finfo(self.like.dtype).bits
         self.pitch = -(-(self.width + 2) // MARGIN) * MARGIN
         threads = thread_count(self.like)
@@ -78,8 +73,8 @@ class Rows:
             self._launch(kernel, jobs, self._given(lines) | {"found": sums})
         return sums.sum(0) if len(sums) > 1 else sums[0]
 
-    def transpose(self, bars: Tensor, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of moments."""
+    def transpose(self, bars: Parts, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light."""
         sums = self._sums()
         lines = borrow(self._line_count(self.depth * self.height), self.like)
         kinds = 2 + len(self.fields)
@@ -89,7 +84,7 @@ class Rows:
         fields = [self.like.new_zeros(each, *shape) for each in channels]
         scales = self.like.new_zeros(2 * self.pieces, self.colors, 3, dtype=torch.float64)
         values = self._given(lines) | {
-            "bars": bars.contiguous(), "found": sums, "sums": scales,
+            "bars": self._addresses(moment_of(bars, k) for k in range(self.count)), "found": sums, "sums": scales,
             "returning": self.like.new_zeros(self.lanes * size),
             "e_bar": fields[0], "sc_bar": fields[-1],
         }  # fmt: skip
@@ -132,12 +127,18 @@ class Rows:
         shape = self.pieces, self.count, *self.like.shape
         return self.like.new_empty(shape) if self.pieces == 1 else self.like.new_zeros(shape)
 
+    def _addresses(self, moments: Iterable[Tensor | None]) -> Tensor:
+        """Where each of `moments` lies, in memory of its own; 0 for none."""
+        held = [one if one is None else one.contiguous() for one in moments]
+        self.held += [one for one in held if one is not None]
+        return torch.tensor([0 if one is None else one.data_ptr() for one in held])
+
     def _given(self, lines: Tensor) -> dict[str, Any]:
         """What all kernels are given, by its names; `found`, `jobs` and cotangents are missing."""
         tables, like = self.tables, self.like
         scratch_rows = 3 * POINTERS + 5 + tables.most
         return {
-            "addresses": self.addresses, "factors": self.swept.factors.contiguous(),
+            "moments": self._addresses(one for pair in self.swept.moments for one in pair), "factors": self.swept.factors.contiguous(),
             "extinction": self.fields[0],
             "scattering": self.fields[-1], "scales": self.swept.scales, "parts": tables.parts,
             "matrices": tables.matrices, "lines": lines, "ranges": self.ranges,

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.share import (
-    ROW_SUM,
     SHARE,
     SHARE_SLOPE,
     constants,
     numbers_by_color,
 )
 from ddrecon.grid import Grid
+from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium

@@ -72,10 +72,10 @@ for (int t = height - 1; t >= 0; --t) {
     auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
     auto read = [&](int k, F* row, int from, int to) {
-        const F* moment = bars + k * all + color * cells + at;
+        const F* moment = (const F*)bars[k] + color * cells + at;
         INDEPENDENT
-        for (int c = from; c < to; ++c) row[c] = moment[c];
-        ask_for(moment, from, to);
+        for (int c = from; c < to; ++c) row[c] = bars[k] ? moment[c] : F(0);
+        if (bars[k]) ask_for(moment, from, to);
     };
     to_directions(to_weighted_light, read, bar_of, 0, width);
     const int* range = ranges + 4 * (k * height + r);

@@ -19,7 +19,7 @@ JOB = 12
 """Whole numbers of a job: see `by_rows.py`."""
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
-    F *found, *bars, *returning, *e_bar, *sc_bar; double *sums; long *addresses;
+    F *found, *returning, *e_bar, *sc_bar; double *sums; long *moments, *bars;
     int *ranges, *jobs, *groups, *points, *pairs, *order;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows;
     int extinction_channels, scattering_channels
@@ -118,7 +118,7 @@ auto ask_for = [&](const F* row, int from, int to) {
 };
 // One of the moments that scatter, from a cell on; those of `bars` and of light follow each other.
 auto read_scattering = [&](long long at, int k, F* row, int from, int to) {
-    const F *light = (const F*)addresses[2 * k], *source = (const F*)addresses[2 * k + 1];
+    const F *light = (const F*)moments[2 * k], *source = (const F*)moments[2 * k + 1];
     const F by_light = light ? factors[k * colors + color] : F(0);
     const F by_source = source ? factors[(count + k) * colors + color] : F(0);
     const F *one = (light ? light : source) + at, *other = (source ? source : light) + at;

@@ -7,8 +7,6 @@ from torch import Tensor
 
 from ddrecon.medium.coefficients import Medium
 
-ROW_SUM = "\n{\n#if defined(__clang__)\n#pragma clang fp reassociate(on)\n#endif\n"
-"""Begins a block whose sums have a free order, or else they would not become vector code."""
 # d is the depth of a mean step, at least LEAST: theta is 1 there, but its formula 0 / 0 in empty
 # cells. rho = d (psi / phi - 1/2).
 SHARE = """
