@@ -16,7 +16,9 @@ from ddrecon.renderer import render
 pytestmark = pytest.mark.slow
 
 
-def image_and_gradients(engine: str, g: float, sigma: tuple[tuple[float, ...], ...]) -> list[Tensor]:
+def image_and_gradients(
+    engine: str, g: float, sigma: tuple[tuple[float, ...], ...]
+) -> list[Tensor]:
     """The image of a small scene lit in colors, and derivatives by its density, g and sun."""
     use_engine(engine)
     density = half_empty(7, 6, 5)
@@ -33,7 +35,7 @@ def image_and_gradients(engine: str, g: float, sigma: tuple[tuple[float, ...], .
 
 @pytest.mark.parametrize("g", [0.0, 0.4, -0.6])
 @pytest.mark.parametrize("sigma", [((0.5,), (8.0,)), ((0.5, 1.0, 2.0), (8.0, 6.0, 4.0))])
-def test_rounds_of_both_engines_agree(g: float, sigma: tuple[tuple[float, ...], ...]):
+def test_rounds_of_both_engines_agree(g: float, sigma: Sections):
     both = (image_and_gradients(engine, g, sigma) for engine in ("warp", "torch"))
     for found, known in zip(*both, strict=True):
         torch.testing.assert_close(found, known, rtol=1e-9, atol=1e-11)
