@@ -119,7 +119,7 @@ def blend_fused(
     gain: Moments,
     swept: Tensor,
     factor: Tensor,
-    length: float,
+    length: Tensor,
 ) -> Moments:
     """From `light` to `diffuse` plus `gain`, and of what is higher to theta `swept`, by `factor`.
 

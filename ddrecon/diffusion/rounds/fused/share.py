@@ -33,7 +33,7 @@ def constants(**is_so: bool) -> str:
     return "".join(f"const bool {name} = {str(so).lower()};\n" for name, so in is_so.items())
 
 
-def numbers_by_color(medium: Medium, length: float, others: Sequence[Tensor]) -> Tensor:
+def numbers_by_color(medium: Medium, length: Tensor, others: Sequence[Tensor]) -> Tensor:
     """The depth of a step of `length` per unit of extinction's field, then `others`, [N, C]."""
     colors = max(each.numel() for each in (medium.extinction.scale, *others))
     each = medium.extinction.scale * length, *others
