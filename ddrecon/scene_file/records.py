@@ -62,10 +62,9 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
         problems.note(node.refused(what))
     for name, child in entries.items():
         with problems.collecting():
-            if name in getattr(kind, "RETIRED", {}):
-                raise child.key_refused(kind.RETIRED[name])  # type: ignore[attr-defined]
             if name not in known:
-                raise child.key_refused(f"unknown key{suggestion(name, known)}")
+                retired = getattr(kind, "RETIRED", {}).get(name)
+                raise child.key_refused(retired or f"unknown key{suggestion(name, known)}")
             if name in declared:
                 values[name] = read_value(child, Rule(hints[name], declared[name].metadata, folder))
         if problems.are_many:
