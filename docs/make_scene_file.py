@@ -14,7 +14,7 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from ddrecon import settings
-from ddrecon.scene_file import light_schema, phase_schema, schema
+from ddrecon.scene_file import camera_schema, light_schema, phase_schema, schema
 from ddrecon.variables.kinds import KINDS, Kind
 
 PAGE = Path(__file__).parent / "scene_file.md"
@@ -28,10 +28,10 @@ KIND_NAMES = {
     settings.Support: "`masks`, number or {file: ...}",
     schema.Triple: "[x, y, z]",
     schema.Count: "[nx, ny, nz]",
-    schema.Size: "[width, height]",
-    phase_schema.Pair: "[x, y]",
+    camera_schema.Size: "[width, height]",
+    camera_schema.Pair: "[x, y]",
     schema.Paths: "file, or list of files",
-    schema.Matrix: "4 rows of 4 numbers",
+    camera_schema.Matrix: "4 rows of 4 numbers",
     tuple[float, ...]: "list of numbers",
     float: "number",
     int: "whole number",
@@ -249,7 +249,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "camera: {type: perspective}",
-        schema.PerspectiveSection,
+        camera_schema.PerspectiveSection,
         "A pinhole camera.\nGive either `origin`, `target` and `up`, or `matrix`.",
         {
             "fov": "Horizontal field of view, in degrees.",
@@ -270,7 +270,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "distortion: {type: opencv}",
-        schema.OpencvSection,
+        camera_schema.OpencvSection,
         "A lens as OpenCV and COLMAP calibrate it, with nerfstudio's k4.\n"
         "Everything else that is said of the camera holds for the pinhole that would be left.",
         dict.fromkeys(("k1", "k2", "k3", "k4"), "Radial: of r^2, r^4, r^6 and r^8 in turn.")
@@ -278,13 +278,13 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "distortion: {type: fisheye}",
-        schema.FisheyeSection,
+        camera_schema.FisheyeSection,
         "A fisheye as OpenCV and COLMAP calibrate it.",
         dict.fromkeys(("k1", "k2", "k3", "k4"), "Of the angle's powers 3, 5, 7 and 9 in turn."),
     ),
     (
         "camera: {type: orthographic}",
-        schema.OrthographicSection,
+        camera_schema.OrthographicSection,
         "Parallel rays, as a satellite far away sees.\n"
         "Its other keys are those of a perspective camera.",
         {

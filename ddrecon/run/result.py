@@ -61,6 +61,9 @@ def describe_result(
             camera = _move_camera(camera, view.camera.pose.tolist())
         camera |= _lens({name: values.get(f"views.{view.name}.{name}") for name in LENS}, camera)
         section["camera"] = camera
+        for key in ("exposure", "offset"):
+            if (value := values.get(f"views.{view.name}.{key}")) is not None:
+                section[key] = value
     return described
 
 

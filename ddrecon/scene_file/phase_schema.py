@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from ddrecon.scene_file.camera_schema import Pair
 from ddrecon.scene_file.light_schema import Color
 from ddrecon.settings import Problem, limited
-
-Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
