@@ -12,12 +12,12 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.errors import DataWarning
+from ddrecon.errors import DataWarning, SceneError
 from ddrecon.medium.phase import Draine, HenyeyGreenstein, Rayleigh, TwoLobe
 from ddrecon.medium.phase_series import Legendre, Tabulated
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.load import SceneFile, read_scene
+from ddrecon.scene_file.load import read_scene
 
 VOLUME = {name: value for name, value in yaml.safe_load(SCENE)["volume"].items() if name != "g"}
 SECTIONS: dict[str, tuple[type, dict[str, Any]]] = {
@@ -50,7 +50,7 @@ def test_each_kind_is_built_and_written_back(
     scene_file = read_scene(write(scene_with(type=name, **numbers)))
     scene = build_scene(scene_file)
     phase = scene.volume.phase
-    assert type(phase) is kind and phase.NAME == name
+    assert isinstance(phase, kind) and name == phase.NAME
     has_colors = any(isinstance(value, list) and len(value) == 3 for value in numbers.values())
     if kind is not Legendre:
         assert phase.colors == (3 if has_colors else 1)
@@ -61,10 +61,11 @@ def test_each_kind_is_built_and_written_back(
 
 
 def test_g_is_short_for_henyey_greenstein(write: Callable[[str], Path]) -> None:
-    scenes = [write_and_load(write, text) for text in (
+    texts = (
         changed(volume=VOLUME | {"g": 0.4}, optimize=None),
         scene_with(type="henyey_greenstein", g=0.4),
-    )]  # fmt: skip
+    )
+    scenes = [write_and_load(write, text) for text in texts]
     assert scenes[0].volume.g == scenes[1].volume.g == torch.tensor(0.4)
 
 
@@ -143,7 +144,5 @@ def test_droplets_scatter_as_one_sphere_does_and_forward(write: Callable[[str], 
 
 
 def test_a_missing_file_is_the_scene_s_mistake(write: Callable[[str], Path]) -> None:
-    from ddrecon.errors import SceneError
-
-    with pytest.raises(SceneError, match="volume.phase.file"):
+    with pytest.raises(SceneError, match=r"volume\.phase\.file"):
         load_scene(write(scene_with(type="table", file="nowhere.csv")))
