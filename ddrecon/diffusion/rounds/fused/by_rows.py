@@ -20,7 +20,7 @@ from ddrecon.diffusion.rounds.fused.surroundings import surround
 from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.spare import borrow, give_back
-from ddrecon.kernels.text import Bound
+from ddrecon.kernels.text import TextKernel
 
 FOLLOWED, KEPT = 16, 8
 """Directions at most that go through the cells together, if lines of few or of all are kept."""
@@ -74,9 +74,8 @@ class Rows:
         sums = self._sums()
         lines = self.like.new_zeros(self._line_count(self.height + 2))
         kernel = follow_kernel(self.bits, self._shares_field, False)
-        bound = kernel.bind(self._given(lines), {"found": sums})
         for jobs in self._launches(is_backward=False):
-            self._launch(bound, jobs)
+            self._launch(kernel, jobs, self._given(lines) | {"found": sums})
         return sums.sum(0) if len(sums) > 1 else sums[0]
 
     def transpose(self, bars: Tensor, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
@@ -90,21 +89,18 @@ class Rows:
         fields = [self.like.new_zeros(each, *shape) for each in channels]
         scales = self.like.new_zeros(2 * self.pieces, self.colors, 3, dtype=torch.float64)
         values = self._given(lines) | {
-            "bars": bars.contiguous(), "sums": scales,
+            "bars": bars.contiguous(), "found": sums, "sums": scales,
             "returning": self.like.new_zeros(self.lanes * size),
             "e_bar": fields[0], "sc_bar": fields[-1],
         }  # fmt: skip
-        kernels = (
-            follow_kernel(self.bits, self._shares_field, True),
-            return_kernel(self.bits, self._shares_field, varies_numbers),
-        )
-        keep, back = (kernel.bind(values, {"found": sums}) for kernel in kernels)
+        keep = follow_kernel(self.bits, self._shares_field, True)
+        back = return_kernel(self.bits, self._shares_field, varies_numbers)
         for jobs in self._launches(is_backward=True):
             # Lines are kept for both halves of the slices.
             if jobs[0].slices[1] == self.depth:
                 whole = [replace(job, slices=(0, self.depth)) for job in jobs]
-                self._launch(keep, whole)
-            self._launch(back, jobs)
+                self._launch(keep, whole, values)
+            self._launch(back, jobs, values)
         give_back(lines)
         found = sums.sum(0) if len(sums) > 1 else sums[0]
         of_fields = [
@@ -187,10 +183,12 @@ class Rows:
         middle = self.depth - self.depth // 2 if way else self.depth // 2
         return (0, middle) if (phase == 0) != is_backward else (middle, self.depth)
 
-    def _launch(self, kernel: Bound, jobs: list[Job]) -> None:
-        rows = torch.tensor([self._row(job) for job in jobs], dtype=torch.int32)
+    def _launch(self, kernel: TextKernel, jobs: list[Job], values: dict[str, Any]) -> None:
+        rows = [self._row(job) for job in jobs]
         work = self.depth * self.height * self.width * self.tables.most * self.count
-        kernel.launch(len(jobs), min(self.threads, len(jobs)), work, jobs=rows)
+        given = values | {"jobs": torch.tensor(rows, dtype=torch.int32)}
+        made = {"found": given.pop("found")}
+        kernel.launch(len(jobs), given, made, min(self.threads, len(jobs)), work=work)
 
     def _row(self, job: Job) -> list[int]:
         """The numbers of a job, `rows.JOB` of them."""
