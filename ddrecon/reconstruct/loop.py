@@ -260,4 +260,4 @@ class Reconstruction:
         """
         if not self._is_test_due or not self.test_level.views:
             return None, None
-        return render_quality(self.test_level, self._values(), self.test_targets, self.memory)
+        return render_quality(self.test_level, self.parameters, self.test_targets, self.memory)
