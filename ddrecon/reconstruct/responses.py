@@ -16,7 +16,6 @@ from torch import Tensor
 from ddrecon.losses import Target
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import View
-from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import RESPONSE
 
 LARGEST_STEP = 2.0
@@ -82,9 +81,9 @@ def fit_held_out(
     for these say nothing of the camera of a test view. Nothing changes where there are none.
     """
     sizes = {
-        parameter.name.rpartition(".")[2]: len(parameter.value)
+        parameter.key: len(parameter.value)
         for parameter in parameters
-        if parameter.name.startswith("views.") and kind_of(parameter.name).is_fitted
+        if parameter.view is not None and parameter.key in RESPONSE
     }
     if not sizes:
         return picture, {}
@@ -104,7 +103,7 @@ def step_responses(
     """Takes the parameters `fitted` of a `view` part of the way to what fits its `picture` best."""
     if not fitted:
         return
-    keys = {parameter.name.rpartition(".")[2]: parameter for parameter in fitted}
+    keys = {parameter.key: parameter for parameter in fitted}
     like = view.camera.pose
     exposure, offset = (
         keys[key].value if key in keys else _value(getattr(view, key), default, like)
