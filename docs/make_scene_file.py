@@ -424,8 +424,8 @@ def _parameters() -> str:
             "## Names of parameters",
             "",
             "What can be found.",
-            "N is a light's place in the list, counted from 0; NAME is a view's name, or `*` for all "
-            "training views.",
+            "N is a light's place in the list, counted from 0.",
+            "NAME is a view's name, or `*` for all training views.",
             "[Commands](cli.md#names-of-parameters) has the same names, by light.",
             "",
             "| name | kept within | by color | from cell to cell |",
