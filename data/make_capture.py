@@ -27,6 +27,7 @@ from ddrecon.grid import Grid
 from ddrecon.io.images.srgb import encode
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.reference.trace import Tracer, open_tracer
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
@@ -112,8 +113,8 @@ def scene_of(density: Tensor, cameras: dict[str, Camera]) -> Scene:
     """The smoke of `density` in its light."""
     sigma = torch.tensor([SIGMA_T], dtype=torch.float64)
     grid = Grid.from_xyz(CELLS, *BOX)
-    g = torch.tensor(G, dtype=torch.float64)
-    volume = Volume(grid, density.double(), (1 - ALBEDO) * sigma, ALBEDO * sigma, g)
+    phase = HenyeyGreenstein(torch.tensor(G, dtype=torch.float64))
+    volume = Volume(grid, density.double(), (1 - ALBEDO) * sigma, ALBEDO * sigma, phase)
     vectors = (torch.tensor(vector, dtype=torch.float64) for vector in (SUN, IRRADIANCE, AMBIENT))
     direction, irradiance, radiance = vectors
     lights = [DirectionalLight(direction, irradiance), AmbientLight(radiance)]

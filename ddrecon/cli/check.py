@@ -10,8 +10,7 @@ from ddrecon.engine import engine_of_parts
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views, start_support
-from ddrecon.reconstruct.support import describe_support
-from ddrecon.run.drive import support_text
+from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.terms import needed_terms

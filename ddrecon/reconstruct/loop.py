@@ -30,10 +30,12 @@ from ddrecon.reconstruct.objective import (
     read_numbers,
     render_quality,
 )
+from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
 from ddrecon.reconstruct.steps import share_out, solve_poses, solve_responses, step_parameters
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
+from ddrecon.settings import AUTO
 from ddrecon.variables.values import with_values
 
 TEST_EVERY = 10
@@ -95,6 +97,7 @@ class Reconstruction:
         self.seed = torch.initial_seed()
         self.memory = SolveMemory(scene.diffusion.warm_start)
         self.before_step: dict[str, Any] | None = None
+        self.smoothing: Smoothing | None = None
         self._enter_stage(0)
 
     @property
@@ -114,6 +117,8 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
+        if self.iteration == 0:
+            self._settle_smoothing()
         stage = stage_of(self.iteration, self.settings.iterations, self.settings.refine_at)
         if stage > self.stage:
             self._enter_stage(stage)
@@ -179,6 +184,7 @@ class Reconstruction:
             "solutions": dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
+            "smoothing": None if self.smoothing is None else self.smoothing.described(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -187,6 +193,8 @@ class Reconstruction:
             parameter.restore(state["parameters"][parameter.name])
         self.total = Row(**state["total"])
         self.misfit, self.seed = state["misfit"], state["seed"]
+        if state["smoothing"] is not None:
+            self._smooth(Smoothing(**state["smoothing"]))
         self._enter_stage(state["stage"])
         for parameter in self.parameters:
             curvature = state["parameters"][parameter.name]["curvature"]
@@ -194,6 +202,18 @@ class Reconstruction:
         self.memory.last = {
             kind: field.to(self.scene.volume.density) for kind, field in state["solutions"].items()
         }
+
+    def _settle_smoothing(self) -> None:
+        """Finds the weight of density's total variation where the scene asks for that."""
+        density = self.settings.parameters.get("density")
+        if self.smoothing is None and density is not None and density.tv == AUTO:
+            self._smooth(find_smoothing(self.scene, Reconstruction))
+
+    def _smooth(self, smoothing: Smoothing) -> None:
+        self.smoothing = smoothing
+        for parameter in self.parameters:
+            if parameter.name == "density":
+                parameter.tv = smoothing.weight
 
     def _enter_stage(self, stage: int) -> None:
         """Takes scenes, parameters and solutions to the resolution of `stage`."""

@@ -55,7 +55,8 @@ class Parameter:
         self.view = owner.removeprefix("views.") if owner.startswith("views.") else None
         self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
-        self.tv = (kind.tv if settings.tv is None else settings.tv) if self.is_field else 0.0
+        weight = settings.tv if isinstance(settings.tv, float) else kind.tv
+        self.tv = weight if self.is_field else 0.0
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None

@@ -66,6 +66,12 @@ def describe_support(support: Support | None, grid: Grid) -> dict[str, float] | 
     return None if support is None else {"cells": float(support.on(grid).float().mean())}
 
 
+def support_text(support: dict[str, float]) -> str:
+    """What `describe_support` says, as a line."""
+    part = 100 * support["cells"]
+    return f"support: density in {part:.3g} % of the cells, where every view may show some"
+
+
 def find_support(
     views: Sequence[View], settings: ParameterSettings, cells: Tensor | None
 ) -> Support | None:

@@ -17,6 +17,8 @@ from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.smoothing import smoothing_text
+from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
@@ -168,10 +170,6 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     lines = [line, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))
+    if "smoothing" in summary:
+        lines.insert(1, smoothing_text(summary["smoothing"]))
     return lines
-
-
-def support_text(support: dict[str, float]) -> str:
-    """What `describe_support` says, as a line."""
-    part = 100 * support["cells"]
-    return f"support: density in {part:.3g} % of the cells, where every view may show some"

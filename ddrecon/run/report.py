@@ -14,6 +14,7 @@ from torch import Tensor
 from ddrecon.io.images.movies import animation_of, encode_frames
 from ddrecon.io.images.table import png_of
 from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.renderer import LightField, view_image
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
@@ -166,6 +167,8 @@ def _volumes(scene: Scene, summary: Mapping[str, Any]) -> list[str]:
     ]
     if "support" in summary:
         parts.append(paragraph(f"Left out by the support: {_left_out(summary)} % of the cells."))
+    if "smoothing" in summary:
+        parts.append(paragraph(smoothing_text(summary["smoothing"])))
     for name in FIELDS:
         value = value_of(scene, name)
         if value.ndim >= 3:

@@ -70,7 +70,7 @@ def describe_result(
 def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
     """The section `volume` with reconstructed `numbers` of its phase function."""
     if "phase" not in volume or not numbers:
-        return volume | numbers
+        return {**volume, **numbers}
     found = {name.removeprefix(PHASE): number for name, number in numbers.items()}
     if "coefficients" in found:
         # They count from chi_1 on, and replace those of a file.

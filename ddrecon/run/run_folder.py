@@ -196,4 +196,8 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
     summary = {"iterations": total.pop("iteration"), **total} | compared_by(run)
     support = describe_support(run.support, run.scene.volume.grid)
-    return summary if support is None else summary | {"support": support}
+    if support is not None:
+        summary["support"] = support
+    if run.smoothing is not None:
+        summary["smoothing"] = run.smoothing.described()
+    return summary

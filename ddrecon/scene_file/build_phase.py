@@ -37,7 +37,10 @@ def build_phase(scene_file: SceneFile, dtype: torch.dtype, device: torch.device)
 
     Raises SceneError, FormatError, or MissingExtraError for droplets without miepython.
     """
-    section, tensor = scene_file.tree.volume.phase, partial(torch.tensor, dtype=dtype, device=device)
+    section, tensor = (
+        scene_file.tree.volume.phase,
+        partial(torch.tensor, dtype=dtype, device=device),
+    )
     match section:
         case None:
             return HenyeyGreenstein(tensor(scene_file.tree.volume.g))

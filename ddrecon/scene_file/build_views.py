@@ -16,10 +16,11 @@ from ddrecon.io.images.table import Image, read_image, read_mask
 from ddrecon.lenses import MODELS, is_folded
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
+from ddrecon.scene_file.camera_schema import CameraSection, LensSection, PerspectiveSection
 from ddrecon.scene_file.files import read_referenced
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.schema import CameraSection, Color, LensSection, PerspectiveSection
 from ddrecon.scene_file.sight import explain_blindness, sees_box
 
 LATTICE = 33

@@ -18,15 +18,15 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.schema import (
+from ddrecon.scene_file.camera_schema import (
     FisheyeSection,
     LensSection,
     Matrix,
     OpencvSection,
     PerspectiveSection,
-    ViewSection,
 )
+from ddrecon.scene_file.nodes import Node
+from ddrecon.scene_file.schema import ViewSection
 from ddrecon.scene_file.view_names import name_views
 
 MODELS: dict[str, tuple[str, ...]] = {

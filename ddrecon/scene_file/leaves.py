@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ddrecon.grid import Triple
+from ddrecon.scene_file.camera_schema import Matrix, Pair, Row, Size
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.nodes import Node, describe_found, show_value
 from ddrecon.scene_file.problems import Problems, suggestion
-from ddrecon.scene_file.schema import Backdrop, Color, Count, Matrix, Pair, Paths, Row, Size
+from ddrecon.scene_file.schema import Backdrop, Count, Paths
 
 T = TypeVar("T")
 

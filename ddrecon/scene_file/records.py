@@ -181,8 +181,14 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
             if (kind := KINDS.get(pattern_of(name))) is None:
                 raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
             settings = read_record(child, ParameterSettings, rule.folder)
-            if settings.support is not None and name != "density":
-                raise _mapping(child)["support"].refused("is for density alone")
+            for key, is_given in (
+                ("support", settings.support is not None),
+                ("tv", settings.tv == AUTO),
+            ):
+                if is_given and name != "density":
+                    raise _mapping(child)[key].refused(
+                        f"{describe_found(_mapping(child)[key])} is for density alone"
+                    )
             parameters[name] = _require_legal(child, settings, kind)
     problems.raise_any()
     if not parameters:

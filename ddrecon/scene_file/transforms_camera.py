@@ -10,9 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ddrecon.lenses import MODELS
-from ddrecon.scene_file.leaves import Rule, read_matrix, read_number, read_text
-from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.schema import (
+from ddrecon.scene_file.camera_schema import (
     FisheyeSection,
     LensSection,
     Matrix,
@@ -20,6 +18,8 @@ from ddrecon.scene_file.schema import (
     PerspectiveSection,
     Size,
 )
+from ddrecon.scene_file.leaves import Rule, read_matrix, read_number, read_text
+from ddrecon.scene_file.nodes import Node
 
 OPENCV = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 """Camera models whose distortion is OpenCV's, as far as they have some."""
@@ -38,8 +38,8 @@ def read_camera(frame: Node, entries: Entries, rule: Rule) -> PerspectiveSection
         raise frame.refused("missing key 'transform_matrix'")
     matrix = read_matrix(entries["transform_matrix"], Rule(Matrix, {}, rule.folder))
     lens = _intrinsics(frame, entries, rule)
-    distortion = _distortion(entries, rule)
-    camera = PerspectiveSection(matrix=matrix, distortion=distortion, **lens)  # type: ignore[arg-type]
+    lens["distortion"] = _distortion(entries, rule)
+    camera = PerspectiveSection(matrix=matrix, **lens)  # type: ignore[arg-type]
     for _, what in camera.problems():
         raise entries["transform_matrix"].refused(what)
     return camera

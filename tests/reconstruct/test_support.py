@@ -181,7 +181,7 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
     [
         ("density={support: alpha}", "density.support: expected one of masks, found"),
         ("density={support: 1.5}", "density.support: must be below 1, found 1.5"),
-        ("g={support: masks}", "g.support: is for density alone"),
+        ("g={support: masks}", "g.support: 'masks' is for density alone"),
         ("density={support: {file: none.npz}}", "support.file: "),
     ],
 )

@@ -19,10 +19,11 @@ from example_scene import SCENE, changed
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.scene_file.build import build_scene, load_scene
+from ddrecon.scene_file.camera_schema import PerspectiveSection
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.export_transforms import export_transforms
 from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.schema import PerspectiveSection, ViewSection
+from ddrecon.scene_file.schema import ViewSection
 
 Read = Callable[..., SceneFile]
 Refusal = Callable[..., list[str]]
