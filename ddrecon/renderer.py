@@ -78,7 +78,7 @@ class Components:
 
 
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
-    """Images `[views, 3, h, w]` (linear radiance) of all views, or of the one named `view`.
+    """Pictures `[views, 3, h, w]` (linear) of all views, or of the one named `view`.
 
     Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume`
     and of its lights. `memory` carries the last solutions from one call to the next, as starting
@@ -93,9 +93,9 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
 
 def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> list[Tensor]:
-    """The images `[3, h, w]` of `views`, which may differ in size, in one light field."""
+    """The pictures `[3, h, w]` of `views`, which may differ in size, in one light field."""
     light_field = solve_light(scene, memory)
-    return [view_image(light_field, scene, view.camera) for view in views]
+    return [view_picture(light_field, scene, view) for view in views]
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
@@ -177,24 +177,46 @@ def solve_diffuse(
     return run_rounds(problem, light, solve, settings.transport_rounds, settings.degree)
 
 
+def view_picture(
+    light_field: LightField, scene: Scene, view: View, derivatives: str = "all"
+) -> Tensor:
+    """The picture `[3, h, w]` that the camera of `view` takes: exposure times radiance, and offset.
+
+    A background of the view is what its picture shows where nothing is before it (E28).
+    `derivatives` is as in `view_image`.
+    """
+    exposure, offset, behind = view.exposure, view.offset, view.background
+    if behind is not None:
+        behind = behind if offset is None else behind - offset.view(-1, 1, 1)
+        behind = behind if exposure is None else behind / exposure.view(-1, 1, 1)
+    picture = view_image(light_field, scene, view.camera, derivatives, behind)
+    picture = picture if exposure is None else exposure.view(-1, 1, 1) * picture
+    return picture if offset is None else picture + offset.view(-1, 1, 1)
+
+
 def view_image(
-    light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all"
+    light_field: LightField,
+    scene: Scene,
+    camera: Camera,
+    derivatives: str = "all",
+    behind: Tensor | None = None,
 ) -> Tensor:
     """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1).
 
     `derivatives` says which radiance passes derivatives on: `all`, `single` (E2 of beams, and what
     is seen unscattered) or `diffusion` (E3, with the ambient light in it). The image is the same.
+    `behind` [C, h, w] is the radiance behind the volume, in place of that of lights.
     """
     if derivatives == "all":
         sight = look_through(camera, scene.volume.grid, scene.render)
-        return _image(_emission(light_field, sight.rays), scene, sight).unflatten(-1, camera.size)
+        image = _image(_emission(light_field, sight.rays), scene, sight, behind, camera.size)
+        return image.unflatten(-1, camera.size)
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
-    single = replace(light_field, diffuse=nothing, turned=()), scene
-    diffusion = replace(light_field, beams=(), skies=()), _without_background(scene)
-    varied, fixed = {"single": (single, diffusion), "diffusion": (diffusion, single)}[derivatives]
+    single = replace(light_field, diffuse=nothing, turned=()), scene, camera, "all", behind
+    diffusion = replace(light_field, beams=(), skies=()), _without_background(scene), camera
     with torch.no_grad():
-        rest = view_image(*fixed, camera).detach()
-    return view_image(*varied, camera) + rest
+        rest = (view_image(*diffusion) if derivatives == "single" else view_image(*single)).detach()
+    return (view_image(*single) if derivatives == "single" else view_image(*diffusion)) + rest
 
 
 def _without_background(scene: Scene) -> Scene:
@@ -215,9 +237,19 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     return Components(reduced, single, image - reduced - single)
 
 
-def _image(emission: Emission, scene: Scene, sight: Sight) -> Tensor:
-    """Radiance [3, pixels]: E1, averaged over the rays of each pixel."""
-    behind = _background(scene.lights, sight.rays) if scene.render.background else None
+def _image(
+    emission: Emission, scene: Scene, sight: Sight, given: Tensor | None, size: tuple[int, int]
+) -> Tensor:
+    """Radiance [3, pixels]: E1, averaged over the rays of each pixel.
+
+    Behind the volume is what is `given` [C, h, w] for an image of this `size`, else the lights.
+    """
+    behind = None
+    if given is not None:
+        pixels = given.expand(-1, *size).flatten(1)
+        behind = pixels.repeat(1, scene.render.samples_per_pixel)
+    elif scene.render.background:
+        behind = _background(scene.lights, sight.rays)
     radiance, clear = march(emission, sight, scene.render, behind)
     if behind is not None:
         radiance = radiance + clear * behind

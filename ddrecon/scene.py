@@ -15,6 +15,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
+from ddrecon.pictures.noise import Noise
 from ddrecon.settings import DiffusionSettings, RenderSettings
 
 if TYPE_CHECKING:
@@ -27,6 +28,10 @@ class View:
 
     `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views
     are never optimized on; `weight` > 0 is how much a training view counts.
+
+    What its camera does to radiance (E28): `exposure` > 0 and `offset`, [1] or [3], None for 1 and
+    0; `background` [C, h, w] or [C, 1, 1] is what the picture shows where the volume is empty, None
+    for the light behind it. `step` and `noise` say how the picture errs, see `ddrecon.pictures`.
     """
 
     name: str
@@ -35,6 +40,11 @@ class View:
     mask: Tensor | None = None
     is_test: bool = False
     weight: float = 1.0
+    exposure: Tensor | None = None
+    offset: Tensor | None = None
+    background: Tensor | None = None
+    step: float = 0.0
+    noise: Noise | None = None
 
 
 @dataclass(eq=False)

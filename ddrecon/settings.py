@@ -185,18 +185,35 @@ class ParameterSettings:
 
 
 @dataclass(frozen=True)
+class NoiseSettings:
+    """How pictures err: `read`, the standard deviation at black, and `shot`, variance by radiance.
+
+    Both are in units of a picture's linear values, of which 1 is white.
+    """
+
+    read: float = bounded(0.0, minimum=0)
+    shot: float = bounded(0.0, minimum=0)
+
+    def problems(self) -> Iterator[Problem]:
+        if self.read == self.shot == 0:
+            yield "read", "no noise at all; give read or shot, or leave noise out to estimate it"
+
+
+@dataclass(frozen=True)
 class OptimizeSettings:
     """What is optimized, and how.
 
     `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
     `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
     all. `derivatives`: which radiance passes derivatives on: all of it, that scattered once, or
-    that scattered more often.
+    that scattered more often. `loss`: None is what the kind of pictures deserves. `noise` is that
+    of all pictures that have none of their own, for the loss `photon`.
     """
 
     parameters: Mapping[str, ParameterSettings]
     iterations: int = bounded(300, minimum=1)
-    loss: str = one_of("l2", LOSSES)
+    loss: str | None = one_of(None, LOSSES)
+    noise: NoiseSettings | None = None
     views_per_iteration: int = bounded(3, minimum=0)
     derivatives: str = one_of("all", DERIVATIVES)
     refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)

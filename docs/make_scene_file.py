@@ -14,14 +14,15 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from ddrecon import settings
-from ddrecon.scene_file import camera_schema, schema
+from ddrecon.scene_file import camera_schema, light_schema, phase_schema, schema
 from ddrecon.variables.kinds import KINDS, Kind
 
 PAGE = Path(__file__).parent / "scene_file.md"
 KIND_NAMES = {
-    schema.Color: "number or [r, g, b]",
+    light_schema.Color: "number or [r, g, b]",
     schema.Quantity: "number, [r, g, b] or {file: ...}",
     schema.Density: "number or {file: ...}",
+    phase_schema.PhaseSection: "{type: ...}",
     settings.Start: "number, list or {file: ...}",
     settings.Weight: "number or `auto`",
     settings.Support: "`masks`, number or {file: ...}",
@@ -76,8 +77,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "albedo": "Single-scattering albedo: the part of the extinction that scatters.",
             "g": (
                 "Mean cosine of the scattering angle (asymmetry parameter) of the "
-                "Henyey-Greenstein phase function; above 0 is forward."
+                "Henyey-Greenstein phase function; above 0 is forward. The short form of `phase`."
             ),
+            "phase": "How light is scattered by angle, in place of `g`; see below.",
         },
     ),
     (
@@ -90,8 +92,74 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
+        "volume.phase: {type: henyey_greenstein}",
+        phase_schema.HenyeyGreensteinSection,
+        "The usual phase function of one number; `g: 0.3` is short for it.",
+        {"g": "Mean cosine of the scattering angle; above 0 is forward."},
+    ),
+    (
+        "volume.phase: {type: two_lobe}",
+        phase_schema.TwoLobeSection,
+        "A mixture of two Henyey-Greenstein functions: haze and smoke, which scatter backward too.",
+        {
+            "g": "The mean cosine of each.",
+            "weight": "The part of the first.",
+        },
+    ),
+    (
+        "volume.phase: {type: rayleigh}",
+        phase_schema.RayleighSection,
+        "Air, and other particles much smaller than the wavelength.\nIt has no numbers.",
+        {},
+    ),
+    (
+        "volume.phase: {type: draine}",
+        phase_schema.DraineSection,
+        "Dust: a Henyey-Greenstein function times 1 + alpha cos^2, normalized (Draine 2003).",
+        {
+            "g": "Of the Henyey-Greenstein function; the mean cosine itself is another.",
+            "alpha": "0 is Henyey-Greenstein's; 1 with `g: 0` is Rayleigh's.",
+        },
+    ),
+    (
+        "volume.phase: {type: legendre}",
+        phase_schema.LegendreSection,
+        "Legendre moments chi_l, the mean of P_l over scattered light; at most 2048 count.\n"
+        "Give either of both.",
+        {
+            "coefficients": "chi_0 = 1, chi_1, ...",
+            "file": (
+                ".csv, .txt or .npz (`value`) with chi_l one a row, in one column or one a color; "
+                "a column `l` before them is allowed."
+            ),
+        },
+    ),
+    (
+        "volume.phase: {type: table}",
+        phase_schema.TableSection,
+        "Values over the angle, of any scale; see [your data](your_data.md#phase-functions).",
+        {
+            "file": (
+                ".csv or .txt with a header: `angle` (degrees) or `cosine`, then one column of "
+                "values or one a color; or .npz with these as arrays, the values called `value`."
+            ),
+        },
+    ),
+    (
+        "volume.phase: {type: mie}",
+        phase_schema.MieSection,
+        "Droplets whose radii follow a gamma distribution, by Mie's theory.\n"
+        'Needs miepython: `pip install "ddrecon[mie]"`.',
+        {
+            "wavelength": "In micrometers, one for each color.",
+            "refractive_index": "Of the droplets; of water 1.33.",
+            "effective_radius": "In micrometers: of clouds 5 to 15.",
+            "effective_variance": "Of the distribution: of clouds about 0.1.",
+        },
+    ),
+    (
         "lights: {type: directional}",
-        schema.DirectionalSection,
+        light_schema.DirectionalSection,
         "Parallel light, such as the sun's.",
         {
             "direction": "The direction in which the light travels, of any length.",
@@ -100,7 +168,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: ambient}",
-        schema.AmbientSection,
+        light_schema.AmbientSection,
         "The same light from everywhere.",
         {
             "radiance": "Of every direction.",
@@ -108,7 +176,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: environment}",
-        schema.EnvironmentSection,
+        light_schema.EnvironmentSection,
         "A latitude-longitude map (HDRI), +y up, oriented as Mitsuba's `envmap`.\n"
         "Small bright regions become suns.",
         {
@@ -123,7 +191,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: point}",
-        schema.PointSection,
+        light_schema.PointSection,
         "Light from a point, inside or outside the box.",
         {
             "position": "Where it is [u].",

@@ -100,7 +100,9 @@ def _read_archive(path: Path) -> tuple[list[str], np.ndarray]:
     columns = [np.atleast_1d(arrays[name]).astype(np.float64) for name in first[:1]]
     if any(column.shape != values.shape[1:] for column in columns):
         raise FormatError(path, f"{first[0]} and value have different lengths")
-    return [*first[:1], *(["value"] * len(values))], np.concatenate([*(c[None] for c in columns), values])
+    return [*first[:1], *(["value"] * len(values))], np.concatenate(
+        [*(c[None] for c in columns), values]
+    )
 
 
 def _read_text(path: Path) -> tuple[list[str], np.ndarray]:
@@ -116,12 +118,15 @@ def _read_text(path: Path) -> tuple[list[str], np.ndarray]:
             rows.append([float(entry) for entry in entries])
         except ValueError:
             if rows or names:
-                raise FormatError(path, f"line {number} is not numbers: {line.strip()[:40]!r}") from None
+                raise FormatError(
+                    path, f"line {number} is not numbers: {line.strip()[:40]!r}"
+                ) from None
             names = [entry.strip("\"'").lower() for entry in entries]
         if rows and len(rows[-1]) != len(names or rows[0]):
             raise FormatError(
-                path, f"line {number} has {len(rows[-1])} numbers, but there are"
-                f" {len(names or rows[0])} columns"
+                path,
+                f"line {number} has {len(rows[-1])} numbers, but there are"
+                f" {len(names or rows[0])} columns",
             )
     if not rows:
         raise FormatError(path, "holds no numbers")

@@ -78,17 +78,22 @@ def launch(
 
     # What was seen to be quick is not worth another thread.
     size = kernel, (count if work is None else work).bit_length()
-    if threads > 1 and _seconds.get(size, math.inf) < QUICK:
+    if threads == 1 or _seconds.get(size, math.inf) < QUICK:
         for i in range(threads):
             run(i)
-        return
-    # The thread that asks takes the first share itself.
+    else:
+        seconds = threads * _share(run, threads)
+        _seconds[size] = min(seconds, _seconds.get(size, math.inf))
+
+
+def _share(run: Callable[[int], None], threads: int) -> float:
+    """Has shares 0 to `threads` run by as many threads; how long this one took for its own [s]."""
     others = [_pool(threads).submit(run, i) for i in range(1, threads)]
     start = perf_counter()
     try:
+        # The thread that asks takes the first share itself.
         run(0)
-        seconds = (perf_counter() - start) * threads
-        _seconds[size] = min(seconds, _seconds.get(size, math.inf))
+        seconds = perf_counter() - start
         # And those not begun by now: other programs may have the processor's other cores.
         for i, other in enumerate(others, 1):
             if other.cancel():
@@ -99,6 +104,7 @@ def launch(
     for other in others:
         if not other.cancelled():
             other.result()
+    return seconds
 
 
 @functools.cache

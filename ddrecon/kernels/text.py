@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 import warp as wp
-from torch import Tensor, is_tensor
+from torch import Tensor
 
 from ddrecon.kernels.launch import launch
 from ddrecon.kernels.native import number_type, program
@@ -85,66 +85,76 @@ class TextKernel:
         made: Mapping[str, Any],
         threads: int | None = None,
         shares: Sequence[Mapping[str, Any]] = (),
+        work: int | None = None,
     ) -> None:
         """Does `count` items with arrays and numbers `given`, and writes to arrays `made`.
 
         Those that are made are contiguous. A thread has what is in its own of `shares` as well.
+        `work` as of `launch.launch`.
         """
         bound = self.bind(given, made)
         if not shares:
-            bound.launch(count, threads)
+            bound.launch(count, threads, work)
             return
-        own = []
-        for share in shares:
-            own.append(self.new_record.from_buffer_copy(bound.record))
-            self.fill(own[-1], dict(self._entries(share)))
+        own = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
+        for record, share in zip(own, shares, strict=True):
+            for name, value in share.items():
+                self.write(record, name, value)
         launch(self.kernel, count, lambda i: [own[i]], bound.like, len(own))
 
     def bind(self, given: Mapping[str, Any], made: Mapping[str, Any]) -> "Bound":
         """The kernel with all that `launch` is given, for many launches."""
-        held = {name: self._ready(name, value) for name, value in self._entries(given)}
-        held |= dict(self._entries(made))
-        record = self.new_record()
-        self.fill(record, held)
-        return Bound(self, record, held, next(each for each in made.values() if is_tensor(each)))
-
-    def _entries(self, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-        """Names and values, those of lists one by one."""
-        for name, value in values.items():
+        record, held = self.new_record(), []
+        for name, value in given.items():
+            ready = value
             if name in self.lists:
-                yield from zip(self.lists[name], value, strict=True)
-            else:
-                yield name, value
+                entries = zip(self.lists[name], value, strict=True)
+                ready = [self._ready(entry, each) for entry, each in entries]
+            elif isinstance(value, Tensor):
+                ready = self._ready(name, value)
+            self.write(record, name, ready)
+            held.append(ready)
+        for name, value in made.items():
+            self.write(record, name, value)
+        like = next(value for value in made.values() if isinstance(value, Tensor))
+        return Bound(self, record, [held, made], like)
 
-    def _ready(self, name: str, value: Any) -> Any:
-        """A value as the text reads it; what is kept of it, its address is valid with."""
-        return value.to(self.arrays[name]).contiguous() if is_tensor(value) else value
+    def _ready(self, name: str, array: Tensor | None) -> Tensor | None:
+        """`array` as the text reads it."""
+        return None if array is None else array.to(self.arrays.get(name)).contiguous()
 
-    def fill(self, record: Any, values: Mapping[str, Any]) -> None:
-        """Writes numbers into `record`, and addresses of arrays; 0 of those that are None."""
-        for name, value in values.items():
-            if name not in self.names:
-                raise ValueError(f"the kernel declares no {name}")
-            if is_tensor(value):
-                if value.dtype != self.arrays[name] or not value.is_contiguous():
-                    raise ValueError(f"{name} is to be contiguous, of type {self.arrays[name]}")
-                value = value.data_ptr()
+    def write(self, record: Any, name: str, value: Any) -> None:
+        """Writes a number into `record`, or the address of an array; 0 of one that is None."""
+        if isinstance(value, Tensor):
+            wanted = self.arrays.get(name)
+            if value.dtype is not wanted or not value.is_contiguous():
+                raise ValueError(f"{name} is declared as {wanted}, and is to be contiguous")
+            setattr(record, name, value.data_ptr())
+        elif name in self.lists:
+            for entry, each in zip(self.lists[name], value, strict=True):
+                self.write(record, entry, each)
+        elif name in self.names:
             setattr(record, name, 0 if value is None else value)
+        else:
+            raise ValueError(f"the kernel declares no {name}")
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A kernel with the `record` it is given, and what this points to."""
+    """A kernel with the `record` it is given; `held` keeps what this points to."""
 
     kernel: TextKernel
     record: Any
-    held: Mapping[str, Any]
+    held: Any
     like: Tensor
 
-    def launch(self, count: int, threads: int | None = None, **numbers: float) -> None:
+    def launch(
+        self, count: int, threads: int | None = None, work: int | None = None, **numbers: float
+    ) -> None:
         """Does `count` items, with these `numbers` changed."""
-        self.kernel.fill(self.record, numbers)
-        launch(self.kernel.kernel, count, [self.record], self.like, threads)
+        for name, number in numbers.items():
+            self.kernel.write(self.record, name, number)
+        launch(self.kernel.kernel, count, [self.record], self.like, threads, work)
 
 
 def _declared(given: str) -> Iterator[tuple[str, bool, str, int]]:

@@ -36,9 +36,9 @@ class Beam:
         """The integral of `scattering` over each segment of view rays, and the phase function p.
 
         Their product is what E2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s
-        per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C, R]. With a
-        forward peak of depth `peak` [N, C, R] at the nodes (E13) it changes along the ray: then the
-        integral holds it, and the factor is 1.
+        per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C, R]. With
+        a forward peak of depth `peak` [N, C, R] at the nodes (E13) it changes along the ray: then
+        the integral holds it, and the factor is 1.
         """
         cosine = self.cosine(nodes.direction)
         if peak is None:

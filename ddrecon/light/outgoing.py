@@ -49,6 +49,6 @@ def _scatter_towards(
 def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor:
     """What light of `beam` scatters `towards` a camera: its phase function is that of E21."""
     z, y, x = (part * cosine for part, cosine in zip(beam.direction, towards, strict=True))
-    cosine = torch.as_tensor(z + y + x)
+    cosine = torch.atleast_3d(z + y + x)
     phase = look_up(turned_phase(medium, beam.turns), angle_of(cosine))[..., 0]
     return beam.radiance * phase.to(cosine.dtype)

@@ -107,7 +107,7 @@ def _scatter_direction(
     """p E tau at cells: what the light going along `travel` scatters `towards` a camera."""
     visible = _attenuate_direction(medium, travel, irradiance[None])[0]
     z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
-    return visible * medium.seen.value(z + y + x)
+    return visible * medium.seen.value(torch.atleast_3d(z + y + x))
 
 
 def _attenuate_direction(medium: Medium, direction: Tensor, weights: Tensor) -> Tensor:

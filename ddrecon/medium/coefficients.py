@@ -18,7 +18,6 @@ from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
 
-
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
 

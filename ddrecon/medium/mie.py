@@ -22,7 +22,7 @@ def scatter_droplets(
 
     Radii r follow the gamma distribution r^((1 - 3 b) / b) exp(-r / (a b)) of Hansen and Travis
     1974 (doi:10.1007/BF00168069), with `effective_radius` a and `effective_variance` b < 0.5.
-    `wavelength` and radii in the same unit. Raises MissingExtraError where miepython is not installed.
+    `wavelength` and radii in the same unit. Raises MissingExtraError without miepython.
     """
     miepython = load_extra("miepython", "a phase function by Mie's theory")
     radii, counts = _radii(effective_radius, effective_variance)

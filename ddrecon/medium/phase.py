@@ -1,9 +1,9 @@
 """Phase functions: how likely light is scattered by which angle.
 
 They are normalized to 4 pi over the sphere, as in docs/theory.md E2. A phase function is known by
-its Legendre moments chi_l, the mean of P_l(cosine) over scattered light: chi_0 = 1, and chi_1 is the
-mean cosine g. Its numbers may differ by color; what is computed from them has the color as first
-axis, of size 1 where all colors share one phase function.
+its Legendre moments chi_l, the mean of P_l(cosine) over scattered light: chi_0 = 1, and chi_1 is
+the mean cosine g. Its numbers may differ by color; what is computed from them has the color as
+first axis, of size 1 where all colors share one phase function.
 """
 
 from __future__ import annotations

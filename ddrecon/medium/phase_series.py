@@ -37,7 +37,7 @@ class _Given(PhaseFunction):
         return torch.cat([peak, tail], 1)
 
     def backward_tail(self, degree: int, count: int) -> Tensor:
-        return 0 * self.moments(count)
+        return torch.zeros_like(self.moments(count))
 
     def length(self) -> int:
         large = self.moments(COUNTS[-1]).detach().abs().amax(0) > NEGLIGIBLE
@@ -66,7 +66,7 @@ class Legendre(_Given):
     def moments(self, count: int) -> Tensor:
         given = self.coefficients.reshape(-1, self.coefficients.shape[-1])[:, : count - 1]
         missing = given.new_zeros(len(given), count - 1 - given.shape[1])
-        return torch.cat([torch.ones_like(given[:, :1]), given, missing], 1)
+        return torch.cat([given.new_ones(len(given), 1), given, missing], 1)
 
     def length(self) -> int:
         count = self.coefficients.shape[-1] + 1
@@ -77,8 +77,8 @@ class Legendre(_Given):
 class Tabulated(_Given):
     """A smooth curve through `values` at even angles from 0 to pi, divided by its integral.
 
-    `values` >= 0: [C, steps + 1] with C = 1 or 3, of any scale; `numerics.angle_table.at_even_angles`
-    makes them from uneven angles.
+    `values` >= 0: [C, steps + 1] with C = 1 or 3, of any scale. `at_even_angles` makes them from
+    uneven ones (`numerics.angle_table`).
     """
 
     NAME = "table"

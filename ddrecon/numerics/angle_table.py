@@ -86,7 +86,9 @@ def at_even_angles(angles: np.ndarray, values: np.ndarray) -> np.ndarray:
     width = widths[left]
     part = (places - angles[left]) / width
     rest = 1 - part
-    value = (1 + 2 * part) * rest**2 * values[:, left] + (1 + 2 * rest) * part**2 * values[:, left + 1]
+    value = (1 + 2 * part) * rest**2 * values[:, left] + (1 + 2 * rest) * part**2 * values[
+        :, left + 1
+    ]
     found: np.ndarray = value + width * part * rest * (
         rest * slopes[:, left] - part * slopes[:, left + 1]
     )

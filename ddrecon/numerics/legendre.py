@@ -47,7 +47,7 @@ def legendre(cosine: Tensor, count: int) -> Tensor:
 
 
 def series_weights(moments: Tensor) -> Tensor:
-    """(2 l + 1) times `moments` [..., l], the coefficients of the Legendre series they belong to."""
+    """(2 l + 1) times `moments` [..., l]: the coefficients of their Legendre series."""
     degree = torch.arange(moments.shape[-1], dtype=moments.dtype, device=moments.device)
     return (2 * degree + 1) * moments
 

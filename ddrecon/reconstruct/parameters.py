@@ -31,16 +31,25 @@ class Parameter:
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
-    is Adam (Kingma and Ba 2015, arXiv:1412.6980).
+    is Adam (Kingma and Ba 2015, arXiv:1412.6980). `rate` is one number or one for each entry.
+    `view` is the name of the view that it belongs to, None for what all views see.
     """
 
     def __init__(
-        self, name: str, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid
+        self,
+        name: str,
+        settings: ParameterSettings,
+        rate: float | Tensor,
+        value: Tensor,
+        grid: Grid,
     ):
         kind = kind_of(name)
         self.name, self.rate, self.grid = name, rate, grid
         self.low = kind.low if settings.min is None else settings.min
         self.high = kind.high if settings.max is None else settings.max
+        self.release = kind.release
+        self.is_fitted = kind.is_fitted and settings.lr is None
+        self.view = name.split(".", 1)[1].rpartition(".")[0] if name.startswith("views.") else None
         self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
@@ -64,6 +73,11 @@ class Parameter:
             total = total + self.tv * variation(self.value, self.grid)
         return total + self.l1 * self.value.abs().mean() if self.l1 else total
 
+    @property
+    def largest_rate(self) -> float:
+        """Its learning rate, or the largest of its entries."""
+        return self.rate if isinstance(self.rate, float) else float(self.rate.max())
+
     def step(self, gradient: Tensor, rate: float) -> None:
         """Moves the value against `gradient`, and back within its bounds.
 
@@ -82,10 +96,10 @@ class Parameter:
         self.value = value.requires_grad_()
 
     def _step(
-        self, before: Tensor, gradient: Tensor, rate: float
+        self, before: Tensor, gradient: Tensor, rate: float | Tensor
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """The value within its bounds, and the moments, after the step from `before`."""
-        if current_engine() == "warp":
+        if current_engine() == "warp" and isinstance(rate, float):
             from ddrecon.reconstruct.fused.passes import step_adam
 
             bounds = self.low, self.high
@@ -97,7 +111,7 @@ class Parameter:
         first = first.lerp(gradient, 1 - BETAS[0])
         second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
         size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
-        value = before.addcdiv(first, size, value=-(rate / weights[0]))
+        value = before - first / size * (rate / weights[0])
         return value.clamp_(self.low, self.high), (first, second)
 
     def value_on(self, grid: Grid) -> Tensor:

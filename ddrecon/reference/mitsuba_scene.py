@@ -102,8 +102,7 @@ def _to_double(volume: Volume) -> Volume:
     Cross sections are [C, z, y, x] or [C, 1, 1, 1].
     """
     density, sigma_a, sigma_s = (
-        value.detach().cpu().double()
-        for value in (volume.density, volume.sigma_a, volume.sigma_s)
+        value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s)
     )
     return Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), volume.phase)
 

@@ -61,13 +61,16 @@ def describe_result(
             camera = _move_camera(camera, view.camera.pose.tolist())
         camera |= _lens({name: values.get(f"views.{view.name}.{name}") for name in LENS}, camera)
         section["camera"] = camera
+        for key in ("exposure", "offset"):
+            if (value := values.get(f"views.{view.name}.{key}")) is not None:
+                section[key] = value
     return described
 
 
 def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
     """The section `volume` with reconstructed `numbers` of its phase function."""
     if "phase" not in volume or not numbers:
-        return volume | numbers
+        return {**volume, **numbers}
     found = {name.removeprefix(PHASE): number for name, number in numbers.items()}
     if "coefficients" in found:
         # They count from chi_1 on, and replace those of a file.

@@ -20,7 +20,7 @@ from ddrecon.io.volumes.table import write_field
 from ddrecon.losses import psnr
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
-from ddrecon.renderer import LightField, solve_light, view_image
+from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.loss_log import LossLog
@@ -157,6 +157,10 @@ class RunFolder:
         for view in scene.views:
             matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
             parameters[f"views.{view.name}.camera"] = {"matrix": matrix}
+            for key in ("exposure", "offset"):
+                if getattr(view, key) is not None:
+                    name = f"views.{view.name}.{key}"
+                    parameters[name] = value_of(scene, name).tolist()
         return parameters
 
     def _write_map(self, name: str, radiance: Tensor) -> str:
@@ -191,7 +195,7 @@ def _render(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
     """The images of the views that have a target, by name."""
     with torch.no_grad():
         return {
-            view.name: view_image(light_field, scene, view.camera)
+            view.name: view_picture(light_field, scene, view)
             for view in scene.views
             if view.image is not None
         }

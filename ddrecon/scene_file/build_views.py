@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, image_places, look_at
 from ddrecon.grid import Grid
-from ddrecon.io.images.table import read_image, read_mask
+from ddrecon.io.images.table import Image, read_image, read_mask
 from ddrecon.lenses import MODELS, is_folded
+from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.camera_schema import CameraSection, LensSection, PerspectiveSection
 from ddrecon.scene_file.files import read_referenced
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.sight import explain_blindness, sees_box
@@ -65,18 +68,25 @@ def _build_view(
     scene_file: SceneFile, index: int, dtype: torch.dtype, device: torch.device
 ) -> View:
     key, section, problems = f"views.{index}", scene_file.tree.views[index], Problems()
-    image = mask = None
+    image = mask = background = None
+    step = 0.0
     if section.image is not None:
         with problems.collecting():
-            pixels = read_referenced(scene_file, f"{key}.image", section.image, read_image).pixels
-            image = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
+            stored = read_referenced(scene_file, f"{key}.image", section.image, read_image)
+            image, step = _pixels(stored, dtype, device), stored.step
+    if isinstance(section.background, Path):
+        with problems.collecting():
+            stored = read_referenced(
+                scene_file, f"{key}.background", section.background, read_image
+            )
+            background = _pixels(stored, dtype, device)
     if section.mask is not None:
         with problems.collecting():
             mask = torch.from_numpy(
                 read_referenced(scene_file, f"{key}.mask", section.mask, read_mask)
             ).to(device, dtype)
     size = _size(section.camera, image)
-    for name, picture in (("image", image), ("mask", mask)):
+    for name, picture in (("image", image), ("mask", mask), ("background", background)):
         if picture is not None and size is not None and tuple(picture.shape[-2:]) != size:
             height, width = picture.shape[-2:]
             problems.note(
@@ -96,7 +106,33 @@ def _build_view(
         pose=camera.pose.to(device, dtype),
         distortion=None if lens is None else lens.to(device, dtype),
     )
-    return View(section.name, camera, image, mask, section.split == "test", section.weight)
+    if section.background is not None and not isinstance(section.background, Path):
+        background = torch.tensor(section.background, dtype=dtype, device=device).view(-1, 1, 1)
+    noise = section.noise
+
+    def color(value: Color, default: float) -> Tensor | None:
+        """[1] or [3], None where it is the default."""
+        tensor = torch.tensor(value, dtype=dtype, device=device).view(-1)
+        return None if value == default else tensor
+
+    return View(
+        section.name,
+        camera,
+        image,
+        mask,
+        section.split == "test",
+        section.weight,
+        color(section.exposure, 1.0),
+        color(section.offset, 0.0),
+        background,
+        step,
+        None if noise is None else Noise(noise.read, noise.shot, step),
+    )
+
+
+def _pixels(image: Image, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The pixels of `image`, [3, h, w]."""
+    return torch.from_numpy(image.pixels).permute(2, 0, 1).contiguous().to(device, dtype)
 
 
 def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None:

@@ -21,9 +21,9 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.memory import Needs, shortage
 from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.schema import Color
 from ddrecon.settings import FieldFile, ParameterSettings
 from ddrecon.variables.kinds import FIELDS
 from ddrecon.variables.values import cross_sections
@@ -60,8 +60,8 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     density = (
         density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
     )
-    tensors = [tensor.to(device, dtype) for tensor in (density, sigma_a, sigma_s)]
-    return Volume(grid, *tensors, phase)
+    density, sigma_a, sigma_s = (tensor.to(device, dtype) for tensor in (density, sigma_a, sigma_s))
+    return Volume(grid, density, sigma_a, sigma_s, phase)
 
 
 def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype) -> Needs:

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from ddrecon.grid import Triple
+from ddrecon.scene_file.camera_schema import Pair
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.settings import Problem, limited
-
-Color = float | Triple
-Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)

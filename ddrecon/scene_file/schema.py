@@ -16,14 +16,12 @@ from typing import ClassVar
 
 from ddrecon.grid import Triple
 from ddrecon.scene_file.camera_schema import CameraSection, Size
-from ddrecon.scene_file.phase_schema import (
-    Color,
-    HenyeyGreensteinSection,
-    PhaseSection,
-)
+from ddrecon.scene_file.light_schema import Color, LightSection
+from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, PhaseSection
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
+    NoiseSettings,
     OptimizeSettings,
     Problem,
     RenderSettings,
@@ -36,6 +34,7 @@ from ddrecon.variables.kinds import PAIRS
 
 Count = tuple[int, int, int]
 Paths = tuple[Path, ...]
+Backdrop = Color | Path
 
 MAX_CELLS = 2**30
 TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
@@ -91,63 +90,11 @@ class VolumeSection:
 
 
 @dataclass(frozen=True)
-class DirectionalSection:
-    """`direction`: the way the light travels; `irradiance` on a plane facing it."""
-
-    type: ClassVar[str] = "directional"
-
-    direction: Triple
-    irradiance: Color = limited(minimum=0)
-
-    def problems(self) -> Iterator[Problem]:
-        if not any(self.direction):
-            yield "direction", "must not be zero"
-
-
-@dataclass(frozen=True)
-class AmbientSection:
-    """The same radiance from everywhere."""
-
-    type: ClassVar[str] = "ambient"
-
-    radiance: Color = limited(minimum=0)
-
-
-@dataclass(frozen=True)
-class EnvironmentSection:
-    """A latitude-longitude map, +y up.
-
-    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about +y.
-
-    `directions`: how many directions its light on the volume is gathered into.
-    """
-
-    type: ClassVar[str] = "environment"
-
-    file: Path
-    scale: float = bounded(1.0, minimum=0)
-    rotation: float = 0.0
-    directions: int = bounded(48, minimum=1, maximum=1024)
-
-
-@dataclass(frozen=True)
-class PointSection:
-    """Light from one point, inside or outside the box; `intensity`: power per solid angle."""
-
-    type: ClassVar[str] = "point"
-
-    position: Triple
-    intensity: Color = limited(minimum=0)
-
-
-LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
-
-
-@dataclass(frozen=True)
 class ViewSection:
     """One view; its camera's `resolution` may be left out where there is an image.
 
-    `weight`: how much it counts in the loss.
+    `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
+    `offset`; `background` is what it shows where the volume is empty.
     """
 
     name: str
@@ -156,6 +103,10 @@ class ViewSection:
     mask: Path | None = None
     split: str = one_of("train", ("train", "test"))
     weight: float = bounded(1.0, above=0)
+    exposure: Color = bounded(1.0, minimum=1e-3)
+    offset: Color = 0.0
+    background: Backdrop | None = None
+    noise: NoiseSettings | None = None
 
     def problems(self) -> Iterator[Problem]:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):

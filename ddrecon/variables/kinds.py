@@ -1,7 +1,7 @@
 """The table of variables: all that is known of each kind of number that can be optimized.
 
 A kind is named by a pattern: N is a light's place in the list, counted from 0, and NAME a view's
-name. `ddrecon.variables.values` reads and replaces the values themselves.
+name, or `*` for all training views. `ddrecon.variables.values` reads and replaces the values.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from ddrecon.variables.default_rates import (
     cross_section_rate,
     density_rate,
     direction_rate,
+    exposure_rate,
     fixed_rate,
+    offset_rate,
+    pose_rate,
     position_rate,
 )
 
@@ -42,7 +45,9 @@ class Kind:
     may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components` are
     the names of a vector's entries, which change one at a time. `is_direction`: only the way a
     vector points matters, and a step keeps its length. `tv` is the default weight of total
-    variation, and `difference_steps` are those of finite differences.
+    variation, and `difference_steps` are those of finite differences. `release` is the part of a
+    run after which the variable begins to move; one that `is_fitted` is solved for rather than
+    moved along its derivative, unless a scene gives its learning rate.
     """
 
     rate: Rate
@@ -54,6 +59,8 @@ class Kind:
     is_direction: bool = False
     tv: float = 0.0
     difference_steps: tuple[float, ...] = LONG_STEPS
+    release: float = 0.0
+    is_fitted: bool = False
 
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
@@ -85,10 +92,14 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.position": Kind(position_rate, components=XYZ, difference_steps=SHORT_STEPS),
     # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
     "views.NAME.camera": Kind(
-        fixed_rate(0.01),
+        pose_rate,
         components=("rotation_x", "rotation_y", "rotation_z", *XYZ),
         difference_steps=SHORT_STEPS,
+        release=0.4,
     ),
+    # what a camera does to radiance: a factor, and what is added to it
+    "views.NAME.exposure": Kind(exposure_rate, low=1e-3, is_color=True, is_fitted=True),
+    "views.NAME.offset": Kind(offset_rate, is_color=True, is_fitted=True),
     # of a perspective camera: its focal length in widths of the image, and the rest of its lens
     "views.NAME.focal": Kind(fixed_rate(1e-3), low=1e-3, difference_steps=SHORT_STEPS),
     "views.NAME.principal_point": Kind(
@@ -119,6 +130,6 @@ def kind_of(name: str) -> Kind:
 
 def pattern_of(name: str) -> str:
     """The pattern in `KINDS` that `name` follows, or `name` itself where it follows none."""
-    if name.startswith("views.") and (view := re.fullmatch(r"views\.(.+)\.(\w+)", name)):
-        return f"views.NAME.{view[2]}"
+    if match := re.fullmatch(r"views\..+\.([a-z_]+)", name):
+        return f"views.NAME.{match[1]}"
     return re.sub(r"^lights\.[0-9]{1,9}\.", "lights.N.", name)

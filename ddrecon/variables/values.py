@@ -10,16 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, twist
+from ddrecon.cameras import twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, VOLUME, kind_of
+
+RESPONSE = {"exposure": 1.0, "offset": 0.0}
+"""What a camera does to radiance, and what it is where a view has none (E28)."""
 
 
 def variable_names(scene: Scene) -> list[str]:
@@ -29,9 +33,7 @@ def variable_names(scene: Scene) -> list[str]:
         for index, light in enumerate(scene.lights)
         for name in _tensors(light)
     ]
-    views = [
-        f"views.{view.name}.{part}" for view in scene.views for part in _camera_parts(view.camera)
-    ]
+    views = [f"views.{view.name}.{part}" for view in scene.views for part in _view_parts(view)]
     return [*_volume_names(scene.volume), *lights, *views]
 
 
@@ -40,7 +42,8 @@ def value_of(scene: Scene, name: str) -> Tensor:
 
     `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
     that light holds them; a camera's twist is the change of its pose, [6] and zero: see
-    `ddrecon.cameras.twist`. Its focal length [] is in widths of its image.
+    `ddrecon.cameras.twist`. Its focal length [] is in widths of its image; exposure and offset are
+    [1] or [3].
     """
     if (known := _own_name(scene.volume, name)) not in variable_names(scene):
         raise KeyError(name)
@@ -49,7 +52,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
     section, _, path = name.partition(".")
     if section == "views":
         view, _, part = path.rpartition(".")
-        return _camera_value(scene.view(view).camera, part)
+        return _view_value(scene.view(view), part)
     index, _, attribute = path.partition(".")
     value: Tensor = getattr(scene.lights[int(index)], attribute)
     return value
@@ -162,14 +165,18 @@ def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Lig
     return changed
 
 
-def _camera_parts(camera: Camera) -> list[str]:
-    """What of `camera` can be varied."""
-    lens = ["focal", "principal_point"] if camera.is_perspective else []
-    return ["camera", *lens, *(["distortion"] if camera.distortion is not None else [])]
+def _view_parts(view: View) -> list[str]:
+    """What of `view` can be varied."""
+    lens = ["focal", "principal_point"] if view.camera.is_perspective else []
+    lens += ["distortion"] if view.camera.distortion is not None else []
+    return ["camera", *lens, *RESPONSE]
 
 
-def _camera_value(camera: Camera, part: str) -> Tensor:
-    pose = camera.pose
+def _view_value(view: View, part: str) -> Tensor:
+    camera, pose = view.camera, view.camera.pose
+    if part in RESPONSE:
+        value = getattr(view, part)
+        return pose.new_full((1,), RESPONSE[part]) if value is None else value
     if part == "camera":
         return pose.new_zeros(6)
     if part == "focal":
@@ -179,16 +186,16 @@ def _camera_value(camera: Camera, part: str) -> Tensor:
 
 
 def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
-    given = {
-        part: values[f"views.{view.name}.{part}"]
-        for part in _camera_parts(view.camera)
-        if f"views.{view.name}.{part}" in values
-    }
+    names = {part: f"views.{view.name}.{part}" for part in _view_parts(view)}
+    given = {part: values[name] for part, name in names.items() if name in values}
     if not given:
         return view
+    response: dict[str, Any] = {part: given.pop(part) for part in RESPONSE if part in given}
     camera = view.camera
     if "camera" in given:
         camera = twist(camera, given.pop("camera"), scene.volume.grid.center_xyz)
     if "focal" in given:
         given["half_width"] = 1 / (2 * given.pop("focal"))
-    return replace(view, camera=replace(camera, **given))  # type: ignore[arg-type]
+    if given:
+        camera = replace(camera, **given)
+    return replace(view, camera=camera, **response)

@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 
 from ddrecon import settings
-from ddrecon.scene_file import camera_schema, schema
+from ddrecon.scene_file import camera_schema, light_schema, phase_schema, schema
 
 DOCS = Path(__file__).parents[2] / "docs"
 ELSEWHERE = {schema.Constant, schema.Bounds, camera_schema.PoseSection, schema.SceneTree}
@@ -33,7 +33,7 @@ def test_the_page_is_what_the_schema_makes_of_it(manual: ModuleType) -> None:
 
 
 def test_every_key_of_every_record_is_explained(manual: ModuleType) -> None:
-    modules = camera_schema, schema, settings
+    modules = camera_schema, schema, light_schema, phase_schema, settings
     names = [value for module in modules for value in vars(module).values()]
     records = {value for value in names if isinstance(value, type) and is_dataclass(value)}
     explained = {record: set(texts) for _, record, _, texts in manual.SECTIONS}

@@ -14,8 +14,8 @@ from example_scene import CAMERA, SCENE, changed
 
 from ddrecon.scene_file.camera_schema import OrthographicSection
 from ddrecon.scene_file.dump import describe, dump_scene
+from ddrecon.scene_file.light_schema import AmbientSection, DirectionalSection
 from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.schema import AmbientSection, DirectionalSection
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,

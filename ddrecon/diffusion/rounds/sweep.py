@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
-from ddrecon.engine import current_engine
+from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
-from ddrecon.numerics.autodiff import is_forward
+from ddrecon.medium.remaining import remaining_moments
+from ddrecon.numerics.autodiff import is_forward, is_fused
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
@@ -67,7 +68,7 @@ class Parts(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """A `direction` of the quadrature (array order), its `weight`, and `harmonics` Y_k [K] there."""
+    """A `direction` of the quadrature (array order), its `weight`, and its `harmonics` Y_k [K]."""
 
     direction: Direction
     weight: float
@@ -83,12 +84,24 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
     parts = Parts.of(medium, source, inflow)
     if is_forward():
         return _sum_over_directions(medium, degree, parts)
-    if current_engine() == "warp":
-        from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
-
-        return sweep_fused(medium, source, inflow, DIRECTIONS[degree])
     moments: Tensor = _Sweep.apply(medium, degree, *parts)
     return moments
+
+
+def sweep_scattered(
+    medium: Medium, light: Moments, source: Moments, inflow: Tensor | None, degree: int
+) -> Moments:
+    """The moments of the radiance that `light` and `source` scatter, p_l phi_k + Q_k (E17).
+
+    `inflow` and `degree` as of `sweep`.
+    """
+    factors = remaining_moments(medium)[: medium.degree + 1]
+    if is_fused():
+        from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
+
+        return sweep_fused(medium, light, factors, source, inflow, DIRECTIONS[degree])
+    scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
+    return Moments.of_harmonics(sweep(medium, scatters, inflow, degree))
 
 
 class _Sweep(torch.autograd.Function):

@@ -18,13 +18,12 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep
-from ddrecon.engine import current_engine
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_scattered
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
-from ddrecon.numerics.autodiff import is_forward, is_varied, recompute
+from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
 
@@ -47,9 +46,7 @@ def run_rounds(
     if rounds == 0:
         return light
     for round_index, factor in enumerate(_blending(problem.medium, rounds), 1):
-        new = _round(problem, light, solve, degree, round_index)
-        # E19: from what was to what the round makes of it, and by `factor` as far
-        light = new if factor is None else light.plus(_times(new.plus(_times(light, -1)), factor))
+        light = _round(problem, light, solve, degree, round_index, factor)
     return light
 
 
@@ -59,40 +56,53 @@ def _round(
     solve: SolverWithMemory[Operator],
     degree: int,
     round_index: int,
+    factor: Tensor | None,
 ) -> Moments:
-    """What one round makes of `light` (E12)."""
+    """What one round makes of `light` (E12); with a `factor`, `factor` as far from light (E19)."""
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
-    moments = remaining_moments(medium)
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E11 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
-    scatters = light.weighted(moments).plus(problem.source).harmonics(medium.degree)
-    swept = Moments.of_harmonics(
-        sweep(medium, scatters, outside if is_lit_from_outside else None, degree)
-    )
+    inflow = outside if is_lit_from_outside else None
+    swept = sweep_scattered(medium, light, problem.source, inflow, degree)
     # Light begins as diffusion's, L0 with 3 F(L0), where S - A L0 is zero.
     diffuse, imbalance = light, None
     if round_index > 1:
         diffuse = Moments(light.mean, problem.flux(light.mean))
         imbalance = recompute(_imbalance, operator, right, light.mean)
-    gain, source = _gain(medium, swept, diffuse, imbalance, degree)
-    turned = None
-    if swept.flux is not None and light.flux is not None:
-        # by how much the round changes the flux that scatters: theta p_1 (L1' - L1)
-        share = recompute(_transport_share, medium, degree)
-        turned = recompute(_turned, share, moments[1], swept.flux, light.flux)
+    gain, source, turned = _gain(medium, swept, light, diffuse, imbalance, degree)
+    if turned is not None:
         source = source + problem.spread(turned)
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
     mean = solve_diffusion(solve_round, operator, right + source)
-    # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain; of what is higher theta
-    new = Moments(mean, problem.flux(mean, turned)).plus(gain)
-    return new if swept.higher is None else replace(new, higher=share * swept.higher)
+    # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
+    new = Moments(mean, problem.flux(mean, turned))
+    if swept.higher is None or factor is None:
+        return new.plus(gain)
+    return _blend(medium, light, new, gain, swept.higher, factor, degree)
 
 
-def _turned(share: Tensor, cosine: Tensor, swept: Vector, light: Vector) -> Vector:
-    """theta p_1 (L1' - L1)."""
-    z, y, x = (share * cosine * (new - old) for new, old in zip(swept, light, strict=True))
-    return z, y, x
+def _blend(
+    medium: Medium,
+    light: Moments,
+    diffuse: Moments,
+    gain: Moments,
+    swept: Tensor,
+    factor: Tensor,
+    degree: int,
+) -> Moments:
+    """Light by `factor` as far from what was as to what a round makes of it (E19).
+
+    That is what is now `diffuse`, plus its gain, and theta times what was `swept` of higher degree.
+    """
+    if is_fused():
+        from ddrecon.diffusion.rounds.fused.blend import blend_fused
+
+        length = _mean_step(medium.grid, degree)
+        return blend_fused(medium, light, diffuse, gain, swept, factor, length)
+    share = recompute(_transport_share, medium, degree)
+    new = replace(diffuse.plus(gain), higher=share * swept)
+    return light.plus(_times(new.plus(_times(light, -1)), factor))
 
 
 def _times(light: Moments, factor: Tensor | float) -> Moments:
@@ -115,21 +125,38 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 
 
 def _gain(
-    medium: Medium, swept: Moments, diffuse: Moments, imbalance: Tensor | None, degree: int
-) -> tuple[Moments, Tensor]:
+    medium: Medium,
+    swept: Moments,
+    light: Moments,
+    diffuse: Moments,
+    imbalance: Tensor | None,
+    degree: int,
+) -> tuple[Moments, Tensor, Vector | None]:
     """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E12, and what they add to S.
 
     That is kappa_s theta (L0' - L0) - theta (S - A L0); `imbalance` is S - A L0, None for zero.
+    And theta p_1 (L1' - L1), by how much the flux that scatters changes (E17).
     """
-    swept = replace(swept, higher=None)
-    if current_engine() == "warp" and not is_forward():
+    cosine = remaining_moments(medium)[1]
+    if is_fused():
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
-        return gain_fused(medium, swept, diffuse, imbalance, _mean_step(medium.grid, degree))
+        length = _mean_step(medium.grid, degree)
+        return gain_fused(medium, swept, light, diffuse, imbalance, cosine, length)
     share = recompute(_transport_share, medium, degree)
+    swept = replace(swept, higher=None)
     gain = swept.plus(diffuse.scaled(-1.0, -1.0)).scaled(share, share)
     source = medium.remaining_scattering * gain.mean
-    return gain, source if imbalance is None else source - share * imbalance
+    source = source if imbalance is None else source - share * imbalance
+    if swept.flux is None or light.flux is None:
+        return gain, source, None
+    return gain, source, recompute(_turned, share, cosine, swept.flux, light.flux)
+
+
+def _turned(share: Tensor, cosine: Tensor, swept: Vector, light: Vector) -> Vector:
+    """theta p_1 (L1' - L1)."""
+    z, y, x = (share * cosine * (new - old) for new, old in zip(swept, light, strict=True))
+    return z, y, x
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:

@@ -165,9 +165,7 @@ def numbers_of(emission: Emission, bound: Tensor | float) -> Tensor:
 
 
 @remember
-def _numbers(
-    colors: int, scale: Tensor, peak: Tensor | None, bound: Tensor | float
-) -> Tensor:
+def _numbers(colors: int, scale: Tensor, peak: Tensor | None, bound: Tensor | float) -> Tensor:
     scale = scale.view(-1).expand(colors)
     peak = 0 * scale if peak is None else peak.view(-1).expand(colors)
     return torch.cat([scale, peak, 0 * scale[:1], torch.as_tensor(bound).to(scale).view(1)])

@@ -32,8 +32,8 @@ def compose(
 
     `out` [C (1 + beams), R] and `masses` [K, R] are the integrals; `scale` and `scattering` [C or
     1] those of both coefficients. What does not change along a ray is multiplied in here: the
-    `irradiances` of beams [C or 1], and p where it is one of the `factors` [1 or C, R] (E2); the scale of
-    kappa_s; and E1's 1 - tau of what is behind.
+    `irradiances` of beams [C or 1], and p where it is one of the `factors` [1 or C, R] (E2); the
+    scale of kappa_s; and E1's 1 - tau of what is behind.
     """
     fixed = [scale, scattering, *irradiances, *(each for each in factors if each is not None)]
     colors = len(out) // (1 + len(irradiances))

@@ -9,17 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.cells import (
-    CELL_ARRAYS,
-    CELL_NUMBERS,
-    COLLECT_CELL,
-    FOLLOW_CELL,
-    RETURN_CELL,
-)
-from ddrecon.diffusion.rounds.fused.kernels import constants
+from ddrecon.diffusion.rounds.fused.cells import COLLECT_CELL, FOLLOW_CELL, GIVEN, RETURN_CELL
 from ddrecon.diffusion.rounds.fused.schedule import POINTS, Step, steps_of
+from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.diffusion.rounds.fused.swept import Swept
-from ddrecon.kernels.records import launch_record, record_kernel
+from ddrecon.kernels.text import TextKernel
 from ddrecon.numerics.harmonics import harmonics
 
 MOST_BYTES = 2**31
@@ -32,8 +26,8 @@ class Cells:
     """The arrays of a sweep on a GPU, and the launches of kernels on them."""
 
     def __init__(self, swept: Swept):
-        self.swept, self.like = swept, swept.moments
-        _, self.colors, *self.shape = swept.moments.shape
+        self.swept, self.like = swept, swept.total()
+        _, self.colors, *self.shape = self.like.shape
         self.kernels = functools.partial(
             cell_kernels, torch.finfo(self.like.dtype).bits, swept.scattering is None
         )
@@ -60,8 +54,6 @@ class Cells:
             given["bar"] = torch.tensordot((values * weights).T.to(bars), bars, 1)
             names = BARS[: 2 + len(fields)] + NUMBER_BARS * varies_numbers
             given |= {name: torch.empty_like(light) for name in names}
-            # Names that a kernel has and does not use.
-            given |= {n: light for n in (*BARS, *NUMBER_BARS, "q_bars") if n not in given}
             for number in reversed(range(max(self.shape))):
                 self._launch(back, given | {"slice": number}, len(steps) * self.colors * self.most)
             given["q_bars"] = q_bars = torch.empty_like(light)
@@ -115,8 +107,9 @@ class Cells:
             )
         return given
 
-    def _launch(self, kernel: Any, values: dict[str, Any], count: int) -> None:
-        launch_record(kernel, count, values, self.like)
+    def _launch(self, kernel: TextKernel, values: dict[str, Any], count: int) -> None:
+        given = dict(values)
+        kernel.launch(count, given, {"light": given.pop("light")})
 
 
 @functools.cache
@@ -132,11 +125,8 @@ def _tables(steps: tuple[Step, ...]) -> tuple[Tensor, Tensor]:
 
 
 @functools.cache
-def cell_kernels(bits: int, shares_field: bool, varies_numbers: bool) -> tuple[Any, Any, Any]:
+def cell_kernels(bits: int, shares_field: bool, varies_numbers: bool) -> list[TextKernel]:
     """The kernels that follow radiance, follow it back, and collect what steps from a cell have."""
     fixed = constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers)
-    bars = CELL_ARRAYS + " ".join((*BARS, *NUMBER_BARS, "bar", "q_bars"))
-    follow = record_kernel("follow_cells", bits, fixed + FOLLOW_CELL, CELL_ARRAYS, CELL_NUMBERS)
-    back = record_kernel("return_cells", bits, fixed + RETURN_CELL, bars, CELL_NUMBERS)
-    collect = record_kernel("collect_cells", bits, fixed + COLLECT_CELL, bars, CELL_NUMBERS)
-    return follow, back, collect
+    texts = {"follow": FOLLOW_CELL, "return": RETURN_CELL, "collect": COLLECT_CELL}
+    return [TextKernel(f"{n}_cells", bits, fixed + text, GIVEN) for n, text in texts.items()]

@@ -19,8 +19,8 @@ from ddrecon.diffusion.rounds.fused.schedule import Tables, make_tables
 from ddrecon.diffusion.rounds.fused.surroundings import surround
 from ddrecon.diffusion.rounds.fused.swept import Swept
 from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.records import launch_record
 from ddrecon.kernels.spare import borrow, give_back
+from ddrecon.kernels.text import TextKernel
 
 FOLLOWED, KEPT = 16, 8
 """Directions at most that go through the cells together, if lines of few or of all are kept."""
@@ -47,8 +47,15 @@ class Rows:
     """The arrays of a sweep on a processor, and the launches of kernels on them."""
 
     def __init__(self, swept: Swept, is_kept: bool):
-        self.swept, self.like = swept, swept.moments
-        self.count, self.colors, self.depth, self.height, self.width = swept.moments.shape
+        self.swept, self.like = swept, swept.like
+        self.count, self.colors = swept.factors.shape[1:]
+        self.depth, self.height, self.width = self.like.shape[1:]
+        # Moments lie in memory of their own; 0 is the address of none.
+        self.moments = [
+            one if one is None else one.contiguous() for pair in swept.moments for one in pair
+        ]
+        addresses = [0 if one is None else one.data_ptr() for one in self.moments]
+        self.addresses = torch.tensor(addresses, dtype=torch.int64)
         self.bits = torch.finfo(self.like.dtype).bits
         self.pitch = -(-(self.width + 2) // MARGIN) * MARGIN
         threads = thread_count(self.like)
@@ -122,15 +129,16 @@ class Rows:
 
     def _sums(self) -> Tensor:
         """Moments for each piece; of a piece without directions they stay zero."""
-        shape = self.pieces, *self.like.shape
+        shape = self.pieces, self.count, *self.like.shape
         return self.like.new_empty(shape) if self.pieces == 1 else self.like.new_zeros(shape)
 
-    def _given(self, lines: Tensor) -> dict[str, Tensor | int]:
+    def _given(self, lines: Tensor) -> dict[str, Any]:
         """What all kernels are given, by its names; `found`, `jobs` and cotangents are missing."""
         tables, like = self.tables, self.like
         scratch_rows = 3 * POINTERS + 5 + tables.most
         return {
-            "moments": like.contiguous(), "extinction": self.fields[0],
+            "addresses": self.addresses, "factors": self.swept.factors.contiguous(),
+            "extinction": self.fields[0],
             "scattering": self.fields[-1], "scales": self.swept.scales, "parts": tables.parts,
             "matrices": tables.matrices, "lines": lines, "ranges": self.ranges,
             "scratch": like.new_zeros(self.lanes * scratch_rows * self.pitch),
@@ -175,17 +183,12 @@ class Rows:
         middle = self.depth - self.depth // 2 if way else self.depth // 2
         return (0, middle) if (phase == 0) != is_backward else (middle, self.depth)
 
-    def _launch(self, kernel: Any, jobs: list[Job], values: dict[str, Tensor | int]) -> None:
+    def _launch(self, kernel: TextKernel, jobs: list[Job], values: dict[str, Any]) -> None:
         rows = [self._row(job) for job in jobs]
         work = self.depth * self.height * self.width * self.tables.most * self.count
-        launch_record(
-            kernel,
-            len(jobs),
-            values | {"jobs": torch.tensor(rows, dtype=torch.int32)},
-            self.like,
-            threads=min(self.threads, len(jobs)),
-            work=work,
-        )
+        given = values | {"jobs": torch.tensor(rows, dtype=torch.int32)}
+        made = {"found": given.pop("found")}
+        kernel.launch(len(jobs), given, made, min(self.threads, len(jobs)), work=work)
 
     def _row(self, job: Job) -> list[int]:
         """The numbers of a job, `rows.JOB` of them."""

@@ -6,9 +6,13 @@ What scatters and I are arrays of all directions, [D, C, z, y, x].
 
 from ddrecon.diffusion.rounds.fused.rows import DECAYED, SLOPES
 
-CELL_ARRAYS = "extinction scattering scales parts near light whole:steps "
-"""Arrays that all kernels of cells are given."""
-CELL_NUMBERS = "slice depth height width colors extinction_channels scattering_channels most"
+GIVEN = """
+    F *extinction, *scattering, *scales, *parts, *near, *light, *bar, *q_bars;
+    F *returning, *far_bar, *mass_bar, *scattered_bar, *scale_bars, *strength_bars, *inflow_bars;
+    int *steps; int slice, depth, height, width, colors, most;
+    int extinction_channels, scattering_channels
+"""
+"""What kernels of cells are given; what is not used, is none."""
 _PLACE = """
 const long long cells = (long long)depth * height * width;
 // A direction: signs along z, y, x, its axis, how many points; then these.

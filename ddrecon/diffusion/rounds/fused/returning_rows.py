@@ -50,7 +50,8 @@ F* own_back = returning + lane * ((height + 2) * back_stride + MARGIN) + MARGIN;
 double* own_sums = sums + 3 * job[8];
 F* e_bars = e_bar + job[9] * cells;
 F* sc_bars = sc_bar + job[10] * cells;
-for (int s = slice_to - 1; s >= slice_from; --s) for (int g = group_to - 1; g >= group_from; --g) {"""
+for (int s = slice_to - 1; s >= slice_from; --s)
+for (int g = group_to - 1; g >= group_from; --g) {"""
     + GROUP
     + "const int ahead = -y_way * width;"
     + MULTIPLY
@@ -70,7 +71,13 @@ for (int t = height - 1; t >= 0; --t) {
     const int own = 3 * POINTERS;
     auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
-    to_directions(to_weighted_light, bars + color * cells + at, bar_of, 0, width);
+    auto read = [&](int k, F* row, int from, int to) {
+        const F* moment = bars + k * all + color * cells + at;
+        INDEPENDENT
+        for (int c = from; c < to; ++c) row[c] = moment[c];
+        ask_for(moment, from, to);
+    };
+    to_directions(to_weighted_light, read, bar_of, 0, width);
     const int* range = ranges + 4 * (k * height + r);
     const int from = range[0], to = range[1];
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;

@@ -17,15 +17,14 @@ POINTERS = 64
 """Moments and pairs of a group at most: so many rows are multiplied at once."""
 JOB = 12
 """Whole numbers of a job: see `by_rows.py`."""
-GIVEN = (
-    "moments extinction scattering scales parts matrices lines scratch nothing "
-    "whole:ranges whole:jobs whole:groups whole:points whole:pairs whole:order "
-)
-"""Arrays that all kernels of rows are given."""
-NUMBERS = (
-    "depth height width pitch colors count even most extinction_channels scattering_channels "
-    "scratch_rows"
-)
+GIVEN = """
+    F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
+    F *found, *bars, *returning, *e_bar, *sc_bar; double *sums; long *addresses;
+    int *ranges, *jobs, *groups, *points, *pairs, *order;
+    int depth, height, width, pitch, colors, count, even, most, scratch_rows;
+    int extinction_channels, scattering_channels
+"""
+"""What kernels of rows are given; what is not used, is none."""
 
 PLACES = (
     f"const int MARGIN = {MARGIN}, POINTERS = {POINTERS}, JOB = {JOB};"
@@ -101,7 +100,7 @@ auto multiply_rows = [&](auto tall, const F* matrix, int ins, F* const* out, con
         }
 };
 auto multiply = [&](const F* matrix, int outs, int ins, F* const* out, const F* const* in,
-                    int from, int to) {
+                    int from, int to) __attribute__((noinline)) {
     int i = 0;
     for (; i + 4 <= outs; i += 4)
         multiply_rows(Four(), matrix + i * ins, ins, out + i, in, from, to);
@@ -114,23 +113,32 @@ auto multiply = [&](const F* matrix, int outs, int ins, F* const* out, const F* 
 // a processor's cache; the next row is asked for in time.
 auto moment_row = [&](int k) -> F* { return scratch_row(k); };
 auto pair_row = [&](int i) -> F* { return scratch_row(POINTERS + i); };
-auto ask_for = [&](const F* begin, int from, int to) {
-    for (int k = 0; k < count; ++k)
-        for (int c = from; c < to; c += 64 / (int)sizeof(F))
-            __builtin_prefetch(begin + k * all + ahead + c);
+auto ask_for = [&](const F* row, int from, int to) {
+    for (int c = from; c < to; c += 64 / (int)sizeof(F)) __builtin_prefetch(row + ahead + c);
 };
-// Radiance of a group's directions, `light(j)`, from a row of moments that `begin` at a cell.
-auto to_directions = [&](const F* matrix, const F* begin, auto light, int from, int to) {
+// One of the moments that scatter, from a cell on; those of `bars` and of light follow each other.
+auto read_scattering = [&](long long at, int k, F* row, int from, int to) {
+    const F *light = (const F*)addresses[2 * k], *source = (const F*)addresses[2 * k + 1];
+    const F by_light = light ? factors[k * colors + color] : F(0);
+    const F by_source = source ? factors[(count + k) * colors + color] : F(0);
+    const F *one = (light ? light : source) + at, *other = (source ? source : light) + at;
+    if (!light && !source) {
+        for (int c = from; c < to; ++c) row[c] = F(0);
+        return;
+    }
+    INDEPENDENT
+    for (int c = from; c < to; ++c) row[c] = by_light * one[c] + by_source * other[c];
+    ask_for(one, from, to);
+    if (other != one) ask_for(other, from, to);
+};
+// Radiance of a group's directions, `light(j)`, from rows of moments that `read` gets.
+auto to_directions = [&](const F* matrix, auto read, auto light, int from, int to) {
     const F* in[POINTERS];
     F* out[POINTERS];
     for (int k = 0; k < count; ++k) {
-        const F* moment = begin + order[k] * all;
-        F* row = moment_row(k);
-        INDEPENDENT
-        for (int c = from; c < to; ++c) row[c] = moment[c];
-        in[k] = row;
+        read(order[k], moment_row(k), from, to);
+        in[k] = moment_row(k);
     }
-    ask_for(begin, from, to);
     for (int p = 0; p < pair_count; ++p)
         out[p] = p < odd_count ? pair_row(2 * p) : light(pair[2 * p]);
     multiply(matrix, pair_count, even, out, in, from, to);
@@ -151,7 +159,7 @@ auto to_directions = [&](const F* matrix, const F* begin, auto light, int from, 
 auto to_moments = [&](const F* matrix, F* begin, auto light, bool is_adding, int from, int to) {
     const F *sums[POINTERS], *differences[POINTERS];
     F* out[POINTERS];
-    if (is_adding) ask_for(begin, from, to);
+    for (int k = 0; k < count && is_adding; ++k) ask_for(begin + k * all, from, to);
     for (int p = 0; p < pair_count; ++p) {
         const F* one = light(pair[2 * p]);
         sums[p] = differences[p] = one;
@@ -242,7 +250,8 @@ FOLLOW = (
     PLACES
     + """
 enum { NEAR, LIGHT };
-const long long stride = 2LL * most * pitch, places = KEEPS ? (long long)depth * height : height + 2;
+const long long stride = 2LL * most * pitch;
+const long long places = KEEPS ? (long long)depth * height : height + 2;
 F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
 for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_to; ++g) {"""
     + GROUP
@@ -265,7 +274,10 @@ for (int t = 0; t < height; ++t) {
     const int* range = ranges + 4 * (k * height + r);
     const int from = range[0], to = range[1];
     const int near_begin = KEEPS ? 0 : range[2], near_end = KEEPS ? width : range[3];
-    to_directions(to_light, moments + color * cells + at, near_of, near_begin, near_end);
+    auto read = [&](int k, F* row, int from, int to) {
+        read_scattering(color * cells + at, k, row, from, to);
+    };
+    to_directions(to_light, read, near_of, near_begin, near_end);
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
     F* __restrict carried = scratch_row(3 * POINTERS);
     for (int j = 0; j < members; ++j) {"""

@@ -30,15 +30,16 @@ POINTS = 4
 class Step:
     """The step to a cell along a direction: from a mean of up to four cells, of given `weights`.
 
-    Slices lie across `axis`. Each of `points` tells how many cells it lies before the cell along z, y and x, none or one, of
-    light with the `signs`. Where `is_along` the first lies in the same row: a recurrence in x.
+    Slices lie across `axis`. Each of `points` tells how many cells it lies before the cell along z,
+    y and x, none or one, of light with the `signs`. Where `is_along` the first lies in the same
+    row: a recurrence in x.
     """
 
     direction: Direction
     axis: int
     half: float
     signs: tuple[int, int, int]
-    points: tuple[tuple[int, int, int], ...]
+    points: tuple[tuple[int, ...], ...]
     weights: tuple[float, ...]
     is_along: bool
 
@@ -52,15 +53,22 @@ class Step:
         for drift, dim in zip(course.drift, course.order[2:], strict=True):
             moved[dim - 1] = drift
         # The cells around where light was, first that on the row itself where it goes along x.
-        found = {}
+        found: dict[tuple[int, ...], float] = {}
         for point in product(*((1,) if i == axis else (0, 1) for i in range(3))):
             parts = (abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True))
             found[point] = math.prod(parts)
         is_along = found.get((0, 0, 1), 0.0) > 0 and axis == X
         kept = {point: weight for point, weight in found.items() if weight > 0}
-        signs = tuple(1 if m > 0 else -1 if m < 0 else 0 for m in moved)
-        points, weights = tuple(kept), tuple(kept.values())
-        return Step(direction, axis, 0.5 * course.step, signs, points, weights, is_along)
+        z, y, x = (1 if m > 0 else -1 if m < 0 else 0 for m in moved)
+        return Step(
+            direction,
+            axis,
+            0.5 * course.step,
+            (z, y, x),
+            tuple(kept),
+            tuple(kept.values()),
+            is_along,
+        )
 
     @property
     def is_up(self) -> bool:
@@ -167,7 +175,7 @@ class _Maker:
     ) -> tuple[tuple[tuple[int, int], ...], ...]:
         """Adds a way's directions; the chunks of each piece, as ranges of groups."""
         total = sum(map(len, units))
-        count = -(-(-(-total // most)) // pieces) * pieces
+        count = math.ceil(total / most / pieces) * pieces
         chunks: list[list[Unit]] = [[] for _ in range(count)]
         done = 0
         for unit in units:
@@ -198,10 +206,9 @@ class _Maker:
             for step, _ in unit:
                 self._add_step(step)
         at = sum(map(len, self.matrices))
-        self.groups.append(
-            [y_way, first, len(self.points) - first, first_pair, len(units), sum(has_odd), at]
-            + [before]
-        )
+        members = len(self.points) - first
+        group = y_way, first, members, first_pair, len(units), sum(has_odd), at, before
+        self.groups.append(list(group))
         # Y_k of pairs as sums over moments, and as sums over pairs; the same with weights.
         ways = torch.tensor([unit[0][0].direction for unit in units], dtype=torch.float64)
         values = harmonics(ways, self.degree)[self.order].T

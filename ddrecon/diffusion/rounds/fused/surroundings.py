@@ -2,14 +2,13 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ddrecon.diffusion.rounds.fused.rows import MARGIN
-from ddrecon.kernels.records import launch_record, record_kernel
+from ddrecon.kernels.text import TextKernel
 
 FAR = 64
 """Cells beyond the ends of a row, where an empty one ends and begins."""
@@ -56,12 +55,12 @@ def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor
     for field in fields:
         result = field.new_empty(MARGIN + len(field) * rows * pitch)
         result[:MARGIN] = 0
-        values = {
-            "cells": field.detach().contiguous(), "larger": result, "occupied": occupied,
-            "channels": len(field), "depth": depth, "height": height, "width": width,
+        given = {
+            "cells": field.detach(), "channels": len(field), "depth": depth, "height": height, "width": width,
             "pitch": pitch, "margin": MARGIN,
         }  # fmt: skip
-        launch_record(copy_kernel(torch.finfo(field.dtype).bits), rows, values, field)
+        kernel = copy_kernel(torch.finfo(field.dtype).bits)
+        kernel.launch(rows, given, {"larger": result, "occupied": occupied})
         larger.append(result)
     return larger, _ranges(occupied, width)
 
@@ -82,7 +81,7 @@ def _ranges(occupied: Tensor, width: int) -> Tensor:
 
 
 @functools.cache
-def copy_kernel(bits: int) -> Any:
+def copy_kernel(bits: int) -> TextKernel:
     """The kernel that copies a row and finds where it is not empty."""
-    numbers = "channels depth height width pitch margin"
-    return record_kernel("surround_rows", bits, _COPY, "cells larger whole:occupied", numbers)
+    given = "F *cells, *larger; int *occupied; int channels, depth, height, width, pitch, margin"
+    return TextKernel("surround_rows", bits, _COPY, given)

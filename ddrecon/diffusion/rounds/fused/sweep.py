@@ -1,4 +1,4 @@
-"""A sweep as one differentiable function of tensors, by fused kernels (E11, E12)."""
+"""A sweep as one differentiable function of tensors, by fused kernels (E11, E17)."""
 
 from __future__ import annotations
 
@@ -9,67 +9,87 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import Swept
-from ddrecon.grid import Grid
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, parts_of
+from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.harmonics import count_harmonics, degrees_of_harmonics
 
 
 def sweep_fused(
     medium: Medium,
-    source: Tensor,
+    light: Moments | None,
+    factors: Tensor,
+    source: Moments,
     inflow: Tensor | None,
     directions: int,
     by_cells: bool | None = None,
-) -> Tensor:
-    """The moments [K, C, z, y, x] of radiance, as `sweep` returns them, by fused kernels.
+) -> Moments:
+    """The moments of the radiance that `light`, by `factors`, and `source` scatter (E17).
 
-    `source` [K, C, z, y, x]: the moments of what scatters; `directions`: of the quadrature;
-    `by_cells`: whether a thread does a cell of a slice, not rows of directions; None: on a GPU.
+    As `sweep_scattered` has it. `directions`: how many the quadrature has; `by_cells`: whether a
+    thread does a cell of a slice, not rows of directions; None: on a GPU.
     """
-    colors = source.shape[1]
+    colors = len(medium.extinction.value) if light is None else len(light.mean)
     strength = (1 - medium.forward_fraction) * medium.scattering.scale
-    entering = source.new_zeros(1) if inflow is None else inflow
+    entering = source.mean.new_zeros(1) if inflow is None else inflow
     scales = torch.stack(
         [each.reshape(-1).expand(colors) for each in (medium.extinction.scale, strength, entering)]
     )
     shares_field = medium.scattering.field is medium.extinction.field
     moments: Tensor = _Sweep.apply(
-        source.is_cuda if by_cells is None else by_cells,
+        source.mean.is_cuda if by_cells is None else by_cells,
         medium.grid,
         directions,
         scales,
         medium.extinction.field,
         None if shares_field else medium.scattering.field,
-        source,
+        _spread_factors(factors, colors),
+        *((None,) * PARTS if light is None else parts_of(light, colors)),
+        *parts_of(source, colors),
     )
-    return moments
+    return Moments.of_harmonics(moments)
+
+
+def _spread_factors(factors: Tensor, colors: int) -> Tensor:
+    """`factors` [L + 1, 1 or C, 1, 1, 1] of light and those of sources, by harmonic: [2, K, C].
+
+    A flux is sqrt(3) times as large as the moments of degree 1.
+    """
+    degree = len(factors) - 1
+    each = factors.reshape(degree + 1, -1).expand(-1, colors)[list(degrees_of_harmonics(degree))]
+    units = each.new_ones(count_harmonics(degree), 1)
+    units[1:4] = 3**-0.5
+    return torch.stack([each * units, units.expand(-1, colors)])
 
 
 class _Sweep(torch.autograd.Function):
-    """The moments of light, and their derivatives by `scales` [3, C], fields and source."""
+    """The moments [K, C, z, y, x] of light, and their derivatives by all tensors of `Swept`."""
 
     @staticmethod
-    def forward(ctx: Any, by_cells: bool, grid: Grid, directions: int, *tensors: Any) -> Tensor:
+    def forward(ctx: Any, by_cells: bool, *given: Any) -> Tensor:
+        grid, directions, *tensors = given
         ctx.by_cells, ctx.of = by_cells, (grid, directions)
         ctx.save_for_backward(*tensors)
-        swept = Swept(grid, directions, *tensors)
+        swept = Swept.of(*given)
         return Cells(swept).follow() if by_cells else Rows(swept, is_kept=False).follow()
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, bars: Tensor) -> tuple[Any, ...]:
-        swept = Swept(*ctx.of, *ctx.saved_tensors)
+        swept = Swept.of(*ctx.of, *ctx.saved_tensors)
+        _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
         sweep = Cells(swept) if ctx.by_cells else Rows(swept, is_kept=True)
-        varies_scales = ctx.needs_input_grad[3]
-        scales_bar, source_bar, fields = sweep.transpose(bars, varies_scales)
+        scales_bar, moments_bar, fields = sweep.transpose(bars, needs_scales)
         extinction_bar, *scattering_bar = fields
         return (
             None,
             None,
             None,
-            scales_bar if varies_scales else None,
+            scales_bar if needs_scales else None,
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
-            source_bar,
+            swept.factor_bar(moments_bar) if needs_factors else None,
+            *swept.part_bars(0, moments_bar, needs_parts[:PARTS]),
+            *swept.part_bars(1, moments_bar, needs_parts[PARTS:]),
         )
