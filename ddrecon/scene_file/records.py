@@ -35,7 +35,6 @@ from ddrecon.settings import (
     ParameterSettings,
     Start,
     Support,
-    Weight,
 )
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
@@ -239,13 +238,6 @@ def _read_start(node: Node, rule: Rule) -> Any:
     )
 
 
-def _read_weight(node: Node, rule: Rule) -> float | str:
-    """A number, or `auto`."""
-    if isinstance(node.value, str):
-        return read_text(node, Rule(str, {"choices": (AUTO,)}, rule.folder))
-    return read_number(node, rule)
-
-
 def _read_support(node: Node, rule: Rule) -> float | str | FieldFile:
     """`masks`, a displayed value, or `{file: path}`."""
     if isinstance(node.value, dict):
@@ -293,7 +285,6 @@ READERS: dict[Any, Callable[[Node, Rule], Any]] = {
     Density: _read_density,
     Quantity: _read_quantity,
     Start: _read_start,
-    Weight: _read_weight,
     Support: _read_support,
     Mapping[str, ParameterSettings]: _read_parameters,
     tuple[ViewSection, ...]: _read_views,

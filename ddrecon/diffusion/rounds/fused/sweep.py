@@ -10,6 +10,7 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
 from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, parts_of, split, units_of_parts
+from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once
@@ -68,19 +69,25 @@ class _Sweep(torch.autograd.Function):
         grid, directions, *tensors = given
         ctx.by_cells, ctx.of = by_cells, (grid, directions)
         ctx.save_for_backward(*tensors)
-        swept = Swept.of(*given)
+        swept, is_saved = Swept.of(*given), any(ctx.needs_input_grad)
         ctx.set_materialize_grads(False)
-        return split((Cells(swept) if by_cells else Rows(swept, is_kept=False)).follow())
+        ctx.threads, ctx.saved = thread_count(swept.like), None
+        if by_cells:
+            return split(Cells(swept).follow())
+        moments, ctx.saved = Rows(swept, ctx.threads).follow(is_saved)
+        return split(moments)
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
         _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
-        sweep = Cells(swept) if ctx.by_cells else Rows(swept, is_kept=True)
-        scales_bar, moments_bar, fields = sweep.transpose(
-            (*bars, *[None] * (PARTS - len(bars))), needs_scales
-        )
+        parts = *bars, *[None] * (PARTS - len(bars))
+        if ctx.by_cells:
+            found = Cells(swept).transpose(parts, needs_scales)
+        else:
+            found = Rows(swept, ctx.threads).transpose(ctx.saved, parts, needs_scales)
+        scales_bar, moments_bar, fields = found
         extinction_bar, *scattering_bar = fields
         return (
             None,
