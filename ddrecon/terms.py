@@ -8,6 +8,7 @@ from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
 from ddrecon.medium.coefficients import Medium, scale_medium
+from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import multiply_scatters
@@ -22,6 +23,7 @@ def needed_terms(scene: Scene) -> list[str]:
     colors = medium.extinction.scale.shape[0]
     is_diffuse = multiply_scatters(medium, settings)
     terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
+    terms.append(_phase_term(scene.volume.phase))
     terms += _light_terms(scene.lights, is_diffuse)
     if not is_diffuse:
         return [*terms, "no multiple scattering: no diffusion solve"]
@@ -67,6 +69,12 @@ def _angle_term(medium: Medium) -> str:
         return "fluxes Q1 and L1 (g is not 0)"
     moments = count_harmonics(medium.degree)
     return f"angles to degree {medium.degree}: {moments} moments of light (g is not 0)"
+
+
+def _phase_term(phase: PhaseFunction) -> str:
+    """Which phase function, and its mean cosine."""
+    cosines = ", ".join(f"{cosine:.3g}" for cosine in phase.moments(2)[:, 1].tolist())
+    return f"phase function {phase.NAME}, mean cosine {cosines}"
 
 
 def _peak_term(medium: Medium) -> str:

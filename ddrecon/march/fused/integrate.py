@@ -137,7 +137,7 @@ def _transpose(
 def _transpose_packets(
     ctx: Any, needs: tuple[bool, bool, Sequence[bool]], out_bar: Tensor, masses_bar: Tensor
 ) -> list[Tensor | None]:
-    """The same in packets of rays, but of rays; of polynomials, table and fields those it `needs`."""
+    """The same in packets, but of rays; of polynomials, table and fields those it `needs`."""
     layout, cells, (needs_polynomials, needs_table, needs_fields) = ctx.layout, ctx.cells, needs
     masses, rays, angles, coefficients, numbers, table, *fields = ctx.saved_tensors
     packets, _ = cut(len(rays), LANES, rays)

@@ -14,11 +14,10 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.renderer import render
 
 pytestmark = pytest.mark.slow
+Sections = tuple[tuple[float, ...], ...]
 
 
-def image_and_gradients(
-    engine: str, g: float, sigma: tuple[tuple[float, ...], ...]
-) -> list[Tensor]:
+def image_and_gradients(engine: str, g: float, sigma: Sections) -> list[Tensor]:
     """The image of a small scene lit in colors, and derivatives by its density, g and sun."""
     use_engine(engine)
     density = half_empty(7, 6, 5)
