@@ -30,7 +30,7 @@ def memory_estimate(scene: Scene) -> int:
         torch.finfo(volume.density.dtype).bits // 8,
         sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
         has_flux=scale_medium(volume).has_flux,
-        has_rounds=scene.diffusion.transport_rounds > 0,
+        has_rounds=scene.diffusion.rounds > 0,
         is_limited=scene.diffusion.model == "flux_limited",
         varied=None
         if scene.optimize is None
