@@ -157,8 +157,8 @@ def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) ->
 def exposures() -> dict[str, tuple[np.ndarray, float]]:
     """The gain by color and the black level of each camera.
 
-    Gains have a geometric mean of 1 over the training cameras in each color: the light has the rest. The
-    held-out camera is the ruler, and has neither.
+    Gains have a geometric mean of 1 over the training cameras in each color: the light has the
+    rest. The held-out camera is the ruler, and has neither.
     """
     generator = np.random.default_rng(SEED + 1)
     gains = generator.uniform(0.7, 1.3, (len(ANGLES), 1)) * generator.uniform(

@@ -25,7 +25,7 @@ DECADES = (1e-4, 1e-3, 1e-2, 1e-1)
 BESIDE = (10**-0.5, 10**0.5)
 """and those tried then, as parts of the best."""
 ITERATIONS = 30
-"""Length of each run: six of them at a quarter of the resolution take as long as about four
+"""Length of each run: six of them at a quarter of the resolution take as long as about six
 iterations at full resolution.
 """
 FEWEST = 3

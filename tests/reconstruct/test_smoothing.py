@@ -85,7 +85,7 @@ def test_two_views_are_too_few(scene: Scene) -> None:
 
 
 def test_auto_is_for_density() -> None:
-    with pytest.raises(SceneError, match="albedo.tv: 'auto' is for density alone"):
+    with pytest.raises(SceneError, match=r"albedo\.tv: .auto. is for density alone"):
         load_scene(
             BALL,
             overrides=["optimize.parameters={density: {}, albedo: {field: true, tv: auto}}"],
