@@ -154,7 +154,7 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
     if numbers:
         parts = {name.removeprefix(PHASE): number for name, number in numbers.items()}
-        phase = replace(phase, **parts)  # type: ignore[arg-type]
+        phase = replace(phase, **parts)
     changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
 
