@@ -229,10 +229,10 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 @pytest.mark.parametrize("architecture", [80, 90])
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
-    layout = Layout(3, 1, 3, (False, True), 0, 0, 32)
+    layout = Layout(3, 1, 3, (False, True), 0, 0, 1, 32)
     kernels = [integral_kernel(layout), tangent_kernel(layout, True)]
     kernels += [adjoint_kernel(layout, is_sliced, True) for is_sliced in (True, False)]
-    for several in (layout, Layout(3, 3, 3, (False, True), 3, 3, 64)):
+    for several in (layout, Layout(3, 3, 3, (False, True), 3, 3, 3, 64)):
         kernels += [packet_integral_kernel(several), packet_adjoint_kernel(several)]
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
