@@ -9,7 +9,7 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLigh
 from ddrecon.light.sky import count_suns
 from ddrecon.medium.coefficients import Medium, scale_medium
 from ddrecon.medium.phase import PhaseFunction
-from ddrecon.medium.remaining import backward_fraction, has_backward_peak
+from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import multiply_scatters
 from ddrecon.scene import Scene
@@ -30,7 +30,7 @@ def needed_terms(scene: Scene) -> list[str]:
     if bool((medium.forward_fraction > 0).any()):
         terms.append(_peak_term(medium))
     terms.append(f"multiple scattering by {settings.model} diffusion, {_method(settings)}")
-    if settings.transport_rounds:
+    if settings.rounds:
         terms += _round_terms(medium, scene)
     else:
         terms.append("no transport rounds: diffusion alone")
@@ -40,9 +40,12 @@ def needed_terms(scene: Scene) -> list[str]:
 def _round_terms(medium: Medium, scene: Scene) -> list[str]:
     """Transport rounds, and the pairs of beams that they go with."""
     settings = scene.diffusion
-    rounds = _count(settings.transport_rounds, "transport round")
+    rounds = _count(settings.rounds, "transport round")
     directions = DIRECTIONS[settings.degree]
     terms = [f"{rounds} of sweeps along {directions} directions, each with a diffusion solve"]
+    if medium.degree > 1:
+        left = remaining_moments(medium)[2].abs().max().item()
+        terms[0] += f"; each leaves up to {left:.2g} of what diffusion lacks"
     if has_backward_peak(medium) and _has_beams(scene.lights):
         part = backward_fraction(medium).max().item()
         terms.append(f"beams in pairs: a backward peak turns {part:.3g} of scattering back")

@@ -136,6 +136,6 @@ def _effective(diffusion: DiffusionSettings) -> DiffusionSettings:
     """Without the degree where there are no rounds that it could matter to."""
     return (
         diffusion
-        if diffusion.transport_rounds
+        if diffusion.rounds
         else replace(diffusion, degree=DiffusionSettings.degree)
     )

@@ -22,6 +22,7 @@ from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
+from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import dump_scene
@@ -103,6 +104,8 @@ def drive_run(
                 disable=is_quiet,
             ) as bar,
         ):
+            if not is_quiet:
+                tqdm.write(loss_text(describe_loss(run.settings, run.train)), file=sys.stderr)
             while not run.is_done:
                 folder.save_in_time(run)
                 row = run.step()
@@ -162,7 +165,8 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         f"loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
     )
     if summary["test_psnr"] is not None:
-        line += f", test PSNR {summary['test_psnr']:.2f} dB"
+        line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
+    line += f", of {summary['compared']}"
     lines = [line, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))

@@ -88,10 +88,11 @@ def _lead(findings: Findings) -> str:
     cells = " x ".join(str(count) for count in reversed(findings.scene.volume.grid.shape))
     summary, test = findings.summary, ""
     if summary["test_psnr"] is not None:
-        test = f", {summary['test_psnr']:.2f} dB of those held out"
+        test = f", {summary['test_psnr']:.2f} dB of those held out, SSIM {summary['test_ssim']:.4f}"
     return (
         f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
-        f"PSNR {summary['psnr']:.2f} dB of the views seen last{test}."
+        f"PSNR {summary['psnr']:.2f} dB of the views seen last{test}. "
+        f"What is compared is {summary['compared']}, by the loss {summary['loss_function']}."
     )
 
 
@@ -129,7 +130,17 @@ def _comparisons(findings: Findings) -> list[str]:
 def _comparison(view: View, image: Tensor, quality: Mapping[str, Any]) -> str:
     target = image if view.image is None else view.image
     shown = comparison(shrink(target, LARGEST), shrink(image, LARGEST))
-    return picture(png_of(shown), f"{view.name} ({quality['split']}): {quality['psnr']:.2f} dB")
+    return picture(png_of(shown), f"{view.name} ({quality['split']}): {_quality_text(quality)}")
+
+
+def _quality_text(quality: Mapping[str, Any]) -> str:
+    """PSNR and SSIM, and the exposure and offset that a held-out picture was compared with."""
+    text = f"{quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f}"
+    for key in ("exposure", "offset"):
+        if f"fitted_{key}" in quality:
+            values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
+            text += f", {key} {values} fitted to it"
+    return text
 
 
 def _view_table(findings: Findings) -> str:
@@ -138,9 +149,9 @@ def _view_table(findings: Findings) -> str:
         height, width = view.camera.size
         split = "test" if view.is_test else "train"
         quality = findings.quality.get(view.name)
-        decibels = f"{quality['psnr']:.2f}" if quality else ""
-        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", decibels))
-    return table(["view", "split", "pixels", "weight", "PSNR [dB]"], rows)
+        told = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
+        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *told))
+    return table(["view", "split", "pixels", "weight", "PSNR [dB]", "SSIM"], rows)
 
 
 def _left_out(summary: Mapping[str, Any]) -> str:

@@ -17,13 +17,13 @@ from ddrecon.io.files.atomic import refusals, remove_temporaries
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
-from ddrecon.losses import psnr
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
-from ddrecon.renderer import LightField, solve_light, view_picture
+from ddrecon.renderer import LightField, solve_light
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.loss_log import LossLog
+from ddrecon.run.quality import compared_by, render_views
 from ddrecon.run.report import Findings, write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
@@ -103,7 +103,8 @@ class RunFolder:
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
         scene = run.current_scene()
-        self._pictures(scene, _render(scene, _solve(scene)), f"_{run.iteration:06d}")
+        images, _ = render_views(run, scene, _solve(scene))
+        self._pictures(scene, images, f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
@@ -114,8 +115,8 @@ class RunFolder:
         write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         light_field = _solve(scene)
-        images = _render(scene, light_field)
-        quality = self._pictures(scene, images, "")
+        images, quality = render_views(run, scene, light_field)
+        self._pictures(scene, images, "")
         summary = _summary(run) | {"views": quality}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
@@ -169,36 +170,21 @@ class RunFolder:
         write_linear(self.path / name, colors)
         return f"{name}.npy"
 
-    def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> dict[str, Any]:
-        """The split and PSNR of each view with a target; writes pictures of views and fields."""
-        folder, quality = self.path / "previews", {}
+    def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> None:
+        """Writes pictures of views and fields."""
+        folder = self.path / "previews"
         for name in FIELDS:
             if (value := value_of(scene, name)).ndim >= 3:
                 write_preview(folder / f"{name}.slices{mark}.png", slices(value))
         for view in scene.views:
             if view.image is not None:
-                image = images[view.name]
-                write_preview(folder / f"{view.name}{mark}.png", comparison(view.image, image))
-                quality[view.name] = {
-                    "split": "test" if view.is_test else "train",
-                    "psnr": psnr(image, view.image, view.mask),
-                }
-        return quality
+                shown = comparison(view.image, images[view.name])
+                write_preview(folder / f"{view.name}{mark}.png", shown)
 
 
 def _solve(scene: Scene) -> LightField:
     with torch.no_grad():
         return solve_light(scene, SolveMemory())
-
-
-def _render(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
-    """The images of the views that have a target, by name."""
-    with torch.no_grad():
-        return {
-            view.name: view_picture(light_field, scene, view)
-            for view in scene.views
-            if view.image is not None
-        }
 
 
 def _plain(value: Tensor) -> Any:
@@ -208,7 +194,7 @@ def _plain(value: Tensor) -> Any:
 
 def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
-    summary = {"iterations": total.pop("iteration"), **total}
+    summary = {"iterations": total.pop("iteration"), **total} | compared_by(run)
     support = describe_support(run.support, run.scene.volume.grid)
     if support is not None:
         summary["support"] = support

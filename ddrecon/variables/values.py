@@ -187,10 +187,10 @@ def _view_value(view: View, part: str) -> Tensor:
 
 def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
     names = {part: f"views.{view.name}.{part}" for part in _view_parts(view)}
-    given = {part: values[name] for part, name in names.items() if name in values}
+    given: dict[str, Any] = {p: values[name] for p, name in names.items() if name in values}
     if not given:
         return view
-    response: dict[str, Any] = {part: given.pop(part) for part in RESPONSE if part in given}
+    response = {part: given.pop(part) for part in RESPONSE if part in given}
     camera = view.camera
     if "camera" in given:
         camera = twist(camera, given.pop("camera"), scene.volume.grid.center_xyz)
