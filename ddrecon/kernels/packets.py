@@ -55,6 +55,7 @@ struct P {{
     INLINE bool every(M is) {{ return is; }}
     INLINE F lane(V x, int) {{ return x; }}
     INLINE double lane_of(W x, int) {{ return x; }}
+    INLINE int lane_of(I x, int) {{ return x; }}
     INLINE W load_wide(const double* p, int first, int) {{ return p[first]; }}
     INLINE void put(V& x, int, F value) {{ x = value; }}
     INLINE V gather(const F* p, I at) {{ return p[at]; }}
@@ -71,6 +72,7 @@ struct P {{
     INLINE bool every(M is) {{ return __builtin_reduce_and(is) != 0; }}
     INLINE F lane(V x, int l) {{ return x[l]; }}
     INLINE double lane_of(W x, int l) {{ return x[l]; }}
+    INLINE int lane_of(I x, int l) {{ return x[l]; }}
     INLINE W load_wide(const double* p, int first, int last) {{
         W x;
         for (int l = 0; l < LANES; ++l) x[l] = p[first + l < last ? first + l : last];

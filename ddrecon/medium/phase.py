@@ -1,9 +1,9 @@
 """Phase functions: how likely light is scattered by which angle.
 
 They are normalized to 4 pi over the sphere, as in docs/theory.md E2. A phase function is known by
-its Legendre moments chi_l, the mean of P_l(cosine) over scattered light: chi_0 = 1, and chi_1 is
-the mean cosine g. Its numbers may differ by color; what is computed from them has the color as
-first axis, of size 1 where all colors share one phase function.
+its Legendre moments chi_l (E22), the mean of P_l(cosine) over scattered light: chi_0 = 1, and
+chi_1 is the mean cosine g. Its numbers may differ by color; what is computed from them has the
+color as first axis, of size 1 where all colors share one phase function.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class Draine(PhaseFunction):
         return henyey_greenstein(cosine, g) * (1 + alpha * cosine * cosine) / norm
 
     def moments(self, count: int) -> Tensor:
-        # w^2 P_l is a sum of P_(l+2), P_l and P_(l-2): two steps of Legendre's recurrence.
+        # E23: w^2 P_l is a sum of P_(l+2), P_l and P_(l-2), by two steps of Legendre's recurrence.
         degree = torch.arange(count, dtype=self.g.dtype, device=self.g.device)
         above = (degree + 1) * (degree + 2) / ((2 * degree + 1) * (2 * degree + 3))
         same = (2 * degree * (degree + 1) - 1) / ((2 * degree - 1) * (2 * degree + 3))

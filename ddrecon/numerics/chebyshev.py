@@ -1,4 +1,4 @@
-"""Functions of a depth from 0 to infinity, as polynomials in x = (depth - s) / (depth + s).
+"""Functions of a depth from 0 to infinity, as polynomials (E25) in x = (depth - s) / (depth + s).
 
 They take a few products where a closed form takes many. By interpolation at Chebyshev's extrema
 (Trefethen 2019, Approximation Theory and Approximation Practice, chapter 2,

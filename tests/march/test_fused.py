@@ -229,8 +229,8 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 def kernels_for(architecture: int) -> list:
     """Some of all kernels: no text depends on the architecture, and each takes seconds."""
     one, several = (
-        Layout(1, 1, 1, (False, True), 0, 0, 32),
-        Layout(3, 3, 3, (False, True), 3, 3, 64),
+        Layout(1, 1, 1, (False, True), 0, 0, 1, 32),
+        Layout(3, 3, 3, (False, True), 3, 3, 3, 64),
     )
     if architecture == 80:
         walks = [tangent_kernel(one, True), adjoint_kernel(one, True, True)]

@@ -152,9 +152,9 @@ def _transpose_packets(
     given = _packets(cells, (rays, angles, coefficients, numbers, table), fields)
     given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
     made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar}
-    tables = [torch.zeros_like(table) if needs_table else None for _ in shares]
+    tables = [torch.zeros_like(table if needs_table else table[:0]) for _ in shares]
     own = [
-        {"bars": _channels(share, fields), "table_bar": table_bar}
+        {"bars": _channels(share, fields), "table_bar": table_bar if needs_table else None}
         for share, table_bar in zip(shares, tables, strict=True)
     ]
     packet_adjoint_kernel(layout).launch(packets, given, made, shares=own)

@@ -53,19 +53,18 @@ constexpr int STEPS = {STEPS};
 struct Point {{
     // Light from a point whose foot is at -`foot` on a ray, `across` the square of its distance.
     // Its angle lies between two of the table of p: the first of four rows, and what they count.
-    int row[LANES];
+    I row;
     V weights[4];
     INLINE Point at(V foot, V across, V t) {{
         Point point;
         const V apart = P::root(across), away = -(foot + t);
-        V u;
-        for (int l = 0; l < LANES; ++l) {{
-            const F place = wp::atan2(P::lane(apart, l), P::lane(away, l)) * F({STEPS / math.pi!r});
-            int first = (int)place;
-            first = first < 0 ? 0 : (first > STEPS - 1 ? STEPS - 1 : first);
-            point.row[l] = 2 * first;
-            P::put(u, l, place - F(first));
-        }}
+        V place = P::all(F(0));
+        for (int l = 0; l < LANES; ++l)
+            P::put(place, l, wp::atan2(P::lane(apart, l), P::lane(away, l)));
+        place *= F({STEPS / math.pi!r});
+        const V first = P::real(P::whole(P::least(place, P::all(F(STEPS - 1)))));
+        const V u = place - first;
+        point.row = 2 * P::whole(first);
         const V rest = F(1) - u, h = P::all(F({math.pi / STEPS!r}));
         point.weights[0] = (F(1) + u + u) * rest * rest;
         point.weights[1] = h * u * rest * rest;
@@ -75,13 +74,12 @@ struct Point {{
     }}
     // The coefficients of p over the depth of the peak; `table` is that of the color.
     INLINE void curve(const Point& point, const F* table, V* out) {{
-        for (int l = 0; l < LANES; ++l) {{
-            const F* const rows = table + (long long)point.row[l] * TERMS;
-            F lane[4];
-            for (int j = 0; j < 4; ++j) lane[j] = P::lane(point.weights[j], l);
-            for (int k = 0; k < TERMS; ++k)
-                P::put(out[k], l, lane[0] * rows[k] + lane[1] * rows[TERMS + k]
-                    + lane[2] * rows[2 * TERMS + k] + lane[3] * rows[3 * TERMS + k]);
+        const I at = point.row * TERMS;
+        for (int k = 0; k < TERMS; ++k) {{
+            V total = point.weights[0] * P::gather(table + k, at);
+            for (int j = 1; j < 4; ++j)
+                total += point.weights[j] * P::gather(table + j * TERMS + k, at);
+            out[k] = total;
         }}
     }}
     // What bars of these are for the table.
@@ -89,7 +87,7 @@ struct Point {{
         for (int l = 0; l < LANES; ++l)
             for (int j = 0; j < 4; ++j)
                 for (int k = 0; k < TERMS; ++k) {{
-                    F* const at = table_bar + (long long)(point.row[l] + j) * TERMS + k;
+                    F* const at = table_bar + (P::lane_of(point.row, l) + j) * TERMS + k;
                     const F more = P::lane(point.weights[j], l) * P::lane(bar[k], l);
 #if defined(__CUDA_ARCH__)
                     atomicAdd(at, more);

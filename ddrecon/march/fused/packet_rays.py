@@ -25,7 +25,8 @@ struct Ray {
     V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * PHASES * COEFFICIENTS + 1];
 };
 // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at
-// and `t` held in the box; values; emission, depth, exp(-depth), and p.
+// and `t` held in the box; values; emission, depth, exp(-depth), and p; of light from points their
+// angle, and the coefficients of p over the depth of the peak.
 struct Node {
     Place y, x;
     Corners q;
@@ -35,6 +36,8 @@ struct Node {
     Run run[LANES];
 #endif
     V s, t, v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
+    Point point[BEAMS + 1];
+    V curve[BEAMS * PHASES * TERMS + 1];
 };
 """
 _BEGIN = """
@@ -167,11 +170,10 @@ auto peak_of = [&](const Node& node, int c) -> V {
     return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
 };
 auto first_of = [&](int b, int c) -> int { return (b * PHASES + c * PHASE_STEP) * COEFFICIENTS; };
-// Of p of beam b in color c: coefficients over the depth of the peak, in `own` where at a point.
-auto curve_of = [&](int b, int c, const Point& point, V* own) -> const V* {
+// Of p of beam b in color c: coefficients over the depth of the peak.
+auto curve_of = [&](const Node& node, int b, int c) -> const V* {
     if (!IS_POINT[b]) return ray.coefficients + first_of(b, c);
-    if (c == 0 || PHASE_STEP) Point::curve(point, table + c * PHASE_STEP * TABLE_STEP, own);
-    return own;
+    return node.curve + (b * PHASES + c * PHASE_STEP) * TERMS;
 };
 // All else at node n: all outputs' emission, depth and p behind the mass `m`.
 auto emit = [&](int n, Node& node, const W* m) {
@@ -187,9 +189,12 @@ auto emit = [&](int n, Node& node, const W* m) {
         node.u[c] = scale[c] * P::narrow(m[c * MASS_STEP]);
     }
     for (int b = 0; b < BEAMS; ++b) {
-        V own[TERMS];
-        Point point;
-        if (IS_POINT[b]) point = Point::at(ray.foot[b], ray.across[b], node.t);
+        if (IS_POINT[b]) {
+            node.point[b] = Point::at(ray.foot[b], ray.across[b], node.t);
+            for (int h = 0; h < PHASES; ++h)
+                Point::curve(node.point[b], table + h * TABLE_STEP,
+                             node.curve + (b * PHASES + h) * TERMS);
+        }
         for (int c = 0; c < C; ++c) {
             const int i = C + b * C + c;
             const V mass = P::narrow(m[c * MASS_STEP]);
@@ -198,10 +203,10 @@ auto emit = [&](int n, Node& node, const W* m) {
             V p = P::all(F(1));
             if (HAS_PEAK) {
                 const V place = Polynomial::place(peak_of(node, c) * way);
-                p = Polynomial::at(curve_of(b, c, point, own), place);
+                p = Polynomial::at(curve_of(node, b, c), place);
                 p = P::most(p, P::all(F(0)));
             } else if (IS_POINT[b]) {
-                p = curve_of(b, c, point, own)[0];
+                p = curve_of(node, b, c)[0];
             }
             node.p[i] = p;
             node.w[i] = scattering * p;

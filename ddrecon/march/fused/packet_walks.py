@@ -79,10 +79,6 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
         scale_bar[c] += u_bar[c] * mass;
     }
     for (int b = 0; b < BEAMS; ++b) {
-        V own[TERMS];
-        Point point;
-        if (IS_POINT[b] && !node.is_empty)
-            point = Point::at(ray.foot[b], ray.across[b], node.t);
         for (int c = 0; c < C; ++c) {
             const int k = c * MASS_STEP, s = FIRST_SCATTERING + c * SCATTERING_STEP;
             const V mass = P::narrow(m_b[k]), scattering = node.v[s];
@@ -98,14 +94,14 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
                 const V place = Polynomial::place(HAS_PEAK ? peak_of(node, c) * way : none);
                 V power = HAS_PEAK ? P::pick(node.p[i] > none, p_bar, none) : p_bar;
                 if (HAS_PEAK)
-                    depth_bar = power * Polynomial::slope(curve_of(b, c, point, own), place);
+                    depth_bar = power * Polynomial::slope(curve_of(node, b, c), place);
                 V powers[TERMS];
                 for (int k = 0; k < TERMS; ++k) {
                     powers[k] = power;
                     power *= place;
                 }
                 if (IS_POINT[b] && table_bar)
-                    Point::spread(point, table_bar + c * PHASE_STEP * TABLE_STEP, powers);
+                    Point::spread(node.point[b], table_bar + c * PHASE_STEP * TABLE_STEP, powers);
                 if (!IS_POINT[b] && varies_polynomials)
                     for (int k = 0; k < TERMS; ++k)
                         polynomial_bar[first_of(b, c) + k] += powers[k];
