@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import click
 
-from ddrecon.cli.command import show_version
 from ddrecon.cli.file_commands import export, info
 from ddrecon.cli.scene_commands import check, optimize, render
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
+from ddrecon.cli.version import show_version
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
