@@ -128,7 +128,9 @@ def require_variation(scene: Scene, parameter: str) -> None:
     except KeyError as error:
         names = variable_names(scene)
         parts = [
-            f"{name}.{part}" for name in names for part in component_names(name, value_of(scene, name))
+            f"{name}.{part}"
+            for name in names
+            for part in component_names(name, value_of(scene, name))
         ]
         guess = "" if parameter in names else suggestion(parameter, [*names, *parts])
         raise UsageError(f"--gradient {parameter}: {error.args[0]}{guess}") from None
