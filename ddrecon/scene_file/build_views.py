@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,7 +18,10 @@ from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import CameraSection, PerspectiveSection
-from ddrecon.scene_file.sight import explain_blindness, sees_box
+from ddrecon.scene_file.sight import explain_blindness, explain_direction, sees_box
+
+NAMED = 4
+"""Views that a line about several names."""
 
 
 def build_views(
@@ -26,17 +31,51 @@ def build_views(
 
     Where `grid` is known, cameras must see it. Raises SceneError or FormatError.
     """
-    problems, views = Problems(), []
+    problems, cameras, views = Problems(), dict[int, Camera](), []
     for index in range(len(scene_file.tree.views)):
         with problems.collecting():
-            views.append(_build_view(scene_file, index, grid, dtype, device))
+            views.append(_build_view(scene_file, index, cameras, dtype, device))
+    if grid is not None:
+        with problems.collecting():
+            _require_sight(scene_file, cameras, grid)
     problems.raise_any()
     return views
 
 
+def _require_sight(scene_file: SceneFile, cameras: Mapping[int, Camera], grid: Grid) -> None:
+    """Raises SceneError where some of `cameras`, by the place of their view, do not see the box.
+
+    They share a line, since they mostly share a cause.
+    """
+    seeing = {index: sees_box(camera, grid) for index, camera in cameras.items()}
+    blind = [index for index, sees in seeing.items() if not sees]
+    if not blind:
+        return
+    views = scene_file.tree.views
+    by_matrix = [index for index in cameras if views[index].camera.matrix is not None]
+    others = [cameras[index] for index in by_matrix if seeing[index]]
+    explain = explain_direction
+    if set(blind) <= set(by_matrix):
+        explain = partial(explain_blindness, others=others)
+    names = [repr(views[index].name) for index in blind]
+    which = f"view {names[0]}"
+    if len(names) > 1:
+        rest = ", ..." if len(names) > NAMED else ""
+        which = f"{len(names)} of {len(views)} views ({', '.join(names[:NAMED])}{rest})"
+    cause = explain([cameras[index] for index in blind], grid=grid)
+    raise scene_file.refused(
+        f"views.{blind[0]}.camera", f"no pixel of {which} looks through the volume; {cause}"
+    )
+
+
 def _build_view(
-    scene_file: SceneFile, index: int, grid: Grid | None, dtype: torch.dtype, device: torch.device
+    scene_file: SceneFile,
+    index: int,
+    cameras: dict[int, Camera],
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> View:
+    """The view number `index`; its camera, on the CPU, is put into `cameras`."""
     key, section, problems = f"views.{index}", scene_file.tree.views[index], Problems()
     image = mask = None
     if section.image is not None:
@@ -61,12 +100,7 @@ def _build_view(
     if size is not None:
         with problems.collecting():
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
-            if grid is not None and not sees_box(camera, grid):
-                raise scene_file.refused(
-                    f"{key}.camera",
-                    f"no pixel of view {section.name!r} looks through the volume;"
-                    f" {explain_blindness(camera, grid)}",
-                )
+            cameras[index] = camera
     problems.raise_any()
     camera = replace(camera, pose=camera.pose.to(device, dtype))
     return View(section.name, camera, image, mask, section.split == "test", section.weight)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
-from ddrecon.scene_file.sight import sees_box
+from ddrecon.scene_file.sight import explain_blindness, sees_box
 
 GRID = Grid.from_xyz(
     (1, 1, 1), (-1, -2, -3), (1, 2, 3)
@@ -81,3 +81,45 @@ def test_one_pixel_suffices():
         torch.tensor([0.0, 1.0, 0.0]),
     )
     assert sees_box(Camera(pose, (1, 501), 0.15), GRID)
+
+
+def given_as(pose: torch.Tensor, is_inverse: bool, is_opencv: bool) -> torch.Tensor:
+    """The camera to world matrix `pose` [3, 4], with OpenGL axes, in another convention."""
+    matrix = torch.cat([pose, torch.tensor([[0.0, 0, 0, 1]])])
+    matrix = matrix @ torch.diag(torch.tensor([1.0, -1, -1, 1])) if is_opencv else matrix
+    return (torch.linalg.inv(matrix) if is_inverse else matrix)[:3]
+
+
+@pytest.mark.parametrize(
+    ("is_inverse", "is_opencv", "words"),
+    [
+        (False, True, "in OpenCV's axes (y down, z forward), ours in OpenGL's: negate"),
+        (True, False, "world to camera, ours camera to world: invert each"),
+        (True, True, "world to camera in OpenCV's axes, as COLMAP has them"),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 7])
+def test_the_convention_of_matrices_is_found(
+    is_inverse: bool, is_opencv: bool, words: str, count: int
+) -> None:
+    """Also where some happen to see the box as they stand."""
+    middle, up = torch.tensor([0.3, 0.1, -0.2]), torch.tensor([0.0, 1.0, 0.0])
+    angles = torch.linspace(0.4, 6, 7)[:count]
+    poses = [
+        look_at(middle + 9 * torch.tensor([float(a.cos()), 0.4, float(a.sin())]), middle, up)
+        for a in angles
+    ]
+    cameras = [Camera(given_as(pose, is_inverse, is_opencv), (9, 12), 0.3) for pose in poses]
+    blind = [camera for camera in cameras if not sees_box(camera, GRID)]
+    seeing = [camera for camera in cameras if sees_box(camera, GRID)]
+    assert blind and explain_blindness(blind, seeing, GRID).startswith(f"the matrices are {words}")
+
+
+def test_no_cure_is_made_up() -> None:
+    """Where the box is elsewhere, as with bounds in another unit, no convention helps."""
+    up = torch.tensor([0.0, 1.0, 0.0])
+    poses = [
+        look_at(torch.tensor([x, 0.0, 90.0]), torch.tensor([x, 0.0, 0.0]), up) for x in (50, 70)
+    ]
+    line = explain_blindness([Camera(pose, (9, 12), 0.1) for pose in poses], [], GRID)
+    assert "check volume.bounds" in line and "looked past" in line

@@ -235,7 +235,7 @@ def test_what_is_no_pinhole_is_refused_by_key(
         ),
         (
             [frame(transform_matrix=[[2 * x for x in row] for row in POSE[:3]] + POSE[3:])],
-            "frames.0.transform_matrix: must be rigid",
+            "frames.0.transform_matrix: its last row",
         ),
         ([{"file_path": "a.png"}], "frames.0: missing key 'transform_matrix'"),
         ([frame(), 3], "frames.1: expected a mapping, found 3"),
@@ -360,3 +360,15 @@ def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="there is no folder"):
         export_transforms(scene, scene_file, tmp_path / "none/t.json", may_exist=False)
     assert (tmp_path / "t.json").read_text() == "mine"
+
+
+def test_what_is_wrong_with_every_frame_is_told_once(refusal: Refusal, tmp_path: Path) -> None:
+    """Ten poses that are scaled are one line; two, or other faults between them, are not."""
+    wrong = (2 * np.array(POSE)).tolist()
+    frames = [frame(None, transform_matrix=wrong) for _ in range(10)]
+    transforms(tmp_path / "t.json", *frames, frame(None, transform_matrix=3), **NERFSTUDIO)
+    lines = refusal(changed(views={"transforms": "t.json"}))
+    assert len(lines) == 2 and "frames.0.transform_matrix: its last row" in lines[0]
+    assert lines[0].endswith("(9 more like this)") and "frames.10.transform_matrix: exp" in lines[1]
+    transforms(tmp_path / "t.json", *frames[:2], **NERFSTUDIO)
+    assert len(refusal(changed(views={"transforms": "t.json"}))) == 2
