@@ -9,6 +9,7 @@ import torch
 from ddrecon.engine import engine_of_parts
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.scene import Scene, View
+from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.terms import needed_terms
 from ddrecon.variables.values import with_values
 
@@ -38,6 +39,8 @@ def memory_estimate(scene: Scene) -> int:
 def describe(scene: Scene) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
+    And what can hardly be meant.
+
     Its parameters are where they start.
     """
     scene = with_values(scene, scene.starts)
@@ -53,6 +56,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
         "engine": engine_of_parts(_parts_in_torch(scene)),
         "memory_bytes": memory_estimate(scene),
+        "doubts": find_doubts(scene),
     }
 
 
@@ -70,6 +74,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"optimizes: {', '.join(parameters) or 'nothing'}",
         f"engine: {_name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
+        *(f"doubtful: {doubt}" for doubt in report["doubts"]),
     ]
 
 

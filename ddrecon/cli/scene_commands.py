@@ -5,12 +5,14 @@ torch is imported inside the commands, so that `--help` answers at once.
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from ddrecon.cli.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, SCENE, in_session
+from ddrecon.errors import DataWarning
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -148,6 +150,7 @@ def optimize(
     """Reconstruct what SCENE asks for from its views' images."""
     from ddrecon.run.drive import drive_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
+    from ddrecon.scene_file.doubts import find_doubts
 
     if has_events:
         require_tensorboard()
@@ -155,6 +158,8 @@ def optimize(
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
+    for doubt in find_doubts(built):
+        warnings.warn(doubt, DataWarning, 2)
     with open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
         run,
         folder,
