@@ -42,7 +42,7 @@ import sys, torch
 from pathlib import Path
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.renderer import solve_light
-from ddrecon.scene.build import load_scene
+from ddrecon.scene_file.build import load_scene
 scene = load_scene(Path(sys.argv[1]))
 density = scene.volume.density.requires_grad_()
 torch.autograd.grad(solve_light(scene, SolveMemory()).outgoing.mean.sum(), density)
