@@ -22,8 +22,9 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import LightField, solve_light, view_image
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
+from ddrecon.run.findings import Findings, given_fields
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.report import Findings, write_run_report
+from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
@@ -119,8 +120,9 @@ class RunFolder:
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
         log, environment = self.log.rows(), self.environment
+        given = given_fields(run.scene)
         findings = Findings(
-            scene, light_field, images, quality, log, summary, environment, settings
+            scene, given, light_field, images, quality, log, summary, environment, settings
         )
         write_run_report(self.path / "report.html", findings)
         return summary
