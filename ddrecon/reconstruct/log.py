@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 class Row:
     """One iteration. PSNRs [dB] are means over views; `test_psnr` is None where none was rendered.
 
+    `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
     `seconds` count from the start of the run; `cells` are those of the grid.
     """
 
@@ -21,9 +22,11 @@ class Row:
     forward_iterations: int
     adjoint_iterations: int
     cells: int
+    data_loss: float
+    penalty: float
 
 
-NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0)
+NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 """The sum of no rows."""
 
 

@@ -146,6 +146,8 @@ class Reconstruction:
             iteration=self.iteration + 1,
             seconds=self.total.seconds + perf_counter() - start,
             loss=numbers.loss,
+            data_loss=numbers.of_images,
+            penalty=numbers.loss - numbers.of_images,
             psnr=numbers.psnr,
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),

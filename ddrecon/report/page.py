@@ -73,6 +73,11 @@ def items(lines: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
+def warnings(lines: Sequence[str]) -> str:
+    """A list of `lines` that is not overlooked."""
+    return f'<div class="doubts">{items(lines)}</div>'
+
+
 def side_by_side(*parts: str) -> str:
     """The `parts` two in a row where there is room, else below each other."""
     return f'<div class="row">{"".join(f"<div>{part}</div>" for part in parts)}</div>'

@@ -105,6 +105,7 @@ def drive_run(
                 folder.save_in_time(run)
                 row = run.step()
                 folder.log.add(row)
+                folder.late.note(run)
                 if events is not None:
                     events.log(row)
                 bar.set_postfix_str(progress_text(run.total, row), refresh=False)
@@ -161,4 +162,5 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     )
     if summary["test_psnr"] is not None:
         line += f", test PSNR {summary['test_psnr']:.2f} dB"
-    return [line, f"density and all else written to {folder}"]
+    diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
+    return [line, *diagnoses, f"density and all else written to {folder}"]

@@ -9,7 +9,16 @@ from typing import Any
 
 from ddrecon.reconstruct.log import Row
 from ddrecon.report.curve import draw_curve
-from ddrecon.report.page import fold, items, paragraph, section, side_by_side, table, write_page
+from ddrecon.report.page import (
+    fold,
+    items,
+    paragraph,
+    section,
+    side_by_side,
+    table,
+    warnings,
+    write_page,
+)
 from ddrecon.run.findings import Findings
 from ddrecon.run.report_views import view_section
 from ddrecon.run.report_volume import turntable, volume_section
@@ -30,7 +39,9 @@ def write_run_report(path: Path, findings: Findings) -> None:
     """Writes the report of `findings` to `path`."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     versions = [(key, _format(value)) for key, value in findings.environment.items()]
+    diagnoses = [diagnosis["text"] for diagnosis in findings.summary["diagnoses"]]
     sections = [
+        *([warnings(diagnoses)] if diagnoses else []),
         section("Volume", volume_section(findings)),
         section("Loss", side_by_side(*_curves(findings.rows))),
         section("Views", *view_section(findings)),
@@ -58,7 +69,10 @@ def _lead(findings: Findings) -> str:
 
 def _curves(rows: Sequence[Row]) -> list[str]:
     """Loss and PSNR by iteration."""
-    losses = {"": [(float(row.iteration), row.loss) for row in rows]}
+    losses = {
+        "images": [(float(row.iteration), row.data_loss) for row in rows],
+        "penalties": [(float(row.iteration), row.penalty) for row in rows],
+    }
     quality = {"seen": [(float(row.iteration), row.psnr) for row in rows]}
     tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
     if tests:

@@ -22,6 +22,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import LightField, solve_light, view_image
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
+from ddrecon.run.diagnoses import LateMeans, diagnose
 from ddrecon.run.findings import Findings, given_fields
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.report import write_run_report
@@ -62,6 +63,7 @@ class RunFolder:
             remove_temporaries(path)
         self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
         self.saved, self.next_save = -1, 0.0
+        self.late = LateMeans()
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run; those of an earlier run are removed."""
@@ -116,10 +118,12 @@ class RunFolder:
         light_field = _solve(scene)
         images = _render(scene, light_field)
         quality = self._pictures(scene, images, "")
-        summary = _summary(run) | {"views": quality}
+        log, environment = self.log.rows(), self.environment
+        diagnoses = diagnose(scene.views, images, quality, log, self.late.moved(run))
+        told = [vars(diagnosis) for diagnosis in diagnoses]
+        summary = _summary(run) | {"views": quality, "diagnoses": told}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
-        log, environment = self.log.rows(), self.environment
         given = given_fields(run.scene)
         findings = Findings(
             scene, given, light_field, images, quality, log, summary, environment, settings

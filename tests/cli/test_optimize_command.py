@@ -76,6 +76,9 @@ def test_the_log_has_a_row_an_iteration(succeed: Run) -> None:
     seconds = [float(row["seconds"]) for row in log]
     assert seconds == sorted(seconds) and seconds[0] > 0
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
+    for row in log:
+        parts = float(row["data_loss"]) + float(row["penalty"])
+        assert parts == pytest.approx(float(row["loss"]), rel=1e-6) and float(row["penalty"]) >= 0
     assert int(log[-1]["forward_iterations"]) > 0 and int(log[-1]["adjoint_iterations"]) > 0
     assert float(log[-1]["test_psnr"]) > 0
 
