@@ -5,7 +5,7 @@
     python benchmarks/accuracy.py order
 
 `cases`: anisotropy, volumes, lights and cameras, by the number of transport rounds. `convergence`:
-rounds, directions and cells together. `order`: transmittance and light scattered once against
+rounds, degrees and cells together. `order`: transmittance and light scattered once against
 closed forms, by size of cells. The others need Mitsuba 3 (extra `reference`).
 """
 
@@ -230,7 +230,7 @@ def row(cells: Iterable[object]) -> None:
     )
 
 
-def measure_cases(references: Path, only: str, pictures: Path | None, directions: int) -> None:
+def measure_cases(references: Path, only: str, pictures: Path | None, degree: int) -> None:
     """Prints, for every case, the errors by number of rounds."""
     row(["case", "noise", "single", *(f"n = {n}" for n in ROUNDS)])
     row(["---"] * (len(ROUNDS) + 3))
@@ -239,10 +239,7 @@ def measure_cases(references: Path, only: str, pictures: Path | None, directions
             continue
         whole = trace(case.scene(), references, noise=case.noise)
         once = trace(case.scene(), references, depth=2, noise=0.02)
-        found = {
-            n: image(case.scene(transport_rounds=n, transport_directions=directions))
-            for n in ROUNDS
-        }
+        found = {n: image(case.scene(transport_rounds=n, degree=degree)) for n in ROUNDS}
         single = once.error(scattered_once(case.scene()))
         errors = [_visible(whole.error(picture), whole.noise) for picture in found.values()]
         row([case.name, whole.noise, _visible(single, once.noise), *errors])
@@ -260,28 +257,25 @@ def _visible(error: float, noise: float) -> str:
 
 
 def measure_convergence(references: Path) -> None:
-    """Prints errors by cells, directions and rounds, against the path-traced image of the finest
+    """Prints errors by cells, degrees and rounds, against the path-traced image of the finest
     grid.
     """
     rounds = (0, 1, 2, 4, 8)
-    row(["case", "noise", "cells", "directions", *(f"n = {n}" for n in rounds)])
+    row(["case", "noise", "cells", "degree", *(f"n = {n}" for n in rounds)])
     row(["---"] * (4 + len(rounds)))
     for case in CONVERGING:
         whole = trace(case.scene(96), references, noise=case.noise, passes=96)
-        for cells, counts in {24: (26, 50, 86), 48: (26, 50, 86), 96: (50,)}.items():
-            diffusion = image(case.scene(cells))
-            for directions in counts:
-                scenes = (
-                    case.scene(cells, transport_rounds=n, transport_directions=directions)
-                    for n in rounds[1:]
-                )
+        for cells, degrees in {24: (3, 5, 7), 48: (3, 5, 7), 96: (5,)}.items():
+            diffusion = image(case.scene(cells, transport_rounds=0))
+            for degree in degrees:
+                scenes = (case.scene(cells, transport_rounds=n, degree=degree) for n in rounds[1:])
                 found = [diffusion, *(image(scene) for scene in scenes)]
                 row(
                     [
                         case.name,
                         whole.noise,
                         cells,
-                        directions,
+                        degree,
                         *(_visible(whole.error(item), whole.noise) for item in found),
                     ]
                 )
@@ -426,11 +420,11 @@ def main() -> None:
     parser.add_argument("--references", type=Path, default=Path("references"))
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--only", default="")
-    parser.add_argument("--directions", type=int, default=50)
+    parser.add_argument("--degree", type=int, default=3)
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.what == "cases":
-        measure_cases(given.references, given.only, given.pictures, given.directions)
+        measure_cases(given.references, given.only, given.pictures, given.degree)
     elif given.what == "convergence":
         measure_convergence(given.references)
     else:

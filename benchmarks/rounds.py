@@ -1,4 +1,4 @@
-"""How long a render of the plume takes by transport rounds and directions, relative to none in the
+"""How long a render of the plume takes by transport rounds and degrees, relative to none in the
 same run: docs/accuracy.md.
 
 python benchmarks/rounds.py [--repeat 3]
@@ -24,8 +24,8 @@ CASES = {
     "RGB": ["render.samples_per_pixel=1"],
     "RGB, 16 rays a pixel": ["render.samples_per_pixel=16"],
 }
-ROUNDS = ((0, 26), (1, 26), (2, 26), (4, 26), (1, 50), (2, 50))
-"""Rounds and directions."""
+ROUNDS = ((0, 3), (1, 3), (2, 3), (3, 3), (1, 5), (2, 5))
+"""Rounds and degrees."""
 
 
 def seconds(scene: Scene, repeat: int) -> float:
@@ -51,17 +51,15 @@ def main() -> None:
                 ROOT / "configs/plume.yaml",
                 overrides=[truth, "optimize.parameters.density={}", *overrides],
             )
-            for rounds, directions in ROUNDS:
-                settings = replace(
-                    scene.diffusion, transport_rounds=rounds, transport_directions=directions
-                )
-                times[rounds, directions].append(
+            for rounds, degree in ROUNDS:
+                settings = replace(scene.diffusion, transport_rounds=rounds, degree=degree)
+                times[rounds, degree].append(
                     seconds(replace(scene, diffusion=settings), arguments.repeat)
                 )
-    print(f"| n | directions | {' | '.join(CASES)} |\n|{'---|' * (2 + len(CASES))}")
-    for (rounds, directions), row in times.items():
+    print(f"| n | degree | {' | '.join(CASES)} |\n|{'---|' * (2 + len(CASES))}")
+    for (rounds, degree), row in times.items():
         ratios = (f"{found / base:.1f}" for found, base in zip(row, times[ROUNDS[0]], strict=True))
-        print(f"| {rounds} | {directions if rounds else '-'} | {' | '.join(ratios)} |")
+        print(f"| {rounds} | {degree if rounds else '-'} | {' | '.join(ratios)} |")
     print(
         "seconds at n = 0:",
         ", ".join(f"{name} {base:.2f}" for name, base in zip(CASES, times[ROUNDS[0]], strict=True)),

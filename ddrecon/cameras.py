@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid, Triple, array_order
+from ddrecon.lenses import distort, ray_through
 
 
 @dataclass(eq=False)
@@ -24,15 +25,25 @@ class Camera:
     origin). `size`: (height, width) in pixels. `is_perspective` chooses between perspective, whose
     horizontal field of view is `2 atan(half_width)`, and orthographic, whose image is `2
     half_width` world units wide. The axis meets the image at `principal_point`, as parts of its
-    width and height from the top left; `pixel_aspect` is the height of a pixel over its width.
+    width and height from the top left; `pixel_aspect` is the height of a pixel over its width. A
+    perspective camera's `lens` is that of `ddrecon.lenses` whose coefficients are `distortion`;
+    None is a pinhole. What is varied is a tensor: [] for `half_width`, [2] for `principal_point`.
     """
 
     pose: Tensor
     size: tuple[int, int]
-    half_width: float
+    half_width: float | Tensor
     is_perspective: bool = True
-    principal_point: tuple[float, float] = (0.5, 0.5)
+    principal_point: tuple[float, float] | Tensor = (0.5, 0.5)
     pixel_aspect: float = 1.0
+    lens: str | None = None
+    distortion: Tensor | None = None
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """All numbers that may be varied and are tensors, the pose first."""
+        others = self.half_width, self.principal_point, self.distortion
+        return [self.pose, *(other for other in others if isinstance(other, Tensor))]
 
     def resize(self, factor: int) -> Camera:
         """The same view with `factor` times fewer pixels along each side (at least one)."""
@@ -151,20 +162,63 @@ def cast_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Rays:
 
     `offset`: where they pass through their pixels, as parts of it (row, column).
     """
+    right, up, backward, origin = camera.pose.unbind(1)
+    x, y = image_places(camera, offset).unbind(1)
+    if not camera.is_perspective:
+        plane = x[:, None] * right - y[:, None] * up
+        return Rays(array_order(origin + plane), array_order((-backward).expand_as(plane)), None)
+    if camera.lens is None or camera.distortion is None:
+        way = x[:, None] * right - y[:, None] * up - backward
+    else:
+        seen = ray_through(camera.lens, camera.distortion, torch.stack([x, y], 1))
+        way = seen @ torch.stack([right, -up, -backward])
+    direction = array_order(torch.nn.functional.normalize(way, dim=-1))
+    eye = array_order(origin)
+    return Rays(eye.expand_as(direction), direction, eye)
+
+
+def image_places(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> Tensor:
+    """Where pixels lie in the plane one unit in front of a perspective camera, `[R, 2]`.
+
+    To the right and down; of an orthographic camera in its image plane, in world units. `offset` is
+    as for `cast_rays`.
+    """
     height, width = camera.size
-    pose, middle = camera.pose, camera.principal_point
+    like, middle = camera.pose, camera.principal_point
+    row, column = (
+        torch.arange(count, dtype=like.dtype, device=like.device) + part
+        for count, part in zip((height, width), offset, strict=True)
+    )
+    step = camera.half_width * 2 / width
+    y, x = torch.meshgrid(
+        (row - middle[1] * height) * (step * camera.pixel_aspect),
+        (column - middle[0] * width) * step,
+        indexing="ij",
+    )
+    return torch.stack([x, y], -1).view(-1, 2)
 
-    def line(count: int) -> Tensor:
-        return torch.arange(count, dtype=pose.dtype, device=pose.device)
 
-    # Places on the image plane one unit in front of the camera, to the right and up.
-    row = (line(height) + offset[0] - middle[1] * height) * (-2 * camera.pixel_aspect / width)
-    column = (line(width) + offset[1] - middle[0] * width) * (2 / width)
-    y, x = torch.meshgrid(row * camera.half_width, column * camera.half_width, indexing="ij")
-    right, up, backward, origin = pose.unbind(1)
-    plane = x.reshape(-1, 1) * right + y.reshape(-1, 1) * up
-    if camera.is_perspective:
-        direction = array_order(torch.nn.functional.normalize(plane - backward, dim=-1))
-        eye = array_order(origin)
-        return Rays(eye.expand_as(direction), direction, eye)
-    return Rays(array_order(origin + plane), array_order((-backward).expand_as(plane)), None)
+def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Where `points` [N, 3] (x, y, z) [u] are seen, `[N, 2]`, and how far away, `[N]`.
+
+    In columns and rows from the image's top left corner; NaN where they are not: behind a
+    perspective camera, or beyond the corners of its image, where distortion may have folded over.
+    """
+    right, up, backward, origin = camera.pose.detach().unbind(1)
+    away = points - origin
+    ray = torch.stack([away @ right, -(away @ up), -(away @ backward)], 1)
+    height, width = camera.size
+    if not camera.is_perspective:
+        places, is_seen = ray[:, :2], torch.ones_like(ray[:, 2], dtype=torch.bool)
+    else:
+        places = ray[:, :2] / ray[:, 2:]
+        if camera.lens is not None and camera.distortion is not None:
+            places = distort(camera.lens, camera.distortion.detach(), ray)
+        cosine = -(cast_rays(camera).direction.flip(1) @ backward)
+        is_seen = ray[:, 2] / away.norm(dim=1) >= cosine.min() - 1e-6
+    step = 2 * float(camera.half_width) / width
+    x, y = places.unbind(1)
+    column = x / step + float(camera.principal_point[0]) * width
+    row = y / (step * camera.pixel_aspect) + float(camera.principal_point[1]) * height
+    seen = torch.stack([column, row], 1)
+    return seen.where(is_seen[:, None], torch.nan), away.norm(dim=1)

@@ -19,6 +19,7 @@ EXTRAS = {
     "imageio_ffmpeg": "mp4",
     "tensorboard": "tensorboard",
     "warp": "fast",
+    "miepython": "mie",
 }
 """Which extra of ddrecon brings which package."""
 

@@ -9,6 +9,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.pictures.noise import Noise
+from ddrecon.pictures.scales import Scale, scale_of
+from ddrecon.pictures.similarity import structural_similarity
 
 ROUNDING = 1e-2
 """Gradients below this, in units of one over the box's shortest side, are penalized quadratically
@@ -21,90 +24,142 @@ HUBER = 0.05
 RELATIVE = 0.05
 """The same part, added to a pixel's target, keeps relative errors finite where targets are black.
 """
+WHITE = 1 - 1e-4
+"""A displayed target this bright says only that it is at least white."""
 
 
-def l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """The square of each entry of `error`; `scale` plays no part."""
+def l2(error: Tensor, target: Target) -> Tensor:
+    """The square of each entry of `error`."""
     return error**2
 
 
-def l1(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """The magnitude of `error` times `scale`: a radiance squared, as all losses are."""
-    return error.abs() * scale
+def l1(error: Tensor, target: Target) -> Tensor:
+    """The magnitude of `error` times the target's scale: a radiance squared, as in `l2`."""
+    return error.abs() * target.scale
 
 
-def huber(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """The square of `error` up to `HUBER` times `scale`, and a straight line beyond.
+def huber(error: Tensor, target: Target) -> Tensor:
+    """The square of `error` up to `HUBER` times the target's scale, and a straight line beyond.
 
     Huber 1964, doi:10.1214/aoms/1177703732.
     """
     return (
         2
         * torch.nn.functional.huber_loss(
-            error / scale, torch.zeros_like(error), reduction="none", delta=HUBER
+            error / target.scale, torch.zeros_like(error), reduction="none", delta=HUBER
         )
-        * scale**2
+        * target.scale**2
     )
 
 
-def relative_l2(error: Tensor, target: Tensor, scale: Tensor) -> Tensor:
+def relative_l2(error: Tensor, target: Target) -> Tensor:
     """The square of `error` over the target, so that dark pixels count as much as bright ones.
 
-    The quotient is multiplied by `scale`, and the target raised by `RELATIVE` of it.
+    The quotient is multiplied by the target's scale, and the target raised by `RELATIVE` of it.
     """
-    return (error / (target.abs() + RELATIVE * scale)) ** 2 * scale**2
+    return (error / (target.image.abs() + RELATIVE * target.scale)) ** 2 * target.scale**2
 
 
-LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+def display(error: Tensor, target: Target) -> Tensor:
+    """The square of `error` in displayed values, by the slope of sRGB at the target (E27).
+
+    So it is quadratic however far off an image is: the curve itself would be steep where an image
+    is still black, and flat where it is too bright. What is brighter than a target that is white
+    does not err.
+    """
+    error = torch.where(target.image >= WHITE, error.clamp(max=0), error)
+    return (error * target.slope) ** 2
+
+
+def photon(error: Tensor, target: Target) -> Tensor:
+    """The square of `error` in units of the noise at the target (E26)."""
+    return (error * target.slope) ** 2
+
+
+LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
     "l2": l2,
     "l1": l1,
     "huber": huber,
     "relative_l2": relative_l2,
+    "display": display,
+    "photon": photon,
 }
 
 
 @dataclass(frozen=True)
 class Target:
-    """What images are compared with: `image` [3, h, w] (linear radiance), and its measures.
+    """What images are compared with, `image` [3, h, w] (linear radiance), and how: by a `loss`.
 
     `seen` [h, w] is 1 where a pixel counts and 0 where it does not; None counts all. `count`: of
-    numbers that do; `scale`: the root of their mean square; `peak`: the largest value squared.
+    numbers that do; `scale`: the root of their mean square. `on` is the scale on which quality is
+    told, `compared` the image on it and `slope` its derivative there; `peak` is its largest value.
     """
 
+    loss: str
     image: Tensor
     seen: Tensor | None
     count: Tensor
     scale: Tensor
+    on: Scale
+    compared: Tensor
+    slope: Tensor
     peak: Tensor
 
     @staticmethod
-    def of(image: Tensor, mask: Tensor | None) -> Target:
-        """The target `image`, of which `mask` [h, w] is seen; None is all of it."""
+    def of(
+        image: Tensor, mask: Tensor | None, loss: str = "l2", noise: Noise | None = None
+    ) -> Target:
+        """The target `image`, of which `mask` [h, w] is seen; None is all of it.
+
+        `noise` is for the loss `photon`, estimated where it is None.
+        """
         tiny = torch.finfo(image.dtype).tiny
         if mask is None:
             count, square = image.new_full((), image[0].numel() * 3), image.square()
         else:
             count, square = (3 * mask.sum()).clamp(min=1), image.square() * mask
         scale = (square.sum() / count).sqrt().clamp(min=tiny**0.25)
-        return Target(image, mask, count, scale, image.max().clamp(min=tiny) ** 2)
+        on = scale_of(loss, image, noise)
+        compared = on.values(image)
+        peak = (
+            compared.max().clamp(min=tiny**0.25) if on.peak is None else scale.new_tensor(on.peak)
+        )
+        return Target(loss, image, mask, count, scale, on, compared, on.slope(image), peak)
 
-    def loss_of(self, loss: str, image: Tensor) -> Tensor:
-        """The mean of `loss` over the pixels and colors of `image` [3, h, w]."""
-        error = LOSSES[loss](image - self.image, self.image, self.scale)
-        return (error if self.seen is None else error * self.seen).sum() / self.count
+    def loss_of(self, image: Tensor) -> Tensor:
+        """The mean of the loss over the pixels and colors of `image` [3, h, w]."""
+        return self._mean(LOSSES[self.loss](image - self.image, self))
 
-    def psnr_of(self, square: Tensor) -> Tensor:
-        """The peak signal-to-noise ratio [dB] of a mean `square` of errors."""
-        tiny = torch.finfo(square.dtype).tiny
-        return 10 * torch.log10(self.peak / square.clamp(min=tiny))
+    @property
+    def power(self) -> Tensor:
+        """The mean square of the target as it is compared, the unit of the loss."""
+        return self._mean(self.compared.square())
+
+    def psnr_of(self, image: Tensor) -> Tensor:
+        """The peak signal-to-noise ratio [dB] of `image` [3, h, w], as it is compared."""
+        square = self._mean((self.on.values(image) - self.compared).square())
+        return 10 * torch.log10(self.peak**2 / square.clamp(min=torch.finfo(square.dtype).tiny))
+
+    def ssim_of(self, image: Tensor) -> Tensor:
+        """The structural similarity of `image` [3, h, w], as it is compared; at most 1."""
+        compared = self.on.values(image)
+        if self.seen is not None:
+            compared = torch.where(self.seen > 0, compared, self.compared)
+        return self._mean(structural_similarity(compared, self.compared, self.peak))
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """The mean of `values` [3, h, w] over the numbers that count."""
+        return (values if self.seen is None else values * self.seen).sum() / self.count
 
 
-def image_loss(loss: str, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+def image_loss(
+    loss: str, image: Tensor, target: Tensor, mask: Tensor | None, noise: Noise | None = None
+) -> Tensor:
     """The mean of `loss` over the pixels and colors of `image` [3, h, w] against `target`.
 
     Pixels where `mask` [h, w] is 0 do not count; None counts all.
     """
-    return Target.of(target, mask).loss_of(loss, image)
+    return Target.of(target, mask, loss, noise).loss_of(image)
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
@@ -112,8 +167,7 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
 
     The peak is the largest value of the target. Pixels where `mask` [h, w] is 0 do not count.
     """
-    known = Target.of(target, mask)
-    return float(known.psnr_of(known.loss_of("l2", image.detach())))
+    return float(Target.of(target, mask).psnr_of(image.detach()))
 
 
 def total_variation(field: Tensor, grid: Grid) -> Tensor:

@@ -28,6 +28,7 @@ from ddrecon.light.environment import environment_radiance
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
 from ddrecon.light.moments import Moments
 from ddrecon.light.outgoing import scatter_once_more, scatter_towards
+from ddrecon.light.pairs import TurnedBeam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import Sky, decompose_lights
@@ -36,6 +37,7 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
+from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, require_plain_autograd
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
@@ -48,13 +50,14 @@ class LightField:
 
     `beams` are those of directional and point lights (E2). `diffuse` is the other light, L0 and L1.
     `skies` are those whose light it lacks: they scatter by the exact phase function, into each
-    camera's rays anew.
+    camera's rays anew. `turned` is light that backward peaks have turned (E20).
     """
 
     medium: Medium
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Moments
     skies: tuple[Sky, ...] = ()
+    turned: tuple[TurnedBeam, ...] = ()
 
     @property
     def outgoing(self) -> Moments:
@@ -75,7 +78,7 @@ class Components:
 
 
 def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
-    """Images `[views, 3, h, w]` (linear radiance) of all views, or of the one named `view`.
+    """Pictures `[views, 3, h, w]` (linear) of all views, or of the one named `view`.
 
     Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume`
     and of its lights. `memory` carries the last solutions from one call to the next, as starting
@@ -91,9 +94,9 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
 
 def render_each(scene: Scene, views: Sequence[View], memory: SolveMemory) -> list[Tensor]:
-    """The images `[3, h, w]` of `views`, which may differ in size, in one light field."""
+    """The pictures `[3, h, w]` of `views`, which may differ in size, in one light field."""
     light_field = solve_light(scene, memory)
-    return [view_image(light_field, scene, view.camera) for view in views]
+    return [view_picture(light_field, scene, view) for view in views]
 
 
 def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
@@ -101,22 +104,23 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
 
     Reduced light alone where nothing scatters twice.
     """
-    medium = scale_medium(scene.volume)
+    medium = scale_medium(scene.volume, scene.diffusion.angles)
     if not multiply_scatters(medium, scene.diffusion):
         return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
     lights = decompose_lights(scene.lights)
-    reduced = reduced_light(medium, lights, medium.has_flux)
-    sky = sum_unscattered_sky(medium, lights, medium.has_flux)
+    has_pairs = scene.diffusion.transport_rounds > 0 and has_backward_peak(medium)
+    reduced = reduced_light(medium, lights, medium.degree, has_pairs)
+    sky = sum_unscattered_sky(medium, lights, medium.degree)
     source = reduced.source
     if sky is not None:
-        source = source.plus(sky.scaled(1.0, medium.mean_cosine))
+        source = source.plus(sky.weighted(remaining_moments(medium)))
     outside = ambient_radiance(lights, medium.g)
     # L0 and L1: E4 to E6.
     diffuse = solve_diffuse(medium, source, outside, scene.diffusion, memory)
     # Skies scatter by E3 as well; beams by E2 on each view ray.
     light = diffuse if sky is None else diffuse.plus(sky)
-    return LightField(medium, reduced.beams, light)
+    return LightField(medium, reduced.beams, light, turned=reduced.turned)
 
 
 def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightField:
@@ -125,14 +129,14 @@ def follow_unscattered_light(medium: Medium, lights: Sequence[Light]) -> LightFi
     Beams, and by quadrature over directions ambient light and skies.
     """
     parts = decompose_lights(lights)
-    beams = reduced_light(medium, parts, False).beams
+    beams = reduced_light(medium, parts, 0).beams
     skies = tuple(part for part in parts if isinstance(part, Sky))
     if any(isinstance(part, AmbientLight) for part in parts):
         skies = (*skies, ambient_sky(ambient_radiance(parts, medium.g)))
     nothing = Moments(torch.zeros_like(medium.extinction.value))
-    if medium.has_flux:
+    if medium.is_anisotropic:
         return LightField(medium, beams, nothing, skies)
-    sky = sum_unscattered_sky(medium, skies, has_flux=False)
+    sky = sum_unscattered_sky(medium, skies, 0)
     return LightField(medium, beams, nothing if sky is None else sky)
 
 
@@ -169,31 +173,51 @@ def solve_diffuse(
             medium, LIMITERS[settings.limiter], source, outside, solve, medium.has_flux
         )
     closure = Closure(settings.closure, medium.grid, settings.floor)
-    problem = DiffusionProblem(medium, closure, source, outside, medium.has_flux)
+    problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    return run_rounds(
-        problem, light, solve, settings.transport_rounds, settings.transport_directions
-    )
+    return run_rounds(problem, light, solve, settings.transport_rounds, settings.degree)
+
+
+def view_picture(
+    light_field: LightField, scene: Scene, view: View, derivatives: str = "all"
+) -> Tensor:
+    """The picture `[3, h, w]` that the camera of `view` takes: exposure times radiance, and offset.
+
+    A background of the view is what its picture shows where nothing is before it (E28).
+    `derivatives` is as in `view_image`.
+    """
+    exposure, offset, behind = view.exposure, view.offset, view.background
+    if behind is not None:
+        behind = behind if offset is None else behind - offset.view(-1, 1, 1)
+        behind = behind if exposure is None else behind / exposure.view(-1, 1, 1)
+    picture = view_image(light_field, scene, view.camera, derivatives, behind)
+    picture = picture if exposure is None else exposure.view(-1, 1, 1) * picture
+    return picture if offset is None else picture + offset.view(-1, 1, 1)
 
 
 def view_image(
-    light_field: LightField, scene: Scene, camera: Camera, derivatives: str = "all"
+    light_field: LightField,
+    scene: Scene,
+    camera: Camera,
+    derivatives: str = "all",
+    behind: Tensor | None = None,
 ) -> Tensor:
     """The image `[3, h, w]` of `camera`, averaged over `samples_per_pixel` rays a pixel (E1).
 
     `derivatives` says which radiance passes derivatives on: `all`, `single` (E2 of beams, and what
     is seen unscattered) or `diffusion` (E3, with the ambient light in it). The image is the same.
+    `behind` [C, h, w] is the radiance behind the volume, in place of that of lights.
     """
     if derivatives == "all":
         sight = look_through(camera, scene.volume.grid, scene.render)
-        return _image(_emission(light_field, sight.rays), scene, sight).unflatten(-1, camera.size)
+        image = _image(_emission(light_field, sight.rays), scene, sight, behind, camera.size)
+        return image.unflatten(-1, camera.size)
     nothing = Moments(torch.zeros_like(light_field.diffuse.mean[:1]))
-    single = replace(light_field, diffuse=nothing), scene
-    diffusion = replace(light_field, beams=(), skies=()), _without_background(scene)
-    varied, fixed = {"single": (single, diffusion), "diffusion": (diffusion, single)}[derivatives]
+    single = replace(light_field, diffuse=nothing, turned=()), scene, camera, "all", behind
+    diffusion = replace(light_field, beams=(), skies=()), _without_background(scene), camera
     with torch.no_grad():
-        rest = view_image(*fixed, camera).detach()
-    return view_image(*varied, camera) + rest
+        rest = (view_image(*diffusion) if derivatives == "single" else view_image(*single)).detach()
+    return (view_image(*single) if derivatives == "single" else view_image(*diffusion)) + rest
 
 
 def _without_background(scene: Scene) -> Scene:
@@ -214,9 +238,19 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     return Components(reduced, single, image - reduced - single)
 
 
-def _image(emission: Emission, scene: Scene, sight: Sight) -> Tensor:
-    """Radiance [3, pixels]: E1, averaged over the rays of each pixel."""
-    behind = _background(scene.lights, sight.rays) if scene.render.background else None
+def _image(
+    emission: Emission, scene: Scene, sight: Sight, given: Tensor | None, size: tuple[int, int]
+) -> Tensor:
+    """Radiance [3, pixels]: E1, averaged over the rays of each pixel.
+
+    Behind the volume is what is `given` [C, h, w] for an image of this `size`, else the lights.
+    """
+    behind = None
+    if given is not None:
+        pixels = given.expand(-1, *size).flatten(1)
+        behind = pixels.repeat(1, scene.render.samples_per_pixel)
+    elif scene.render.background:
+        behind = _background(scene.lights, sight.rays)
     radiance, clear = march(emission, sight, scene.render, behind)
     if behind is not None:
         radiance = radiance + clear * behind
@@ -228,7 +262,7 @@ def _image(emission: Emission, scene: Scene, sight: Sight) -> Tensor:
 def _emission(light_field: LightField, bundle: Rays) -> Emission:
     """What the medium sends towards the camera that `bundle` belongs to (E2, E3)."""
     medium = light_field.medium
-    diffuse = scatter_towards(medium, light_field.diffuse, bundle)
+    diffuse = scatter_towards(medium, light_field.diffuse, bundle, light_field.turned)
     if light_field.skies:
         towards = bundle.towards_eye(medium.grid)
         diffuse = diffuse + scatter_sky(medium, light_field.skies, towards)
@@ -238,7 +272,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.scattering,
         light_field.beams,
         diffuse,
-        medium.g,
+        medium.seen,
         medium.peak,
     )
 

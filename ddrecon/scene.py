@@ -15,6 +15,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
+from ddrecon.pictures.noise import Noise
 from ddrecon.settings import DiffusionSettings, RenderSettings
 
 if TYPE_CHECKING:
@@ -27,6 +28,10 @@ class View:
 
     `mask` [h, w] is 1 where a pixel counts and 0 where it is ignored; None counts all. Test views
     are never optimized on; `weight` > 0 is how much a training view counts.
+
+    What its camera does to radiance (E28): `exposure` > 0 and `offset`, [1] or [3], None for 1 and
+    0; `background` [C, h, w] or [C, 1, 1] is what the picture shows where the volume is empty, None
+    for the light behind it. `step` and `noise` say how the picture errs, see `ddrecon.pictures`.
     """
 
     name: str
@@ -35,11 +40,18 @@ class View:
     mask: Tensor | None = None
     is_test: bool = False
     weight: float = 1.0
+    exposure: Tensor | None = None
+    offset: Tensor | None = None
+    background: Tensor | None = None
+    step: float = 0.0
+    noise: Noise | None = None
 
 
 @dataclass(eq=False)
 class Scene:
     """A loaded scene.
+
+    `support` [z, y, x] is above 0 where density may be, if a file says so.
 
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
     optimized parameter starts from.
@@ -52,6 +64,7 @@ class Scene:
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
     starts: dict[str, Tensor] = field(default_factory=dict)
+    support: Tensor | None = None
     path: Path | None = None
 
     def view(self, name: str) -> View:

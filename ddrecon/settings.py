@@ -11,13 +11,13 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, ClassVar, TypedDict, Unpack
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR
 from ddrecon.diffusion.limiters import LIMITERS
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.losses import LOSSES
-from ddrecon.numerics.quadrature import DEGREES
 
 DERIVATIVES = ("all", "single", "diffusion")
 """Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the
@@ -83,10 +83,16 @@ class DiffusionSettings:
 
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
-    The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps along
-    `transport_directions` directions take P1 towards transport (docs/theory.md, section 5).
-    Left out, it becomes one where there can be any.
+    The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
+    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 5). Left out, there
+    is one where there can be any.
     """
+
+    RETIRED: ClassVar[Mapping[str, str]] = {
+        "transport_directions": "directions follow from diffusion.degree: write degree: 3 for 26, "
+        "5 for 50 or 7 for 86"
+    }
+    """Keys of old scene files, and what to write instead."""
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
     scheme: str = one_of("conservative", ("conservative", "printed"))
@@ -97,11 +103,16 @@ class DiffusionSettings:
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
     transport_rounds: int = optional(minimum=0, maximum=16)
-    transport_directions: int = one_of(26, DEGREES)
+    degree: int = one_of(3, DIRECTIONS)
 
     def __post_init__(self) -> None:
         if self.transport_rounds is None:
             object.__setattr__(self, "transport_rounds", int(self._can_have_rounds))
+
+    @property
+    def angles(self) -> int:
+        """The degree to which light's angles are kept: 1 by diffusion alone."""
+        return self.degree if self.transport_rounds else 1
 
     @property
     def _can_have_rounds(self) -> bool:
@@ -129,6 +140,13 @@ class FieldFile:
 Start = float | tuple[float, ...] | FieldFile
 """Where a parameter starts: the same number everywhere, a vector or color, or a file's values."""
 
+Weight = float | str
+"""A weight, or `auto`: it is found."""
+AUTO = "auto"
+Support = float | str | FieldFile
+"""Where medium may be: `masks`, the displayed value above which a pixel shows some, or a field."""
+MASKS = "masks"
+
 
 @dataclass(frozen=True)
 class ParameterSettings:
@@ -139,16 +157,21 @@ class ParameterSettings:
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
     always does). `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as
-    the whole brightness of the targets.
+    the whole brightness of the targets; `auto` finds the weight by leaving views out.
+
+    `support`: where density may be above 0, by what pictures show, widened by `support_margin`
+    pixels; None is anywhere.
     """
 
     init: Start | None = None
     lr: float | None = optional(above=0)
     min: float | None = None
     max: float | None = None
-    tv: float | None = optional(minimum=0)
+    tv: Weight | None = optional(minimum=0)
     l1: float = bounded(0.0, minimum=0)
     field: bool | None = None
+    support: Support | None = optional(minimum=0, below=1)
+    support_margin: float = bounded(2.0, minimum=0, maximum=1000)
 
     def problems(self) -> Iterator[Problem]:
         low = -math.inf if self.min is None else self.min
@@ -162,18 +185,35 @@ class ParameterSettings:
 
 
 @dataclass(frozen=True)
+class NoiseSettings:
+    """How pictures err: `read`, the standard deviation at black, and `shot`, variance by radiance.
+
+    Both are in units of a picture's linear values, of which 1 is white.
+    """
+
+    read: float = bounded(0.0, minimum=0)
+    shot: float = bounded(0.0, minimum=0)
+
+    def problems(self) -> Iterator[Problem]:
+        if self.read == self.shot == 0:
+            yield "read", "no noise at all; give read or shot, or leave noise out to estimate it"
+
+
+@dataclass(frozen=True)
 class OptimizeSettings:
     """What is optimized, and how.
 
     `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
     `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
     all. `derivatives`: which radiance passes derivatives on: all of it, that scattered once, or
-    that scattered more often.
+    that scattered more often. `loss`: None is what the kind of pictures deserves. `noise` is that
+    of all pictures that have none of their own, for the loss `photon`.
     """
 
     parameters: Mapping[str, ParameterSettings]
     iterations: int = bounded(300, minimum=1)
-    loss: str = one_of("l2", LOSSES)
+    loss: str | None = one_of(None, LOSSES)
+    noise: NoiseSettings | None = None
     views_per_iteration: int = bounded(3, minimum=0)
     derivatives: str = one_of("all", DERIVATIVES)
     refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
-from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.coefficients import Medium, scale_medium
+from ddrecon.medium.remaining import backward_fraction, has_backward_peak
+from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import multiply_scatters
 from ddrecon.scene import Scene
 from ddrecon.settings import DiffusionSettings
@@ -14,26 +17,60 @@ from ddrecon.settings import DiffusionSettings
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
-    medium, settings = scale_medium(scene.volume), scene.diffusion
+    settings = scene.diffusion
+    medium = scale_medium(scene.volume, settings.angles)
     colors = medium.extinction.scale.shape[0]
     is_diffuse = multiply_scatters(medium, settings)
     terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
     terms += _light_terms(scene.lights, is_diffuse)
     if not is_diffuse:
         return [*terms, "no multiple scattering: no diffusion solve"]
-    if bool(medium.g > 0):
-        terms.append("delta-Eddington scaling of the forward peak (g > 0)")
+    if bool((medium.forward_fraction > 0).any()):
+        terms.append(_peak_term(medium))
     terms.append(f"multiple scattering by {settings.model} diffusion, {_method(settings)}")
     if settings.transport_rounds:
-        terms.append(
-            f"{_count(settings.transport_rounds, 'transport round')} of sweeps along "
-            f"{settings.transport_directions} directions, each with a diffusion solve"
-        )
+        terms += _round_terms(medium, scene)
     else:
         terms.append("no transport rounds: diffusion alone")
-    has_fluxes = medium.has_flux
-    terms.append("fluxes Q1 and L1 (g is not 0)" if has_fluxes else "no fluxes Q1 and L1 (g = 0)")
+    return [*terms, _angle_term(medium)]
+
+
+def _round_terms(medium: Medium, scene: Scene) -> list[str]:
+    """Transport rounds, and the pairs of beams that they go with."""
+    settings = scene.diffusion
+    rounds = _count(settings.transport_rounds, "transport round")
+    directions = DIRECTIONS[settings.degree]
+    terms = [f"{rounds} of sweeps along {directions} directions, each with a diffusion solve"]
+    if has_backward_peak(medium) and _has_beams(scene.lights):
+        part = backward_fraction(medium).max().item()
+        terms.append(f"beams in pairs: a backward peak turns {part:.3g} of scattering back")
     return terms
+
+
+def _has_beams(lights: Sequence[Light]) -> bool:
+    """Whether a light is directional, or has suns that are."""
+    return any(
+        isinstance(light, DirectionalLight)
+        or (isinstance(light, EnvironmentLight) and count_suns(light)[0] > 0)
+        for light in lights
+    )
+
+
+def _angle_term(medium: Medium) -> str:
+    """What of light's direction is kept."""
+    if medium.degree == 0:
+        return "no fluxes Q1 and L1 (g = 0)"
+    if medium.degree == 1:
+        return "fluxes Q1 and L1 (g is not 0)"
+    moments = count_harmonics(medium.degree)
+    return f"angles to degree {medium.degree}: {moments} moments of light (g is not 0)"
+
+
+def _peak_term(medium: Medium) -> str:
+    """What part of scattering counts as not scattered."""
+    fractions = medium.forward_fraction.flatten().tolist()
+    parts = ", ".join(f"{fraction:.3g}" for fraction in fractions)
+    return f"delta-Eddington scaling of the forward peak, {parts} of scattering"
 
 
 def _method(settings: DiffusionSettings) -> str:

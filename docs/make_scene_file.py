@@ -14,21 +14,24 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from ddrecon import settings
-from ddrecon.scene_file import schema
+from ddrecon.scene_file import camera_schema, light_schema, phase_schema, schema
 from ddrecon.variables.kinds import KINDS, Kind
 
 PAGE = Path(__file__).parent / "scene_file.md"
 KIND_NAMES = {
-    schema.Color: "number or [r, g, b]",
+    light_schema.Color: "number or [r, g, b]",
     schema.Quantity: "number, [r, g, b] or {file: ...}",
     schema.Density: "number or {file: ...}",
+    phase_schema.PhaseSection: "{type: ...}",
     settings.Start: "number, list or {file: ...}",
+    settings.Weight: "number or `auto`",
+    settings.Support: "`masks`, number or {file: ...}",
     schema.Triple: "[x, y, z]",
     schema.Count: "[nx, ny, nz]",
-    schema.Size: "[width, height]",
-    schema.Pair: "[x, y]",
+    camera_schema.Size: "[width, height]",
+    camera_schema.Pair: "[x, y]",
     schema.Paths: "file, or list of files",
-    schema.Matrix: "4 rows of 4 numbers",
+    camera_schema.Matrix: "4 rows of 4 numbers",
     tuple[float, ...]: "list of numbers",
     float: "number",
     int: "whole number",
@@ -74,8 +77,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "albedo": "Single-scattering albedo: the part of the extinction that scatters.",
             "g": (
                 "Mean cosine of the scattering angle (asymmetry parameter) of the "
-                "Henyey-Greenstein phase function; above 0 is forward."
+                "Henyey-Greenstein phase function; above 0 is forward. The short form of `phase`."
             ),
+            "phase": "How light is scattered by angle, in place of `g`; see below.",
         },
     ),
     (
@@ -88,8 +92,74 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
+        "volume.phase: {type: henyey_greenstein}",
+        phase_schema.HenyeyGreensteinSection,
+        "The usual phase function of one number; `g: 0.3` is short for it.",
+        {"g": "Mean cosine of the scattering angle; above 0 is forward."},
+    ),
+    (
+        "volume.phase: {type: two_lobe}",
+        phase_schema.TwoLobeSection,
+        "A mixture of two Henyey-Greenstein functions: haze and smoke, which scatter backward too.",
+        {
+            "g": "The mean cosine of each.",
+            "weight": "The part of the first.",
+        },
+    ),
+    (
+        "volume.phase: {type: rayleigh}",
+        phase_schema.RayleighSection,
+        "Air, and other particles much smaller than the wavelength.\nIt has no numbers.",
+        {},
+    ),
+    (
+        "volume.phase: {type: draine}",
+        phase_schema.DraineSection,
+        "Dust: a Henyey-Greenstein function times 1 + alpha cos^2, normalized (Draine 2003).",
+        {
+            "g": "Of the Henyey-Greenstein function; the mean cosine itself is another.",
+            "alpha": "0 is Henyey-Greenstein's; 1 with `g: 0` is Rayleigh's.",
+        },
+    ),
+    (
+        "volume.phase: {type: legendre}",
+        phase_schema.LegendreSection,
+        "Legendre moments chi_l, the mean of P_l over scattered light; at most 2048 count.\n"
+        "Give either of both.",
+        {
+            "coefficients": "chi_0 = 1, chi_1, ...",
+            "file": (
+                ".csv, .txt or .npz (`value`) with chi_l one a row, in one column or one a color; "
+                "a column `l` before them is allowed."
+            ),
+        },
+    ),
+    (
+        "volume.phase: {type: table}",
+        phase_schema.TableSection,
+        "Values over the angle, of any scale; see [your data](your_data.md#phase-functions).",
+        {
+            "file": (
+                ".csv or .txt with a header: `angle` (degrees) or `cosine`, then one column of "
+                "values or one a color; or .npz with these as arrays, the values called `value`."
+            ),
+        },
+    ),
+    (
+        "volume.phase: {type: mie}",
+        phase_schema.MieSection,
+        "Droplets whose radii follow a gamma distribution, by Mie's theory.\n"
+        'Needs miepython: `pip install "ddrecon[mie]"`.',
+        {
+            "wavelength": "In micrometers, one for each color.",
+            "refractive_index": "Of the droplets; of water 1.33.",
+            "effective_radius": "In micrometers: of clouds 5 to 15.",
+            "effective_variance": "Of the distribution: of clouds about 0.1.",
+        },
+    ),
+    (
         "lights: {type: directional}",
-        schema.DirectionalSection,
+        light_schema.DirectionalSection,
         "Parallel light, such as the sun's.",
         {
             "direction": "The direction in which the light travels, of any length.",
@@ -98,7 +168,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: ambient}",
-        schema.AmbientSection,
+        light_schema.AmbientSection,
         "The same light from everywhere.",
         {
             "radiance": "Of every direction.",
@@ -106,7 +176,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: environment}",
-        schema.EnvironmentSection,
+        light_schema.EnvironmentSection,
         "A latitude-longitude map (HDRI), +y up, oriented as Mitsuba's `envmap`.\n"
         "Small bright regions become suns.",
         {
@@ -121,7 +191,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: point}",
-        schema.PointSection,
+        light_schema.PointSection,
         "Light from a point, inside or outside the box.",
         {
             "position": "Where it is [u].",
@@ -146,19 +216,20 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
-        "views: {ring: ...} or {transforms: ...}",
+        "views: {ring: ...}, {transforms: ...} or {colmap: ...}",
         schema.ViewSource,
         "Views that are not listed one by one.",
         {
             "ring": "Cameras in a circle; see below.",
             "transforms": "`transforms.json` of NeRF, instant-ngp or nerfstudio, read as it is.",
+            "colmap": "Folder of COLMAP's sparse model, such as `sparse/0`; text or binary.",
             "images": (
                 "For a ring: a pattern such as `targets/train_*.exr`, whose files, sorted, "
-                "belong to the cameras in turn."
+                "belong to the cameras in turn. For COLMAP: the folder of its pictures."
             ),
             "test_every": (
-                "For transforms without splits: one view in this many, the first of them, is a "
-                "test view."
+                "For transforms without splits and COLMAP: one view in this many, the first of "
+                "them, is a test view."
             ),
         },
     ),
@@ -178,7 +249,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "camera: {type: perspective}",
-        schema.PerspectiveSection,
+        camera_schema.PerspectiveSection,
         "A pinhole camera.\nGive either `origin`, `target` and `up`, or `matrix`.",
         {
             "fov": "Horizontal field of view, in degrees.",
@@ -187,6 +258,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "left."
             ),
             "pixel_aspect": "Height of a pixel over its width.",
+            "distortion": "Of its lens; see below. Left out, there is none.",
             "origin": "Where the camera stands [u].",
             "target": "A point on its axis [u].",
             "up": "The direction that is up in the image.",
@@ -197,8 +269,22 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
+        "distortion: {type: opencv}",
+        camera_schema.OpencvSection,
+        "A lens as OpenCV and COLMAP calibrate it, with nerfstudio's k4.\n"
+        "Everything else that is said of the camera holds for the pinhole that would be left.",
+        dict.fromkeys(("k1", "k2", "k3", "k4"), "Radial: of r^2, r^4, r^6 and r^8 in turn.")
+        | dict.fromkeys(("p1", "p2"), "Tangential."),
+    ),
+    (
+        "distortion: {type: fisheye}",
+        camera_schema.FisheyeSection,
+        "A fisheye as OpenCV and COLMAP calibrate it.",
+        dict.fromkeys(("k1", "k2", "k3", "k4"), "Of the angle's powers 3, 5, 7 and 9 in turn."),
+    ),
+    (
         "camera: {type: orthographic}",
-        schema.OrthographicSection,
+        camera_schema.OrthographicSection,
         "Parallel rays, as a satellite far away sees.\n"
         "Its other keys are those of a perspective camera.",
         {
@@ -238,7 +324,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
                 "it is 1, or 0 where there are none: without model `p1` or scheme `conservative`."
             ),
-            "transport_directions": "Directions of such a sweep.",
+            "degree": (
+                "Degree to which such sweeps keep light's angles, along 26, 50 or 86 directions."
+            ),
         },
     ),
     (
@@ -272,13 +360,19 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density and 0 for others."
+                " density and 0 for others. `auto` finds it by leaving a view out."
             ),
             "l1": "Weight of its mean, which empties what no picture needs.",
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "
                 "always does."
             ),
+            "support": (
+                "For density: where it may be above 0. `masks`: nowhere that a view sees and its "
+                "mask, or alpha, says is empty; a number: nor where it displays no more than that "
+                "(sRGB, 0 to 1); or a field that is above 0 there. Left out: anywhere."
+            ),
+            "support_margin": "Pixels by which what a view shows is widened for that.",
         },
     ),
 ]

@@ -17,10 +17,12 @@ from ddrecon.diffusion.operator import harmonic_mean
 from ddrecon.diffusion.rounds.characteristics import Course, follow, radiance_along
 from ddrecon.diffusion.rounds.sweep import sweep
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
-from ddrecon.numerics.chebyshev import SCALE, evaluate_positive
+from ddrecon.medium.phase import HenyeyGreenstein
+from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.numerics.chebyshev import COEFFICIENTS, SCALE, evaluate_positive
 from ddrecon.numerics.decay import decay_mean, decayed_line, decayed_sum
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.running_sum import running_sum
 
@@ -101,7 +103,7 @@ def plain_positive(coefficients: Tensor, depth: Tensor) -> Tensor:
 
 def polynomials(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
     nodes, colors, rows, columns = shape
-    coefficients = random_values(10, rows * columns, seed=1, dtype=dtype) - 0.45
+    coefficients = random_values(COEFFICIENTS, rows * columns, seed=1, dtype=dtype) - 0.45
     return coefficients, depths(nodes, colors, rows * columns, seed=2, dtype=dtype)
 
 
@@ -140,38 +142,36 @@ def shift(values: Tensor, drift: float, dim: int) -> Tensor:
     return values * (1 - abs(drift)) + behind * abs(drift)
 
 
-DIRECTIONS = 26
+DEGREE = 3
 
 
 def scattering_light(
-    field: Tensor, scale: Tensor, albedo: Tensor, mean: Tensor, *flux: Tensor
-) -> tuple[Medium, Moments]:
-    """A medium and light in it from what is varied."""
+    field: Tensor, scale: Tensor, albedo: Tensor, source: Tensor
+) -> tuple[Medium, Tensor]:
+    """A medium and what scatters in it from what is varied."""
     grid = Grid(tuple(field.shape[1:]), (0, 0, 0), (1.0, 1.5, 1.0))
     g = scale.new_tensor(0.3)
     scattering, absorption = scale * albedo, scale * (1 - albedo)
     coefficients = (Coefficient(s, field) for s in (scale, scattering, absorption))
-    light = Moments(mean, (flux[0], flux[1], flux[2]))
-    return Medium(grid, *coefficients, g, g, scale.new_tensor(0.0), None), light
+    seen = SeenPhase(HenyeyGreenstein(g), 1)
+    return Medium(grid, *coefficients, g, g, scale.new_tensor(0.0), None, seen), source
 
 
-def swept(*inputs: Tensor) -> tuple[Tensor, ...]:
-    found = sweep(*scattering_light(*inputs), None, DIRECTIONS)
-    return found.mean, *(found.flux or ())
+def swept(*inputs: Tensor) -> Tensor:
+    return sweep(*scattering_light(*inputs), None, DEGREE)
 
 
-def plain_swept(*inputs: Tensor) -> tuple[Tensor, ...]:
-    """The mean of I and 3 times that of I w over a quadrature of directions."""
-    medium, light = scattering_light(*inputs)
-    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS)
-    totals = [torch.zeros_like(light.mean)] * 4
-    for (z, y, x), weight in zip(points.tolist(), weights.tolist(), strict=True):
-        radiance = radiance_along(medium, light, None, (z, y, x))
-        factors = weight, 3 * weight * z, 3 * weight * y, 3 * weight * x
-        totals = [
-            torch.add(total, radiance, alpha=f) for total, f in zip(totals, factors, strict=True)
-        ]
-    return tuple(totals)
+def plain_swept(*inputs: Tensor) -> Tensor:
+    """The means of I Y_k over a quadrature of directions."""
+    medium, source = scattering_light(*inputs)
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), 26)
+    values = harmonics(points, DEGREE)[: len(source)].to(source)
+    total = torch.zeros_like(source)
+    for i, (direction, weight) in enumerate(zip(points.tolist(), weights.tolist(), strict=True)):
+        here = values[:, i].view(-1, 1, 1, 1, 1)
+        radiance = radiance_along(medium, (here * source).sum(0), None, tuple(direction))
+        total = total + weight * here * radiance
+    return total
 
 
 def light_in_cells(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
@@ -181,8 +181,8 @@ def light_in_cells(shape: Shape, dtype: torch.dtype) -> tuple[Tensor, ...]:
         0.5 + 0.5 * random_values(colors, 1, 1, 1, seed=s, dtype=dtype) for s in (2, 3)
     )
     mean = 1 + random_values(colors, slices, rows, columns, seed=4, dtype=dtype)
-    flux = (random_values(colors, slices, rows, columns, seed=5 + a, dtype=dtype) for a in range(3))
-    return field, scale, albedo, mean, *flux
+    higher = random_values(15, colors, slices, rows, columns, seed=5, dtype=dtype) - 0.5
+    return field, scale, albedo, torch.cat([mean[None], higher])
 
 
 RULES = {

@@ -2,11 +2,14 @@
 
 from dataclasses import fields
 
+import numpy as np
 import pytest
 import torch
 
 from ddrecon.grid import Grid
-from ddrecon.losses import HUBER, LOSSES, image_loss, psnr, total_variation
+from ddrecon.io.images import srgb
+from ddrecon.losses import HUBER, LOSSES, Target, image_loss, psnr, total_variation
+from ddrecon.pictures.noise import Noise
 from ddrecon.settings import OptimizeSettings
 
 
@@ -27,9 +30,7 @@ def test_a_scene_may_ask_for_every_loss_there_is() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_loss_is_least_at_the_target_and_grows_with_the_square_of_all_brightness(
-    loss: str,
-) -> None:
+def test_a_loss_is_least_at_the_target_and_grows_away_from_it(loss: str) -> None:
     image, target = (
         torch.rand(3, 4, 5, dtype=torch.float64),
         torch.rand(3, 4, 5, dtype=torch.float64),
@@ -40,8 +41,56 @@ def test_a_loss_is_least_at_the_target_and_grows_with_the_square_of_all_brightne
         for part in (0.1, 0.5, 1.0)
     ]
     assert 0 < values[0] < values[1] < values[2]
+
+
+@pytest.mark.parametrize("loss", ["l2", "l1", "huber", "relative_l2"])
+def test_a_loss_of_radiance_grows_with_the_square_of_all_brightness(loss: str) -> None:
+    image, target = torch.rand(2, 3, 4, 5, dtype=torch.float64).unbind()
+    value = float(image_loss(loss, image, target, None))
     assert float(image_loss(loss, 7 * image, 7 * target, None)) == pytest.approx(
-        49 * values[2], rel=1e-12
+        49 * value, rel=1e-12
+    )
+
+
+def test_small_errors_are_those_of_displayed_values() -> None:
+    target = torch.linspace(0.0005, 0.99, 60, dtype=torch.float64).view(3, 4, 5)
+    error = 1e-6 * torch.linspace(-1, 1, 60, dtype=torch.float64).view(3, 4, 5)
+    shown = torch.from_numpy(srgb.encode((target + error).numpy()) - srgb.encode(target.numpy()))
+    assert float(image_loss("display", target + error, target, None)) == pytest.approx(
+        float(shown.square().mean()), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_derivative_at_black_is_finite_and_not_zero(loss: str) -> None:
+    target = torch.rand(3, 4, 5)
+    target[:, :2] = 0
+    image = torch.zeros(3, 4, 5, requires_grad=True)
+    image_loss(loss, image, target, None).backward()
+    assert torch.isfinite(image.grad).all() and (image.grad[:, 2:] < 0).all()
+
+
+def test_what_is_brighter_than_a_white_pixel_of_a_display_does_not_err() -> None:
+    target = torch.tensor([1.0, 0.5]).expand(3, 1, 2)
+    brighter = torch.tensor([3.0, 0.5]).expand(3, 1, 2)
+    assert image_loss("display", brighter, target, None) == 0
+    assert image_loss("display", target - 0.1, target, None) > 0
+
+
+def test_noise_counts_alike_in_dark_and_bright_pixels() -> None:
+    noise = Noise(0.01, 0.002)
+    for level in (0.0, 0.01, 1.0):
+        target = torch.full((3, 8, 8), level, dtype=torch.float64)
+        error = (0.01**2 + 0.002 * level) ** 0.5
+        assert float(image_loss("photon", target + error, target, None, noise)) == pytest.approx(1)
+
+
+def test_psnr_of_displayed_values_has_white_for_its_peak() -> None:
+    target = torch.full((3, 8, 8), 0.2)
+    shown = float(srgb.encode(np.array(0.2))) + 0.01
+    brighter = torch.full((3, 8, 8), float(srgb.decode(np.array(shown))))
+    assert float(Target.of(target, None, "display").psnr_of(brighter)) == pytest.approx(
+        40, abs=1e-2
     )
 
 
@@ -68,8 +117,10 @@ def test_a_relative_error_counts_alike_in_dark_and_bright_pixels() -> None:
 @pytest.mark.parametrize("loss", LOSSES)
 def test_masked_pixels_do_not_count(loss: str) -> None:
     image, target, mask = torch.rand(3, 4, 5), torch.rand(3, 4, 5), (torch.rand(4, 5) > 0.5).float()
-    spoiled = torch.where(mask > 0, target, target + 100)
-    assert image_loss(loss, image, spoiled, mask) == image_loss(loss, image, target, mask)
+    spoiled, noise = torch.where(mask > 0, target, target + 100), Noise(0.01, 0.0)
+    assert image_loss(loss, image, spoiled, mask, noise) == image_loss(
+        loss, image, target, mask, noise
+    )
 
 
 def test_what_counts_is_averaged() -> None:

@@ -18,13 +18,13 @@ from ddrecon.settings import DiffusionSettings
 class Sweep:
     """What is tried.
 
-    These are tolerances of solves, models, transport rounds with directions, steps a voxel,
+    These are tolerances of solves, models, transport rounds with degrees, steps a voxel,
     tolerances of interpolated pixels, and factors by which the grid is made coarser.
     """
 
     tolerances: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
     models: tuple[str, ...] = ("p1", "flux_limited")
-    rounds: tuple[tuple[int, int], ...] = ((0, 26), (1, 26), (2, 26), (4, 26), (2, 50))
+    rounds: tuple[tuple[int, int], ...] = ((0, 3), (1, 3), (2, 3), (4, 3), (2, 5))
     steps: tuple[int, ...] = (1, 2)
     pixels: tuple[float, ...] = (0, 0.01, 0.05, 1)
     coarser: tuple[int, ...] = (2, 4)
@@ -90,12 +90,12 @@ def _variants(sweep: Sweep) -> Iterator[Variant]:
         yield _vary_diffusion("closure", closure, closure=closure)
     for model in sweep.models:
         yield _vary_diffusion("model", model, model=model, transport_rounds=None)
-    for rounds, directions in sweep.rounds:
+    for rounds, degree in sweep.rounds:
         yield _vary_diffusion(
             "rounds",
-            f"{rounds}, {directions} directions",
+            f"{rounds}, degree {degree}",
             transport_rounds=rounds,
-            transport_directions=directions,
+            degree=degree,
         )
     for steps in sweep.steps:
         yield _vary_march("steps", steps, steps_per_voxel=steps)
@@ -133,9 +133,9 @@ def _is_same(changed: Scene, scene: Scene) -> bool:
 
 
 def _effective(diffusion: DiffusionSettings) -> DiffusionSettings:
-    """Without the number of directions where there are no rounds that it could matter to."""
+    """Without the degree where there are no rounds that it could matter to."""
     return (
         diffusion
         if diffusion.transport_rounds
-        else replace(diffusion, transport_directions=DiffusionSettings.transport_directions)
+        else replace(diffusion, degree=DiffusionSettings.degree)
     )

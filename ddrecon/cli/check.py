@@ -7,7 +7,10 @@ from typing import Any
 import torch
 
 from ddrecon.engine import engine_of_parts
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
+from ddrecon.reconstruct.setup import select_views, start_support
+from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.terms import needed_terms
@@ -26,7 +29,7 @@ def memory_estimate(scene: Scene) -> int:
         max(volume.sigma_a.shape[0], volume.sigma_s.shape[0]),
         torch.finfo(volume.density.dtype).bits // 8,
         sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
-        has_flux=bool(volume.g != 0) or "g" in scene.starts,
+        has_flux=scale_medium(volume).has_flux,
         has_rounds=scene.diffusion.transport_rounds > 0,
         is_limited=scene.diffusion.model == "flux_limited",
         varied=None
@@ -54,6 +57,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
+        "support": _describe_support(scene),
         "engine": engine_of_parts(_parts_in_torch(scene)),
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
@@ -72,10 +76,20 @@ def lines(report: dict[str, Any]) -> list[str]:
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(parameters) or 'nothing'}",
+        *([support_text(report["support"])] if report["support"] else []),
         f"engine: {_name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
         *(f"doubtful: {doubt}" for doubt in report["doubts"]),
     ]
+
+
+def _describe_support(scene: Scene) -> dict[str, float] | None:
+    """Which part of the cells density may be in; None where that is all of them."""
+    if scene.optimize is None:
+        return None
+    train = select_views(scene, is_test=False)
+    support = start_support(train, scene.optimize)
+    return describe_support(support, scene.volume.grid)
 
 
 def _view_line(view: dict[str, Any]) -> str:

@@ -72,20 +72,28 @@ class DiffusionProblem:
                 right = right - recompute(_divergence, self.medium, self.diffusion, flux, axis)
         return Operator((z, y, x), loss), right
 
-    def flux(self, mean: Tensor) -> Vector | None:
-        """L1 of L0 = `mean`; None where light's direction does not matter."""
+    def flux(self, mean: Tensor, more: Vector | None = None) -> Vector | None:
+        """L1 of L0 = `mean`, with `more` flux in the source; None where direction does not matter."""
         if not self.has_flux:
             return None
+        source = Moments(mean, self.source.flux).plus(Moments(mean, more)).flux
         if is_fused():
             from ddrecon.diffusion.fused.flux import find_flux
 
-            return find_flux(self.medium, self.diffusion, self.source.flux, self.outside, mean)
-        along = self._source_flux().items()
+            return find_flux(self.medium, self.diffusion, source, self.outside, mean)
         z, y, x = (
             recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)
-            for axis, flux in along
+            for axis, flux in zip(AXES, source or (None, None, None), strict=True)
         )
         return z, y, x
+
+    def spread(self, flux: Vector) -> Tensor:
+        """- div(D kappa_s `flux`), what a source of that flux adds to the right side of E4."""
+        z, y, x = (
+            recompute(_divergence, self.medium, self.diffusion, along, axis)
+            for axis, along in zip(AXES, flux, strict=True)
+        )
+        return -(z + y + x)
 
     def _source_flux(self) -> dict[int, Tensor | None]:
         return dict(zip(AXES, self.source.flux or (None, None, None), strict=True))

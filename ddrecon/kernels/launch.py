@@ -54,39 +54,46 @@ def launch(
     arguments: Sequence[Any] | Callable[[int], Sequence[Any]],
     like: Tensor,
     threads: int | None = None,
+    work: int | None = None,
 ) -> None:
     """Runs `kernel` for `count` items where tensor `like` lies.
 
     On a processor the items are cut into so many shares as there are `threads` (None: as many as
     torch has); a function of a share's number gives it `arguments` of its own. Which thread does a
     share is left to chance, and changes no result: the one that asks does all where that is quick,
-    and those that no other has begun by the time it has done its own.
+    and those that no other has begun by the time it has done its own. `work`: a number that tells
+    how long it takes, where that of items does not.
     """
-    _start()
+    if not count:
+        return
     threads = thread_count(like) if threads is None else threads
-    device = wp.device_from_torch(like.device)
+    device = _device(like.device)
     _load(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
     stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
 
     def run(i: int) -> None:
         given = arguments(i) if callable(arguments) else arguments
-        items = bounds[i + 1] - bounds[i]
-        wp.launch(kernel, items, [bounds[i], *given], device=device, stream=stream)
+        _call(kernel, device, bounds[i + 1] - bounds[i], [bounds[i], *given], stream)
 
     # What was seen to be quick is not worth another thread.
-    size = kernel, count.bit_length()
-    if threads > 1 and _seconds.get(size, math.inf) < QUICK:
+    size = kernel, (count if work is None else work).bit_length()
+    if threads == 1 or _seconds.get(size, math.inf) < QUICK:
         for i in range(threads):
             run(i)
-        return
-    # The thread that asks takes the first share itself.
+    else:
+        seconds = threads * _share(run, threads)
+        _seconds[size] = min(seconds, _seconds.get(size, math.inf))
+
+
+def _share(run: Callable[[int], None], threads: int) -> float:
+    """Has shares 0 to `threads` run by as many threads; how long this one took for its own [s]."""
     others = [_pool(threads).submit(run, i) for i in range(1, threads)]
     start = perf_counter()
     try:
+        # The thread that asks takes the first share itself.
         run(0)
-        seconds = (perf_counter() - start) * threads
-        _seconds[size] = min(seconds, _seconds.get(size, math.inf))
+        seconds = perf_counter() - start
         # And those not begun by now: other programs may have the processor's other cores.
         for i, other in enumerate(others, 1):
             if other.cancel():
@@ -97,6 +104,7 @@ def launch(
     for other in others:
         if not other.cancelled():
             other.result()
+    return seconds
 
 
 @functools.cache
@@ -114,6 +122,36 @@ def _start() -> None:
     finally:
         os.dup2(kept, 2)
         os.close(kept)
+
+
+@functools.cache
+def _device(device: torch.device) -> Any:
+    _start()
+    return wp.device_from_torch(device)
+
+
+def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -> None:
+    """Runs `kernel` for `items` in this thread, with all it is `given`."""
+    if not items:
+        return
+    calls = _calls(kernel, device.alias)
+    try:
+        call = calls.pop()
+    except IndexError:
+        call = wp.launch(kernel, items, given, device=device, record_cmd=True)
+    if call.bounds.size != items:
+        call.set_dim(items)
+    for place, value in enumerate(given):
+        ready = value.__ctype__() if hasattr(value, "__ctype__") else value
+        call.set_param_at_index_from_ctype(place, ready)
+    call.launch(stream)
+    calls.append(call)
+
+
+@functools.cache
+def _calls(kernel: Any, device: str) -> list[Any]:
+    """Launches of `kernel` that nobody is making: given anew, they take a quarter of the time."""
+    return []
 
 
 @functools.cache

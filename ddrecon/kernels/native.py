@@ -15,6 +15,8 @@ In the text `F` is the type of numbers, and there are the functions below.
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import Any
 
 import warp as wp
@@ -83,14 +85,12 @@ auto total = [](const F* values, int count) -> double {
 """`total(values, count)`: a sum in double precision, eight at a time; to be put before a body."""
 
 
-def _polynomial(degree: int) -> dict[str, str]:
-    """exp's, of its Taylor series: the first coefficient and Horner's lines."""
-    inverse, coefficients = 1.0, [1.0]
-    for k in range(1, degree + 1):
-        inverse /= k
-        coefficients.append(inverse)
-    lines = [f"p = p * r + F({c!r});" for c in reversed(coefficients[:-1])]
-    return {"first": repr(coefficients[-1]), "horner": " ".join(lines)}
+def taylor(bits: int, shift: int, sign: int, variable: str) -> tuple[str, str]:
+    """The last coefficient sign^k / (k + shift)! that counts, and Horner's lines for the others."""
+    terms = 14 if bits == 64 else 8
+    coefficients = [sign**k / math.factorial(k + shift) for k in range(terms)]
+    lines = [f"p = p * {variable} + F({c!r});" for c in reversed(coefficients[:-1])]
+    return repr(coefficients[-1]), " ".join(lines)
 
 
 def _series(terms: int) -> dict[str, str]:
@@ -106,19 +106,26 @@ def _series(terms: int) -> dict[str, str]:
     }
 
 
-_TEXT = {
-    32: (_TYPES + _DECAY + _PSI + _LOOPS).format(
-        number="float", integer="int", exp="expf", most="87.0", shift="12582912.0", digits=23,
-        log2_high="0.693145751953125", log2_low="1.42860682030941723212e-6",
-        **_polynomial(7), **_series(7),
-    ),
-    64: (_TYPES + _DECAY + _PSI + _LOOPS).format(
-        number="double", integer="long long", exp="exp", most="700.0",
-        shift="6755399441055744.0", digits=52,
-        log2_high="0.693147180369123816490", log2_low="1.90821492927058770002e-10",
-        **_polynomial(13), **_series(13),
-    ),
-}  # fmt: skip
+def names(bits: int) -> dict[str, str | int]:
+    """What texts call types of numbers, and the numbers of which exp is made."""
+    first, horner = taylor(bits, 0, 1, "r")
+    if bits == 32:
+        return {
+            "number": "float", "integer": "int", "exp": "expf", "digits": 23, "most": "87.0",
+            "shift": "12582912.0", "log2_high": "0.693145751953125",
+            "log2_low": "1.42860682030941723212e-6", "first": first, "horner": horner,
+        }  # fmt: skip
+    return {
+        "number": "double", "integer": "long long", "exp": "exp", "digits": 52, "most": "700.0",
+        "shift": "6755399441055744.0", "log2_high": "0.693147180369123816490",
+        "log2_low": "1.90821492927058770002e-10", "first": first, "horner": horner,
+    }  # fmt: skip
+
+
+@functools.cache
+def _definitions(bits: int) -> str:
+    text = _TYPES + _DECAY + _PSI + _LOOPS
+    return text.format(**names(bits), **_series(13 if bits == 64 else 7))
 
 
 def number_type(bits: int) -> Any:
@@ -134,4 +141,4 @@ def program(bits: int, body: str) -> str:
     (1 - (1 - exp(-depth)) / depth) / depth for depth from 0 to 1/2, and `psi_slope_series(depth)`
     its derivative. `INDEPENDENT` before a loop says that no turn reads what another writes.
     """
-    return _TEXT[bits] + body
+    return _definitions(bits) + body

@@ -13,7 +13,9 @@ functions below.
 
 from __future__ import annotations
 
-import math
+import functools
+
+from ddrecon.kernels.native import names, taylor
 
 LANES = 16
 """Items in a packet on a processor."""
@@ -120,35 +122,12 @@ struct P {{
 """
 
 
-def _taylor(terms: int, shift: int, sign: int) -> tuple[str, str]:
-    """The last of `terms` coefficients sign^k / (k + shift)!, and Horner's lines for the others."""
-    coefficients = [sign**k / math.factorial(k + shift) for k in range(terms)]
-    variable = "depth" if shift else "r"
-    lines = [f"p = p * {variable} + F({c!r});" for c in reversed(coefficients[:-1])]
-    return repr(coefficients[-1]), " ".join(lines)
-
-
-def _text(bits: int, **names: object) -> str:
-    first, horner = _taylor(14 if bits == 64 else 8, 0, 1)
-    psi_first, psi = _taylor(14 if bits == 64 else 8, 2, -1)
-    return _TEXT.format(
-        first=first, horner=horner, psi_first=psi_first, psi=psi, lanes=LANES, **names
-    )
-
-
-_TEXTS = {
-    32: _text(
-        32, number="float", exp="expf", most="87.0", shift="12582912.0", digits=23,
-        log2_high="0.693145751953125", log2_low="1.42860682030941723212e-6",
-    ),
-    64: _text(
-        64, number="double", exp="exp", most="700.0",
-        shift="6755399441055744.0", digits=52,
-        log2_high="0.693147180369123816490", log2_low="1.90821492927058770002e-10",
-    ),
-}  # fmt: skip
+@functools.cache
+def _definitions(bits: int) -> str:
+    psi_first, psi = taylor(bits, 2, -1, "depth")
+    return _TEXT.format(**names(bits), psi_first=psi_first, psi=psi, lanes=LANES)
 
 
 def packet_program(bits: int, body: str) -> str:
     """C++ for `wp.func_native`: `body` behind the types and functions of packets."""
-    return _TEXTS[bits] + body
+    return _definitions(bits) + body

@@ -5,32 +5,28 @@ take many cells at a time, and one cell on a GPU. Colors come one after the othe
 more streams from memory than a processor looks ahead in.
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
 
-import warp as wp
-from torch import Tensor, is_tensor
+from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import launch
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.text import TextKernel
 
-_NUMBERS = "nz", "ny", "nx", "width", "parts"
-_LENGTHS = "hz", "hy", "hx", "lz", "ly", "lx"
+_GRID = "int nz, ny, nx, width, parts; F hz, hy, hx, lz, ly, lx;"
 _ROW = """
 #if defined(__CUDA_ARCH__)
 #define INLINE
 #else
 #define INLINE __attribute__((always_inline))
 #endif
-const int nz = cells.nz, ny = cells.ny, nx = cells.nx;
-const F hz = cells.hz, hy = cells.hy, hx = cells.hx;  // a cell's sides
-const F lz = cells.lz, ly = cells.ly, lx = cells.lx;  // the grid's lower corner
-const int rows = nz * ny, c = item / (rows * cells.parts);
-const int row = item / cells.parts - c * rows;
-const int begin = (item % cells.parts) * cells.width;
-const int end = begin + cells.width < nx ? begin + cells.width : nx;
+// nz, ny, nx: the grid's cells; hz, hy, hx: a cell's sides; lz, ly, lx: the grid's lower corner
+const int rows = nz * ny, c = item / (rows * parts);
+const int row = item / parts - c * rows;
+const int begin = (item % parts) * width;
+const int end = begin + width < nx ? begin + width : nx;
 const int z = row / ny, y = row % ny;
 const long long plane = (long long)ny * nx, size = plane * nz, start = (long long)row * nx;
 // The offset of the item's color in an array of `colors` colors, each of `entries`; 0 if of one.
@@ -41,34 +37,20 @@ auto color = [=](int colors, long long entries) -> long long {
 
 
 @functools.cache
-def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") -> Any:
+def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") -> TextKernel:
     """The kernel `name` that does `text` for each part of a row.
 
     The text has the color `c`; the cells `begin` to `end` of row `z`, `y`, which lie `start` behind
-    the first of a color's `size`; pointers called as the `arrays`; whole `numbers`; and what
-    `program` has.
+    the first of a color's `size`; pointers called as the `arrays`; and whole `numbers`.
     """
-    F = number_type(bits)
-    fields = dict.fromkeys((*_NUMBERS, *numbers.split()), int) | dict.fromkeys(_LENGTHS, F)
-    fields |= dict.fromkeys(arrays.split(), wp.uint64)
-    # The arrays' addresses.
-    Cells = wp.struct(type("Cells", (), {"__annotations__": fields, "__module__": __name__}))
-    given = [f"F* const {one} = (F*)cells.{one};" for one in arrays.split()]
-    given += [f"const int {one} = cells.{one};" for one in numbers.split()]
-
-    @wp.func_native(program(bits, _ROW + "\n".join(given) + text))
-    def do_row(item: int, cells: Cells): ...
-
-    @wp.kernel(enable_backward=False, module="unique", name=name)
-    def do_rows(first: int, cells: Cells):
-        do_row(first + wp.tid(), cells)
-
-    do_rows.Cells = Cells
-    return do_rows
+    given = _GRID + f"F {', '.join('*' + one for one in arrays.split())};"
+    if numbers:
+        given += f"int {', '.join(numbers.split())}"
+    return TextKernel(name, bits, _ROW + text, given)
 
 
 def launch_rows(
-    kernel: Callable[[int], Any],
+    kernel: Callable[[int], TextKernel],
     grid: Grid,
     colors: int,
     given: Mapping[str, Tensor | int],
@@ -79,20 +61,9 @@ def launch_rows(
     Both hold arrays and numbers by their names; those that are made are contiguous.
     """
     like = next(iter(made.values()))
-    ready = kernel(8 * like.element_size())
-    cells = ready.Cells()
-    cells.nz, cells.ny, cells.nx = grid.shape
-    cells.hz, cells.hy, cells.hx = grid.spacing
-    cells.lz, cells.ly, cells.lx = grid.lower
-    cells.width = 1 if like.is_cuda else cells.nx
-    cells.parts = cells.nx // cells.width
-    # Addresses, since making Warp's arrays takes longer; `held` keeps what lies there.
-    held = {
-        name: value.to(like.dtype).contiguous() if is_tensor(value) else value
-        for name, value in given.items()
-    }
-    for name, value in (held | made).items():
-        setattr(cells, name, value.data_ptr() if is_tensor(value) else value)
-    if not all(value.is_contiguous() for value in made.values()):
-        raise ValueError("arrays that kernels write are contiguous")
-    launch(ready, colors * grid.shape[0] * grid.shape[1] * cells.parts, [cells], like)
+    width = 1 if like.is_cuda else grid.shape[2]
+    names = "nz", "ny", "nx", "hz", "hy", "hx", "lz", "ly", "lx", "width", "parts"
+    numbers = *grid.shape, *grid.spacing, *grid.lower, width, grid.shape[2] // width
+    of_grid = dict(zip(names, numbers, strict=True))
+    count = colors * grid.cells // width
+    kernel(8 * like.element_size()).launch(count, {**of_grid, **given}, made)

@@ -13,7 +13,7 @@ from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.shear import sum_mass_to_cells
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.phase import henyey_greenstein, peaked_phase_along
+from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.nodes import Nodes
 
@@ -31,19 +31,19 @@ class Beam:
     irradiance: Tensor
 
     def scatter(
-        self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None
+        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
         """The integral of `scattering` over each segment of view rays, and the phase function p.
 
         Their product is what E2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s
-        per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [R]. With a
-        forward peak of depth `peak` [N, C, R] at the nodes (E13) it changes along the ray: then the
-        integral holds it, and the factor is 1.
+        per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C, R]. With
+        a forward peak of depth `peak` [N, C, R] at the nodes (E13) it changes along the ray: then
+        the integral holds it, and the factor is 1.
         """
         cosine = self.cosine(nodes.direction)
         if peak is None:
-            return nodes.integral(scattering), henyey_greenstein(cosine, g)
-        return nodes.integral(scattering * peaked_phase_along(peak, cosine, g)), 1.0
+            return nodes.integral(scattering), seen.value(cosine)
+        return nodes.integral(scattering * seen.along(peak, cosine)), 1.0
 
     def cosine(self, direction: Tensor) -> Tensor:
         """Cosine [R] between the light and what leaves along view rays of `direction` [R, 3]."""
@@ -58,8 +58,10 @@ def leaving_cosine(direction: Tensor, travel: Tensor) -> Tensor:
     return -(direction @ travel)
 
 
-def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tuple[Beam, Moments]:
+def follow_beam(medium: Medium, light: DirectionalLight, degree: int) -> tuple[Beam, Moments]:
     """The beam of `light` in `medium`, and the moments of E tau / (4 pi) at cells (E2).
+
+    They go up to `degree`, and are those of radiance that all travels with the beam.
 
     tau is averaged over each cell along the beam, so that the energy taken from the beam is what
     cells receive, however thick they are.
@@ -72,4 +74,4 @@ def follow_beam(medium: Medium, light: DirectionalLight, has_flux: bool) -> tupl
     )
     received = irradiance / (4 * math.pi) * recompute(extinction.mean_transmittance, entered, step)
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
-    return beam, beam_moments(received, direction, has_flux)
+    return beam, beam_moments(received, direction, degree)

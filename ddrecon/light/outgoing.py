@@ -2,34 +2,53 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
 
 from ddrecon.cameras import Rays
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.pairs import TurnedBeam
 from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.remaining import remaining_moments, turned_phase
+from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
 
 
 def scatter_once_more(medium: Medium, light: Moments) -> Moments:
-    """(1 - f) (L0 + g' L1.w) as moments, per unit length and kappa_s (E3).
-
-    `light`: L0 and L1.
-    """
-    kept = 1 - medium.forward_fraction
-    return light.scaled(kept, kept * medium.mean_cosine)
+    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E3, E21)."""
+    return light.weighted((1 - medium.forward_fraction) * remaining_moments(medium))
 
 
-def scatter_towards(medium: Medium, light: Moments, rays: Rays) -> Tensor:
+def scatter_towards(
+    medium: Medium, light: Moments, rays: Rays, turned: Sequence[TurnedBeam] = ()
+) -> Tensor:
     """The radiance >= 0 `[C, z, y, x]` of `scatter_once_more` towards the camera of `rays`.
 
-    As `Moments.positive_along` has it.
+    With what the `turned` beams scatter (E21). As `Moments.positive_along` has it.
     """
-    if is_fused():
+    is_plain = light.higher is None and not turned
+    if is_fused() and is_plain and medium.mean_cosine.ndim == 0:
         from ddrecon.light.fused.outgoing import scatter_fused
 
         return scatter_fused(medium, light, rays)
-    return recompute(_scatter_towards, medium, light, rays)
+    return recompute(_scatter_towards, medium, light, rays, turned)
 
 
-def _scatter_towards(medium: Medium, light: Moments, rays: Rays) -> Tensor:
-    return scatter_once_more(medium, light).positive_along(rays.towards_eye(medium.grid))
+def _scatter_towards(
+    medium: Medium, light: Moments, rays: Rays, turned: Sequence[TurnedBeam]
+) -> Tensor:
+    towards = rays.towards_eye(medium.grid)
+    seen = [_scatter_turned(medium, beam, towards) for beam in turned]
+    more = functools.reduce(torch.add, seen) if seen else None
+    return scatter_once_more(medium, light).positive_along(towards, more)
+
+
+def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor:
+    """What light of `beam` scatters `towards` a camera: its phase function is that of E21."""
+    z, y, x = (part * cosine for part, cosine in zip(beam.direction, towards, strict=True))
+    cosine = torch.atleast_3d(z + y + x)
+    phase = look_up(turned_phase(medium, beam.turns), angle_of(cosine))[..., 0]
+    return beam.radiance * phase.to(cosine.dtype)

@@ -24,7 +24,7 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.phase import henyey_greenstein, peaked_phase
+from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.nodes import Nodes
@@ -52,7 +52,7 @@ class PointBeam:
     least_square: float
 
     def scatter(
-        self, scattering: Tensor, nodes: Nodes, g: Tensor, peak: Tensor | None
+        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
         """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`, and 1.
 
@@ -62,8 +62,7 @@ class PointBeam:
         along = foot + nodes.distance
 
         # The phase function at the nodes, of the angle between light and view ray.
-        cosine = (-along / (across + along * along).sqrt())[:, None]
-        phase = henyey_greenstein(cosine, g) if peak is None else peaked_phase(peak, cosine, g)
+        phase = seen.at_angles(peak, torch.atan2(across.sqrt().expand_as(along), -along))
 
         # The integral of 1 / r^2 over a segment is the angle it subtends at the light, over the
         # ray's distance from it: int ds / (d^2 + s^2) = atan(s / d) / d.
@@ -82,10 +81,10 @@ class PointBeam:
         return foot, _bounded_square(offset - foot[:, None] * direction, self.least_square)
 
 
-def follow_point_light(
-    medium: Medium, light: PointLight, has_flux: bool
-) -> tuple[PointBeam, Moments]:
+def follow_point_light(medium: Medium, light: PointLight, degree: int) -> tuple[PointBeam, Moments]:
     """The beam of `light` in `medium`, and the moments of I tau / (4 pi r^2) at cells (E2).
+
+    They go up to `degree`, and are those of radiance that all travels away from the light.
 
     tau is averaged over each cell along the light's ray.
     """
@@ -116,7 +115,7 @@ def follow_point_light(
 
     received = irradiance / (4 * math.pi) / square * extinction.mean_transmittance(entered, step)
     beam = PointBeam(mass, position, irradiance, least_square)
-    return beam, beam_moments(received, direction.movedim(-1, 0), has_flux)
+    return beam, beam_moments(received, direction.movedim(-1, 0), degree)
 
 
 def _least_square(grid: Grid) -> float:

@@ -15,9 +15,11 @@ from torch import Tensor
 from ddrecon.light.beam import Beam, follow_beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments
+from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.remember import remember
 
@@ -26,19 +28,46 @@ from ddrecon.numerics.remember import remember
 class ReducedLight:
     """Light of directional and point lights not yet scattered.
 
-    `source`: Q0 and Q1 of all `beams` together, averaged over cells; no Q1 where it was not wanted.
+    `source`: Q0, Q1 and what follows, of all `beams` together, averaged over cells, to the degree
+    that was wanted. `turned`: light that backward peaks have turned back and forth (E20).
     """
 
     beams: tuple[Beam | PointBeam, ...]
     source: Moments
+    turned: tuple[TurnedBeam, ...] = ()
 
 
-def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> ReducedLight:
+def reduced_light(
+    medium: Medium, lights: Sequence[Source], degree: int, has_pairs: bool = False
+) -> ReducedLight:
     """The light of directional and point `lights` that reaches each cell unscattered.
 
-    Q0 = sum of E tau / (4 pi) and Q1 = 3 g' sum of E tau w / (4 pi) over lights that go along w, g'
-    being the mean cosine of the scattering that remains. Without `has_flux` no Q1 is computed.
+    Of lights that go along w the source holds the sum of p_l Y_k(w) E tau / (4 pi), p_l being the
+    moments of the scattering that remains (E17), for k up to `degree`: Q0, and Q1 with 3 g'. With
+    `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E20).
     """
+    if degree <= 1 and not has_pairs:
+        return _to_first_order(medium, lights, degree)
+    beams: list[Beam | PointBeam] = []
+    sources: list[Moments] = []
+    turned: list[TurnedBeam] = []
+    for light in lights:
+        if isinstance(light, DirectionalLight) and has_pairs:
+            beam, pair = follow_pair(medium, light)
+            beams.append(beam)
+            sources.append(pair.source(medium))
+            turned += pair.turned
+        elif isinstance(light, DirectionalLight | PointLight):
+            one, received = _follow(medium, light, degree)
+            beams.append(one)
+            sources.append(received.weighted(remaining_moments(medium)))
+    nothing = Moments(torch.zeros_like(medium.extinction.value))
+    source = reduce(Moments.plus, sources) if sources else nothing
+    return ReducedLight(tuple(beams), source, tuple(turned))
+
+
+def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> ReducedLight:
+    """`reduced_light` with Q0, and Q1 where `degree` is 1."""
     beams: dict[int, Beam | PointBeam] = {}
     parts, received = [], []
     directional = {
@@ -47,22 +76,26 @@ def reduced_light(medium: Medium, lights: Sequence[Source], has_flux: bool) -> R
     if directional and is_fused():
         from ddrecon.light.fused.beams import follow_beams
 
-        found, moments = follow_beams(medium, list(directional.values()), has_flux)
+        found, moments = follow_beams(medium, list(directional.values()), degree > 0)
         beams.update(zip(directional, found, strict=True))
         parts.append(moments)
     for i, light in enumerate(lights):
         if i not in beams and isinstance(light, DirectionalLight | PointLight):
-            beams[i], moments = (
-                follow_beam(medium, light, has_flux)
-                if isinstance(light, DirectionalLight)
-                else follow_point_light(medium, light, has_flux)
-            )
+            beams[i], moments = _follow(medium, light, degree)
             received.append(moments)
     if received:
-        parts.append(reduce(Moments.plus, received).scaled(1.0, 3 * medium.mean_cosine))
+        parts.append(reduce(Moments.plus, received).scaled(1.0, medium.mean_cosine))
     elif not parts:
         parts.append(Moments(torch.zeros_like(medium.extinction.value)))
     return ReducedLight(tuple(beams[i] for i in sorted(beams)), reduce(Moments.plus, parts))
+
+
+def _follow(
+    medium: Medium, light: DirectionalLight | PointLight, degree: int
+) -> tuple[Beam | PointBeam, Moments]:
+    if isinstance(light, DirectionalLight):
+        return follow_beam(medium, light, degree)
+    return follow_point_light(medium, light, degree)
 
 
 def ambient_radiance(lights: Sequence[object], like: Tensor) -> Tensor:

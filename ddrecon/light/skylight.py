@@ -15,9 +15,12 @@ from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.shear import sum_mass_to_cells
 from ddrecon.light.sky import Sky
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.phase import henyey_greenstein
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
+
+MOST_MOMENTS = 4
+"""So many moments are summed at once by fused kernels."""
 
 
 def ambient_sky(radiance: Tensor) -> Sky:
@@ -27,32 +30,52 @@ def ambient_sky(radiance: Tensor) -> Sky:
     return Sky(directions, irradiance, directions[..., None] * irradiance[:, None])
 
 
-def sum_unscattered_sky(medium: Medium, lights: Sequence[object], has_flux: bool) -> Moments | None:
-    """Light of all skies in `lights` not yet scattered, to first order in angle; None of no sky.
+def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -> Moments | None:
+    """Light of all skies in `lights` not yet scattered, to `degree` in angle; None of no sky.
 
     Mean and flux are (1 / (4 pi)) int L_ri dw and (3 / (4 pi)) int L_ri w dw over the sphere: Q0,
-    and Q1 but for g (docs/theory.md section 1). Without `has_flux` there is no flux.
+    and Q1 but for g (docs/theory.md section 1). Moments of higher degree take all light of a region
+    as going along its middle (E17).
     """
     skies = _lit_skies(lights)
     if skies and is_fused():
-        return _sum_fused(medium, skies, has_flux)
+        return _sum_fused(medium, skies, degree)
     total = None
     for sky in skies:
-        vectors = sky.vector if has_flux else [None] * len(sky.travel)
-        for travel, irradiance, vector in zip(sky.travel, sky.irradiance, vectors, strict=True):
-            part = recompute(_attenuate_direction, medium, travel, irradiance, vector)
-            total = part if total is None else total.plus(part)
-    return None if total is None else total.scaled(1 / (4 * math.pi), 3 / (4 * math.pi))
+        for travel, weights in zip(sky.travel, _moment_weights(sky, degree), strict=True):
+            part = recompute(_attenuate_direction, medium, travel, weights)
+            total = part if total is None else total + part
+    return None if total is None else _as_moments(total)
 
 
-def _sum_fused(medium: Medium, skies: Sequence[Sky], has_flux: bool) -> Moments:
+def _as_moments(sums: Sequence[Tensor] | Tensor) -> Moments:
+    """Light of which `sums` has the mean, then the flux along z, y, x, then what is higher."""
+    if len(sums) == 1:
+        return Moments(sums[0])
+    higher = sums[4:]
+    if not isinstance(higher, Tensor):
+        higher = torch.stack(list(higher)) if higher else sums[0][:0]
+    return Moments(sums[0], (sums[1], sums[2], sums[3]), higher if len(higher) else None)
+
+
+def _moment_weights(sky: Sky, degree: int) -> Tensor:
+    """What transmittance is multiplied by, [N, moments, C]: the moments of light outside."""
+    weights = [sky.irradiance[:, None]]
+    if degree > 0:
+        weights.append(3 * sky.vector)
+    if degree > 1:
+        weights.append(harmonics(sky.travel, degree)[4:].T[..., None] * sky.irradiance[:, None])
+    return torch.cat(weights, 1) / (4 * math.pi)
+
+
+def _sum_fused(medium: Medium, skies: Sequence[Sky], degree: int) -> Moments:
     """What `sum_unscattered_sky` returns, by fused kernels: directions one after the other."""
     from ddrecon.light.fused.beams import attenuate
 
-    mean, flux = torch.cat([sky.irradiance for sky in skies]), torch.cat([s.vector for s in skies])
-    weights = torch.cat([mean[:, None], 3 * flux], 1) if has_flux else mean[:, None]
+    weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
     directions = torch.cat([sky.travel for sky in skies])
-    return attenuate(medium, directions, weights / (4 * math.pi))[0]
+    found = [attenuate(medium, directions, some)[0] for some in weights.split(MOST_MOMENTS, 1)]
+    return _as_moments([each for light in found for each in (light.mean, *(light.flux or ()))])
 
 
 def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:
@@ -82,29 +105,22 @@ def _scatter_direction(
     medium: Medium, travel: Tensor, irradiance: Tensor, towards: Vector
 ) -> Tensor:
     """p E tau at cells: what the light going along `travel` scatters `towards` a camera."""
-    visible = _attenuate_direction(medium, travel, irradiance, None).mean
+    visible = _attenuate_direction(medium, travel, irradiance[None])[0]
     z, y, x = (component * cosine for component, cosine in zip(travel, towards, strict=True))
-    return visible * henyey_greenstein(z + y + x, medium.g)
+    return visible * medium.seen.value(torch.atleast_3d(z + y + x))
 
 
-def _attenuate_direction(
-    medium: Medium, direction: Tensor, irradiance: Tensor, vector: Tensor | None
-) -> Moments:
-    """`irradiance` ([C] or scalar) and `vector` [3, C], each times tau along `direction`.
+def _attenuate_direction(medium: Medium, direction: Tensor, weights: Tensor) -> Tensor:
+    """`weights` [moments, C] times tau along `direction`, `[moments, C, z, y, x]`.
 
     tau is averaged over each cell.
     """
-    if is_fused() and vector is None:
+    if is_fused() and len(weights) == 1:
         from ddrecon.light.fused.beams import attenuate
 
-        return attenuate(medium, direction[None], irradiance.view(1, 1, -1))[0]
+        return attenuate(medium, direction[None], weights[None])[0].mean[None]
     extinction = medium.extinction
     entered, step = sum_mass_to_cells(
         extinction.field, medium.grid, direction, extinction.mass_bound
     )
-    visible = extinction.mean_transmittance(entered, step)
-    mean = visible * irradiance.view(-1, 1, 1, 1)
-    if vector is None:
-        return Moments(mean)
-    z, y, x = (visible * component.view(-1, 1, 1, 1) for component in vector)
-    return Moments(mean, (z, y, x))
+    return extinction.mean_transmittance(entered, step) * weights[..., None, None, None]

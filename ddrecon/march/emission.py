@@ -13,6 +13,7 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.medium.coefficients import Coefficient
+from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.third_order import ThirdOrder
 
@@ -23,8 +24,8 @@ class Emission:
 
     Emission per unit length is kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2 and E3.
     `diffuse` [C, z, y, x] is the radiance that scatters into the camera's rays from all light but
-    beams; `g` is the mean cosine of p. Point lights have E = I / r^2. `peak` is the medium's: what
-    its forward peak does to p (E13).
+    beams; `seen` is p. Point lights have E = I / r^2. `peak` is the medium's: what its forward peak
+    does to p (E13).
     """
 
     grid: Grid
@@ -32,7 +33,7 @@ class Emission:
     scattering: Coefficient
     beams: tuple[Beam | PointBeam, ...]
     diffuse: Tensor
-    g: Tensor
+    seen: SeenPhase
     peak: Tensor | None
 
     @property

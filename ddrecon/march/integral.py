@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.engine import current_engine
+from ddrecon.light.point_light import PointBeam
 from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.march.emission import Emission, Sampled, pack_channels
@@ -50,7 +51,7 @@ def march(
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
         return nothing, 1 - nothing
-    march_rays, march_lattice = _pick_engine()
+    march_rays, march_lattice = _pick_engine(emission)
     channels = pack_channels(emission)
     sampler = make_sampler(channels, emission.grid, sight.way, settings.steps_per_voxel)
     if sight.lattice is None or sight.places is None:
@@ -65,9 +66,10 @@ def march(
     return scattered, 1 - opacity
 
 
-def _pick_engine() -> tuple[Callable[..., Part], Callable[..., Tensor]]:
+def _pick_engine(emission: Emission) -> tuple[Callable[..., Part], Callable[..., Tensor]]:
     """How rays and lattices of rays are marched by the engine in use."""
-    if current_engine() == "warp":
+    has_points = any(isinstance(beam, PointBeam) for beam in emission.beams)
+    if current_engine() == "warp" and not has_points and emission.seen.colors == 1:
         from ddrecon.march.fused import march as fused
 
         return fused.march_rays, fused.march_lattice
@@ -163,7 +165,7 @@ def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> Tensor:
         # E13: the depth of the forward peak, from where the light enters to the camera.
         depth = None if at_nodes.peak is None else at_nodes.peak * (passed + to_light)
         # E2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
-        weight, phase = beam.scatter(at_nodes.scattering, nodes, emission.g, depth)
+        weight, phase = beam.scatter(at_nodes.scattering, nodes, emission.seen, depth)
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
         scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
     # E1: what comes from the volume, and 1 - tau of what is behind it.

@@ -3,7 +3,7 @@
 `march_plainly` is what `ddrecon.march.integral.march` computes, at equal steps along every ray and
 differentiated by autograd alone. The renderer takes the other, which is faster and needs less
 memory; tests hold the two side by side. They differ in two details: `march` interpolates masses to
-third order, and for parallel light it evaluates E13 as a polynomial.
+third order, and it takes E13 from a table of polynomials.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.point_light import PointBeam
 from ddrecon.march.box import intersect_box
 from ddrecon.march.emission import Emission
-from ddrecon.medium.phase import henyey_greenstein, peaked_phase
 
 
 def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, Tensor]:
@@ -45,11 +44,11 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
         cosine = -(travel * rays.direction).sum(-1)
         mass = _interpolate(grid, beam.mass, points)
         if emission.peak is None:
-            phase = henyey_greenstein(cosine, emission.g)
+            phase = emission.seen.value(cosine)
         else:
             # E13: the forward peak spreads the light on its way to the node and to the camera.
             depth = _interpolate(grid, emission.peak, points) * (passed + mass)
-            phase = peaked_phase(depth, cosine, emission.g)
+            phase = emission.seen.at(depth, cosine)
         radiance = radiance + phase * irradiance / (4 * math.pi) * torch.exp(-scale * mass)
     # E2 + E3: the integral of tau kappa_s times that, and tau of the whole way.
     scattering = _interpolate(grid, emission.scattering.value, points)

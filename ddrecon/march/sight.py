@@ -5,6 +5,7 @@ It takes many small operations, and reads of numbers for which a processor waits
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, fields
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -73,31 +74,35 @@ def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
     It is kept with the camera, unless that is varied, and found anew when any of its fields is
     another or has changed.
     """
-    pose = camera.pose
-    if pose.requires_grad or is_forward() or pose.is_inference():
+    tensors = camera.tensors
+    is_varied = any(tensor.requires_grad or tensor.is_inference() for tensor in tensors)
+    if is_varied or is_forward():
         return _look(camera, grid, settings)
     key = _key(camera, grid, settings)
     kept = _KEPT.get(camera)
-    if kept is None or kept[0] != key or kept[1] is not pose:
+    if kept is None or kept[0] != key or not all(map(operator.is_, kept[1], tensors)):
         _KEPT.pop(camera, None)
         with torch.inference_mode(False), torch.no_grad():
-            kept = key, pose, _look(camera, grid, settings)
+            kept = key, tensors, _look(camera, grid, settings)
         if kept[2].bytes + sum(sight.bytes for _, _, sight in _KEPT.values()) <= LIMIT:
             _KEPT[camera] = kept
     return kept[2]
 
 
-_KEPT: WeakKeyDictionary[Camera, tuple[tuple[Any, ...], Tensor, Sight]] = WeakKeyDictionary()
-"""By camera, and as long as that is there: what its sight was found for, its pose and its sight."""
+_KEPT: WeakKeyDictionary[Camera, tuple[tuple[Any, ...], list[Tensor], Sight]] = WeakKeyDictionary()
+"""By camera, as long as it is there: what its sight was found for, its tensors and its sight."""
 
 
 def _key(camera: Camera, grid: Grid, settings: RenderSettings) -> tuple[Any, ...]:
-    values = (getattr(camera, part.name) for part in fields(camera) if part.name != "pose")
-    pose, is_interpolated = camera.pose, settings.tolerance > 0
+    values = (getattr(camera, part.name) for part in fields(camera))
+    plain = (value for value in values if not isinstance(value, Tensor))
+    versions = tuple(map(version_of, camera.tensors))
     # The numbers themselves, which NumPy may have changed; but a GPU would be waited for.
-    numbers = None if pose.is_cuda else pose.detach().numpy().tobytes()
-    version = version_of(pose), numbers
-    return (*version, *values, grid, settings.samples_per_pixel, is_interpolated)
+    numbers = tuple(
+        tensor.detach().numpy().tobytes() for tensor in camera.tensors if not tensor.is_cuda
+    )
+    is_interpolated = settings.tolerance > 0
+    return (versions, numbers, *plain, grid, settings.samples_per_pixel, is_interpolated)
 
 
 def _look(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:

@@ -12,33 +12,61 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import forward_fraction, scaled_mean_cosine
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
+from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
 
+P1_DEGREE = 1
+"""Diffusion knows light to this degree in angle: its mean and its flux."""
 
-@dataclass(eq=False)
+
+@dataclass(eq=False, init=False)
 class Volume:
     """What a user describes: density, and cross sections per unit density, on a `grid`.
 
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
-    [C] or per cell [C, z, y, x] with C = 1 or 3; `g`: mean cosine of scattering, scalar in (-1, 1).
-    Tensors may be replaced or require gradients. Raises ValueError where shapes disagree.
+    [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function, or g in (-1, 1), the
+    mean cosine of Henyey and Greenstein's. Tensors may be replaced or require gradients. Raises
+    ValueError where shapes disagree.
     """
 
     grid: Grid
     density: Tensor
     sigma_a: Tensor
     sigma_s: Tensor
-    g: Tensor
+    phase: PhaseFunction
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        density: Tensor,
+        sigma_a: Tensor,
+        sigma_s: Tensor,
+        phase: PhaseFunction | Tensor,
+    ):
+        self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
+        self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
         if tuple(self.density.shape) != self.grid.shape:
             raise ValueError(
                 f"density is {tuple(self.density.shape)} but the grid has {self.grid.shape} "
                 "cells [z, y, x]"
             )
+
+    @property
+    def g(self) -> Tensor:
+        """The mean cosine of Henyey and Greenstein's phase function.
+
+        It may be replaced. Raises AttributeError where the volume has another phase function.
+        """
+        if isinstance(self.phase, HenyeyGreenstein):
+            return self.phase.g
+        raise AttributeError(f"the phase function is {self.phase.NAME}: see volume.phase")
+
+    @g.setter
+    def g(self, g: Tensor) -> None:
+        self.phase = HenyeyGreenstein(g)
 
 
 @dataclass(frozen=True)
@@ -75,10 +103,11 @@ class Medium:
     """Coefficients of a medium of whose scattering the part f counts as not scattered.
 
     f is `forward_fraction`, the forward peak's. `absorption` is kappa_a. `scattering` is all of
-    kappa_s, by which beams scatter with the exact phase function of mean cosine `g`. `extinction`
-    is kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that remains. `peak` is
-    f kappa_s per unit of the extinction's field: times a mass, it is the depth x of E13. It is
-    [C, 1, 1, 1], or [C, z, y, x] where cross sections vary, and None without a peak.
+    kappa_s, by which beams scatter with the exact phase function `seen`, of mean cosine `g`.
+    `extinction` is kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that
+    remains. These three are scalars, or [3, 1, 1, 1] where colors differ. `peak` is f kappa_s per
+    unit of the extinction's field: times a mass, it is the depth x of E13. It is [C, 1, 1, 1], or
+    [C, z, y, x] where cross sections vary, and None without a peak.
     """
 
     grid: Grid
@@ -89,6 +118,7 @@ class Medium:
     mean_cosine: Tensor
     forward_fraction: Tensor
     peak: Tensor | None
+    seen: SeenPhase
 
     @property
     def remaining_scattering(self) -> Tensor:
@@ -108,13 +138,26 @@ class Medium:
         """Whether light's direction matters to scattering: g is not 0, or is being varied."""
         return is_varied(self.g) or is_any_nonzero(self.g)
 
+    @property
+    def degree(self) -> int:
+        """The degree in angle to which light is known: 0 where its direction does not matter."""
+        is_directed = self.is_anisotropic if self.seen.degree > P1_DEGREE else self.has_flux
+        return self.seen.degree if is_directed else 0
 
-def scale_medium(volume: Volume) -> Medium:
+    @property
+    def is_anisotropic(self) -> bool:
+        """Whether the phase function differs from that of isotropic scattering, or may come to."""
+        return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
+
+
+def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
     """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
 
-    f and g' are `forward_fraction` and `scaled_mean_cosine` of `phase.py`, where the source is.
+    f is what of the phase function lies beyond `degree`, g' = (g - f) / (1 - f). Source: Joseph,
+    Wiscombe, Weinman 1976, doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
     """
-    return _medium(volume, *_scale_phase(volume.g))
+    fraction = _forward_fraction(type(volume.phase), degree, *volume.phase.numbers)
+    return _medium(volume, SeenPhase(volume.phase, degree), fraction)
 
 
 def keep_medium(volume: Volume) -> Medium:
@@ -122,11 +165,13 @@ def keep_medium(volume: Volume) -> Medium:
 
     Path tracing separates single from multiple scattering by it.
     """
-    return _medium(volume, torch.zeros_like(volume.g), volume.g)
+    return _medium(volume, SeenPhase(volume.phase, P1_DEGREE), None)
 
 
-def _medium(volume: Volume, fraction: Tensor, mean_cosine: Tensor) -> Medium:
-    sigma_a, sigma_s = _broadcast(volume.sigma_a), _broadcast(volume.sigma_s)
+def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
+    g = _mean_cosine(type(volume.phase), *volume.phase.numbers)
+    fraction = 0 * g.detach() if fraction is None else fraction
+    sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
     density = volume.density[None]
 
     def coefficient(sigma: Tensor) -> Coefficient:
@@ -140,10 +185,11 @@ def _medium(volume: Volume, fraction: Tensor, mean_cosine: Tensor) -> Medium:
         extinction=coefficient(extinction),
         scattering=coefficient(sigma_s),
         absorption=coefficient(sigma_a),
-        g=volume.g,
-        mean_cosine=mean_cosine,
+        g=g,
+        mean_cosine=_scaled_mean_cosine(g, fraction),
         forward_fraction=fraction,
         peak=peak,
+        seen=seen,
     )
 
 
@@ -153,8 +199,23 @@ def _mass_bound(scale: Tensor) -> Tensor:
 
 
 @remember
-def _scale_phase(g: Tensor) -> tuple[Tensor, Tensor]:
-    return forward_fraction(g), scaled_mean_cosine(g)
+def _mean_cosine(kind: type[PhaseFunction], *numbers: Tensor) -> Tensor:
+    return _for_cells(kind(*numbers).moments(2)[:, 1])
+
+
+@remember
+def _forward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+    return _for_cells(kind(*numbers).forward_fraction(degree))
+
+
+@remember
+def _scaled_mean_cosine(g: Tensor, fraction: Tensor) -> Tensor:
+    return (g - fraction) / (1 - fraction)
+
+
+def _for_cells(numbers: Tensor) -> Tensor:
+    """One number for each color, [1 or 3], as a scalar or `[3, 1, 1, 1]`."""
+    return numbers[0] + 0 if len(numbers) == 1 else numbers.view(-1, 1, 1, 1) + 0
 
 
 def _extinction_and_peak(
@@ -188,8 +249,10 @@ def _peak_per_mass(extinction: Tensor, forward: Tensor) -> Tensor:
     return torch.where(extinction > 0, forward / torch.where(extinction > 0, extinction, 1), 0)
 
 
-def _broadcast(sigma: Tensor) -> Tensor:
-    return sigma if sigma.ndim == 4 else along_colors(sigma)
+def _broadcast(sigma: Tensor, g: Tensor) -> Tensor:
+    """`sigma` as [C, z, y, x], with as many colors as `g` has."""
+    sigma = sigma if sigma.ndim == 4 else along_colors(sigma)
+    return sigma if len(sigma) > 1 or g.ndim == 0 else sigma.expand(3, -1, -1, -1)
 
 
 @remember

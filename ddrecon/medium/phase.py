@@ -1,102 +1,251 @@
-"""The Henyey-Greenstein phase function and the delta-Eddington scaling of its forward peak.
+"""Phase functions: how likely light is scattered by which angle.
 
-Phase functions are normalized to 4 pi over the sphere, as in docs/theory.md E2.
+They are normalized to 4 pi over the sphere, as in docs/theory.md E2. A phase function is known by
+its Legendre moments chi_l, the mean of P_l(cosine) over scattered light: chi_0 = 1, and chi_1 is
+the mean cosine g. Its numbers may differ by color; what is computed from them has the color as
+first axis, of size 1 where all colors share one phase function.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
-from ddrecon.engine import current_engine
-from ddrecon.numerics.autodiff import is_forward, is_varied
-from ddrecon.numerics.chebyshev import evaluate_positive, fit_chebyshev
-from ddrecon.numerics.decay import decay_mean
+from ddrecon.numerics.legendre import COUNTS
+
+NEGLIGIBLE = 1e-9
+"""Moments below this are left out of series."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseFunction(ABC):
+    """What every phase function can be asked.
+
+    Its fields are tensors: its numbers, by which all that it returns is differentiable.
+    """
+
+    NAME: ClassVar[str]
+    """What a scene file calls it."""
+    VARIABLES: ClassVar[tuple[str, ...]] = ()
+    """Those of its numbers that can be optimized."""
+
+    @abstractmethod
+    def value(self, cosine: Tensor) -> Tensor:
+        """p >= 0, normalized to 4 pi, `[C, *cosine.shape]`.
+
+        `cosine`: between the directions of travel before and after scattering, in [-1, 1].
+        """
+
+    @abstractmethod
+    def moments(self, count: int) -> Tensor:
+        """chi_l for l < `count`, [C, count]."""
+
+    @abstractmethod
+    def peak_tail(self, degree: int, count: int) -> Tensor:
+        """The moments f r_l of the forward peak for `count` degrees l > `degree`, [C, count].
+
+        The first is f, the part of scattering that counts as not scattered where light is known to
+        `degree` (docs/theory.md E16). f is 0 without a forward peak, and the others are at most f.
+        """
+
+    @abstractmethod
+    def backward_tail(self, degree: int, count: int) -> Tensor:
+        """The moments b r_l of the backward peak for `count` degrees l > `degree`, [C, count].
+
+        They are those about the backward direction. The first is b, the part of scattering that
+        counts as turned back where light is known to `degree`; the others are at most b.
+        """
+
+    @abstractmethod
+    def length(self) -> int:
+        """How many moments are not negligible; one of `numerics.legendre.COUNTS`."""
+
+    @property
+    def numbers(self) -> tuple[Tensor, ...]:
+        """All numbers, in the order of the fields."""
+        return tuple(getattr(self, field.name) for field in fields(self))
+
+    @property
+    def colors(self) -> int:
+        """How many colors have a phase function of their own: 1 where all share one."""
+        return len(self.moments(1))
+
+    def forward_fraction(self, degree: int) -> Tensor:
+        """f [C], the forward peak's part of scattering where light is known to `degree`."""
+        return self.peak_tail(degree, 1)[:, 0]
+
+    def backward_fraction(self, degree: int) -> Tensor:
+        """b [C], the backward peak's part of scattering where light is known to `degree`."""
+        return self.backward_tail(degree, 1)[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class HenyeyGreenstein(PhaseFunction):
+    """p(w) = (1 - g^2) / (1 + g^2 - 2 g w)^(3/2), chi_l = g^l.
+
+    `g`: mean cosine in (-1, 1), scalar or [3]. Source: Henyey and Greenstein 1941,
+    doi:10.1086/144246.
+    """
+
+    NAME = "henyey_greenstein"
+    VARIABLES = ("g",)
+
+    g: Tensor
+
+    def value(self, cosine: Tensor) -> Tensor:
+        return henyey_greenstein(cosine, _beside(self.g, cosine))
+
+    def moments(self, count: int) -> Tensor:
+        return _powers(self.g, 0, count)
+
+    def peak_tail(self, degree: int, count: int) -> Tensor:
+        return _powers(self.g.clamp(min=0), degree + 1, count)
+
+    def backward_tail(self, degree: int, count: int) -> Tensor:
+        return _powers((-self.g).clamp(min=0), degree + 1, count)
+
+    def length(self) -> int:
+        return _length_of(self.g)
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLobe(PhaseFunction):
+    """`weight` of the first of two Henyey-Greenstein functions, and the rest of the second.
+
+    `g` [2]: their mean cosines; `weight`: in [0, 1], scalar or [3].
+    """
+
+    NAME = "two_lobe"
+    VARIABLES = ("g", "weight")
+
+    g: Tensor
+    weight: Tensor
+
+    def value(self, cosine: Tensor) -> Tensor:
+        return self._mix([lobe.value(cosine) for lobe in self.lobes], cosine.ndim)
+
+    def moments(self, count: int) -> Tensor:
+        return self._mix([lobe.moments(count) for lobe in self.lobes], 1)
+
+    def peak_tail(self, degree: int, count: int) -> Tensor:
+        return self._mix([lobe.peak_tail(degree, count) for lobe in self.lobes], 1)
+
+    def backward_tail(self, degree: int, count: int) -> Tensor:
+        return self._mix([lobe.backward_tail(degree, count) for lobe in self.lobes], 1)
+
+    def length(self) -> int:
+        return _length_of(self.g)
+
+    @property
+    def lobes(self) -> tuple[HenyeyGreenstein, HenyeyGreenstein]:
+        """Both functions."""
+        return HenyeyGreenstein(self.g[0]), HenyeyGreenstein(self.g[1])
+
+    def _mix(self, parts: Sequence[Tensor], axes: int) -> Tensor:
+        weight = self.weight.reshape(-1, *[1] * axes)
+        return weight * parts[0] + (1 - weight) * parts[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Rayleigh(PhaseFunction):
+    """p(w) = 3/4 (1 + w^2), of particles much smaller than the wavelength; it has no peak.
+
+    `like`: any tensor of the precision that is wanted.
+    """
+
+    NAME = "rayleigh"
+
+    like: Tensor
+
+    def value(self, cosine: Tensor) -> Tensor:
+        return (0.75 * (1 + cosine * cosine))[None]
+
+    def moments(self, count: int) -> Tensor:
+        found = self.like.new_zeros(1, count)
+        found[:, :1], found[:, 2:3] = 1.0, 0.1
+        return found
+
+    def peak_tail(self, degree: int, count: int) -> Tensor:
+        return self.like.new_zeros(1, count)
+
+    def backward_tail(self, degree: int, count: int) -> Tensor:
+        return self.like.new_zeros(1, count)
+
+    def length(self) -> int:
+        return COUNTS[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Draine(PhaseFunction):
+    """A Henyey-Greenstein function times (1 + alpha w^2), normalized.
+
+    `g` in (-1, 1) and `alpha` >= 0, scalars or [3]. alpha = 0 is Henyey-Greenstein, g = 0 with
+    alpha = 1 is Rayleigh; the mean cosine is not g. Source: Draine 2003, doi:10.1086/379118.
+    """
+
+    NAME = "draine"
+    VARIABLES = ("g", "alpha")
+
+    g: Tensor
+    alpha: Tensor
+
+    def value(self, cosine: Tensor) -> Tensor:
+        alpha, norm = _beside(self.alpha, cosine), _beside(self._norm, cosine)
+        g = _beside(self.g, cosine)
+        return henyey_greenstein(cosine, g) * (1 + alpha * cosine * cosine) / norm
+
+    def moments(self, count: int) -> Tensor:
+        # w^2 P_l is a sum of P_(l+2), P_l and P_(l-2): two steps of Legendre's recurrence.
+        degree = torch.arange(count, dtype=self.g.dtype, device=self.g.device)
+        above = (degree + 1) * (degree + 2) / ((2 * degree + 1) * (2 * degree + 3))
+        same = (2 * degree * (degree + 1) - 1) / ((2 * degree - 1) * (2 * degree + 3))
+        below = degree * (degree - 1) / ((2 * degree - 1) * (2 * degree + 1))
+        powers = _powers(self.g, 0, count + 2)
+        lower = torch.cat([torch.zeros_like(powers[:, :2]), powers[:, : count - 2]], 1)[:, :count]
+        bent = above * powers[:, 2:] + same * powers[:, :-2] + below * lower
+        return (powers[:, :-2] + self.alpha.reshape(-1, 1) * bent) / self._norm.reshape(-1, 1)
+
+    def peak_tail(self, degree: int, count: int) -> Tensor:
+        return self._lobe.peak_tail(degree, count).expand(self._norm.numel(), -1)
+
+    def backward_tail(self, degree: int, count: int) -> Tensor:
+        return self._lobe.backward_tail(degree, count).expand(self._norm.numel(), -1)
+
+    def length(self) -> int:
+        return _length_of(self.g)
+
+    @property
+    def _lobe(self) -> HenyeyGreenstein:
+        return HenyeyGreenstein(self.g)
+
+    @property
+    def _norm(self) -> Tensor:
+        """The mean of 1 + alpha w^2 over what the lobe scatters."""
+        return 1 + self.alpha * (1 + 2 * self.g * self.g) / 3
 
 
 def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
-    """p(cosine) = (1 - g^2) / (1 + g^2 - 2 g cosine)^(3/2), normalized to 4 pi.
-
-    `cosine`: cosine between the directions of travel before and after scattering, in [-1, 1]; `g`:
-    mean cosine, scalar in (-1, 1). Source: Henyey and Greenstein 1941, doi:10.1086/144246.
-    """
+    """(1 - g^2) / (1 + g^2 - 2 g `cosine`)^(3/2); both broadcast."""
     return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
 
 
-def forward_fraction(g: Tensor) -> Tensor:
-    """The fraction f of scattering that counts as not scattered: g^2 for g > 0, else 0.
-
-    A phase function with g <= 0 has no forward peak to remove; f and its derivative are continuous
-    at g = 0. Source: delta-Eddington scaling, Joseph, Wiscombe, Weinman 1976,
-    doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
-    """
-    return g.clamp(min=0) ** 2
+def _beside(number: Tensor, cosine: Tensor) -> Tensor:
+    """`number`, scalar or [C], to broadcast against `[C, *cosine.shape]`."""
+    return number.reshape(-1, *[1] * cosine.ndim)
 
 
-def scaled_mean_cosine(g: Tensor) -> Tensor:
-    """The mean cosine g' = (g - f) / (1 - f) of what remains: g / (1 + g) for g > 0, else g."""
-    return g / (1 + g.clamp(min=0))
+def _powers(g: Tensor, first: int, count: int) -> Tensor:
+    """g^l for `count` degrees l from `first` on, [C, count]."""
+    degree = torch.arange(first, first + count, dtype=g.dtype, device=g.device)
+    return g.reshape(-1, 1) ** degree
 
 
-def peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
-    """S (docs/theory.md E13), >= 0: what replaces the phase function from a beam into a view ray.
-
-    It holds light scattered once, and light that the forward peak alone scattered. `depth` x >= 0:
-    f times the optical depth of scattering from where the light enters, by the point where it
-    turns, to where the view ray leaves; at 0 this is `henyey_greenstein`. `cosine`: as there,
-    broadcast against `depth`; `g` >= 0, scalar. It is 0 where it would be negative, since
-    scattering without its peak has only two moments.
-    """
-    return _signed_peaked_phase(depth, cosine, g).clamp(min=0)
-
-
-def peaked_phase_along(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
-    """`peaked_phase` at `depth` [N, C, R] along R rays, each with one `cosine` [R], by polynomials.
-
-    Exact at depth 0; elsewhere off by at most 0.007 up to g = 0.95, relative to the function's
-    value or to 1 where that is less.
-    """
-    return evaluate_positive(fit_peaked_phase(cosine, g), depth)
-
-
-def fit_peaked_phase(cosine: Tensor, g: Tensor) -> Tensor:
-    """The polynomials [COEFFICIENTS, R] that stand for `peaked_phase` at each `cosine` [R]."""
-    if current_engine() == "warp" and not (is_varied(cosine) or is_varied(g) or is_forward()):
-        from ddrecon.medium.fused import peak as fused
-
-        return fused.fit_peaked_phase(cosine, g)
-
-    def along_depth(depths: Tensor) -> Tensor:
-        return _signed_peaked_phase(depths, cosine.double(), g.double())
-
-    return fit_chebyshev(along_depth, cosine)
-
-
-def _signed_peaked_phase(depth: Tensor, cosine: Tensor, g: Tensor) -> Tensor:
-    """S of E13 before it is held at zero."""
-    fraction = forward_fraction(g)
-    # phi(x), the part of the peak's light that turns here.
-    turned = decay_mean(depth)
-    # h(x) of E15, written as g exp(-x (1 - g)) phi(g x) / phi(x): nothing cancels, and h(0) = g.
-    spread = g * torch.exp((g - 1) * depth) * decay_mean(g * depth) / turned
-    # (1 - f) p', what scatters without its peak.
-    without_peak = (1 - fraction) * (1 + 3 * scaled_mean_cosine(g) * cosine)
-    return without_peak + fraction * turned * _spread_peak(spread, cosine)
-
-
-def _spread_peak(spread: Tensor, cosine: Tensor) -> Tensor:
-    """q_h of E16: the forward peak, whose moments are 1, 1, 1, h, h^2, ... with h = `spread`.
-
-    q_h = (p_h - 1 - 3 h w) / h^2 + 1 + 3 w, where w is the `cosine` and p_h the Henyey-Greenstein
-    function. Written so that nothing cancels at small h ("Without cancellation" beside E13 in
-    docs/theory.md has every step).
-    """
-    # With a = h - 2 w and r = sqrt(1 + h a): p_h = (1 - h^2) / r^3.
-    away = spread - 2 * cosine
-    root = (1 + spread * away).sqrt()
-    # C in 1 / r^3 = 1 - (3/2) h a + (h a)^2 C: since h a = r^2 - 1,
-    # C = (1 - (5/2) r^3 + (3/2) r^5) / (r^3 (r^2 - 1)^2), where (r - 1)^2 is divided out.
-    curvature = (1 + root * (2 + root * (3 + 1.5 * root))) / (root**3 * (root + 1) ** 2)
-    # (3/2) h a = (3/2) h^2 - 3 h w, so the terms 1 + 3 h w cancel by algebra, and all that is left
-    # holds h^2: q_h = 3 w - 3/2 + (3/2) h a + (1 - h^2) a^2 C.
-    return 3 * cosine - 1.5 + 1.5 * spread * away + (1 - spread * spread) * away * away * curvature
+def _length_of(g: Tensor) -> int:
+    """How many powers of the largest of `g` are not negligible."""
+    largest = float(g.detach().abs().max())
+    return next((count for count in COUNTS if largest**count < NEGLIGIBLE), COUNTS[-1])

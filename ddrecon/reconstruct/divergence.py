@@ -45,7 +45,7 @@ def explain_divergence(
         for parameter in parameters
     )
     rates = " and ".join(
-        f"optimize.parameters.{parameter.name}.lr (now {parameter.rate:.3g})"
+        f"optimize.parameters.{parameter.name}.lr (now {parameter.largest_rate:.3g})"
         for parameter in parameters
     )
     return DivergenceError(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.renderer import solve_light, view_image
+from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import VOLUME
 from ddrecon.variables.values import with_values
@@ -53,7 +53,7 @@ def differentiate(
     for name in names:
         lit = with_values(scene, outside)
         view = lit.view(name)
-        image = view_image(light_field, lit, view.camera, derivatives)
+        image = view_picture(light_field, lit, view, derivatives)
         view_loss = loss_of(view, image)
         if view_loss.requires_grad:
             sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))

@@ -43,7 +43,7 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
     sigma_a, sigma_s = (
         _resample_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s)
     )
-    coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, volume.g)
+    coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, volume.phase)
     return replace(
         scene, volume=coarse, views=[_view_at_level(view, factor) for view in scene.views]
     )
@@ -73,8 +73,11 @@ def _view_at_level(view: View, factor: int) -> View:
     powers = (2**k for k in range(factor.bit_length()))
     fits = [power for power in powers if min(view.camera.size) // power >= FEWEST_PIXELS]
     camera, image, mask = view.camera.resize(max(fits, default=1)), view.image, view.mask
+    background = view.background
+    if background is not None and background.shape[1:] != (1, 1):
+        background = adaptive_avg_pool2d(background, camera.size)
     if image is not None:
         image = adaptive_avg_pool2d(image, camera.size)
     if mask is not None:
         mask = (adaptive_avg_pool2d(mask[None], camera.size)[0] > 0.5).to(mask.dtype)
-    return replace(view, camera=camera, image=image, mask=mask)
+    return replace(view, camera=camera, image=image, mask=mask, background=background)

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class Row:
-    """One iteration. PSNRs [dB] are means over views; `test_psnr` is None where none was rendered.
+    """One iteration. PSNRs [dB] and SSIMs are means over views, of values as they are compared.
 
     `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
-    `seconds` count from the start of the run; `cells` are those of the grid.
+    `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
+    views are None where none was rendered, and SSIMs where they were not looked at.
     """
 
     iteration: int
@@ -24,6 +25,8 @@ class Row:
     cells: int
     data_loss: float
     penalty: float
+    ssim: float | None = None
+    test_ssim: float | None = None
 
 
 NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
@@ -33,11 +36,17 @@ NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 def sum_rows(total: Row, row: Row) -> Row:
     """`total` of the rows before `row`, and `row`.
 
-    It is `row` with all solver iterations so far and the last known PSNR of test views.
+    It is `row` with all solver iterations so far, and where it lacks SSIM or the quality of test
+    views, the last that is known.
     """
+    known = {
+        name: getattr(total, name)
+        for name in ("test_psnr", "ssim", "test_ssim")
+        if getattr(row, name) is None
+    }
     return replace(
         row,
-        test_psnr=total.test_psnr if row.test_psnr is None else row.test_psnr,
+        **known,
         forward_iterations=total.forward_iterations + row.forward_iterations,
         adjoint_iterations=total.adjoint_iterations + row.adjoint_iterations,
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -17,9 +17,9 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
-from ddrecon.losses import Target
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
+from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.levels import factors, resample, scene_at_level, stage_of
 from ddrecon.reconstruct.log import NO_ROWS, Row, sum_rows
@@ -27,13 +27,15 @@ from ddrecon.reconstruct.objective import (
     Comparison,
     add_penalties,
     read_numbers,
-    render_psnr,
-    target_of,
+    render_quality,
 )
 from ddrecon.reconstruct.rates import rate_at
+from ddrecon.reconstruct.responses import step_responses
+from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
+from ddrecon.settings import AUTO
 from ddrecon.variables.values import with_values
 
 TEST_EVERY = 10
@@ -69,8 +71,9 @@ class Reconstruction:
     """The state of a run: its parameters, their resolution, and the sum of its log, `total`.
 
     The objective is the weighted mean of the views' image loss plus, for each parameter, its
-    penalty times `power`, the mean square of the targets. `misfit` is the root of the last mean
-    loss over `power`. `before_step` is the state before the last step was made.
+    penalty times `power`, the mean square of the targets as the `loss` compares them. `misfit` is
+    the root of the last mean loss over `power`. `before_step` is the state before the last step was
+    made.
     """
 
     def __init__(self, scene: Scene, iterations: int | None = None):
@@ -79,14 +82,20 @@ class Reconstruction:
         self.train = setup.select_views(scene, is_test=False)
         self.test = setup.select_views(scene, is_test=True)
         setup.require_usable(self.train, self.settings)
-        self.power = setup.mean_power(self.train)
+        self.loss = setup.choose_loss(self.settings, self.train)
+        views = replace(scene, views=[*self.train.views, *self.test.views])
+        self.noises = setup.noises_of(views, self.settings) if self.loss == "photon" else {}
+        self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
         self.parameters = setup.start_parameters(scene, self.settings)
+        self.gauges = find_gauges(self.train, self.parameters)
+        self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
         self.total = NO_ROWS
         self.misfit = 1.0
         self.seed = torch.initial_seed()
         self.memory = SolveMemory(scene.diffusion.warm_start)
         self.before_step: dict[str, Any] | None = None
+        self.smoothing: Smoothing | None = None
         self._enter_stage(0)
 
     @property
@@ -106,6 +115,8 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
+        if self.iteration == 0:
+            self._settle_smoothing()
         stage = stage_of(self.iteration, self.settings.iterations, self.settings.refine_at)
         if stage > self.stage:
             self._enter_stage(stage)
@@ -125,7 +136,7 @@ class Reconstruction:
         # See: which views this iteration compares.
         views = self._views()
         # Differentiate: the objective and its derivative by every parameter.
-        compared = Comparison(self.settings.loss, views, self.targets)
+        compared = Comparison(views, self.targets, self._is_test_due)
         objective = self._differentiate(views, compared)
         loss, gradients = add_penalties(objective, self.parameters, self.power)
         # Check: a derivative that is not finite would spoil the parameters for good.
@@ -135,12 +146,10 @@ class Reconstruction:
         self.before_step = self.state() | {"solutions": solutions}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
-        rate = rate_at(self.iteration, self.settings.iterations)
-        for parameter in self.parameters:
-            parameter.step(gradients[parameter.name], rate)
+        self._step(gradients, compared.pictures)
         # Test: now and then, how good the parameters are for views they were not made from.
         solves = [(record.kind, record.iterations) for record in self.memory.records]
-        test_psnr = self._test_psnr()
+        test_psnr, test_ssim = self._test_quality()
         # Log.
         row = Row(
             iteration=self.iteration + 1,
@@ -153,6 +162,8 @@ class Reconstruction:
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),
             adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
             cells=self.train_level.volume.grid.cells,
+            ssim=numbers.ssim,
+            test_ssim=test_ssim,
         )
         self.total = sum_rows(self.total, row)
         return row
@@ -173,6 +184,7 @@ class Reconstruction:
             "solutions": dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
+            "smoothing": None if self.smoothing is None else self.smoothing.described(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -181,10 +193,24 @@ class Reconstruction:
             parameter.restore(state["parameters"][parameter.name])
         self.total = Row(**state["total"])
         self.misfit, self.seed = state["misfit"], state["seed"]
+        if state["smoothing"] is not None:
+            self._smooth(Smoothing(**state["smoothing"]))
         self._enter_stage(state["stage"])
         self.memory.last = {
             kind: field.to(self.scene.volume.density) for kind, field in state["solutions"].items()
         }
+
+    def _settle_smoothing(self) -> None:
+        """Finds the weight of density's total variation where the scene asks for that."""
+        density = self.settings.parameters.get("density")
+        if self.smoothing is None and density is not None and density.tv == AUTO:
+            self._smooth(find_smoothing(self.scene, Reconstruction))
+
+    def _smooth(self, smoothing: Smoothing) -> None:
+        self.smoothing = smoothing
+        for parameter in self.parameters:
+            if parameter.name == "density":
+                parameter.tv = smoothing.weight
 
     def _enter_stage(self, stage: int) -> None:
         """Takes scenes, parameters and solutions to the resolution of `stage`."""
@@ -192,13 +218,16 @@ class Reconstruction:
         self.train_level, self.test_level = (
             scene_at_level(scene, self.factors[stage]) for scene in (self.train, self.test)
         )
-        self.targets = {
-            view.name: Target.of(target_of(view), view.mask) for view in self.train_level.views
-        }
+        self.targets, self.test_targets = (
+            setup.targets_of(level, self.loss, self.noises)
+            for level in (self.train_level, self.test_level)
+        )
         grid = self.train_level.volume.grid
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
+            if parameter.name == "density" and self.support is not None:
+                parameter.restrict(self.support.on(grid))
         self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
 
     def _views(self) -> list[View]:
@@ -222,10 +251,35 @@ class Reconstruction:
         finally:
             self.memory.tolerance_floor = {}
 
-    def _test_psnr(self) -> float | None:
-        """The mean PSNR [dB] of the test views; None without any, or where it is not their turn."""
+    def _step(self, gradients: dict[str, Tensor], pictures: dict[str, Tensor]) -> None:
+        """Every parameter against its derivative, but those of views not seen or not yet due.
+
+        Responses go part of the way to those that fit the `pictures` of this iteration best.
+        """
+        iterations = self.settings.iterations
+        due = [p for p in self.parameters if p.view is None or p.view in pictures]
+        for parameter in due:
+            begin = round(parameter.release * iterations)
+            rate = rate_at(self.iteration, iterations, begin)
+            if rate and not parameter.is_fitted:
+                parameter.step(gradients[parameter.name], rate)
+        for name, picture in pictures.items():
+            fitted = [p for p in due if p.view == name and p.is_fitted]
+            step_responses(fitted, self.train_level.view(name), picture, self.targets[name])
+        for gauge in self.gauges:
+            gauge.hold()
+
+    @property
+    def _is_test_due(self) -> bool:
+        """Whether test views, and SSIM, are looked at in this iteration."""
         iteration = self.iteration + 1
-        is_due = iteration % TEST_EVERY == 0 or iteration == self.settings.iterations
-        if not is_due or not self.test_level.views:
-            return None
-        return render_psnr(self.test_level, self._values(), self.memory)
+        return iteration % TEST_EVERY == 0 or iteration == self.settings.iterations
+
+    def _test_quality(self) -> tuple[float | None, float | None]:
+        """The mean PSNR [dB] and SSIM of the test views.
+
+        None without any, or where it is not their turn.
+        """
+        if not self._is_test_due or not self.test_level.views:
+            return None, None
+        return render_quality(self.test_level, self._values(), self.test_targets, self.memory)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.losses import Target, psnr
+from ddrecon.losses import Target
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
@@ -28,16 +28,19 @@ def target_of(view: View) -> Tensor:
 
 @dataclass
 class Comparison:
-    """Compares images of `views` with their `targets` by name, each once, by the loss `kind`.
+    """Compares images of `views` with their `targets` by name, each once.
 
-    `losses` and `psnrs` [dB] are those compared so far, in their order.
+    `losses`, `psnrs` [dB] and, where `has_similarity`, `similarities` are those compared so far, in
+    their order; `pictures` are the images by name.
     """
 
-    kind: str
     views: Sequence[View]
     targets: Mapping[str, Target]
+    has_similarity: bool = False
+    pictures: dict[str, Tensor] = field(default_factory=dict)
     losses: list[Tensor] = field(default_factory=list)
     psnrs: list[Tensor] = field(default_factory=list)
+    similarities: list[Tensor] = field(default_factory=list)
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
         """What `view` and its rendered `image` add to the objective.
@@ -45,9 +48,11 @@ class Comparison:
         That is its share, by weight, of the views' mean loss.
         """
         target = self.targets[view.name]
-        loss = target.loss_of(self.kind, image)
-        square = loss if self.kind == "l2" else target.loss_of("l2", image.detach())
-        self.psnrs.append(target.psnr_of(square.detach()))
+        self.pictures[view.name] = image.detach()
+        loss = target.loss_of(image)
+        self.psnrs.append(target.psnr_of(image.detach()))
+        if self.has_similarity:
+            self.similarities.append(target.ssim_of(image.detach()))
         value = view.weight / sum(view.weight for view in self.views) * loss
         self.losses.append(value.detach())
         return value
@@ -61,11 +66,15 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Numbers:
-    """What Python knows of an iteration: the `loss`, its part of the images, their mean `psnr`."""
+    """What Python knows of an iteration: the `loss`, its part of the images, their mean `psnr`.
+
+    And their mean `ssim`, None where that was not looked at.
+    """
 
     loss: float
     of_images: float
     psnr: float
+    ssim: float | None
 
 
 def read_numbers(
@@ -80,12 +89,15 @@ def read_numbers(
     Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
     """
     extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-    psnr, image_losses = compared.psnrs, compared.losses
-    read = torch.stack([loss, objective.loss, *psnr, *image_losses, *extremes]).tolist()
-    if not all(math.isfinite(number) for number in read[2 + len(psnr) :]):
+    quality = [*compared.psnrs, *compared.similarities]
+    read = torch.stack([loss, objective.loss, *quality, *compared.losses, *extremes]).tolist()
+    if not all(math.isfinite(number) for number in read[2 + len(quality) :]):
         compared.require_finite()
         require_finite(parameters, gradients)
-    return Numbers(read[0], read[1], sum(read[2 : 2 + len(psnr)]) / len(psnr))
+    count = len(compared.psnrs)
+    psnrs, similarities = read[2 : 2 + count], read[2 + count : 2 + len(quality)]
+    ssim = sum(similarities) / count if similarities else None
+    return Numbers(read[0], read[1], sum(psnrs) / count, ssim)
 
 
 def add_penalties(
@@ -105,11 +117,18 @@ def add_penalties(
     return loss, gradients
 
 
-def render_psnr(scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory) -> float:
-    """The mean PSNR [dB] of the views of `scene`, rendered with those `values` that it has."""
-    known, views = variable_names(scene), scene.views
+def render_quality(
+    scene: Scene, values: Mapping[str, Tensor], targets: Mapping[str, Target], memory: SolveMemory
+) -> tuple[float, float]:
+    """The mean PSNR [dB] and SSIM of the views of `scene` against their `targets` by name.
+
+    They are rendered with those `values` that the scene has.
+    """
+    known = variable_names(scene)
     with torch.no_grad():
         rendered = with_values(scene, {name: values[name] for name in values if name in known})
         images = render_each(rendered, rendered.views, memory)
-    pairs = zip(images, views, strict=True)
-    return sum(psnr(image, target_of(view), view.mask) for image, view in pairs) / len(views)
+        pairs = [(targets[v.name], i) for v, i in zip(rendered.views, images, strict=True)]
+        quality = torch.stack([torch.stack([t.psnr_of(i), t.ssim_of(i)]) for t, i in pairs])
+    psnr, ssim = quality.mean(0).tolist()
+    return psnr, ssim

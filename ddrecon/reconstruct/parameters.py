@@ -30,21 +30,33 @@ class Parameter:
     """The value of one variable, and the optimizer that moves it within its bounds.
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
-    every resolution. The optimizer is Adam (Kingma and Ba 2015, arXiv:1412.6980).
+    every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
+    is Adam (Kingma and Ba 2015, arXiv:1412.6980). `rate` is one number or one for each entry.
+    `view` is the name of the view that it belongs to, None for what all views see.
     """
 
     def __init__(
-        self, name: str, settings: ParameterSettings, rate: float, value: Tensor, grid: Grid
+        self,
+        name: str,
+        settings: ParameterSettings,
+        rate: float | Tensor,
+        value: Tensor,
+        grid: Grid,
     ):
         kind = kind_of(name)
         self.name, self.rate, self.grid = name, rate, grid
         self.low = kind.low if settings.min is None else settings.min
         self.high = kind.high if settings.max is None else settings.max
+        self.release = kind.release
+        self.is_fitted = kind.is_fitted and settings.lr is None
+        self.view = name.split(".", 1)[1].rpartition(".")[0] if name.startswith("views.") else None
         self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
-        self.tv = (kind.tv if settings.tv is None else settings.tv) if self.is_field else 0.0
+        weight = settings.tv if isinstance(settings.tv, float) else kind.tv
+        self.tv = weight if self.is_field else 0.0
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
+        self.support: Tensor | None = None
         self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
@@ -61,6 +73,11 @@ class Parameter:
             total = total + self.tv * variation(self.value, self.grid)
         return total + self.l1 * self.value.abs().mean() if self.l1 else total
 
+    @property
+    def largest_rate(self) -> float:
+        """Its learning rate, or the largest of its entries."""
+        return self.rate if isinstance(self.rate, float) else float(self.rate.max())
+
     def step(self, gradient: Tensor, rate: float) -> None:
         """Moves the value against `gradient`, and back within its bounds.
 
@@ -74,13 +91,15 @@ class Parameter:
         value, self.moments = self._step(before, gradient, rate * self.rate)
         if self.is_direction:
             value.mul_(before.norm() / value.norm())
+        if self.support is not None:
+            value.mul_(self.support)
         self.value = value.requires_grad_()
 
     def _step(
-        self, before: Tensor, gradient: Tensor, rate: float
+        self, before: Tensor, gradient: Tensor, rate: float | Tensor
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """The value within its bounds, and the moments, after the step from `before`."""
-        if current_engine() == "warp":
+        if current_engine() == "warp" and isinstance(rate, float):
             from ddrecon.reconstruct.fused.passes import step_adam
 
             bounds = self.low, self.high
@@ -92,7 +111,7 @@ class Parameter:
         first = first.lerp(gradient, 1 - BETAS[0])
         second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
         size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
-        value = before.addcdiv(first, size, value=-(rate / weights[0]))
+        value = before - first / size * (rate / weights[0])
         return value.clamp_(self.low, self.high), (first, second)
 
     def value_on(self, grid: Grid) -> Tensor:
@@ -112,6 +131,13 @@ class Parameter:
         self.value = self.value_on(grid).requires_grad_()
         first, second = (resample(moment, grid) for moment in self.moments)
         self.moments = first * volume_ratio, second * volume_ratio**2
+
+    def restrict(self, support: Tensor) -> None:
+        """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
+        self.support = support.to(self.value.dtype)
+        self.value = (self.value.detach() * self.support).requires_grad_()
+        first, second = self.moments
+        self.moments = first * self.support, second * self.support
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it; further steps make new tensors."""

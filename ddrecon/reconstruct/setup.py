@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
 
 from ddrecon.errors import SceneError
+from ddrecon.losses import Target
+from ddrecon.pictures.noise import Noise, estimate_noise
 from ddrecon.reconstruct.divergence import describe_flaw
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate
+from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings
 from ddrecon.variables.values import value_of, variable_names
@@ -57,9 +61,50 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
         raise SceneError(problems)
 
 
-def mean_power(train: Scene) -> float:
-    """The mean square of the targets of `train` [radiance squared]."""
-    return float(torch.stack([target_of(view).square().mean() for view in train.views]).mean())
+def choose_loss(settings: OptimizeSettings, train: Scene) -> str:
+    """The loss that `settings` ask for, or what the pictures of the views of `train` deserve.
+
+    That is `display` for pictures stored as sRGB values, `l2` for linear ones. Raises SceneError
+    where there are both.
+    """
+    if settings.loss is not None:
+        return settings.loss
+    encoded = [view.name for view in train.views if view.step]
+    linear = [view.name for view in train.views if not view.step]
+    if encoded and linear:
+        raise SceneError(
+            f"optimize.loss: some training pictures are sRGB files ({_name_some(encoded)}), others"
+            f" linear ({_name_some(linear)}); say how to compare them, loss: display or loss: l2"
+        )
+    return "display" if encoded else "l2"
+
+
+def _name_some(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
+def noises_of(scene: Scene, settings: OptimizeSettings) -> dict[str, Noise]:
+    """The noise of the picture of each view of `scene`, by name: given, or estimated from it."""
+    given = settings.noise
+    return {
+        view.name: view.noise
+        or (Noise(given.read, given.shot, view.step) if given else None)
+        or estimate_noise(target_of(view), view.step)
+        for view in scene.views
+    }
+
+
+def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str, Target]:
+    """What the views of `scene` are compared with by `loss`, by name."""
+    return {
+        view.name: Target.of(target_of(view), view.mask, loss, noises.get(view.name))
+        for view in scene.views
+    }
+
+
+def mean_power(targets: Mapping[str, Target]) -> float:
+    """The mean square of the `targets`, as they are compared."""
+    return float(torch.stack([target.power for target in targets.values()]).mean())
 
 
 def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter]:
@@ -71,3 +116,15 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         rate = wanted.lr or default_rate(scene, name, start)
         parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid))
     return parameters
+
+
+def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
+    """Where density may be, by the views of `train` or a file; None is anywhere.
+
+    Raises SceneError where that is nowhere.
+    """
+    density = settings.parameters.get("density")
+    support = None if density is None else find_support(train.views, density, train.support)
+    if support is not None:
+        support.on(train.volume.grid)
+    return support

@@ -7,11 +7,12 @@ whose weight comes out a rounding below zero, so there each color is traced by i
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from torch import Tensor
 
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
+from ddrecon.medium.phase import PhaseFunction, TwoLobe
 from ddrecon.scene import Scene
 
 
@@ -24,9 +25,22 @@ def pick_color(scene: Scene, color: int) -> Scene:
         scene.volume,
         sigma_a=_pick(scene.volume.sigma_a, color),
         sigma_s=_pick(scene.volume.sigma_s, color),
+        phase=_pick_phase(scene.volume.phase, color),
     )
     lights = [_pick_light(light, color) for light in scene.lights]
     return replace(scene, volume=volume, lights=lights)
+
+
+def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:
+    if phase.colors == 1:
+        return phase
+    numbers = {field.name: getattr(phase, field.name) for field in fields(phase)}
+    lobes = {"g"} if isinstance(phase, TwoLobe) else set()
+    picked = {
+        name: number if name in lobes or number.ndim == 0 else _pick(number, color)
+        for name, number in numbers.items()
+    }
+    return replace(phase, **picked)
 
 
 def _pick_light(light: Light, color: int) -> Light:

@@ -25,6 +25,7 @@ from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
 from ddrecon.reference.mitsuba_lights import mitsuba_lights
+from ddrecon.reference.mitsuba_phase import mitsuba_phase
 from ddrecon.scene import Scene, View
 
 LONGEST = 1024
@@ -48,8 +49,8 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
     """`scene` seen by the cameras of `views`, by paths of at most `depth` segments.
 
     With 2 light scatters once; -1 is `LONGEST`. The cameras are `sensor_0`, `sensor_1`, ... Raises
-    SceneError for what Mitsuba cannot show: several environment maps, pixels that are not square,
-    and views of whose rays only some start inside the volume.
+    SceneError for what Mitsuba cannot show: several environment maps, a phase function that differs
+    by color, pixels that are not square, and views of whose rays only some start inside the volume.
     """
     return {
         "type": "scene",
@@ -91,7 +92,7 @@ def _medium(volume: Volume) -> dict[str, Any]:
         "sigma_t": _grid_volume(field, volume.grid),
         "scale": scale,
         "albedo": _albedo(volume),
-        "phase": {"type": "hg", "g": volume.g.item()},
+        "phase": mitsuba_phase(volume.phase),
     }
 
 
@@ -100,11 +101,10 @@ def _to_double(volume: Volume) -> Volume:
 
     Cross sections are [C, z, y, x] or [C, 1, 1, 1].
     """
-    density, sigma_a, sigma_s, g = (
-        value.detach().cpu().double()
-        for value in (volume.density, volume.sigma_a, volume.sigma_s, volume.g)
+    density, sigma_a, sigma_s = (
+        value.detach().cpu().double() for value in (volume.density, volume.sigma_a, volume.sigma_s)
     )
-    return Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), g)
+    return Volume(volume.grid, density, _fields(sigma_a), _fields(sigma_s), volume.phase)
 
 
 def _fields(sigma: Tensor) -> Tensor:
@@ -193,9 +193,11 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
                 f"view {view.name!r}: Mitsuba's pixels are square, "
                 f"those of this camera {camera.pixel_aspect:.6g} times as high as wide"
             )
+        if camera.lens is not None:
+            raise SceneError(f"view {view.name!r}: Mitsuba's cameras have no lens distortion")
         fov = 2 * math.degrees(math.atan(camera.half_width))
         offsets = {
-            f"principal_point_offset_{axis}": 0.5 - place
+            f"principal_point_offset_{axis}": 0.5 - float(place)
             for axis, place in zip("xy", camera.principal_point, strict=True)
         }
         return {
@@ -206,7 +208,8 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
             "to_world": matrix,
             **sensor,
         }
-    scale = np.diag([camera.half_width, camera.half_width, 1.0, 1.0])
+    half_width = float(camera.half_width)
+    scale = np.diag([half_width, half_width, 1.0, 1.0])
     return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
 
 

@@ -50,11 +50,13 @@ def open_tracer(
 ) -> Tracer:
     """What traces `views` of `scene`, by paths of at most `depth` segments, -1 for no limit.
 
-    It takes `threads` threads (None: all). Colors whose extinctions differ are traced one by one.
+    It takes `threads` threads (None: all). Colors whose extinctions or phase functions differ are
+    traced one by one.
     Raises MissingExtraError without Mitsuba, SceneError for what it cannot show.
     """
     module = load_mitsuba(threads)
-    scenes = [scene] if is_gray(scene.volume) else [pick_color(scene, color) for color in range(3)]
+    is_shared = is_gray(scene.volume) and scene.volume.phase.colors == 1
+    scenes = [scene] if is_shared else [pick_color(scene, color) for color in range(3)]
     return Tracer(
         module,
         tuple(

@@ -17,6 +17,8 @@ from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.smoothing import smoothing_text
+from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
@@ -163,4 +165,9 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     if summary["test_psnr"] is not None:
         line += f", test PSNR {summary['test_psnr']:.2f} dB"
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
-    return [line, *diagnoses, f"density and all else written to {folder}"]
+    lines = [line, *diagnoses, f"density and all else written to {folder}"]
+    if "support" in summary:
+        lines.insert(1, support_text(summary["support"]))
+    if "smoothing" in summary:
+        lines.insert(1, smoothing_text(summary["smoothing"]))
+    return lines

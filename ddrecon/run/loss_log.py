@@ -25,6 +25,8 @@ READERS: dict[str, Callable[[str], Any]] = {
     "forward_iterations": int,
     "adjoint_iterations": int,
     "cells": int,
+    "ssim": lambda text: float(text) if text else None,
+    "test_ssim": lambda text: float(text) if text else None,
 }
 """What reads the text of a cell, by column."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +13,7 @@ from ddrecon.cameras import Camera
 from ddrecon.io.images.movies import SECONDS, encode_frames
 from ddrecon.io.images.table import png_of
 from ddrecon.io.images.webp import moving_webp_of
+from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.renderer import view_image
 from ddrecon.report.page import movie, paragraph, picture, side_by_side
 from ddrecon.report.pictures import find_white, pixels, projections, slices
@@ -18,7 +21,7 @@ from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 from ddrecon.run.findings import Findings
 from ddrecon.scene import View
 from ddrecon.turntable import place_turntable, upright_axis
-from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.kinds import FIELDS
 from ddrecon.variables.values import value_of
 
 FRAMES, FRAME = 24, 256
@@ -30,7 +33,7 @@ ENLARGED = 2
 def volume_section(findings: Findings) -> str:
     """Every field that was found, and beside it what the scene file has in its place."""
     scene = findings.scene
-    named = {name: value_of(scene, name) for name in VOLUME}
+    named = {name: value_of(scene, name) for name in FIELDS}
     named = {name: value for name, value in named.items() if value.ndim >= 3}
     whites = {name: find_white_value(value) for name, value in named.items()}
     z, y, x = scene.volume.grid.extent
@@ -43,7 +46,19 @@ def volume_section(findings: Findings) -> str:
     towards = cameras[0].pose[:, 3] - cameras[0].pose.new_tensor(scene.volume.grid.center_xyz)
     eye = towards.tolist()
     still = _stills(named)
-    return volume_viewer(fields, still, upright_axis(cameras), (eye[0], eye[1], eye[2]))
+    viewer = volume_viewer(fields, still, upright_axis(cameras), (eye[0], eye[1], eye[2]))
+    return "\n".join([viewer, *_remarks(findings.summary)])
+
+
+def _remarks(summary: Mapping[str, Any]) -> list[str]:
+    """What the run did to the volume by itself."""
+    remarks = []
+    if "support" in summary:
+        left_out = 100 * (1 - summary["support"]["cells"])
+        remarks.append(paragraph(f"Left out by the support: {left_out:.3g} % of the cells."))
+    if "smoothing" in summary:
+        remarks.append(paragraph(smoothing_text(summary["smoothing"])))
+    return remarks
 
 
 def _stills(fields: dict[str, Tensor]) -> str:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+from ddrecon.lenses import MODELS
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import PAIRS, VOLUME
+from ddrecon.variables.kinds import PAIRS, PHASE, VOLUME
 
+LENS = ("focal", "principal_point", "distortion")
 RESULT = "result.yaml"
 """What the file is called in a run's folder."""
 
@@ -43,7 +46,8 @@ def describe_result(
         name for pair in PAIRS if set(pair) & set(volume) for name in (*PAIRS[0], *PAIRS[1])
     }
     kept = {name: value for name, value in described["volume"].items() if name not in replaced}
-    described["volume"] = kept | box | volume
+    numbers = {name: volume.pop(name) for name in [*volume] if name == "g" or PHASE in name}
+    described["volume"] = _with_phase(kept | box | volume, numbers)
     # The lights, an attribute at a time: `lights.0.irradiance`.
     for name, value in values.items():
         if name.startswith("lights."):
@@ -55,8 +59,38 @@ def describe_result(
         camera = section["camera"] | {"resolution": [width, height]}
         if f"views.{view.name}.camera" in values:
             camera = _move_camera(camera, view.camera.pose.tolist())
+        camera |= _lens({name: values.get(f"views.{view.name}.{name}") for name in LENS}, camera)
         section["camera"] = camera
+        for key in ("exposure", "offset"):
+            if (value := values.get(f"views.{view.name}.{key}")) is not None:
+                section[key] = value
     return described
+
+
+def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `volume` with reconstructed `numbers` of its phase function."""
+    if "phase" not in volume or not numbers:
+        return {**volume, **numbers}
+    found = {name.removeprefix(PHASE): number for name, number in numbers.items()}
+    if "coefficients" in found:
+        # They count from chi_1 on, and replace those of a file.
+        found["coefficients"] = [1.0, *found["coefficients"]]
+        volume["phase"].pop("file", None)
+    return volume | {"phase": volume["phase"] | found}
+
+
+def _lens(values: Mapping[str, Any], camera: dict[str, Any]) -> dict[str, Any]:
+    """The keys of the section `camera` that say what was found of its lens; None was not sought."""
+    found: dict[str, Any] = {}
+    if values["focal"] is not None:
+        found["fov"] = 2 * math.degrees(math.atan(0.5 / values["focal"]))
+    if values["principal_point"] is not None:
+        found["principal_point"] = values["principal_point"]
+    if values["distortion"] is not None:
+        model = camera["distortion"]["type"]
+        coefficients = zip(MODELS[model], values["distortion"], strict=True)
+        found["distortion"] = {"type": model} | dict(coefficients)
+    return found
 
 
 def _move_camera(camera: dict[str, Any], pose: list[list[float]]) -> dict[str, Any]:

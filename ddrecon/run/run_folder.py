@@ -19,7 +19,8 @@ from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.losses import psnr
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import LightField, solve_light, view_image
+from ddrecon.reconstruct.support import describe_support
+from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.diagnoses import LateMeans, diagnose
@@ -30,7 +31,7 @@ from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.kinds import CROSS_SECTIONS, FIELDS, VOLUME
 from ddrecon.variables.values import value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
@@ -136,7 +137,7 @@ class RunFolder:
         value = value_of(scene, name)
         if value.ndim < 3:
             return _plain(value)
-        if name not in VOLUME and value.ndim == 3:
+        if name not in FIELDS and value.ndim == 3:
             return self._write_map(name, value)
         array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
         file, box = Path("volumes", f"{name}.npz"), np.array(scene.volume.grid.bounds_xyz)
@@ -149,8 +150,9 @@ class RunFolder:
         Maps become files of their own, but for those that are `stored`.
         """
         parameters: dict[str, Any] = {}
-        for name in ("sigma_a", "sigma_s", "g"):
-            if (value := value_of(scene, name)).ndim < 2:
+        for name in variable_names(scene):
+            is_number = name in VOLUME and name not in FIELDS
+            if (is_number or name in CROSS_SECTIONS) and (value := value_of(scene, name)).ndim < 2:
                 parameters[name] = value.tolist()
         for name in variable_names(scene):
             if name.startswith("lights."):
@@ -161,6 +163,10 @@ class RunFolder:
         for view in scene.views:
             matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
             parameters[f"views.{view.name}.camera"] = {"matrix": matrix}
+            for key in ("exposure", "offset"):
+                if getattr(view, key) is not None:
+                    name = f"views.{view.name}.{key}"
+                    parameters[name] = value_of(scene, name).tolist()
         return parameters
 
     def _write_map(self, name: str, radiance: Tensor) -> str:
@@ -172,7 +178,7 @@ class RunFolder:
     def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> dict[str, Any]:
         """The split and PSNR of each view with a target; writes pictures of views and fields."""
         folder, quality = self.path / "previews", {}
-        for name in VOLUME:
+        for name in FIELDS:
             if (value := value_of(scene, name)).ndim >= 3:
                 write_preview(folder / f"{name}.slices{mark}.png", slices(value))
         for view in scene.views:
@@ -195,7 +201,7 @@ def _render(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
     """The images of the views that have a target, by name."""
     with torch.no_grad():
         return {
-            view.name: view_image(light_field, scene, view.camera)
+            view.name: view_picture(light_field, scene, view)
             for view in scene.views
             if view.image is not None
         }
@@ -208,4 +214,10 @@ def _plain(value: Tensor) -> Any:
 
 def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
-    return {"iterations": total.pop("iteration"), **total}
+    summary = {"iterations": total.pop("iteration"), **total}
+    support = describe_support(run.support, run.scene.volume.grid)
+    if support is not None:
+        summary["support"] = support
+    if run.smoothing is not None:
+        summary["smoothing"] = run.smoothing.described()
+    return summary

@@ -11,11 +11,16 @@ import torch
 from ddrecon.light.lights import Light
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
-from ddrecon.scene_file.build_starts import build_starts, require_start_files
+from ddrecon.scene_file.build_starts import (
+    build_starts,
+    build_support,
+    require_start_files,
+)
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_volume
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import Problems
+from ddrecon.variables.wildcards import name_each
 
 
 def load_scene(
@@ -51,7 +56,11 @@ def build_scene(
         lights = build_lights(scene_file, dtype, place)
     require_start_files(scene_file, problems)
     problems.raise_any()
+    optimize = tree.optimize
+    if optimize is not None:
+        optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
     scene = Scene(
-        volume, lights, views, tree.render, tree.diffusion, tree.optimize, {}, scene_file.path
+        volume, lights, views, tree.render, tree.diffusion, optimize, path=scene_file.path
     )
-    return replace(scene, starts=build_starts(scene_file, scene))
+    support = build_support(scene_file, volume.density)
+    return replace(scene, starts=build_starts(scene_file, scene), support=support)

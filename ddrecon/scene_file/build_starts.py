@@ -18,7 +18,7 @@ from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile, ParameterSettings
 from ddrecon.variables.kinds import Kind, kind_of
-from ddrecon.variables.values import value_of, variable_names
+from ddrecon.variables.values import component_names, value_of, variable_names
 
 
 def require_start_files(scene_file: SceneFile, problems: Problems) -> None:
@@ -28,6 +28,10 @@ def require_start_files(scene_file: SceneFile, problems: Problems) -> None:
         if isinstance(settings.init, FieldFile):
             with problems.collecting():
                 require(scene_file, f"optimize.parameters.{name}.init.file", settings.init.file)
+        if isinstance(settings.support, FieldFile):
+            with problems.collecting():
+                key = f"optimize.parameters.{name}.support.file"
+                require(scene_file, key, settings.support.file)
 
 
 def build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
@@ -43,6 +47,19 @@ def build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
     return starts
 
 
+def build_support(scene_file: SceneFile, like: Tensor) -> Tensor | None:
+    """The cells [z, y, x] where density may be, of the file that says so; None without one.
+
+    They are at any resolution, of the type of `like`. Raises SceneError or FormatError.
+    """
+    optimize = scene_file.tree.optimize
+    settings = optimize.parameters.get("density") if optimize else None
+    if settings is None or not isinstance(settings.support, FieldFile):
+        return None
+    key, file = "optimize.parameters.density.support.file", settings.support
+    return _read_cells(scene_file, key, "density", file, like)
+
+
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:
     key = f"optimize.parameters.{name}"
     try:
@@ -56,7 +73,7 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
         read = _read_cells if kind.is_cellwise else _read_pixels
         value = read(scene_file, f"{key}.init.file", name, settings.init, value)
     elif settings.init is not None:
-        value = _fill(scene_file, f"{key}.init", kind, settings.init, value)
+        value = _fill(scene_file, f"{key}.init", name, settings.init, value)
     if kind.is_cellwise:
         value = _spread(scene_file, key, kind, settings, value, scene.volume.grid.shape)
     if not bool(((value >= kind.low) & (value <= kind.high)).all()):
@@ -103,16 +120,19 @@ def _size(pixels: Tensor) -> str:
 
 
 def _fill(
-    scene_file: SceneFile, key: str, kind: Kind, init: float | tuple[float, ...], value: Tensor
+    scene_file: SceneFile, key: str, name: str, init: float | tuple[float, ...], value: Tensor
 ) -> Tensor:
     """`value` with every entry `init`, or every color or component its own."""
-    count = len(kind.components)
+    kind = kind_of(name)
+    count = len(component_names(name, value)) if kind.components else 0
     if isinstance(init, float) and not count:
         return torch.full_like(value, init)
     if isinstance(init, tuple) and kind.is_color and len(init) == 3:
         colors = value.new_tensor(init).view(-1, *[1] * (value.ndim - 1))
         return colors.expand(3, *value.shape[1:]).clone()
     if isinstance(init, tuple) and count and len(init) == count:
+        return value.new_tensor(init)
+    if isinstance(init, tuple) and value.ndim == 1 and not count and len(init) == len(value):
         return value.new_tensor(init)
     expected = f"a list of {count} numbers" if count else "one number"
     if kind.is_color:

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, look_at
+from ddrecon.cameras import Camera, image_places, look_at
 from ddrecon.grid import Grid
-from ddrecon.io.images.table import read_image, read_mask
+from ddrecon.io.images.table import Image, read_image, read_mask
+from ddrecon.lenses import MODELS, is_folded
+from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
+from ddrecon.scene_file.camera_schema import CameraSection, LensSection, PerspectiveSection
 from ddrecon.scene_file.files import read_referenced
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.schema import CameraSection, PerspectiveSection
-from ddrecon.scene_file.sight import explain_blindness, explain_direction, sees_box
+from ddrecon.scene_file.sight import explain_blindness, sees_box
 
 NAMED = 4
 """Views that a line about several names."""
+LATTICE = 33
+"""Pixels along each side of an image at which its distortion is checked."""
 
 
 def build_views(
@@ -31,64 +36,61 @@ def build_views(
 
     Where `grid` is known, cameras must see it. Raises SceneError or FormatError.
     """
-    problems, cameras, views = Problems(), dict[int, Camera](), []
+    problems, views = Problems(), []
     for index in range(len(scene_file.tree.views)):
         with problems.collecting():
-            views.append(_build_view(scene_file, index, cameras, dtype, device))
+            views.append(_build_view(scene_file, index, dtype, device))
     if grid is not None:
-        with problems.collecting():
-            _require_sight(scene_file, cameras, grid)
+        _note_blind(scene_file, views, grid, problems)
     problems.raise_any()
     return views
 
 
-def _require_sight(scene_file: SceneFile, cameras: Mapping[int, Camera], grid: Grid) -> None:
-    """Raises SceneError where some of `cameras`, by the place of their view, do not see the box.
-
-    They share a line, since they mostly share a cause.
-    """
-    seeing = {index: sees_box(camera, grid) for index, camera in cameras.items()}
-    blind = [index for index, sees in seeing.items() if not sees]
+def _note_blind(
+    scene_file: SceneFile, views: Sequence[View], grid: Grid, problems: Problems
+) -> None:
+    """Notes the `views` that do not see the box of `grid`, in one line: they share a cause."""
+    seeing = [sees_box(view.camera, grid) for view in views]
+    blind = [view for view, sees in zip(views, seeing, strict=True) if not sees]
     if not blind:
         return
-    views = scene_file.tree.views
-    by_matrix = [index for index in cameras if views[index].camera.matrix is not None]
-    others = [cameras[index] for index in by_matrix if seeing[index]]
-    explain = explain_direction
-    if set(blind) <= set(by_matrix):
-        explain = partial(explain_blindness, others=others)
-    names = [repr(views[index].name) for index in blind]
-    which = f"view {names[0]}"
-    if len(names) > 1:
-        rest = ", ..." if len(names) > NAMED else ""
-        which = f"{len(names)} of {len(views)} views ({', '.join(names[:NAMED])}{rest})"
-    cause = explain([cameras[index] for index in blind], grid=grid)
-    raise scene_file.refused(
-        f"views.{blind[0]}.camera", f"no pixel of {which} looks through the volume; {cause}"
-    )
+    others = [view.camera for view, sees in zip(views, seeing, strict=True) if sees]
+    sections = scene_file.tree.views
+    index = [section.name for section in sections].index(blind[0].name)
+    key, which = f"views.{index}.camera", f"no pixel of view {blind[0].name!r}"
+    if len(blind) > 1:
+        named = ", ".join(repr(view.name) for view in blind[:NAMED])
+        rest = ", ..." if len(blind) > NAMED else ""
+        which = f"no pixel of {len(blind)} of {len(sections)} views ({named}{rest})"
+    if len(blind) == len(sections) > 1:
+        key, which = "views", "none"
+    why = explain_blindness([view.camera for view in blind], grid, others)
+    problems.note(scene_file.refused(key, f"{which} looks through the volume; {why}"))
 
 
 def _build_view(
-    scene_file: SceneFile,
-    index: int,
-    cameras: dict[int, Camera],
-    dtype: torch.dtype,
-    device: torch.device,
+    scene_file: SceneFile, index: int, dtype: torch.dtype, device: torch.device
 ) -> View:
-    """The view number `index`; its camera, on the CPU, is put into `cameras`."""
     key, section, problems = f"views.{index}", scene_file.tree.views[index], Problems()
-    image = mask = None
+    image = mask = background = None
+    step = 0.0
     if section.image is not None:
         with problems.collecting():
-            pixels = read_referenced(scene_file, f"{key}.image", section.image, read_image).pixels
-            image = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
+            stored = read_referenced(scene_file, f"{key}.image", section.image, read_image)
+            image, step = _pixels(stored, dtype, device), stored.step
+    if isinstance(section.background, Path):
+        with problems.collecting():
+            stored = read_referenced(
+                scene_file, f"{key}.background", section.background, read_image
+            )
+            background = _pixels(stored, dtype, device)
     if section.mask is not None:
         with problems.collecting():
             mask = torch.from_numpy(
                 read_referenced(scene_file, f"{key}.mask", section.mask, read_mask)
             ).to(device, dtype)
     size = _size(section.camera, image)
-    for name, picture in (("image", image), ("mask", mask)):
+    for name, picture in (("image", image), ("mask", mask), ("background", background)):
         if picture is not None and size is not None and tuple(picture.shape[-2:]) != size:
             height, width = picture.shape[-2:]
             problems.note(
@@ -100,10 +102,41 @@ def _build_view(
     if size is not None:
         with problems.collecting():
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
-            cameras[index] = camera
+            _require_unfolded(scene_file, f"{key}.camera", camera)
     problems.raise_any()
-    camera = replace(camera, pose=camera.pose.to(device, dtype))
-    return View(section.name, camera, image, mask, section.split == "test", section.weight)
+    lens = camera.distortion
+    camera = replace(
+        camera,
+        pose=camera.pose.to(device, dtype),
+        distortion=None if lens is None else lens.to(device, dtype),
+    )
+    if section.background is not None and not isinstance(section.background, Path):
+        background = torch.tensor(section.background, dtype=dtype, device=device).view(-1, 1, 1)
+    noise = section.noise
+
+    def color(value: Color, default: float) -> Tensor | None:
+        """[1] or [3], None where it is the default."""
+        tensor = torch.tensor(value, dtype=dtype, device=device).view(-1)
+        return None if value == default else tensor
+
+    return View(
+        section.name,
+        camera,
+        image,
+        mask,
+        section.split == "test",
+        section.weight,
+        color(section.exposure, 1.0),
+        color(section.offset, 0.0),
+        background,
+        step,
+        None if noise is None else Noise(noise.read, noise.shot, step),
+    )
+
+
+def _pixels(image: Image, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The pixels of `image`, [3, h, w]."""
+    return torch.from_numpy(image.pixels).permute(2, 0, 1).contiguous().to(device, dtype)
 
 
 def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None:
@@ -129,8 +162,34 @@ def _build_camera(
             True,
             section.principal_point,
             section.pixel_aspect,
+            *_lens(section.distortion),
         )
     return Camera(pose, size, section.width / 2, is_perspective=False)
+
+
+def _lens(section: LensSection | None) -> tuple[str | None, Tensor | None]:
+    """The model of a lens and its coefficients, float64."""
+    if section is None:
+        return None, None
+    coefficients = [getattr(section, name) for name in MODELS[section.type]]
+    return section.type, torch.tensor(coefficients, dtype=torch.float64)
+
+
+def _require_unfolded(scene_file: SceneFile, key: str, camera: Camera) -> None:
+    """Raises SceneError where the distortion of `camera` folds over within the image."""
+    if camera.lens is None or camera.distortion is None:
+        return
+    # The corners of a coarse lattice of pixels, those of the image among them.
+    rows, columns = (torch.linspace(0, side - 1, LATTICE).long() for side in camera.size)
+    places = image_places(camera).view(*camera.size, 2)[rows][:, columns].flatten(0, 1)
+    folded = is_folded(camera.lens, camera.distortion, places)
+    if bool(folded.any()):
+        y, x = divmod(int(folded.nonzero()[0]), LATTICE)
+        raise scene_file.refused(
+            f"{key}.distortion",
+            f"folds over within the image: no one direction is seen at pixel ({int(columns[x])},"
+            f" {int(rows[y])}); check its coefficients and the focal length, or crop the picture",
+        )
 
 
 def _pose(section: CameraSection) -> Tensor:

@@ -19,15 +19,15 @@ from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
 from ddrecon.memory import Needs, shortage
+from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.schema import Color
 from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import KINDS, VOLUME
+from ddrecon.variables.kinds import FIELDS
 from ddrecon.variables.values import cross_sections
 
-QUANTITIES = tuple(name for name in VOLUME if KINDS[name].is_cellwise)
 Fields = Mapping[str, Field]
 
 
@@ -53,15 +53,15 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     else:
         sigma_a, sigma_s = cross_sections(quantity("sigma_t"), quantity("albedo"))
     sigma_a, sigma_s = _same_colors(sigma_a, sigma_s)
+    phase = build_phase(scene_file, dtype, device)
+    if phase.colors > 1:
+        sigma_a, sigma_s = (sigma.expand(3, *sigma.shape[1:]) for sigma in (sigma_a, sigma_s))
     density = quantity("density")
     density = (
         density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
     )
-    tensors = [
-        tensor.to(device, dtype)
-        for tensor in (density, sigma_a, sigma_s, torch.tensor(section.g, dtype=torch.float64))
-    ]
-    return Volume(grid, *tensors)
+    density, sigma_a, sigma_s = (tensor.to(device, dtype) for tensor in (density, sigma_a, sigma_s))
+    return Volume(grid, density, sigma_a, sigma_s, phase)
 
 
 def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype) -> Needs:
@@ -74,7 +74,7 @@ def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype
         fields[name].values.ndim == 4
         if name in fields
         else isinstance(getattr(section, name), tuple)
-        for name in QUANTITIES
+        for name in FIELDS
     ]
     colors = 3 if any(given) else 1
     optimized = tree.optimize.parameters if tree.optimize else {}
@@ -84,7 +84,7 @@ def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype
         colors,
         torch.finfo(dtype).bits // 8,
         sum(width * height for width, height in sizes),
-        has_flux=section.g != 0 or "g" in optimized,
+        has_flux=section.g != 0 or section.phase is not None or "g" in optimized,
         has_rounds=tree.diffusion.transport_rounds > 0,
         is_limited=tree.diffusion.model == "flux_limited",
         varied=sum(_varied(name, settings, fields, colors) for name, settings in optimized.items())
@@ -102,12 +102,12 @@ def _varied(name: str, settings: ParameterSettings, fields: Fields, colors: int)
         if settings.field is None
         else settings.field
     )
-    return colors if name in QUANTITIES and is_field else 0
+    return colors if name in FIELDS and is_field else 0
 
 
 def _read_fields(scene_file: SceneFile) -> Fields:
     problems, fields = Problems(), {}
-    for name in QUANTITIES:
+    for name in FIELDS:
         value = getattr(scene_file.tree.volume, name)
         if isinstance(value, FieldFile):
             with problems.collecting():

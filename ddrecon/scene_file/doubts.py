@@ -71,5 +71,5 @@ def _pixels_across(camera: Camera, grid: Grid) -> float:
     distance = 1.0
     if camera.is_perspective:
         distance = float(torch.dist((low + high) / 2, camera.pose[:, 3].double()))
-    width = 2 * camera.half_width * distance
+    width = 2 * float(camera.half_width) * distance
     return float(torch.dist(low, high)) / max(width, 1e-30) * camera.size[1]

@@ -61,7 +61,8 @@ def _plain(value: Any) -> Any:
 def _left_out(record: Any) -> set[str]:
     """Keys of the alternatives that `record` did not take."""
     groups = getattr(record, "ALTERNATIVES", ())
-    return {name for group in groups if getattr(record, group[0]) is None for name in group}
+    left_out = {name for group in groups if getattr(record, group[0]) is None for name in group}
+    return left_out | {"g"} if getattr(record, "phase", None) is not None else left_out
 
 
 class _Dumper(yaml.SafeDumper):

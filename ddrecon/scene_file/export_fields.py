@@ -6,10 +6,10 @@ import numpy as np
 
 from ddrecon.io.volumes.field import Fields
 from ddrecon.scene import Scene
-from ddrecon.variables.values import value_of
+from ddrecon.variables.values import value_of, variable_names
 
-EXPORTED = ("density", "sigma_t", "albedo", "g")
-"""What is told of a medium: sigma_t and albedo are what programs of film and games take."""
+LEFT_OUT = ("sigma_a", "sigma_s")
+"""What is not told of a medium: sigma_t and albedo are what programs of film and games take."""
 
 
 def fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:
@@ -19,9 +19,14 @@ def fields_of(scene: Scene) -> tuple[Fields, Fields, np.ndarray]:
     its corners (x, y, z).
     """
     fields, constants = dict[str, np.ndarray](), dict[str, np.ndarray]()
-    for name in EXPORTED:
+    for name in variable_names(scene):
+        if name in LEFT_OUT or name.startswith(("lights.", "views.")):
+            continue
         value = value_of(scene, name).detach().float().cpu()
         if value.ndim == 4:
             value = value.permute(1, 2, 3, 0).squeeze(-1)
-        (fields if value.ndim >= 3 else constants)[name] = value.numpy()
+        if value.ndim >= 3:
+            fields[name] = value.numpy()
+        elif value.numel() in (1, 3):
+            constants[name] = value.numpy()
     return fields, constants, np.array(scene.volume.grid.bounds_xyz)

@@ -9,8 +9,12 @@ from typing import Any
 from ddrecon.errors import SceneError
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.json_file import write_json
+from ddrecon.lenses import MODELS
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.load import SceneFile
+
+NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+"""What lenses are called there."""
 
 
 def export_transforms(
@@ -30,7 +34,9 @@ def export_transforms(
             {key: _relative(file, path) for key, file in files.items() if file is not None}
             | _camera(view)
         )
-    write_json(path, {"camera_model": "PINHOLE", **_splits(scene.views, frames), "frames": frames})
+    models = {frame.get("camera_model", "PINHOLE") for frame in frames}
+    model = models.pop() if len(models) == 1 else "PINHOLE"
+    write_json(path, {"camera_model": model, **_splits(scene.views, frames), "frames": frames})
     return [path]
 
 
@@ -45,15 +51,18 @@ def _camera(view: View) -> dict[str, Any]:
             f"view {view.name!r}: an orthographic camera has no place in a transforms.json"
         )
     (height, width), (x, y) = camera.size, camera.principal_point
-    focal = width / 2 / camera.half_width
-    intrinsics = {
+    focal = width / 2 / float(camera.half_width)
+    intrinsics: dict[str, Any] = {
         "w": width,
         "h": height,
         "fl_x": focal,
         "fl_y": focal / camera.pixel_aspect,
-        "cx": x * width,
-        "cy": y * height,
+        "cx": float(x) * width,
+        "cy": float(y) * height,
     }
+    if camera.lens is not None and camera.distortion is not None:
+        coefficients = zip(MODELS[camera.lens], camera.distortion.tolist(), strict=True)
+        intrinsics |= {"camera_model": NAMES[camera.lens]} | dict(coefficients)
     return intrinsics | {"transform_matrix": [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
 
 

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ddrecon.grid import Triple
+from ddrecon.scene_file.camera_schema import Matrix, Pair, Row, Size
+from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.nodes import Node, describe_found, show_value
 from ddrecon.scene_file.problems import Problems, suggestion
-from ddrecon.scene_file.schema import Color, Count, Matrix, Pair, Paths, Row, Size
+from ddrecon.scene_file.schema import Backdrop, Count, Paths
 
 T = TypeVar("T")
 
@@ -162,6 +164,11 @@ def read_color(node: Node, rule: Rule) -> float | tuple[float, ...]:
     return read_number(node, rule)
 
 
+def read_backdrop(node: Node, rule: Rule) -> float | tuple[float, ...] | Path:
+    """A number, [red, green, blue], or the path of a picture."""
+    return read_path(node, rule) if isinstance(node.value, str) else read_color(node, rule)
+
+
 def _entries(node: Node, count: int, what: str) -> list[Node]:
     if not isinstance(node.value, list) or len(node.value) != count:
         raise node.refused(f"expected a list of {count} {what}, found {describe_found(node)}")
@@ -181,5 +188,6 @@ LEAVES: dict[Any, Callable[[Node, Rule], Any]] = {
     Paths: read_paths,
     Matrix: read_matrix,
     Color: read_color,
+    Backdrop: read_backdrop,
     tuple[float, ...]: read_fraction_list,
 }

@@ -13,6 +13,7 @@ from operator import or_
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
+from ddrecon.scene_file.colmap import read_colmap
 from ddrecon.scene_file.leaves import (
     LEAVES,
     Rule,
@@ -27,7 +28,15 @@ from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.ring import ring_views
 from ddrecon.scene_file.schema import Constant, Density, Quantity, ViewSection, ViewSource
 from ddrecon.scene_file.transforms import read_transforms
-from ddrecon.settings import FieldFile, ParameterSettings, Start
+from ddrecon.settings import (
+    AUTO,
+    MASKS,
+    FieldFile,
+    ParameterSettings,
+    Start,
+    Support,
+    Weight,
+)
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
@@ -53,6 +62,8 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
         problems.note(node.refused(what))
     for name, child in entries.items():
         with problems.collecting():
+            if name in getattr(kind, "RETIRED", {}):
+                raise child.key_refused(kind.RETIRED[name])  # type: ignore[attr-defined]
             if name not in known:
                 raise child.key_refused(f"unknown key{suggestion(name, known)}")
             if name in declared:
@@ -169,9 +180,16 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
         with problems.collecting():
             if (kind := KINDS.get(pattern_of(name))) is None:
                 raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
-            parameters[name] = _require_legal(
-                child, read_record(child, ParameterSettings, rule.folder), kind
-            )
+            settings = read_record(child, ParameterSettings, rule.folder)
+            for key, is_given in (
+                ("support", settings.support is not None),
+                ("tv", settings.tv == AUTO),
+            ):
+                if is_given and name != "density":
+                    raise _mapping(child)[key].refused(
+                        f"{describe_found(_mapping(child)[key])} is for density alone"
+                    )
+            parameters[name] = _require_legal(child, settings, kind)
     problems.raise_any()
     if not parameters:
         raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
@@ -222,12 +240,31 @@ def _read_start(node: Node, rule: Rule) -> Any:
     )
 
 
+def _read_weight(node: Node, rule: Rule) -> float | str:
+    """A number, or `auto`."""
+    if isinstance(node.value, str):
+        return read_text(node, Rule(str, {"choices": (AUTO,)}, rule.folder))
+    return read_number(node, rule)
+
+
+def _read_support(node: Node, rule: Rule) -> float | str | FieldFile:
+    """`masks`, a displayed value, or `{file: path}`."""
+    if isinstance(node.value, dict):
+        return read_record(node, FieldFile, rule.folder)
+    if isinstance(node.value, str):
+        return read_text(node, Rule(str, {"choices": (MASKS,)}, rule.folder))
+    return read_number(node, rule)
+
+
 def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
     """A list of views with names of their own, or the views of a ring or of transforms."""
     if isinstance(node.value, dict):
         source = read_record(node, ViewSource, rule.folder)
         if source.ring is not None:
             return ring_views(node, source.ring, source.images, rule.folder)
+        if source.colmap is not None:
+            images = (rule.folder / (source.images or "")).absolute()
+            return read_colmap(node.value["colmap"], source.colmap, images, source.test_every)
         return read_transforms(node.value["transforms"], source.transforms or (), source.test_every)
     entries = read_list(node)
     for index, entry in enumerate(entries):
@@ -257,6 +294,8 @@ READERS: dict[Any, Callable[[Node, Rule], Any]] = {
     Density: _read_density,
     Quantity: _read_quantity,
     Start: _read_start,
+    Weight: _read_weight,
+    Support: _read_support,
     Mapping[str, ParameterSettings]: _read_parameters,
     tuple[ViewSection, ...]: _read_views,
 }

@@ -6,8 +6,9 @@ import glob
 import math
 from pathlib import Path
 
+from ddrecon.scene_file.camera_schema import PerspectiveSection
 from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.schema import PerspectiveSection, RingSection, ViewSection
+from ddrecon.scene_file.schema import RingSection, ViewSection
 
 
 def ring_cameras(ring: RingSection) -> list[PerspectiveSection]:

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from ddrecon.grid import Triple
+from ddrecon.scene_file.camera_schema import CameraSection, Size
+from ddrecon.scene_file.light_schema import Color, LightSection
+from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, PhaseSection
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
+    NoiseSettings,
     OptimizeSettings,
     Problem,
     RenderSettings,
@@ -31,12 +33,8 @@ from ddrecon.settings import (
 from ddrecon.variables.kinds import PAIRS
 
 Count = tuple[int, int, int]
-Size = tuple[int, int]
-Pair = tuple[float, float]
 Paths = tuple[Path, ...]
-Color = float | Triple
-Row = tuple[float, float, float, float]
-Matrix = tuple[Row, Row, Row, Row]
+Backdrop = Color | Path
 
 MAX_CELLS = 2**30
 TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
@@ -81,132 +79,22 @@ class VolumeSection:
     sigma_t: Quantity | None = optional(minimum=0)
     albedo: Quantity | None = optional(minimum=0, maximum=1)
     g: float = bounded(0.0, above=-1, below=1)
+    phase: PhaseSection | None = None
 
     def problems(self) -> Iterator[Problem]:
+        if self.phase is not None and self.g != 0:
+            yield "phase", "g is the short form of a phase function: give only one of g or phase"
         x, y, z = self.resolution or (1, 1, 1)
         if x * y * z > MAX_CELLS:
             yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
 
 
 @dataclass(frozen=True)
-class DirectionalSection:
-    """`direction`: the way the light travels; `irradiance` on a plane facing it."""
-
-    type: ClassVar[str] = "directional"
-
-    direction: Triple
-    irradiance: Color = limited(minimum=0)
-
-    def problems(self) -> Iterator[Problem]:
-        if not any(self.direction):
-            yield "direction", "must not be zero"
-
-
-@dataclass(frozen=True)
-class AmbientSection:
-    """The same radiance from everywhere."""
-
-    type: ClassVar[str] = "ambient"
-
-    radiance: Color = limited(minimum=0)
-
-
-@dataclass(frozen=True)
-class EnvironmentSection:
-    """A latitude-longitude map, +y up.
-
-    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about +y.
-
-    `directions`: how many directions its light on the volume is gathered into.
-    """
-
-    type: ClassVar[str] = "environment"
-
-    file: Path
-    scale: float = bounded(1.0, minimum=0)
-    rotation: float = 0.0
-    directions: int = bounded(48, minimum=1, maximum=1024)
-
-
-@dataclass(frozen=True)
-class PointSection:
-    """Light from one point, inside or outside the box; `intensity`: power per solid angle."""
-
-    type: ClassVar[str] = "point"
-
-    position: Triple
-    intensity: Color = limited(minimum=0)
-
-
-LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoseSection:
-    """Where a camera stands, and its `resolution` (width, height) in pixels.
-
-    The pose is `origin`, `target` and `up` [u], or `matrix`, camera to world with OpenGL axes.
-    """
-
-    ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
-
-    origin: Triple | None = None
-    target: Triple | None = None
-    up: Triple = (0.0, 1.0, 0.0)
-    matrix: Matrix | None = None
-    resolution: Size | None = optional(minimum=1, maximum=16384)
-
-    def problems(self) -> Iterator[Problem]:
-        if self.matrix is not None:
-            yield from _rigidity(np.array(self.matrix))
-
-
-def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
-    """Why `matrix` [4, 4] is no rotation and shift, where it is not."""
-    rotation = matrix[:3, :3]
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-4:
-        yield "matrix", "its last row must be [0, 0, 0, 1]"
-    elif np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
-        yield (
-            "matrix",
-            "must be rigid, but its first three columns are not of unit length and perpendicular",
-        )
-    elif np.linalg.det(rotation) < 0:
-        yield "matrix", "must be rigid, but it mirrors (determinant -1)"
-
-
-@dataclass(frozen=True, kw_only=True)
-class PerspectiveSection(PoseSection):
-    """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
-
-    The axis meets the image at `principal_point`, parts of its width and height from the top left.
-    `pixel_aspect`: height of a pixel over its width.
-    """
-
-    type: ClassVar[str] = "perspective"
-
-    fov: float = limited(above=0, below=180)
-    principal_point: Pair = (0.5, 0.5)
-    pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrthographicSection(PoseSection):
-    """`width` of the image [u]."""
-
-    type: ClassVar[str] = "orthographic"
-
-    width: float = limited(above=0)
-
-
-CameraSection = PerspectiveSection | OrthographicSection
-
-
-@dataclass(frozen=True)
 class ViewSection:
     """One view; its camera's `resolution` may be left out where there is an image.
 
-    `weight`: how much it counts in the loss.
+    `weight`: how much it counts in the loss. Its picture is `exposure` times radiance plus
+    `offset`; `background` is what it shows where the volume is empty.
     """
 
     name: str
@@ -215,6 +103,10 @@ class ViewSection:
     mask: Path | None = None
     split: str = one_of("train", ("train", "test"))
     weight: float = bounded(1.0, above=0)
+    exposure: Color = bounded(1.0, minimum=1e-3)
+    offset: Color = 0.0
+    background: Backdrop | None = None
+    noise: NoiseSettings | None = None
 
     def problems(self) -> Iterator[Problem]:
         if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
@@ -251,30 +143,34 @@ class RingSection:
 
 @dataclass(frozen=True)
 class ViewSource:
-    """Views that are not listed one by one: those of a ring, or of transforms.json files.
+    """Views not listed one by one: of a ring, of transforms.json files, or of a COLMAP model.
 
-    Such files are written by NeRF, instant-ngp or nerfstudio.
+    Such files are written by NeRF, instant-ngp or nerfstudio; the model is a folder.
 
-    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn. Of every
-    `test_every` views of files that say nothing of it, the first is a test view.
+    `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn, or the
+    folder of COLMAP's pictures. Of every `test_every` views of files that say nothing of it, the
+    first is a test view.
     """
 
-    ALTERNATIVES: ClassVar = (("ring",), ("transforms",))
+    ALTERNATIVES: ClassVar = (("ring",), ("transforms",), ("colmap",))
 
     ring: RingSection | None = None
     transforms: Paths | None = None
+    colmap: Path | None = None
     images: str | None = None
     test_every: int | None = optional(minimum=2)
 
     def problems(self) -> Iterator[Problem]:
         if self.ring is not None and self.images is None and self.ring.resolution is None:
             yield "ring", "missing key 'resolution'; only views with images can go without"
-        if self.ring is None and self.images is not None:
-            yield "images", "is for a ring; transforms name their images themselves"
+        if self.transforms is not None and self.images is not None:
+            yield "images", "is for a ring or COLMAP; transforms name their images themselves"
+        if self.colmap is not None and self.images is None:
+            yield "colmap", "missing key 'images', the folder of its pictures"
         if self.ring is not None and self.test_every is not None:
             yield (
                 "test_every",
-                "is for transforms; list the views of a ring to keep some as test views",
+                "is for transforms and COLMAP; list the views of a ring to keep some as test views",
             )
 
 
@@ -291,3 +187,19 @@ class SceneTree:
     render: RenderSettings = field(default_factory=RenderSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
+
+    def __post_init__(self) -> None:
+        parameters = self.optimize.parameters if self.optimize else {}
+        if self.optimize and self._has_one_g and "phase.g" in parameters and "g" not in parameters:
+            named = {"g" if name == "phase.g" else name: what for name, what in parameters.items()}
+            object.__setattr__(self, "optimize", replace(self.optimize, parameters=named))
+
+    @property
+    def _has_one_g(self) -> bool:
+        """Whether `g` and `phase.g` are the same number, that of Henyey and Greenstein."""
+        return isinstance(self.volume.phase, HenyeyGreensteinSection | None)
+
+    def problems(self) -> Iterator[Problem]:
+        parameters = self.optimize.parameters if self.optimize else {}
+        if self._has_one_g and {"g", "phase.g"} <= set(parameters):
+            yield "optimize", "g and phase.g are the same number: name it once"

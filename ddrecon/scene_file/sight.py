@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ddrecon.cameras import Camera, cast_rays
+from ddrecon.cameras import Camera, cast_rays, project
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
 
@@ -29,73 +29,73 @@ def sees_box(camera: Camera, grid: Grid) -> bool:
     )
 
 
-def _turn_axes(pose: Tensor) -> Tensor:
-    """`pose` [3, 4] with OpenCV's axes for OpenGL's, or the other way round."""
-    return pose * pose.new_tensor([1, -1, -1, 1])
-
-
-def _invert(pose: Tensor) -> Tensor:
-    """World to camera for camera to world, of a rigid `pose` [3, 4]."""
-    rotation = pose[:, :3].T
-    return torch.cat([rotation, -rotation @ pose[:, 3:]], 1)
-
-
-CURES = {
-    "the matrices are in OpenCV's axes (y down, z forward), ours in OpenGL's: negate the second and"
-    " third column of each": _turn_axes,
-    "the matrices are world to camera, ours camera to world: invert each": _invert,
-    "the matrices are world to camera in OpenCV's axes, as COLMAP has them, ours camera to world in"
-    " OpenGL's: invert each, then negate its second and third column": lambda pose: _turn_axes(
-        _invert(pose)
+CONVENTIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "OpenCV axes (right, down, forward): negate the second and third column of each matrix": (
+        lambda pose: pose * pose.new_tensor([1, -1, -1, 1])
+    ),
+    "world to camera: give the inverse of each matrix": lambda pose: _inverse(pose),
+    "world to camera with OpenCV axes: give the inverse of each matrix, its second and third column"
+    " negated": lambda pose: _inverse(pose) * pose.new_tensor([1, -1, -1, 1]),
+    "z up, as in Blender, in a scene with y up: turn the cameras or volume.bounds": (
+        lambda pose: pose.new_tensor([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ pose
+    ),
+    "y up in a scene with z up, as in Blender: turn the cameras or volume.bounds": (
+        lambda pose: pose.new_tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) @ pose
     ),
 }
-"""What may be wrong with matrices, and what is right then."""
+"""What poses may be instead of camera to world with OpenGL axes, and what makes these of them."""
 
 
-def explain_blindness(blind: Sequence[Camera], others: Sequence[Camera], grid: Grid) -> str:
-    """Why, most likely, the cameras `blind` do not see the box of `grid`.
+def explain_blindness(cameras: Sequence[Camera], grid: Grid, seeing: Sequence[Camera] = ()) -> str:
+    """Why, most likely, none of `cameras` sees the box of `grid`.
 
-    All of them, and `others`, which do see it, have their poses as matrices. Where none have, there
-    are no `others`, and a wrong target is the likely cause.
+    `seeing` are those of the scene that do, which they may by chance.
     """
-    for cameras in ([*blind, *others], blind):
-        misses = {what: _mean_miss(cameras, cure, grid) for what, cure in CURES.items()}
-        what = min(misses, key=misses.__getitem__)
-        if math.isfinite(misses[what]):
-            return what
-    return explain_direction(blind, grid)
-
-
-def _mean_miss(cameras: Sequence[Camera], cure: Callable[[Tensor], Tensor], grid: Grid) -> float:
-    """How far the `cameras`, cured, look past the middle of the box, on average [rad].
-
-    Infinite where one of them does not see it.
-    """
-    angles = []
-    for camera in cameras:
-        cured = replace(camera, pose=cure(camera.pose.double()))
-        if not sees_box(cured, grid):
-            return math.inf
-        angles.append(_angle_off(cured.pose, grid))
-    return sum(angles) / len(angles)
-
-
-def _angle_off(pose: Tensor, grid: Grid) -> float:
-    """The angle between where a camera looks and where the middle of the box is [rad]."""
-    towards = pose.new_tensor(grid.center_xyz) - pose[:, 3]
-    cosine = torch.dot(towards, -pose[:, 2]) / towards.norm().clamp(min=1e-30)
-    return math.acos(max(-1.0, min(1.0, float(cosine))))
-
-
-def explain_direction(cameras: Sequence[Camera], grid: Grid) -> str:
-    """Where `cameras` look instead of at the box of `grid`."""
-    poses = [camera.pose.double() for camera in cameras]
-    if all(_angle_off(pose, grid) > math.pi / 2 for pose in poses):
-        return "the volume lies behind: a camera looks along its -z axis with +y up, as in OpenGL"
-    low, high = (poses[0].new_tensor(corner) for corner in grid.bounds_xyz)
-    away = min(float(torch.dist((low + high) / 2, pose[:, 3])) for pose in poses)
+    middle = grid.center_xyz
+    for group in ([*cameras, *seeing], cameras):
+        for what, convert in CONVENTIONS.items() if len(group) > 1 else ():
+            if all(_looks_at(replace(one, pose=convert(one.pose)), grid) for one in group):
+                return f"it would with matrices read otherwise; they seem to be {what}"
+    if len(cameras) > 1 and (place := _meeting_place(cameras)) is not None:
+        return (
+            f"the cameras look at about ({', '.join(f'{x:.3g}' for x in place.tolist())}), but the"
+            f" middle of volume.bounds is ({', '.join(f'{x:.3g}' for x in middle)}): are both in"
+            " the same units and axes?"
+        )
+    (low, high), pose = grid.bounds_xyz, cameras[0].pose.double()
+    center = pose.new_tensor(middle)
+    if torch.dot(center - pose[:, 3], -pose[:, 2]) < 0:
+        return (
+            "the volume lies behind the camera, which looks along its -z axis with +y up, as in"
+            " OpenGL: where poses are in OpenCV's axes, negate the second and third column of each"
+            " matrix"
+        )
+    away = torch.dist(center, pose[:, 3]) / torch.dist(pose.new_tensor(low), pose.new_tensor(high))
     return (
-        f"it is looked past, from {away / float(torch.dist(low, high)):.3g} diagonals of the box"
-        " away: check volume.bounds (are they in the units of the cameras?), targets, and fields of"
-        " view or widths"
+        f"the camera looks past it, from {away:.3g} diagonals of the box away: check volume.bounds"
+        " (are they in the units of the cameras?), its target, and its field of view or width"
     )
+
+
+def _inverse(pose: Tensor) -> Tensor:
+    turned = pose[:, :3].T
+    return torch.cat([turned, -turned @ pose[:, 3:]], 1)
+
+
+def _looks_at(camera: Camera, grid: Grid) -> bool:
+    """Whether the middle of the box of `grid` is in the image of `camera`."""
+    center = camera.pose.new_tensor([grid.center_xyz])
+    (column, row), _ = (values[0] for values in project(camera, center))
+    height, width = camera.size
+    return bool((column >= 0) & (column <= width) & (row >= 0) & (row <= height))
+
+
+def _meeting_place(cameras: Sequence[Camera]) -> Tensor | None:
+    """The point (x, y, z) nearest to the axes of `cameras`; None where they are parallel."""
+    poses = torch.stack([camera.pose.double() for camera in cameras])
+    axes, origins = poses[:, :, 2:3], poses[:, :, 3:]
+    across = torch.eye(3, dtype=poses.dtype) - axes @ axes.mT
+    total = across.sum(0)
+    if torch.linalg.eigvalsh(total)[0] < 1e-3 * len(cameras):
+        return None
+    return torch.linalg.solve(total, (across @ origins).sum(0))[:, 0]

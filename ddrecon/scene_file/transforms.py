@@ -21,6 +21,7 @@ from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.schema import ViewSection
 from ddrecon.scene_file.transforms_camera import Entries, read_camera
+from ddrecon.scene_file.view_names import name_views
 
 MAX_BYTES = 64 * 2**20
 TEST_NAME = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)
@@ -40,7 +41,8 @@ def read_transforms(
         with problems.collecting():
             views += _file_views(_document(node, path), path, test_every)
     problems.raise_any()
-    return tuple(replace(view, name=name) for view, name in zip(views, _names(views), strict=True))
+    names = name_views([view.image for view in views])
+    return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
 
 
 def _document(node: Node, path: Path) -> Node:
@@ -139,15 +141,3 @@ def _image(entries: Entries, rule: Rule) -> Path | None:
         return None
     path = read_path(entries["file_path"], rule)
     return path if path.suffix.lower() in READERS else path.with_name(f"{path.name}.png")
-
-
-def _names(views: Sequence[ViewSection]) -> list[str]:
-    """A name for each view, all different."""
-    paths = [view.image or Path(f"view_{index:02d}") for index, view in enumerate(views)]
-    stems = [re.sub(r"[^A-Za-z0-9_-]", "_", path.stem) for path in paths]
-    longer = [
-        f"{re.sub(r'[^A-Za-z0-9_-]', '_', path.parent.name)}_{stem}"
-        for path, stem in zip(paths, stems, strict=True)
-    ]
-    numbered = [f"{index:03d}_{stem}" for index, stem in enumerate(stems)]
-    return next(names for names in (stems, longer, numbered) if len(set(names)) == len(names))

@@ -1,4 +1,4 @@
-"""The camera of one frame of a `transforms.json`: a pinhole.
+"""The camera of one frame of a `transforms.json`, with its lens.
 
 Its intrinsics are in pixels, or it has an angle of view.
 """
@@ -9,29 +9,36 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from ddrecon.lenses import MODELS
+from ddrecon.scene_file.camera_schema import (
+    FisheyeSection,
+    LensSection,
+    Matrix,
+    OpencvSection,
+    PerspectiveSection,
+    Size,
+)
 from ddrecon.scene_file.leaves import Rule, read_matrix, read_number, read_text
 from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.schema import Matrix, PerspectiveSection, Size
 
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
-"""Camera models that are pinholes where they have no distortion."""
-REMEDY = (
-    "undistort the pictures first (COLMAP: image_undistorter) and give the cameras of the results"
-)
+OPENCV = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+"""Camera models whose distortion is OpenCV's, as far as they have some."""
+FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+REMEDY = "undistort the pictures first (COLMAP: image_undistorter) and give the cameras they get"
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6")
 Entries = Mapping[str, Node]
 
 
 def read_camera(frame: Node, entries: Entries, rule: Rule) -> PerspectiveSection:
     """The camera that `entries` describe, those of `frame` and of its file.
 
-    Raises SceneError for what is wrong or distorted.
+    Raises SceneError for what is wrong.
     """
-    _require_pinhole(entries, rule)
     if "transform_matrix" not in entries:
         raise frame.refused("missing key 'transform_matrix'")
     matrix = read_matrix(entries["transform_matrix"], Rule(Matrix, {}, rule.folder))
     lens = _intrinsics(frame, entries, rule)
+    lens["distortion"] = _distortion(entries, rule)
     camera = PerspectiveSection(matrix=matrix, **lens)  # type: ignore[arg-type]
     for _, what in camera.problems():
         raise entries["transform_matrix"].refused(what)
@@ -84,21 +91,24 @@ def _size(entries: Entries, rule: Rule) -> Size | None:
     return int(width), int(height)
 
 
-def _require_pinhole(entries: Entries, rule: Rule) -> None:
-    """Raises SceneError for cameras that are not pinholes."""
-    if (
-        "camera_model" in entries
-        and read_text(entries["camera_model"], rule).upper() not in PINHOLES
-    ):
+def _distortion(entries: Entries, rule: Rule) -> LensSection | None:
+    """The lens; None for a pinhole. Raises SceneError for a model that is not known."""
+    model = read_text(entries["camera_model"], rule).upper() if "camera_model" in entries else ""
+    if model and model not in (*OPENCV, *FISHEYE):
         raise entries["camera_model"].refused(
-            f"{entries['camera_model'].value} is no pinhole camera; {REMEDY}"
+            f"{entries['camera_model'].value} is a lens that is not modeled; {REMEDY}"
         )
-    if "is_fisheye" in entries and entries["is_fisheye"].value:
-        raise entries["is_fisheye"].refused(f"a fisheye is no pinhole camera; {REMEDY}")
-    terms = [entries[name] for name in DISTORTION if name in entries]
-    terms += entries["distortion_params"].children() if "distortion_params" in entries else []
-    for term in terms:
-        if read_number(term, rule) != 0:
-            raise term.refused(
-                f"{term.value:g} is a lens distortion, which is not modeled; {REMEDY}"
-            )
+    is_fisheye = model in FISHEYE or ("is_fisheye" in entries and bool(entries["is_fisheye"].value))
+    section = FisheyeSection if is_fisheye else OpencvSection
+    given = {name: read_number(entries[name], rule) for name in COEFFICIENTS if name in entries}
+    if "distortion_params" in entries:
+        # nerfstudio: k1, k2, k3, k4, p1, p2
+        nodes = entries["distortion_params"].children()
+        given |= dict(zip(COEFFICIENTS, (read_number(node, rule) for node in nodes), strict=False))
+    known = MODELS[section.type]
+    for name, value in given.items():
+        if name not in known and value != 0:
+            source = entries[name if name in entries else "distortion_params"]
+            raise source.refused(f"{name} = {value:g} is not modeled; {REMEDY}")
+    lens = {name: value for name, value in given.items() if name in known}
+    return section(**lens) if is_fisheye or any(lens.values()) else None

@@ -59,7 +59,7 @@ def starting_point(
 def loss_at(
     scene: Scene, point: Mapping[str, Tensor], generator: torch.Generator
 ) -> Callable[[Mapping[str, Tensor]], Tensor]:
-    """The image loss of `scene` (float64) as a function of some parameters.
+    """The image loss of `scene` (float64), that it asks for or `l2`, as a function of parameters.
 
     The others are as in `point`. Targets are the images of the views that have them, else random
     ones.
@@ -73,12 +73,13 @@ def loss_at(
         for view in views
     ]
     memory = SolveMemory(is_warm=False)
+    kind = (scene.optimize.loss if scene.optimize else None) or "l2"
 
     def loss(values: Mapping[str, Tensor]) -> Tensor:
         changed = with_values(exact, {**point, **values})
         images = render_each(changed, [changed.view(view.name) for view in views], memory)
         losses = [
-            image_loss("l2", image, target, view.mask)
+            image_loss(kind, image, target, view.mask, view.noise)
             for image, target, view in zip(images, targets, views, strict=True)
         ]
         return torch.stack(losses).mean()

@@ -1,7 +1,7 @@
 """The table of variables: all that is known of each kind of number that can be optimized.
 
 A kind is named by a pattern: N is a light's place in the list, counted from 0, and NAME a view's
-name. `ddrecon.variables.values` reads and replaces the values themselves.
+name, or `*` for all training views. `ddrecon.variables.values` reads and replaces the values.
 """
 
 from __future__ import annotations
@@ -9,15 +9,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from ddrecon.lenses import MODELS
 from ddrecon.variables.default_rates import (
     Rate,
     brightness_rate,
     cross_section_rate,
     density_rate,
     direction_rate,
+    exposure_rate,
     fixed_rate,
+    offset_rate,
+    pose_rate,
     position_rate,
 )
 
@@ -41,7 +45,9 @@ class Kind:
     may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components` are
     the names of a vector's entries, which change one at a time. `is_direction`: only the way a
     vector points matters, and a step keeps its length. `tv` is the default weight of total
-    variation, and `difference_steps` are those of finite differences.
+    variation, and `difference_steps` are those of finite differences. `release` is the part of a
+    run after which the variable begins to move; one that `is_fitted` is solved for rather than
+    moved along its derivative, unless a scene gives its learning rate.
     """
 
     rate: Rate
@@ -53,9 +59,14 @@ class Kind:
     is_direction: bool = False
     tv: float = 0.0
     difference_steps: tuple[float, ...] = LONG_STEPS
+    release: float = 0.0
+    is_fitted: bool = False
 
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
+_MEAN_COSINE = Kind(
+    fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
+)
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True)
 
 KINDS: Mapping[str, Kind] = {
@@ -64,7 +75,11 @@ KINDS: Mapping[str, Kind] = {
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
-    "g": Kind(fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS),
+    "g": _MEAN_COSINE,
+    "phase.g": replace(_MEAN_COSINE, is_color=True),
+    "phase.weight": Kind(fixed_rate(0.05), low=0, high=1, is_color=True),
+    "phase.alpha": Kind(fixed_rate(0.05), low=0, is_color=True),
+    "phase.coefficients": Kind(fixed_rate(0.02), low=-1, high=1),
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
@@ -77,15 +92,31 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.position": Kind(position_rate, components=XYZ, difference_steps=SHORT_STEPS),
     # a turn [rad] about the camera's own axes and a shift [u] along them: see ddrecon.cameras.twist
     "views.NAME.camera": Kind(
-        fixed_rate(0.01),
+        pose_rate,
         components=("rotation_x", "rotation_y", "rotation_z", *XYZ),
         difference_steps=SHORT_STEPS,
+        release=0.4,
+    ),
+    # what a camera does to radiance: a factor, and what is added to it
+    "views.NAME.exposure": Kind(exposure_rate, low=1e-3, is_color=True, is_fitted=True),
+    "views.NAME.offset": Kind(offset_rate, is_color=True, is_fitted=True),
+    # of a perspective camera: its focal length in widths of the image, and the rest of its lens
+    "views.NAME.focal": Kind(fixed_rate(1e-3), low=1e-3, difference_steps=SHORT_STEPS),
+    "views.NAME.principal_point": Kind(
+        fixed_rate(1e-3), components=("x", "y"), difference_steps=SHORT_STEPS
+    ),
+    "views.NAME.distortion": Kind(
+        fixed_rate(1e-3), components=MODELS["opencv"], difference_steps=SHORT_STEPS
     ),
 }
 """Every kind of variable, by its pattern."""
 
-VOLUME = tuple(pattern for pattern in KINDS if "." not in pattern)
+VOLUME = tuple(pattern for pattern in KINDS if not pattern.startswith(("lights.", "views.")))
 """The variables of the volume."""
+FIELDS = tuple(name for name in VOLUME if KINDS[name].is_cellwise)
+"""Those that may differ from cell to cell."""
+PHASE = "phase."
+"""What variables of a phase function begin with; `phase.g` of Henyey and Greenstein's is `g`."""
 CROSS_SECTIONS = ("sigma_a", "sigma_s")
 EXTINCTION_AND_ALBEDO = ("sigma_t", "albedo")
 PAIRS = (CROSS_SECTIONS, EXTINCTION_AND_ALBEDO)
@@ -99,6 +130,6 @@ def kind_of(name: str) -> Kind:
 
 def pattern_of(name: str) -> str:
     """The pattern in `KINDS` that `name` follows, or `name` itself where it follows none."""
-    if re.fullmatch(r"views\..+\.camera", name):
-        return "views.NAME.camera"
+    if match := re.fullmatch(r"views\..+\.([a-z_]+)", name):
+        return f"views.NAME.{match[1]}"
     return re.sub(r"^lights\.[0-9]{1,9}\.", "lights.N.", name)

@@ -1,14 +1,16 @@
 """The numbers of a scene by name, read out of a scene and put back into it.
 
-`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo` and `g` are the volume's; `lights.0.irradiance`
-is any number of the first light; `views.front.camera` is the twist of a camera. Vectors are (x, y,
-z), colors lead.
+`density`, `sigma_a`, `sigma_s`, `sigma_t`, `albedo`, `g` and `phase.*` are the volume's;
+`lights.0.irradiance` is any number of the first light; `views.front.camera` is the twist of a
+camera, `.focal`, `.principal_point` and `.distortion` are its lens. Vectors are (x, y, z), colors
+lead.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,8 +18,12 @@ from torch import Tensor
 from ddrecon.cameras import twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, VOLUME, kind_of
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, VOLUME, kind_of
+
+RESPONSE = {"exposure": 1.0, "offset": 0.0}
+"""What a camera does to radiance, and what it is where a view has none (E28)."""
 
 
 def variable_names(scene: Scene) -> list[str]:
@@ -27,7 +33,8 @@ def variable_names(scene: Scene) -> list[str]:
         for index, light in enumerate(scene.lights)
         for name in _tensors(light)
     ]
-    return [*VOLUME, *lights, *(f"views.{view.name}.camera" for view in scene.views)]
+    views = [f"views.{view.name}.{part}" for view in scene.views for part in _view_parts(view)]
+    return [*_volume_names(scene.volume), *lights, *views]
 
 
 def value_of(scene: Scene, name: str) -> Tensor:
@@ -35,15 +42,17 @@ def value_of(scene: Scene, name: str) -> Tensor:
 
     `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
     that light holds them; a camera's twist is the change of its pose, [6] and zero: see
-    `ddrecon.cameras.twist`.
+    `ddrecon.cameras.twist`. Its focal length [] is in widths of its image; exposure and offset are
+    [1] or [3].
     """
-    if name not in variable_names(scene):
+    if (known := _own_name(scene.volume, name)) not in variable_names(scene):
         raise KeyError(name)
-    if name in VOLUME:
-        return _volume_value(scene.volume, name)
+    if known in VOLUME:
+        return _volume_value(scene.volume, known)
     section, _, path = name.partition(".")
     if section == "views":
-        return scene.view(path.removesuffix(".camera")).camera.pose.new_zeros(6)
+        view, _, part = path.rpartition(".")
+        return _view_value(scene.view(view), part)
     index, _, attribute = path.partition(".")
     value: Tensor = getattr(scene.lights[int(index)], attribute)
     return value
@@ -57,6 +66,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     Raises KeyError for a name that is none, ValueError for a density of another shape than the
     grid's.
     """
+    values = {_own_name(scene.volume, name): value for name, value in values.items()}
     known = variable_names(scene)
     unknown = [name for name in values if name not in known]
     if unknown:
@@ -64,9 +74,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     lights = [
         _replace_light(light, f"lights.{index}", values) for index, light in enumerate(scene.lights)
     ]
-    views = [
-        _replace_view(view, values.get(f"views.{view.name}.camera"), scene) for view in scene.views
-    ]
+    views = [_replace_view(view, values, scene) for view in scene.views]
     volume = _replace_volume(
         scene.volume, {name: values[name] for name in VOLUME if name in values}
     )
@@ -79,7 +87,9 @@ def component_names(name: str, value: Tensor) -> tuple[str, ...]:
     Raises KeyError for a name of no variable.
     """
     kind = kind_of(name)
-    return ("r", "g", "b") if kind.is_color and value.shape[:1] == (3,) else kind.components
+    if kind.is_color and value.shape[:1] == (3,):
+        return ("r", "g", "b")
+    return kind.components[: len(value)] if kind.components else ()
 
 
 def cross_sections(sigma_t: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,7 +110,24 @@ def _tensors(light: Light) -> list[str]:
     return [field.name for field in fields(light) if isinstance(getattr(light, field.name), Tensor)]
 
 
+def _volume_names(volume: Volume) -> list[str]:
+    """The variables of `volume`: its phase function has its own numbers, or g alone."""
+    known = [name for name in VOLUME if name != "g" and not name.startswith(PHASE)]
+    if isinstance(volume.phase, HenyeyGreenstein):
+        return [*known, "g"]
+    return [*known, *(PHASE + name for name in volume.phase.VARIABLES)]
+
+
+def _own_name(volume: Volume, name: str) -> str:
+    """`name`, or `g` for `phase.g` where both are the same."""
+    is_short = name == f"{PHASE}g" and isinstance(volume.phase, HenyeyGreenstein)
+    return "g" if is_short else name
+
+
 def _volume_value(volume: Volume, name: str) -> Tensor:
+    if name.startswith(PHASE):
+        number: Tensor = getattr(volume.phase, name.removeprefix(PHASE))
+        return number
     if name not in EXTINCTION_AND_ALBEDO:
         value: Tensor = getattr(volume, name)
         return value
@@ -121,7 +148,14 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)
     if "density" in stored and stored["density"].ndim == 0:
         stored["density"] = stored["density"].expand(volume.grid.shape)
-    changed: Volume = replace(volume, **stored)  # type: ignore[arg-type]
+    phase = volume.phase
+    if "g" in stored:
+        phase = HenyeyGreenstein(stored.pop("g"))
+    numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
+    if numbers:
+        parts = {name.removeprefix(PHASE): number for name, number in numbers.items()}
+        phase = replace(phase, **parts)  # type: ignore[arg-type]
+    changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
 
 
@@ -131,7 +165,37 @@ def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Lig
     return changed
 
 
-def _replace_view(view: View, change: Tensor | None, scene: Scene) -> View:
-    if change is None:
+def _view_parts(view: View) -> list[str]:
+    """What of `view` can be varied."""
+    lens = ["focal", "principal_point"] if view.camera.is_perspective else []
+    lens += ["distortion"] if view.camera.distortion is not None else []
+    return ["camera", *lens, *RESPONSE]
+
+
+def _view_value(view: View, part: str) -> Tensor:
+    camera, pose = view.camera, view.camera.pose
+    if part in RESPONSE:
+        value = getattr(view, part)
+        return pose.new_full((1,), RESPONSE[part]) if value is None else value
+    if part == "camera":
+        return pose.new_zeros(6)
+    if part == "focal":
+        return 1 / (2 * torch.as_tensor(camera.half_width, dtype=pose.dtype, device=pose.device))
+    value = getattr(camera, part)
+    return torch.as_tensor(value, dtype=pose.dtype, device=pose.device)
+
+
+def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
+    names = {part: f"views.{view.name}.{part}" for part in _view_parts(view)}
+    given = {part: values[name] for part, name in names.items() if name in values}
+    if not given:
         return view
-    return replace(view, camera=twist(view.camera, change, scene.volume.grid.center_xyz))
+    response: dict[str, Any] = {part: given.pop(part) for part in RESPONSE if part in given}
+    camera = view.camera
+    if "camera" in given:
+        camera = twist(camera, given.pop("camera"), scene.volume.grid.center_xyz)
+    if "focal" in given:
+        given["half_width"] = 1 / (2 * given.pop("focal"))
+    if given:
+        camera = replace(camera, **given)
+    return replace(view, camera=camera, **response)

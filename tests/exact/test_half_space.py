@@ -65,7 +65,7 @@ def half_space(albedo: float, sun: float, cells: int = 192, rounds: int = 0) -> 
         closure="smooth",
         floor=1e-6,
         transport_rounds=rounds,
-        transport_directions=50,
+        degree=5,
     )
     return replace(scene, views=[View(f"mu {cosine}", looking_down(cosine)) for cosine in VIEWS])
 

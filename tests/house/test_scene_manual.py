@@ -10,10 +10,10 @@ from types import ModuleType
 import pytest
 
 from ddrecon import settings
-from ddrecon.scene_file import schema
+from ddrecon.scene_file import camera_schema, light_schema, phase_schema, schema
 
 DOCS = Path(__file__).parents[2] / "docs"
-ELSEWHERE = {schema.Constant, schema.Bounds, schema.PoseSection, schema.SceneTree}
+ELSEWHERE = {schema.Constant, schema.Bounds, camera_schema.PoseSection, schema.SceneTree}
 """Records whose keys are explained with those of others."""
 
 
@@ -33,17 +33,18 @@ def test_the_page_is_what_the_schema_makes_of_it(manual: ModuleType) -> None:
 
 
 def test_every_key_of_every_record_is_explained(manual: ModuleType) -> None:
-    names = [*vars(schema).values(), *vars(settings).values()]
+    modules = camera_schema, schema, light_schema, phase_schema, settings
+    names = [value for module in modules for value in vars(module).values()]
     records = {value for value in names if isinstance(value, type) and is_dataclass(value)}
     explained = {record: set(texts) for _, record, _, texts in manual.SECTIONS}
     assert set(explained) == records - ELSEWHERE
-    pose = {field.name for field in fields(schema.PoseSection)}
+    pose = {field.name for field in fields(camera_schema.PoseSection)}
     for record, keys in explained.items():
         known = {field.name for field in fields(record)}
-        assert keys == known - (pose if record is schema.OrthographicSection else set())
+        assert keys == known - (pose if record is camera_schema.OrthographicSection else set())
 
 
 def test_no_key_takes_just_a_mapping_unless_it_is_one(manual: ModuleType) -> None:
-    plain = {"bounds", "camera", "ring", "parameters"}
+    plain = {"bounds", "camera", "distortion", "ring", "parameters"}
     rows = [line.split("|") for line in manual.page().splitlines() if line.startswith("| `")]
     assert {row[1].strip(" `") for row in rows if row[2].strip().startswith("mapping")} == plain

@@ -19,10 +19,10 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
     """What launches did: first item, number of items, and the arguments."""
     seen: list[tuple[int, ...]] = []
 
-    def note(kernel: object, size: int, given: list[int], **_: object) -> None:
+    def note(kernel: object, device: object, size: int, given: list[int], stream: None) -> None:
         seen.append((given[0], size, *given[1:]))
 
-    monkeypatch.setattr(launching.wp, "launch", note)
+    monkeypatch.setattr(launching, "_call", note)
     monkeypatch.setattr(launching, "_load", lambda kernel, device: None)
     return seen
 

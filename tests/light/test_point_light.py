@@ -82,7 +82,7 @@ def test_without_a_medium_light_falls_with_the_square_of_the_distance(position: 
     flux = torch.stack(received.flux, -1)[0]
     torch.testing.assert_close(
         flux[is_apart],
-        (expected / distance)[is_apart][:, None] * offset[is_apart],
+        3 * (expected / distance)[is_apart][:, None] * offset[is_apart],
         rtol=1e-12,
         atol=1e-16,
     )
@@ -141,7 +141,7 @@ def test_single_scattering_of_thin_air_around_a_light_is_its_closed_form():
     beams = reduced_light(medium, [light_at(position)], False).beams
     dark = torch.zeros(1, *grid.shape, dtype=torch.float64)
     emission = Emission(
-        grid, medium.extinction, medium.scattering, beams, dark, medium.g, medium.peak
+        grid, medium.extinction, medium.scattering, beams, dark, medium.seen, medium.peak
     )
     radiance = march_rays(emission, bundle, RenderSettings())[0][0]
     light = array_order(torch.tensor(position, dtype=torch.float64))

@@ -31,11 +31,11 @@ def medium_in(
 
 
 def unscattered_ambient(medium: Medium, radiance: Tensor) -> Moments:
-    return sum_unscattered_sky(medium, [ambient_sky(radiance)], has_flux=True)
+    return sum_unscattered_sky(medium, [ambient_sky(radiance)], degree=1)
 
 
 def reduced(grid: Grid, density: Tensor, lights: list, **medium) -> ReducedLight:
-    return reduced_light(medium_in(grid, density, **medium), lights, has_flux=True)
+    return reduced_light(medium_in(grid, density, **medium), lights, degree=1)
 
 
 @pytest.mark.parametrize("depth_per_cell", [1e-3, 1.0, 30.0])

@@ -243,7 +243,7 @@ def saved_bytes(scene: Scene, directions: int) -> int:
     )
     parts = decompose_map(light_of(radiance, directions=directions))
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        sum_unscattered_sky(medium, parts, has_flux=True)
+        sum_unscattered_sky(medium, parts, degree=1)
     return sum(storages.values())
 
 

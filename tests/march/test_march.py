@@ -67,7 +67,7 @@ def emission_of(
         medium.scattering,
         reduced_light(medium, [light], False).beams,
         diffuse,
-        medium.g,
+        medium.seen,
         medium.peak,
     )
 
@@ -240,7 +240,7 @@ def test_a_cross_section_may_be_a_field(has_fields: str, g: float):
             medium.scattering,
             beams,
             random_values(3, *grid.shape, seed=4),
-            medium.g,
+            medium.seen,
             medium.peak,
         )
         results.append(torch.cat(march_rays(emission, cast_rays(camera), every_ray(1))))

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays, cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.light import beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.march.box import cross_box
 from ddrecon.march.emission import Channels, Emission
 from ddrecon.march.plain import march_plainly
 from ddrecon.march.samplers import choose_way, make_sampler
-from ddrecon.medium.phase import peaked_phase
+from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.renderer import _emission, solve_light
 from ddrecon.scene import Scene
@@ -68,9 +67,19 @@ each_view = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
 
 @pytest.fixture
 def same_fields(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Masses are interpolated linearly, and E13 is evaluated itself, in the fast march as well."""
+    """Masses are interpolated linearly, and E13 is summed itself, in the fast march as well."""
+
+    def along(seen: SeenPhase, depth: Tensor, cosine: Tensor) -> Tensor:
+        return seen.at(depth.movedim(1, 0), cosine).movedim(0, 1)
+
+    def at_angles(seen: SeenPhase, depth: Tensor | None, angle: Tensor) -> Tensor:
+        if depth is None:
+            return seen.value(angle.cos()).movedim(0, 1)
+        return seen.at(depth.movedim(1, 0), angle.cos()).movedim(0, 1)
+
     monkeypatch.setattr(ThirdOrder, "bounded", lambda _, correction: 0 * correction)
-    monkeypatch.setattr(beam, "peaked_phase_along", peaked_phase)
+    monkeypatch.setattr(SeenPhase, "along", along)
+    monkeypatch.setattr(SeenPhase, "at_angles", at_angles)
 
 
 def lit_scene(lights: list[Light], view: dict[str, Any], **changes: Any) -> Scene:

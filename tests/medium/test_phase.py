@@ -1,4 +1,4 @@
-"""The phase function and the scaling of its peak, checked by their moments over the sphere."""
+"""Phase functions and the scaling of their peak, checked by their moments over the sphere."""
 
 from __future__ import annotations
 
@@ -8,108 +8,224 @@ import numpy as np
 import pytest
 import torch
 from media import box_grid, random_values
+from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
-from ddrecon.medium.phase import (
-    forward_fraction,
-    henyey_greenstein,
-    peaked_phase,
-    peaked_phase_along,
-    scaled_mean_cosine,
-)
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.medium.phase_series import Legendre, Tabulated
+from ddrecon.numerics.angle_table import STEPS
+from ddrecon.numerics.legendre import even_angles
 
 MEAN_COSINES = (-0.8, -0.3, 0.0, 0.4, 0.8)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(100)
 
 
-def scalar(value: float) -> torch.Tensor:
+def tensor(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def scalar(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def legendre_moment(phase: torch.Tensor, degree: int) -> float:
-    """The average of P_degree(cosine) over the sphere, weighted by a phase function given at the
-    `NODES`.
-    """
-    polynomial = np.polynomial.legendre.Legendre.basis(degree)(NODES)
-    return float((phase.numpy() * polynomial * WEIGHTS).sum() / 2)
+def bump() -> Tensor:
+    """A smooth table with a wide peak, not normalized."""
+    return 3 * torch.exp(2 * even_angles(STEPS).cos())[None]
+
+
+PHASES: dict[str, PhaseFunction] = {
+    "forward": HenyeyGreenstein(scalar(0.7)),
+    "backward": HenyeyGreenstein(scalar(-0.4)),
+    "by color": HenyeyGreenstein(tensor(0.7, 0.0, -0.3)),
+    "two lobes": TwoLobe(tensor(0.7, -0.5), scalar(0.6)),
+    "two lobes by color": TwoLobe(tensor(0.7, 0.2), tensor(0.2, 0.6, 1.0)),
+    "rayleigh": Rayleigh(scalar(0.0)),
+    "draine": Draine(scalar(0.6), scalar(1.5)),
+    "draine backward": Draine(tensor(-0.6, 0.1, 0.0), tensor(1.0, 0.0, 2.0)),
+    "series": Legendre(tensor(0.5, 0.3, 0.1, 0.05)),
+    "series by color": Legendre(tensor(0.5, 0.3, 0.1, 0.2, 0.1, 0.05, 0.3, 0.15, 0.02).view(3, 3)),
+    "table": Tabulated(bump()),
+}
+each_phase = pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES.keys())
+each_degree = pytest.mark.parametrize("degree", [1, 3])
+
+
+def legendre_moments(values: Tensor, count: int) -> Tensor:
+    """The averages [C, count] of P_l over the sphere, weighted by values [C, n] at NODES."""
+    rows = np.polynomial.legendre.legvander(NODES, count - 1) * WEIGHTS[:, None] / 2
+    return values @ torch.from_numpy(rows)
+
+
+@each_phase
+def test_moments_are_those_of_the_values(phase: PhaseFunction):
+    found = legendre_moments(phase.value(torch.tensor(NODES)), 12)
+    torch.testing.assert_close(found, phase.moments(12), rtol=0, atol=1e-7)
+    assert len(found) == phase.colors
+
+
+@each_phase
+def test_the_mean_over_the_sphere_is_one(phase: PhaseFunction):
+    assert torch.equal(phase.moments(1), torch.ones_like(phase.moments(1)))
 
 
 @pytest.mark.parametrize("g", MEAN_COSINES)
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_moments_are_powers_of_the_mean_cosine(g: float, degree: int):
-    phase = henyey_greenstein(torch.tensor(NODES), scalar(g))
-    assert legendre_moment(phase, degree) == pytest.approx(g**degree, abs=1e-12)
+def test_moments_of_henyey_and_greenstein_are_powers_of_the_mean_cosine(g: float):
+    expected = torch.tensor([g**degree for degree in range(4)], dtype=torch.float64)
+    torch.testing.assert_close(HenyeyGreenstein(scalar(g)).moments(4)[0], expected)
 
 
-def peak_moment(g: float, depth: float, degree: int) -> float:
+@pytest.mark.parametrize(
+    "one, other",
+    [
+        (Draine(scalar(0.0), scalar(1.0)), Rayleigh(scalar(0.0))),
+        (Draine(scalar(0.6), scalar(0.0)), HenyeyGreenstein(scalar(0.6))),
+        (TwoLobe(tensor(0.6, -0.9), scalar(1.0)), HenyeyGreenstein(scalar(0.6))),
+        (TwoLobe(tensor(0.6, -0.9), scalar(0.0)), HenyeyGreenstein(scalar(-0.9))),
+        (Legendre(tensor(0.0, 0.1)), Rayleigh(scalar(0.0))),
+        (Tabulated(1 + even_angles(STEPS).cos()[None] ** 2), Rayleigh(scalar(0.0))),
+        (Legendre(0.6 ** torch.arange(1, 200).double()), HenyeyGreenstein(scalar(0.6))),
+    ],
+)
+def test_special_cases_are_each_other(one: PhaseFunction, other: PhaseFunction):
+    cosine = torch.linspace(-1, 1, 37, dtype=torch.float64)
+    torch.testing.assert_close(one.value(cosine), other.value(cosine), rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(one.moments(30), other.moments(30), rtol=0, atol=1e-10)
+    for degree in (1, 3):
+        torch.testing.assert_close(
+            one.forward_fraction(degree), other.forward_fraction(degree), rtol=0, atol=1e-10
+        )
+
+
+@pytest.mark.parametrize("phase", [*PHASES.values()][:-1], ids=[*PHASES][:-1])
+def test_values_and_moments_have_both_derivatives(phase: PhaseFunction):
+    kind, cosine = type(phase), tensor(-0.95, 0.2, 0.9).requires_grad_()
+    numbers = [number.clone().requires_grad_() for number in phase.numbers]
+
+    def found(cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
+        made = kind(*numbers)
+        return made.value(cosine), made.moments(5), made.peak_tail(1, 4), made.backward_tail(3, 4)
+
+    assert torch.autograd.gradcheck(found, (cosine, *numbers), check_forward_ad=True)
+
+
+# --- what a forward peak does to a beam ----------------------------------------------------------
+
+
+def peak_moment(g: float, depth: float, degree: int, kept: int) -> float:
     """The moment of light that the forward peak alone has scattered, once at a given place on its
     way of `depth` scatterings.
 
     n of them fall on the way with Poisson's probability, each is the one in question with 1 / n,
-    and n in a row have the moments of one to the power of n: 1 up to the second, g for the third.
+    and n in a row have the moments of one to the power of n: 1 up to `kept`, then g, g^2, ...
     """
     counts = range(1, 80)
     chances = [math.exp(-depth) * depth ** (n - 1) / math.factorial(n) for n in counts]
-    return g**2 * sum(
-        chance * g ** (n * max(0, degree - 2)) for chance, n in zip(chances, counts, strict=True)
+    return g ** (kept + 1) * sum(
+        chance * g ** (n * max(0, degree - kept - 1))
+        for chance, n in zip(chances, counts, strict=True)
     )
 
 
 @pytest.mark.parametrize("g", [0.05, 0.2, 0.4])
 @pytest.mark.parametrize("depth", [1e-9, 0.3, 2.0, 9.0])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@each_degree
 def test_a_peak_spreads_light_by_the_moments_of_its_scatterings(
     g: float, depth: float, degree: int
 ):
-    phase = peaked_phase(scalar(depth), torch.tensor(NODES), scalar(g))
-    rest = {0: 1 - g**2, 1: (1 - g**2) * g / (1 + g)}.get(degree, 0.0)
-    assert legendre_moment(phase, degree) == pytest.approx(
-        rest + peak_moment(g, depth, degree), rel=1e-9
-    )
+    seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
+    found = legendre_moments(seen.at(tensor(depth)[None], torch.tensor(NODES)), 8)[0]
+    for moment in range(8):
+        rest = g**moment - g ** (degree + 1) if moment <= degree else 0.0
+        expected = rest + peak_moment(g, depth, moment, degree)
+        assert float(found[moment]) == pytest.approx(expected, rel=1e-7)
 
 
-@pytest.mark.parametrize("g", [0.0, 1e-4, 0.3, 0.8, 0.95])
-def test_a_peak_that_nothing_lies_behind_is_the_exact_phase_function(g: float):
+@each_phase
+@each_degree
+def test_a_peak_that_nothing_lies_behind_is_the_exact_phase_function(
+    phase: PhaseFunction, degree: int
+):
     cosine = torch.linspace(-1, 1, 101, dtype=torch.float64)
-    torch.testing.assert_close(
-        peaked_phase(scalar(0.0), cosine, scalar(g)),
-        henyey_greenstein(cosine, scalar(g)),
-        rtol=1e-9,
-        atol=1e-12,
+    seen, exact = SeenPhase(phase, degree), phase.value(cosine)
+    torch.testing.assert_close(seen.at(tensor(0.0)[None], cosine), exact, rtol=1e-6, atol=1e-6)
+    along = seen.along(torch.zeros(1, len(exact), 101, dtype=torch.float64), cosine)
+    torch.testing.assert_close(along[0], exact, rtol=1e-6, atol=1e-6)
+
+
+@each_phase
+def test_a_spread_peak_is_finite_and_not_negative_at_any_depth(phase: PhaseFunction):
+    depth = torch.logspace(-30, 10, 21).view(-1, 1, 1).requires_grad_()
+    cosine = torch.linspace(-1, 1, 21).requires_grad_()
+    found = SeenPhase(phase, 3).along(depth.expand(-1, phase.colors, 21), cosine)
+    bars = torch.autograd.grad(found.sum(), (depth, cosine))
+    assert (found >= 0).all()
+    assert all(bool(each.isfinite().all()) for each in (found, *bars))
+
+
+@pytest.mark.parametrize("g", [0.1, 0.5, 0.85, 0.95])
+@each_degree
+def test_along_rays_a_spread_peak_is_nearly_the_same(g: float, degree: int):
+    """And the same where nothing lies behind it."""
+    cosine = torch.linspace(-1, 1, 41, dtype=torch.float64)
+    depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 400)]).double().view(-1, 1, 1)
+    seen = SeenPhase(HenyeyGreenstein(scalar(g)), degree)
+    along, exact = (
+        seen.along(depth.expand(-1, 1, 41), cosine)[:, 0],
+        seen.at(depth.movedim(1, 0), cosine)[0],
     )
+    torch.testing.assert_close(along[0], exact[0], rtol=1e-5, atol=1e-6)
+    assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
 
 
-def test_a_spread_peak_is_finite_and_not_negative_at_any_depth():
-    depth, cosine = torch.logspace(-30, 10, 61)[:, None].requires_grad_(), torch.linspace(-1, 1, 21)
-    for g in (0.0, 0.5, 0.99):
-        phase = peaked_phase(depth, cosine, torch.tensor(g))
-        slope = torch.autograd.grad(phase.sum(), depth)[0]
-        assert phase.isfinite().all() and (phase >= 0).all() and slope.isfinite().all()
+@pytest.mark.parametrize("name", ["forward", "two lobes by color", "series"])
+def test_along_rays_all_derivatives_agree_with_differences(name: str):
+    phase = PHASES[name]
+    kind, numbers = type(phase), [number.clone().requires_grad_() for number in phase.numbers]
+    depth = random_values(3, 3, 4).requires_grad_()
+    cosine = tensor(-0.9, -0.2, 0.4, 0.95).requires_grad_()
+
+    def found(depth: Tensor, cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:
+        seen = SeenPhase(kind(*numbers), 1)
+        angles = cosine.acos().expand(3, 4)
+        return (
+            seen.along(depth, cosine),
+            seen.at_angles(depth, angles),
+            seen.at_angles(None, angles),
+        )
+
+    assert torch.autograd.gradcheck(found, (depth, cosine, *numbers), check_forward_ad=True)
 
 
 def test_isotropic_scattering_is_one_everywhere():
     assert torch.equal(
-        henyey_greenstein(torch.linspace(-1, 1, 7, dtype=torch.float64), scalar(0.0)),
-        torch.ones(7, dtype=torch.float64),
+        HenyeyGreenstein(scalar(0.0)).value(torch.linspace(-1, 1, 7, dtype=torch.float64)),
+        torch.ones(1, 7, dtype=torch.float64),
     )
 
 
-@pytest.mark.parametrize("g", [0.1, 0.5, 0.95])
-def test_scaling_a_forward_peak_keeps_its_first_two_moments(g: float):
-    f, rest = forward_fraction(scalar(g)), scaled_mean_cosine(scalar(g))
-    assert (f + (1 - f) * rest).item() == pytest.approx(g, rel=1e-14)
-    assert f.item() == pytest.approx(g**2, rel=1e-14)
+# --- the scaled medium ---------------------------------------------------------------------------
+
+
+@each_phase
+@each_degree
+def test_scaling_a_forward_peak_leaves_no_backward_rest(phase: PhaseFunction, degree: int):
+    """What remains has a mean cosine, and a peak no more than all of scattering."""
+    f = phase.forward_fraction(degree)
+    assert bool(((f >= 0) & (f < 1)).all())
+    if isinstance(phase, Legendre | Tabulated | Rayleigh):
+        rest = (phase.moments(2)[:, 1] - f) / (1 - f)
+        assert bool((rest >= -1e-12).all())
 
 
 @pytest.mark.parametrize("g", [-0.95, -0.2, 0.0])
 def test_nothing_is_scaled_without_a_forward_peak(g: float):
-    assert forward_fraction(scalar(g)) == 0 and scaled_mean_cosine(scalar(g)) == g
+    assert HenyeyGreenstein(scalar(g)).forward_fraction(1) == 0
 
 
-@pytest.mark.parametrize("function", [forward_fraction, scaled_mean_cosine])
-def test_the_scaling_has_a_continuous_derivative_at_zero(function):
+def test_the_scaling_has_a_continuous_derivative_at_zero():
     slopes = torch.autograd.functional.jacobian(
-        lambda g: function(g).sum(), torch.tensor([-1e-9, 1e-9], dtype=torch.float64)
+        lambda g: HenyeyGreenstein(g).forward_fraction(1).sum(), tensor(-1e-9, 1e-9)
     )
     assert slopes[0].item() == pytest.approx(slopes[1].item(), abs=1e-8)
 
@@ -164,25 +280,3 @@ def test_a_density_of_another_shape_is_refused():
             random_values(1),
             scalar(0.0),
         )
-
-
-@pytest.mark.parametrize("g", [0.1, 0.5, 0.85, 0.95])
-def test_along_rays_a_spread_peak_is_nearly_the_same(g: float):
-    """And the same where nothing lies behind it."""
-    cosine = torch.linspace(-1, 1, 41, dtype=torch.float64)
-    depth = torch.cat([torch.zeros(1), torch.logspace(-4, 4, 400)]).double()[:, None]
-    along, exact = (
-        peaked_phase_along(depth[:, None].expand(-1, 1, 41), cosine, scalar(g))[:, 0],
-        peaked_phase(depth, cosine, scalar(g)),
-    )
-    torch.testing.assert_close(along[0], exact[0], rtol=1e-9, atol=1e-12)
-    assert float(((along - exact).abs() / exact.clamp(min=1)).max()) < 0.007
-
-
-def test_along_rays_both_derivatives_agree_with_differences():
-    depth = torch.rand(
-        3, 2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    ).requires_grad_()
-    cosine = torch.tensor([-0.9, -0.2, 0.4, 0.95], dtype=torch.float64).requires_grad_()
-    arguments = (depth, cosine, scalar(0.6).requires_grad_())
-    assert torch.autograd.gradcheck(peaked_phase_along, arguments, check_forward_ad=True)

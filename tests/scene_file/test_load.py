@@ -12,9 +12,10 @@ import pytest
 import yaml
 from example_scene import CAMERA, SCENE, changed
 
+from ddrecon.scene_file.camera_schema import OrthographicSection
 from ddrecon.scene_file.dump import describe, dump_scene
+from ddrecon.scene_file.light_schema import AmbientSection, DirectionalSection
 from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.schema import AmbientSection, DirectionalSection, OrthographicSection
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
@@ -246,8 +247,12 @@ ONE_FAULT = [
         "diffusion.scheme: 'printed' is for diffusion.model p1; flux_limited needs 'conservative'",
     ),
     (
-        "diffusion.transport_directions=48",
-        "diffusion.transport_directions: expected one of 26, 50, 86, found 48",
+        "diffusion.transport_directions=50",
+        "diffusion.transport_directions: directions follow from diffusion.degree: write degree: 3",
+    ),
+    (
+        "diffusion.degree=4",
+        "diffusion.degree: expected one of 3, 5, 7, found 4",
     ),
     ("diffusion.transport_rounds=17", "diffusion.transport_rounds: must be at most 16"),
     (

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from example_scene import changed
 
+from ddrecon.scene_file.camera_schema import PerspectiveSection
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.ring import ring_cameras
-from ddrecon.scene_file.schema import PerspectiveSection, RingSection
+from ddrecon.scene_file.schema import RingSection
 
 RING = {"count": 3, "radius": 3.2, "height": 0.3, "fov": 28, "resolution": [8, 6]}
 ORIGINS = [  # of the cameras of shared/reference/views_plume, train_00 to train_09

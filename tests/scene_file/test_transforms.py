@@ -19,10 +19,11 @@ from example_scene import SCENE, changed
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.scene_file.build import build_scene, load_scene
+from ddrecon.scene_file.camera_schema import PerspectiveSection
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.export_transforms import export_transforms
 from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.schema import PerspectiveSection, ViewSection
+from ddrecon.scene_file.schema import ViewSection
 
 Read = Callable[..., SceneFile]
 Refusal = Callable[..., list[str]]
@@ -204,13 +205,12 @@ def test_a_dumped_scene_is_the_same(read: Read, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"k1": 0.01}, "k1: 0.01 is a lens distortion, which is not modeled; undistort"),
+        ({"k5": 0.01}, "k5: k5 = 0.01 is not modeled; undistort"),
         (
-            {"distortion_params": [0, 0, 0, 0, 1e-3, 0]},
-            "distortion_params.4: 0.001 is a lens distortion",
+            {"camera_model": "OPENCV_FISHEYE", "distortion_params": [0, 0, 0, 0, 1e-3, 0]},
+            "distortion_params: p1 = 0.001 is not modeled",
         ),
-        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model: OPENCV_FISHEYE is no pinhole camera"),
-        ({"is_fisheye": True}, "is_fisheye: a fisheye is no pinhole camera"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR is a lens that is not modeled"),
         ({"fl_x": 0}, "fl_x: must be above 0"),
         ({"w": 8.5}, "w: expected a whole number, found 8.5"),
         ({"w": None}, "w: expected a number, found nothing"),
@@ -218,7 +218,7 @@ def test_a_dumped_scene_is_the_same(read: Read, tmp_path: Path) -> None:
         ({"cx": float("nan")}, "cx: expected a finite number"),
     ],
 )
-def test_what_is_no_pinhole_is_refused_by_key(
+def test_what_is_no_camera_of_ours_is_refused_by_key(
     refusal: Refusal, tmp_path: Path, change: dict[str, Any], problem: str
 ) -> None:
     (line,) = refusal(transforms(tmp_path / "transforms.json", frame(), **(NERFSTUDIO | change)))
@@ -235,7 +235,7 @@ def test_what_is_no_pinhole_is_refused_by_key(
         ),
         (
             [frame(transform_matrix=[[2 * x for x in row] for row in POSE[:3]] + POSE[3:])],
-            "frames.0.transform_matrix: its last row",
+            "frames.0.transform_matrix: must be rigid",
         ),
         ([{"file_path": "a.png"}], "frames.0: missing key 'transform_matrix'"),
         ([frame(), 3], "frames.1: expected a mapping, found 3"),
@@ -372,3 +372,40 @@ def test_what_is_wrong_with_every_frame_is_told_once(refusal: Refusal, tmp_path:
     assert lines[0].endswith("(9 more like this)") and "frames.10.transform_matrix: exp" in lines[1]
     transforms(tmp_path / "t.json", *frames[:2], **NERFSTUDIO)
     assert len(refusal(changed(views={"transforms": "t.json"}))) == 2
+
+
+LENSES = {
+    "OPENCV": {"k1": -0.1, "k2": 0.02, "k3": 0.0, "k4": 0.0, "p1": 1e-3, "p2": -2e-3},
+    "OPENCV_FISHEYE": {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.0},
+}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_lenses_are_read_and_written(read: Read, tmp_path: Path, model: str) -> None:
+    """Key by key or as a list; through our own scene files and transforms, to the same rays."""
+    lens, own = LENSES[model], {"camera_model": model}
+    listed = own | {"distortion_params": list(lens.values())}
+    bare = {key: value for key, value in NERFSTUDIO.items() if key not in ("k1", "k2")}
+    rays = []
+    for numbers in (own | lens, listed):
+        scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **(bare | numbers)))
+        dump_scene(scene_file, tmp_path / "dump.yaml")
+        assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
+        scene = build_scene(scene_file, dtype=torch.float64)
+        export_transforms(scene, scene_file, tmp_path / "again.json", may_exist=True)
+        again = read(changed(views={"transforms": "again.json"}))
+        for one in (scene, build_scene(again, dtype=torch.float64)):
+            rays.append(cast_rays(one.views[0].camera).direction)
+    for other in rays[1:]:
+        torch.testing.assert_close(other, rays[0], rtol=0, atol=1e-15)
+    read(transforms(tmp_path / "transforms.json", frame(None), **bare))
+    pinhole = cast_rays(load_scene(tmp_path / "scene.yaml", dtype=torch.float64).views[0].camera)
+    assert (pinhole.direction - rays[0]).abs().max() > 1e-4
+
+
+def test_a_lens_that_folds_over_is_refused(read: Read, tmp_path: Path) -> None:
+    numbers = NERFSTUDIO | {"k1": -12.0}
+    scene_file = read(transforms(tmp_path / "transforms.json", frame(None), **numbers))
+    with pytest.raises(SceneError, match=r"folds over within the image.* pixel \(0, 0\)") as caught:
+        build_scene(scene_file)
+    assert len(caught.value.problems) == 1

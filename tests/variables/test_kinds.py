@@ -21,14 +21,38 @@ SMALL = [
     "volume.density=0.7",
     "volume.sigma_a=[0.3, 0.4, 0.5]",
     "lights.0.irradiance=[3, 2, 1]",
-    *(f"views.{index}.camera.resolution=[7, 6]" for index in (0, 1)),
+    *(f"views.{index}.camera.resolution=[7, 6]" for index in range(4)),
 ]
 
 
+DRAINE = "{type: draine, g: [0.5, 0.3, -0.2], alpha: [1, 0.5, 0.2]}"
+LOBES = "{type: two_lobe, g: [0.6, -0.3], weight: [0.7, 0.6, 0.5]}"
+SERIES = "{type: legendre, coefficients: [1, 0.4, 0.2, 0.1]}"
+PHASES = {
+    "phase.g": DRAINE,
+    "phase.weight": LOBES,
+    "phase.alpha": DRAINE,
+    "phase.coefficients": SERIES,
+}
+"""Phase functions that have numbers other than g."""
+
+
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    """A scene with every kind of light, in which all kinds of variables occur."""
-    return load_scene(CONFIG, overrides=SMALL, dtype=torch.float64)
+def scenes() -> dict[str, Scene]:
+    """Scenes with every kind of light, in which all kinds of variables occur, by phase function."""
+    phases = {"": ["volume.g=0.3"]}
+    others = ["volume.g=0", "optimize.parameters={density: {}}"]
+    phases |= {phase: [*others, f"volume.phase={phase}"] for phase in PHASES.values()}
+    return {
+        phase: load_scene(CONFIG, overrides=[*SMALL, *changes], dtype=torch.float64)
+        for phase, changes in phases.items()
+    }
+
+
+@pytest.fixture
+def scene(scenes: dict[str, Scene], request: pytest.FixtureRequest) -> Scene:
+    """The one that has a variable of the kind in question."""
+    return scenes[PHASES.get(request.node.callspec.params["pattern"], "")]
 
 
 def name_of(pattern: str, scene: Scene) -> str:
@@ -36,8 +60,14 @@ def name_of(pattern: str, scene: Scene) -> str:
     return [name for name in variable_names(scene) if pattern_of(name) == pattern][-1]
 
 
-def test_the_table_has_every_variable_of_a_scene_and_no_other(scene: Scene) -> None:
-    assert {pattern_of(name) for name in variable_names(scene)} == set(KINDS)
+def test_the_table_has_every_variable_of_a_scene_and_no_other(scenes: dict[str, Scene]) -> None:
+    names = [name for scene in scenes.values() for name in variable_names(scene)]
+    assert {pattern_of(name) for name in names} == set(KINDS)
+
+
+def test_phase_g_is_g_where_there_is_but_one(scenes: dict[str, Scene]) -> None:
+    changed = with_values(scenes[""], {"phase.g": torch.tensor(0.1, dtype=torch.float64)})
+    assert value_of(changed, "g") == value_of(changed, "phase.g") == 0.1
 
 
 @pytest.mark.parametrize("pattern", KINDS)
@@ -64,8 +94,8 @@ def test_values_are_within_bounds_and_stay_there_in_a_step(scene: Scene, pattern
     kind, name = KINDS[pattern], name_of(pattern, scene)
     value = value_of(scene, name)
     assert kind.low < kind.high and bool((value >= kind.low).all() and (value <= kind.high).all())
-    rate = kind.rate(scene.volume, value)
-    assert rate > 0
+    rate = kind.rate(scene, name, value)
+    assert bool((torch.as_tensor(rate) > 0).all())
     for sign in (1, -1):
         parameter = Parameter(name, ParameterSettings(), rate, value, scene.volume.grid)
         for _ in range(20):

@@ -1,6 +1,6 @@
 """Radiance along one direction through the whole grid, by short characteristics (E11).
 
-w . grad I + kappa_t I = kappa_s (q + q1 . w) is integrated from slice to slice. The slices lie
+w . grad I + kappa_t I = kappa_s q is integrated from slice to slice. The slices lie
 across the axis along which the direction crosses most cells, and are visited in the order that
 light takes. A ray reaches each cell's center from the slice before, where it crossed between
 centers; depth and scattering depth of the step are those of the mean of its ends, and what scatters
@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.numerics.autodiff import keep
 from ddrecon.numerics.decay import decayed_line
@@ -79,18 +78,16 @@ class Course:
 
 
 def radiance_along(
-    medium: Medium, light: Moments, inflow: Tensor | None, direction: Direction
+    medium: Medium, scatters: Tensor, inflow: Tensor | None, direction: Direction
 ) -> Tensor:
-    """I [C, z, y, x] at cell centers along `direction`, of what `light` scatters into it (E11).
+    """I [C, z, y, x] at cell centers along `direction`, of what `scatters` into it (E11).
 
-    `direction`: the unit vector of travel (array order); `light`: the moments q and q1 of all light
-    that scatters, to which `medium` gives (1 - f) kappa_s; `inflow` [C, 1, 1, 1]: the radiance that
-    enters the box, None for none.
+    `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
+    `medium` adds (1 - f) kappa_s a unit length; `inflow` [C, 1, 1, 1]: the radiance that enters the
+    box, None for none.
     """
     course = Course.of(medium.grid, direction)
-    # q + q1 . w at the cells
-    z, y, x = light.mean.new_tensor(direction)
-    scatters = course.lay(light.along((z, y, x)))
+    scatters = course.lay(scatters)
     # over the step to each cell: the depth int kappa_t ds, and int (1 - f) kappa_s ds
     mass = _step_integral(medium.extinction, course)
     scattering_mass = (
@@ -101,7 +98,7 @@ def radiance_along(
     depth = mass * _scale(medium.extinction)
     # what scatters along the step and reaches its end, and the part of I that is lost on it
     line, lost = decayed_line(scatters, course.before(scatters, is_repeated=True), depth)
-    scattering_scale = (1 - medium.forward_fraction) * _scale(medium.scattering)
+    scattering_scale = (1 - medium.forward_fraction.view(1, -1, 1, 1)) * _scale(medium.scattering)
     source = line * (scattering_mass * scattering_scale)
     if inflow is None:
         return course.lift(follow(1 - lost, source, course))

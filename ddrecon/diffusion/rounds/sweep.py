@@ -1,4 +1,4 @@
-"""One sweep: radiance along every direction of a quadrature, of which only moments are kept (E12).
+"""One sweep: radiance along every direction of a quadrature, of which only moments are kept (E17).
 
 Directions are gone through one at a time, and computed again one at a time in the backward pass:
 memory does not grow with their number.
@@ -7,6 +7,7 @@ memory does not grow with their number.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,18 +15,22 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
-from ddrecon.engine import current_engine
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
-from ddrecon.numerics.autodiff import is_forward
+from ddrecon.medium.remaining import remaining_moments
+from ddrecon.numerics.autodiff import is_forward, is_fused
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
+
+DIRECTIONS = {3: 26, 5: 50, 7: 86}
+"""By the degree to which angles are kept, directions of a rule that is exact to twice that."""
 
 
 class Parts(NamedTuple):
     """All tensors that a sweep depends on, as autograd must be given them: one by one.
 
     `scattering_field` is None where the field is that of extinction; `inflow` is None for no light
-    from outside; `z`, `y`, `x` are the flux of what scatters, None where it has none.
+    from outside; `source` [K, C, z, y, x] are the moments of what scatters.
     """
 
     extinction_scale: Tensor
@@ -34,14 +39,11 @@ class Parts(NamedTuple):
     scattering_field: Tensor | None
     forward_fraction: Tensor
     inflow: Tensor | None
-    mean: Tensor
-    z: Tensor | None = None
-    y: Tensor | None = None
-    x: Tensor | None = None
+    source: Tensor
 
     @staticmethod
-    def of(medium: Medium, light: Moments, inflow: Tensor | None) -> Parts:
-        """The parts of `medium` and of the `light` that scatters in it."""
+    def of(medium: Medium, source: Tensor, inflow: Tensor | None) -> Parts:
+        """The parts of `medium` and of what scatters in it."""
         shares_field = medium.scattering.field is medium.extinction.field
         return Parts(
             medium.extinction.scale,
@@ -50,19 +52,11 @@ class Parts(NamedTuple):
             None if shares_field else medium.scattering.field,
             medium.forward_fraction,
             inflow,
-            light.mean,
-            *(light.flux or ()),
+            source,
         )
 
-    @property
-    def flux(self) -> Vector | None:
-        """The flux of the light that scatters."""
-        if self.z is None or self.y is None or self.x is None:
-            return None
-        return self.z, self.y, self.x
-
-    def radiance(self, medium: Medium, direction: Direction) -> Tensor:
-        """I along `direction` (E11), these parts standing for those of `medium`."""
+    def radiance(self, medium: Medium, scatters: Tensor, direction: Direction) -> Tensor:
+        """I along `direction` of what `scatters` (E11), these parts standing for the `medium`'s."""
         field = self.extinction_field if self.scattering_field is None else self.scattering_field
         medium = replace(
             medium,
@@ -70,58 +64,81 @@ class Parts(NamedTuple):
             scattering=Coefficient(self.scattering_scale, field),
             forward_fraction=self.forward_fraction,
         )
-        return radiance_along(medium, Moments(self.mean, self.flux), self.inflow, direction)
+        return radiance_along(medium, scatters, self.inflow, direction)
 
 
-def sweep(medium: Medium, light: Moments, inflow: Tensor | None, directions: int) -> Moments:
-    """L0' and, where `light` has flux, L1' of the radiance that `light` scatters (E11, E12).
+class Ray(NamedTuple):
+    """A `direction` of the quadrature (array order), its `weight`, and its `harmonics` Y_k [K]."""
 
-    `light` and `inflow`, light from outside, are those of `radiance_along`; `directions`: how many
-    the quadrature has.
+    direction: Direction
+    weight: float
+    harmonics: Tensor
+
+
+def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) -> Tensor:
+    """The moments [K, C, z, y, x] of the radiance that `source` scatters (E11, E17).
+
+    `source` [K, C, z, y, x]: moments of what scatters, to some degree; `inflow`: light from
+    outside, as of `radiance_along`; `degree`: by which directions are chosen (`DIRECTIONS`).
     """
-    parts = Parts.of(medium, light, inflow)
+    parts = Parts.of(medium, source, inflow)
     if is_forward():
-        mean, *flux = _sum_over_directions(medium, directions, parts)
-    elif current_engine() == "warp":
+        return _sum_over_directions(medium, degree, parts)
+    moments: Tensor = _Sweep.apply(medium, degree, *parts)
+    return moments
+
+
+def sweep_scattered(
+    medium: Medium, light: Moments, source: Moments, inflow: Tensor | None, degree: int
+) -> Moments:
+    """The moments of the radiance that `light` and `source` scatter, p_l phi_k + Q_k (E17).
+
+    `inflow` and `degree` as of `sweep`.
+    """
+    factors = remaining_moments(medium)[: medium.degree + 1]
+    if is_fused():
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
-        weighted = _directions(directions, 1 if light.flux is None else 4)
-        mean, *flux = sweep_fused(medium, light, inflow, weighted)
-    else:
-        mean, *flux = _Sweep.apply(medium, directions, *parts)
-    if not flux:
-        return Moments(mean)
-    z, y, x = flux
-    return Moments(mean, (z, y, x))
+        return sweep_fused(medium, light, factors, source, inflow, DIRECTIONS[degree])
+    scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
+    return Moments.of_harmonics(sweep(medium, scatters, inflow, degree))
 
 
 class _Sweep(torch.autograd.Function):
     """The moments of all directions; the backward pass computes each direction's radiance again."""
 
     @staticmethod
-    def forward(ctx: Any, medium: Medium, directions: int, *parts: Any) -> tuple[Tensor, ...]:
-        ctx.medium, ctx.directions = medium, directions
+    def forward(ctx: Any, medium: Medium, degree: int, *parts: Any) -> Tensor:
+        ctx.medium, ctx.degree = medium, degree
         ctx.save_for_backward(*parts)
-        return _sum_over_directions(medium, directions, Parts(*parts))
+        return _sum_over_directions(medium, degree, Parts(*parts))
 
     @staticmethod
     def backward(ctx: Any, *moment_bars: Tensor) -> tuple[Tensor | None, ...]:
+        (moments_bar,) = moment_bars
+        *others, source = ctx.saved_tensors
         leaves: list[Any] = [
             part if part is None else part.detach().requires_grad_(need)
-            for part, need in zip(ctx.saved_tensors, ctx.needs_input_grad[2:], strict=True)
+            for part, need in zip(others, ctx.needs_input_grad[2:-1], strict=True)
         ]
+        parts = Parts._make([*leaves, source])
         varied = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
         totals = [torch.zeros_like(leaf) for leaf in varied]
-        for direction, weights in _directions(ctx.directions, len(moment_bars)):
+        source_bar = torch.zeros_like(source) if ctx.needs_input_grad[-1] else None
+        for ray in _rays(ctx.degree, source):
+            # what scatters along this direction, as a leaf, so that its cotangent is spread once
+            scatters = torch.tensordot(ray.harmonics, source, 1)
+            scatters.requires_grad_(source_bar is not None)
             # I along this direction once more (E11), with the graph of this direction alone
             with torch.enable_grad():
-                radiance = Parts(*leaves).radiance(ctx.medium, direction)
-            # E12 transposed: I_bar is the sum over moments of weight times moment_bar
-            radiance_bar = torch.stack(
-                [weight * bar for weight, bar in zip(weights, moment_bars, strict=True)]
-            ).sum(0)
+                radiance = parts.radiance(ctx.medium, scatters, ray.direction)
+            # E17 transposed: I_bar is the sum over moments of weight times moment_bar
+            radiance_bar = torch.tensordot(ray.weight * ray.harmonics, moments_bar, 1)
             # E11 transposed, by autograd: what each part receives from this direction
-            bars = torch.autograd.grad(radiance, varied, radiance_bar, allow_unused=True)
+            wanted = varied if source_bar is None else [*varied, scatters]
+            bars = list(torch.autograd.grad(radiance, wanted, radiance_bar, allow_unused=True))
+            if source_bar is not None:
+                add_outer(source_bar, ray.harmonics, bars.pop())
             for total, bar in zip(totals, bars, strict=True):
                 if bar is not None:
                     total += bar
@@ -129,31 +146,38 @@ class _Sweep(torch.autograd.Function):
         part_bars = (
             None if leaf is None or not leaf.requires_grad else next(remaining) for leaf in leaves
         )
-        return None, None, *part_bars
+        return None, None, *part_bars, source_bar
 
 
-def _sum_over_directions(medium: Medium, directions: int, parts: Parts) -> tuple[Tensor, ...]:
-    """The mean of I and, where `parts` have flux, 3 times the mean of I w along z, y, x (E12)."""
-    totals: list[Tensor] = []
-    for direction, weights in _directions(directions, 1 if parts.flux is None else 4):
-        radiance = parts.radiance(medium, direction)
-        totals = totals or [torch.zeros_like(radiance)] * len(weights)
-        totals = [
-            torch.add(total, radiance, alpha=weight)
-            for total, weight in zip(totals, weights, strict=True)
-        ]
-    return tuple(totals)
+def _sum_over_directions(medium: Medium, degree: int, parts: Parts) -> Tensor:
+    """The means over the sphere of I Y_k (E17)."""
+    moments = torch.zeros_like(parts.source)
+    for ray in _rays(degree, parts.source):
+        scatters = torch.tensordot(ray.harmonics, parts.source, 1)
+        radiance = parts.radiance(medium, scatters, ray.direction)
+        moments = add_outer(moments, ray.weight * ray.harmonics, radiance)
+    return moments
+
+
+def add_outer(total: Tensor, factors: Tensor, field: Tensor | None) -> Tensor:
+    """`total` [K, C, z, y, x] with `factors` [K] times `field` added, in place."""
+    if field is not None:
+        total.view(len(factors), -1).addr_(factors, field.reshape(-1))
+    return total
+
+
+def _rays(degree: int, source: Tensor) -> Iterator[Ray]:
+    """The rays of the quadrature for `degree`, with a harmonic for each moment of `source`."""
+    directions, weights, values = _rule(degree, len(source))
+    for direction, weight, row in zip(directions, weights, values.to(source), strict=True):
+        yield Ray(direction, weight, row)
 
 
 @functools.cache
-def _directions(count: int, moments: int) -> tuple[tuple[Direction, tuple[float, ...]], ...]:
-    """Each direction w (array order) and the weights of its I in the moments of E12.
-
-    They are W, 3 W w_z, 3 W w_y and 3 W w_x, W being the quadrature's weight, or the first
-    `moments` of them.
-    """
-    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
-    return tuple(
-        ((z, y, x), (w, 3 * w * z, 3 * w * y, 3 * w * x)[:moments])
-        for (z, y, x), w in zip(points.tolist(), weights.tolist(), strict=True)
-    )
+@torch.inference_mode(False)
+def _rule(degree: int, count: int) -> tuple[tuple[Direction, ...], tuple[float, ...], Tensor]:
+    """Directions, weights, and the first `count` harmonics [N, K] of each direction."""
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS[degree])
+    values = harmonics(points, degree).T[:, :count].contiguous()
+    directions = tuple((z, y, x) for z, y, x in points.tolist())
+    return directions, tuple(weights.tolist()), values

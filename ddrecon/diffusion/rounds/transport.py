@@ -8,6 +8,7 @@ real geometry, and takes the moments of what arrives. What it changes is passed 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import replace
 
 import torch
@@ -17,14 +18,17 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.sweep import sweep
-from ddrecon.engine import current_engine
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_scattered
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import is_forward, is_varied, recompute
+from ddrecon.medium.remaining import remaining_moments
+from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
+
+SPECTRUM = 0.9
+"""A finite medium's spectrum is about that part of an infinite one's."""
 
 
 def run_rounds(
@@ -32,49 +36,127 @@ def run_rounds(
     light: Moments,
     solve: SolverWithMemory[Operator],
     rounds: int,
-    directions: int,
+    degree: int,
 ) -> Moments:
-    """L0 and L1 after `rounds` of sweeps along so many `directions` (E12).
+    """Light after `rounds` of sweeps, its angles kept to `degree` (E12, E17).
 
-    `light`: the solution of `problem` by `solve`, where the first round begins.
+    `light`: the solution of `problem` by `solve`, where the first round begins; `degree`: that of
+    the quadrature. Only the mean is kept where light's direction does not matter.
     """
     if rounds == 0:
         return light
-    operator, right = problem.system
-    medium, outside = problem.medium, problem.outside
-    is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
-    for round_index in range(1, rounds + 1):
-        # E11 along every direction, of all light that scatters: q = L0 + Q0 and q1 = g L1 + Q1
-        scatters = light.scaled(1.0, medium.mean_cosine).plus(problem.source)
-        swept = sweep(medium, scatters, outside if is_lit_from_outside else None, directions)
-        # Light begins as diffusion's, L0 with 3 F(L0), where S - A L0 is zero.
-        diffuse, imbalance = light, None
-        if round_index > 1:
-            diffuse = Moments(light.mean, problem.flux(light.mean))
-            imbalance = recompute(_imbalance, operator, right, light.mean)
-        gain, source = _gain(medium, swept, diffuse, imbalance, directions)
-        solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
-        mean = solve_diffusion(solve_round, operator, right + source)
-        # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
-        light = Moments(mean, problem.flux(mean)).plus(gain)
+    for round_index, factor in enumerate(_blending(problem.medium, rounds), 1):
+        light = _round(problem, light, solve, degree, round_index, factor)
     return light
 
 
+def _round(
+    problem: DiffusionProblem,
+    light: Moments,
+    solve: SolverWithMemory[Operator],
+    degree: int,
+    round_index: int,
+    factor: Tensor | None,
+) -> Moments:
+    """What one round makes of `light` (E12); with a `factor`, `factor` as far from light (E19)."""
+    operator, right = problem.system
+    medium, outside = problem.medium, problem.outside
+    is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
+    # E11 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
+    inflow = outside if is_lit_from_outside else None
+    swept = sweep_scattered(medium, light, problem.source, inflow, degree)
+    # Light begins as diffusion's, L0 with 3 F(L0), where S - A L0 is zero.
+    diffuse, imbalance = light, None
+    if round_index > 1:
+        diffuse = Moments(light.mean, problem.flux(light.mean))
+        imbalance = recompute(_imbalance, operator, right, light.mean)
+    gain, source, turned = _gain(medium, swept, light, diffuse, imbalance, degree)
+    if turned is not None:
+        source = source + problem.spread(turned)
+    solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
+    mean = solve_diffusion(solve_round, operator, right + source)
+    # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
+    new = Moments(mean, problem.flux(mean, turned))
+    if swept.higher is None or factor is None:
+        return new.plus(gain)
+    return _blend(medium, light, new, gain, swept.higher, factor, degree)
+
+
+def _blend(
+    medium: Medium,
+    light: Moments,
+    diffuse: Moments,
+    gain: Moments,
+    swept: Tensor,
+    factor: Tensor,
+    degree: int,
+) -> Moments:
+    """Light by `factor` as far from what was as to what a round makes of it (E19).
+
+    That is what is now `diffuse`, plus its gain, and theta times what was `swept` of higher degree.
+    """
+    if is_fused():
+        from ddrecon.diffusion.rounds.fused.blend import blend_fused
+
+        length = _mean_step(medium.grid, degree)
+        return blend_fused(medium, light, diffuse, gain, swept, factor, length)
+    share = recompute(_transport_share, medium, degree)
+    new = replace(diffuse.plus(gain), higher=share * swept)
+    return light.plus(_times(new.plus(_times(light, -1)), factor))
+
+
+def _times(light: Moments, factor: Tensor | float) -> Moments:
+    return light.scaled(factor, factor, factor)
+
+
+def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
+    """The factors o = 1 / (1 - nu) of E19, one for each round, largest first.
+
+    nu are Chebyshev's nodes of the interval from p_3, where that is negative, to p_2: by about so
+    much a round multiplies what is left in the moments that diffusion lacks. None where light's
+    direction does not matter.
+    """
+    if medium.degree < 2:
+        return [None] * rounds
+    moments = remaining_moments(medium)
+    high, low = SPECTRUM * moments[2], SPECTRUM * moments[3].clamp(max=0)
+    nodes = [math.cos(math.pi * (2 * k + 1) / (2 * rounds)) for k in range(rounds)]
+    return [1 / (1 - ((low + high) / 2 + (high - low) / 2 * node)) for node in nodes]
+
+
 def _gain(
-    medium: Medium, swept: Moments, diffuse: Moments, imbalance: Tensor | None, directions: int
-) -> tuple[Moments, Tensor]:
+    medium: Medium,
+    swept: Moments,
+    light: Moments,
+    diffuse: Moments,
+    imbalance: Tensor | None,
+    degree: int,
+) -> tuple[Moments, Tensor, Vector | None]:
     """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E12, and what they add to S.
 
     That is kappa_s theta (L0' - L0) - theta (S - A L0); `imbalance` is S - A L0, None for zero.
+    And theta p_1 (L1' - L1), by how much the flux that scatters changes (E17).
     """
-    if current_engine() == "warp" and not is_forward():
+    cosine = remaining_moments(medium)[1]
+    if is_fused():
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
-        return gain_fused(medium, swept, diffuse, imbalance, _mean_step(medium.grid, directions))
-    share = recompute(_transport_share, medium, directions)
+        length = _mean_step(medium.grid, degree)
+        return gain_fused(medium, swept, light, diffuse, imbalance, cosine, length)
+    share = recompute(_transport_share, medium, degree)
+    swept = replace(swept, higher=None)
     gain = swept.plus(diffuse.scaled(-1.0, -1.0)).scaled(share, share)
     source = medium.remaining_scattering * gain.mean
-    return gain, source if imbalance is None else source - share * imbalance
+    source = source if imbalance is None else source - share * imbalance
+    if swept.flux is None or light.flux is None:
+        return gain, source, None
+    return gain, source, recompute(_turned, share, cosine, swept.flux, light.flux)
+
+
+def _turned(share: Tensor, cosine: Tensor, swept: Vector, light: Vector) -> Vector:
+    """theta p_1 (L1' - L1)."""
+    z, y, x = (share * cosine * (new - old) for new, old in zip(swept, light, strict=True))
+    return z, y, x
 
 
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
@@ -85,7 +167,7 @@ def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     return imbalance
 
 
-def _transport_share(medium: Medium, directions: int) -> Tensor:
+def _transport_share(medium: Medium, degree: int) -> Tensor:
     """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E14).
 
     The rest is diffusion's. rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic diffuses
@@ -94,19 +176,17 @@ def _transport_share(medium: Medium, directions: int) -> Tensor:
     """
     # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
     # 1e-6, theta is 1 already
-    half_depth = (0.5 * _mean_step(medium.grid, directions) * medium.extinction.value).clamp(
-        min=1e-3
-    )
+    half_depth = (0.5 * _mean_step(medium.grid, degree) * medium.extinction.value).clamp(min=1e-3)
     rho = half_depth / torch.tanh(half_depth) - 1
     return 1 / (1 + rho**2)
 
 
 @functools.cache
-def _mean_step(grid: Grid, directions: int) -> float:
+def _mean_step(grid: Grid, degree: int) -> float:
     """The mean length of a step along the directions of the quadrature [u]."""
     # the length of a step along each direction; along an axis of one cell nothing varies, so such
     # steps do not count
-    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), directions)
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), DIRECTIONS[degree])
     courses = [Course.of(grid, tuple(point)) for point in points.tolist()]
     step_lengths = weights.new_tensor(
         [course.step if grid.shape[course.order[0] - 1] > 1 else 0.0 for course in courses]

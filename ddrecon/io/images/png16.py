@@ -28,9 +28,19 @@ HEADER = struct.Struct(">IIBBBBB")
 
 def has_deep_colors(path: Path) -> bool:
     """Whether the file at `path` is a PNG of several channels of 16 bits."""
+    head = _head(path)
+    return is_deep_png(path) and head[25] in CHANNELS
+
+
+def is_deep_png(path: Path) -> bool:
+    """Whether the file at `path` is a PNG of 16 bits a channel."""
+    head = _head(path)
+    return head[:8] == MAGIC and len(head) == 26 and head[24] == 16
+
+
+def _head(path: Path) -> bytes:
     with path.open("rb") as stream:
-        head = stream.read(26)
-    return head[:8] == MAGIC and len(head) == 26 and head[24] == 16 and head[25] in CHANNELS
+        return stream.read(26)
 
 
 def read_deep_png(path: Path) -> np.ndarray:

@@ -20,7 +20,7 @@ from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images import srgb
 from ddrecon.io.images.exr import has_exr, read_exr, write_exr
 from ddrecon.io.images.hdr import read_hdr
-from ddrecon.io.images.png16 import has_deep_colors, read_deep_png
+from ddrecon.io.images.png16 import has_deep_colors, is_deep_png, read_deep_png
 from ddrecon.io.images.tiff import read_tiff, write_tiff
 
 PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
@@ -36,11 +36,13 @@ Pillow alone would go by content whatever the suffix, and run Ghostscript on Pos
 class Image:
     """`pixels` float32 [h, w, 3]: linear radiance, finite, black where empty.
 
-    `coverage` float32 [h, w] is the alpha, where the file has one.
+    `coverage` float32 [h, w] is the alpha, where the file has one. `step` is that between
+    neighboring values as stored, where these are encoded by sRGB: 1/255 of 8 bits; else 0.
     """
 
     pixels: np.ndarray
     coverage: np.ndarray | None = None
+    step: float = 0.0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -54,12 +56,14 @@ def read_image(path: Path) -> Image:
     Raises FormatError when it is damaged, of an unknown kind, or has NaN or infinite pixels.
     """
     values = _read_values(path)
+    step = _step(path)
     if values.ndim == 2:
-        return Image(np.repeat(values[..., None], 3, axis=2))
+        return Image(np.repeat(values[..., None], 3, axis=2), None, step)
     if values.shape[2] == 3:
-        return Image(values)
+        return Image(values, None, step)
     coverage = values[..., 3]
-    return Image(np.where(coverage[..., None] > 0, values[..., :3], np.float32(0)), coverage)
+    pixels = np.where(coverage[..., None] > 0, values[..., :3], np.float32(0))
+    return Image(pixels, coverage, step)
 
 
 def read_mask(path: Path) -> np.ndarray:
@@ -128,6 +132,13 @@ def _read_values(path: Path) -> np.ndarray:
     values = as_float32(values)
     _require_finite(values, path)
     return values
+
+
+def _step(path: Path) -> float:
+    """The step between neighboring sRGB values of the image at `path`; 0 where it is linear."""
+    if READERS[path.suffix.lower()] is not _read_encoded:
+        return 0.0
+    return 1 / 65535 if is_deep_png(path) else 1 / 255
 
 
 def _require_finite(values: np.ndarray, path: Path) -> None:

@@ -43,6 +43,12 @@ def npz_names(path: Path) -> list[str]:
         return _without_bounds(_names(archive))
 
 
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of the archive at `path` by name. Raises FormatError when it is damaged."""
+    with _open(path) as archive:
+        return {name: _read_entry(archive, name, path) for name in _names(archive)}
+
+
 @contextmanager
 def _open(path: Path) -> Iterator[zipfile.ZipFile]:
     try:

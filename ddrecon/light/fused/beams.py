@@ -49,8 +49,8 @@ def _weights(directions: Tensor, mean_cosine: Tensor | None, *irradiances: Tenso
     weights = torch.stack(torch.broadcast_tensors(*irradiances))[:, None] / (4 * math.pi)
     if mean_cosine is None:
         return weights
-    flux = 3 * mean_cosine * directions[..., None] * weights
-    return torch.cat([weights, flux], 1)
+    flux = 3 * mean_cosine.view(-1) * directions[..., None] * weights
+    return torch.cat([weights.expand(-1, -1, flux.shape[2]), flux], 1)
 
 
 def attenuate(

@@ -4,18 +4,17 @@
 beside each other.
 """
 
+from __future__ import annotations
+
 import functools
-import math
-from types import SimpleNamespace
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import array, launch, thread_count
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
 from ddrecon.numerics.autodiff import differentiate_once
 
@@ -49,85 +48,53 @@ class _Integral(torch.autograd.Function):
     ) -> Tensor:
         ctx.save_for_backward(field, first, last, length, fraction)
         total = field.new_empty(len(field), len(length))
-        ways = _ways(field, first, last, length, fraction, total=total)
-        kernel = way_kernels(field.element_size() * 8).integrate
-        launch(kernel, _items(length), [ways], field)
+        given = _ways(field, first, last, length, fraction)
+        items, _ = cut(len(length), BLOCK, length)
+        way_kernel(field.element_size() * 8).launch(items, given, {"totals": total})
         return total
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor | None, ...]:
-        field, first, last, length, fraction = ctx.saved_tensors
+        ways = field, first, last, length, _ = ctx.saved_tensors
         varies = any(ctx.needs_input_grad[1:4])
-        bars = [each.new_zeros(each.shape if varies else 0) for each in (first, last, length)]
+        bars = [each.new_zeros(each.shape) if varies else None for each in (first, last, length)]
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
         shares = [field.new_zeros(field.shape) for _ in range(thread_count(field))]
-        names = "first_bar", "last_bar", "length_bar"
-        given = dict(zip(names, bars, strict=True), total=total_bar)
-        ways = [
-            _ways(field, first, last, length, fraction, field_bar=share, **given)
-            for share in shares
-        ]
-        for each in ways:
-            each.varies = varies
-        kernel = way_kernels(field.element_size() * 8).adjoint
-        launch(kernel, _items(length), lambda i: [ways[i]], field)
-        found = bars if varies else [None, None, None]
-        return functools.reduce(Tensor.add_, shares), *found, None
-
-
-def _items(length: Tensor) -> int:
-    return math.ceil(len(length) / (1 if length.is_cuda else BLOCK))
+        given = _ways(*ways) | {"varies": varies, "totals": total_bar}
+        made = dict(zip(("firsts_bar", "lasts_bar", "lengths_bar"), bars, strict=True))
+        own = [{"fields_bar": share} for share in shares]
+        items, _ = cut(len(length), BLOCK, length)
+        kernel = way_adjoint_kernel(field.element_size() * 8)
+        kernel.launch(items, given, made | own[0], shares=own)
+        return functools.reduce(Tensor.add_, shares), *bars, None
 
 
 def _ways(
-    field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor, **more: Tensor
-) -> Any:
-    """The record that kernels are given."""
-    ways = way_kernels(field.element_size() * 8).Ways()
-    ways.count, ways.samples, ways.channels = len(length), len(fraction), len(field)
-    ways.depth, ways.height, ways.width = field.shape[1:]
-    tensors = {"field": field, "first": first, "last": last, "length": length}
-    for name, tensor in (tensors | {"fraction": fraction} | more).items():
-        setattr(ways, name, array(tensor.reshape(-1)))
-    return ways
+    field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
+) -> dict[str, Any]:
+    """What both kernels are given."""
+    channels, depth, height, width = field.shape
+    sizes = {"channels": channels, "depth": depth, "height": height, "width": width}
+    sizes |= {"ways": len(length), "samples": len(fraction)}
+    arrays = {"fields": field, "firsts": first, "lasts": last, "lengths": length}
+    return sizes | arrays | {"fraction": fraction}
+
+
+_GIVEN = """
+int ways, samples, channels, depth, height, width;
+F *fields, *firsts, *lasts, *lengths, *fraction, *totals;
+"""
 
 
 @functools.cache
-def way_kernels(bits: int) -> SimpleNamespace:
-    """The kernels for numbers of so many `bits`, and the record `Ways` that they are given."""
-    F = number_type(bits)
+def way_kernel(bits: int) -> TextKernel:
+    """The kernel of integrals along ways."""
+    return TextKernel("integrate_ways", bits, INTEGRATE, _GIVEN)
 
-    @wp.struct
-    class Ways:
-        """What `_Integral` is given, and cotangents; `total` is the integral, or its cotangent."""
 
-        count: int
-        samples: int
-        channels: int
-        depth: int
-        height: int
-        width: int
-        varies: bool
-        field: wp.array(dtype=F)
-        first: wp.array(dtype=F)
-        last: wp.array(dtype=F)
-        length: wp.array(dtype=F)
-        fraction: wp.array(dtype=F)
-        total: wp.array(dtype=F)
-        field_bar: wp.array(dtype=F)
-        first_bar: wp.array(dtype=F)
-        last_bar: wp.array(dtype=F)
-        length_bar: wp.array(dtype=F)
-
-    def kernel(body: str) -> Any:
-        @wp.func_native(program(bits, body))
-        def do_item(item: int, ways: Ways): ...
-
-        @wp.kernel(enable_backward=False, module="unique")
-        def do_items(first: int, ways: Ways):
-            do_item(first + wp.tid(), ways)
-
-        return do_items
-
-    return SimpleNamespace(Ways=Ways, integrate=kernel(INTEGRATE), adjoint=kernel(ADJOINT))
+@functools.cache
+def way_adjoint_kernel(bits: int) -> TextKernel:
+    """Its adjoint, from cotangents `totals`; of ends and lengths where ways vary."""
+    more = "int varies; F *fields_bar, *firsts_bar, *lasts_bar, *lengths_bar"
+    return TextKernel("ways_adjoint", bits, ADJOINT, _GIVEN + more)

@@ -8,14 +8,14 @@ enum { BLOCK = 1 };
 #else
 enum { BLOCK = 128 };
 #endif
-const int P = ways.count, M = ways.samples, begin = item * BLOCK;
+const int P = ways, M = samples, begin = item * BLOCK;
 const int count = begin + BLOCK < P ? BLOCK : P - begin;
-const int D = ways.depth, H = ways.height, W = ways.width;
+const int D = depth, H = height, W = width;
 const size_t cells = size_t(D) * H * W;
 const int up_z = D > 1 ? H * W : 0, up_y = H > 1 ? W : 0, up_x = W > 1 ? 1 : 0;
-const F* __restrict first = &ways.first.data[begin];
-const F* __restrict last = &ways.last.data[begin];
-const F* __restrict length = &ways.length.data[begin];
+const F* __restrict first = firsts + begin;
+const F* __restrict last = lasts + begin;
+const F* __restrict length = lengths + begin;
 
 // The cell before place `p` on a line of `size` cells, and the part of the way to the next one.
 struct Place { int n; F a; };
@@ -28,7 +28,7 @@ auto blend = [](F a, F low, F high) -> F { return low + a * (high - low); };
 """
 # Where sample i of way t lies.
 _SAMPLE = """
-const F f = ways.fraction.data[i];
+const F f = fraction[i];
 const F pz = last[t] - f * (last[t] - first[t]);
 const F py = last[t + P] - f * (last[t + P] - first[t + P]);
 const F px = last[t + 2 * P] - f * (last[t + 2 * P] - first[t + 2 * P]);
@@ -46,8 +46,8 @@ const F v110 = field[at + up_z + up_y], v111 = field[at + up_z + up_y + up_x];
 INTEGRATE = (
     _WAYS
     + """
-for (int channel = 0; channel < ways.channels; ++channel) {
-    const F* __restrict field = &ways.field.data[channel * cells];
+for (int channel = 0; channel < channels; ++channel) {
+    const F* __restrict field = fields + channel * cells;
     F sum[BLOCK];
     for (int t = 0; t < count; ++t) sum[t] = F(0);
     for (int i = 0; i < M; ++i)
@@ -61,7 +61,7 @@ for (int channel = 0; channel < ways.channels; ++channel) {
             const F high = blend(y.a, blend(x.a, v100, v101), blend(x.a, v110, v111));
             sum[t] += blend(z.a, low, high);
         }
-    F* __restrict total = &ways.total.data[size_t(channel) * P + begin];
+    F* __restrict total = totals + size_t(channel) * P + begin;
     for (int t = 0; t < count; ++t) total[t] = sum[t] * length[t] / F(M);
 }
 """
@@ -87,10 +87,10 @@ auto shift_of = [&](F p, int size) -> F {
 auto slope_of = [](F p, int size, F low, F high) -> F {
     return p > F(0) && p < F(size - 1) ? high - low : F(0);
 };
-for (int channel = 0; channel < ways.channels; ++channel) {
-    const F* __restrict field = &ways.field.data[channel * cells];
-    F* __restrict field_bar = &ways.field_bar.data[channel * cells];
-    const F* __restrict bar = &ways.total.data[size_t(channel) * P + begin];
+for (int channel = 0; channel < channels; ++channel) {
+    const F* __restrict field = fields + channel * cells;
+    F* __restrict field_bar = fields_bar + channel * cells;
+    const F* __restrict bar = totals + size_t(channel) * P + begin;
     F part[BLOCK], az[BLOCK], ay[BLOCK], ax[BLOCK];
     int corner[BLOCK];
     for (int t = 0; t < count; ++t) part[t] = bar[t] * length[t] / F(M);
@@ -114,10 +114,10 @@ for (int channel = 0; channel < ways.channels; ++channel) {
             add(to + up_z + up_y + up_x, high_high * ax[t]);
         }
     }
-    if (!ways.varies) continue;
-    F* __restrict first_bar = &ways.first_bar.data[begin];
-    F* __restrict last_bar = &ways.last_bar.data[begin];
-    F* __restrict length_bar = &ways.length_bar.data[begin];
+    if (!varies) continue;
+    F* __restrict first_bar = firsts_bar + begin;
+    F* __restrict last_bar = lasts_bar + begin;
+    F* __restrict length_bar = lengths_bar + begin;
     for (int i = 0; i < M; ++i)
         for (int t = 0; t < count; ++t) {
 """

@@ -4,18 +4,17 @@ Rays gather the field of all slices, one row of rays at a time; cells gather fro
 the other order for the adjoint: in no step do two items write to the same place.
 """
 
+from __future__ import annotations
+
 import functools
 import math
 from types import SimpleNamespace
-from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import array, launch
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.text import TextKernel
 from ddrecon.light.fused import shear_adjoint_code as adjoint_code
 from ddrecon.light.fused import shear_code as code
 from ddrecon.numerics.slicing import Slicing, across
@@ -52,8 +51,8 @@ class Shear:
             "start": (count - 1) * slice_stride * slicing.is_reversed,
             "slice_stride": -slice_stride if slicing.is_reversed else slice_stride,
             "row_stride": row_stride,
-            "window_slice": window[0] if is_slices_first else window[1],
-            "window_row": window[1] if is_slices_first else window[0],
+            "window_slice_stride": window[0] if is_slices_first else window[1],
+            "window_row_stride": window[1] if is_slices_first else window[0],
             "is_slices_first": is_slices_first,
         }
         self.window = count * (height + 3) * (width + 3)
@@ -88,16 +87,13 @@ class Sum:
         self.shear, self.laid = shear, laid
         self.kernels = shear_kernels(laid.element_size() * 8)
         self.entered = torch.empty_like(laid)
-        self.windows = laid.new_empty(1 + has_adjoint, len(laid) * shear.window)
-        self.beam = self.kernels.Beam()
-        for name, number in shear.record.items():
-            setattr(self.beam, name, number)
-        self.beam.light, self.beam.has_refinements = light, has_adjoint
-        self._give(numbers=numbers, field=laid, entered=self.entered)
-        self._give(masses=self.windows[0], refinements=self.windows[-1])
+        windows = laid.new_empty(1 + has_adjoint, len(laid) * shear.window)
+        self.masses, self.refinements = windows[0], windows[-1]
+        self.given = shear.record | {"light": light, "numbers": numbers, "field": laid}
         rays, cells = shear.items(laid)
-        launch(self.kernels.rays, rays, [self.beam], laid)
-        launch(self.kernels.cells, cells, [self.beam], laid)
+        made = {"masses": self.masses, "refinements": self.refinements if has_adjoint else None}
+        self.kernels.rays.launch(rays, self.given, made)
+        self.kernels.cells.launch(cells, self.given | made, {"entered": self.entered})
 
     def adjoint(self, entered_bar: Tensor, field_bar: Tensor, varies: bool) -> Tensor | None:
         """The cotangent [4] of the beam's numbers, if it `varies`; adds to that of the field.
@@ -110,74 +106,35 @@ class Sum:
             name: self.laid.new_zeros(4 * count * varies, dtype=torch.float64)
             for name, count in counts.items()
         }
-        corrections_bar = torch.empty_like(entered_bar)
-        self.beam.varies = varies
-        self._give(entered_bar=entered_bar, corrections_bar=corrections_bar, field_bar=field_bar)
-        self._give(**sums)
-        launch(self.kernels.cells_adjoint, cells, [self.beam], self.laid)
-        launch(self.kernels.rays_adjoint, rays, [self.beam], self.laid)
-        launch(self.kernels.field_adjoint, cells, [self.beam], self.laid)
+        given = self.given | {"varies": varies, "entered_bar": entered_bar}
+        made = sums | {"masses": self.masses, "refinements": self.refinements}
+        made |= {"corrections_bar": torch.empty_like(entered_bar), "field_bar": field_bar}
+        self.kernels.cells_adjoint.launch(cells, given, made)
+        self.kernels.rays_adjoint.launch(rays, given, made)
+        self.kernels.field_adjoint.launch(cells, given, made)
         if not varies:
             return None
         return torch.stack([each.view(-1, 4).sum(0) for each in sums.values()]).sum(0)
 
-    def _give(self, **tensors: Tensor) -> None:
-        for name, tensor in tensors.items():
-            setattr(self.beam, name, array(tensor.reshape(-1)))
+
+_GIVEN = """
+int slices, height, width, rows, columns, first_row, first_column, start, slice_stride, row_stride;
+int window_slice_stride, window_row_stride, is_slices_first, light, varies;
+F *numbers, *field, *entered, *masses, *refinements, *entered_bar, *corrections_bar, *field_bar;
+double *by_cells, *by_rays, *by_field
+"""
 
 
 @functools.cache
 def shear_kernels(bits: int) -> SimpleNamespace:
-    """The kernels for numbers of so many `bits`, and the record `Beam` that they are given."""
-    F = number_type(bits)
-
-    @wp.struct
-    class Beam:
-        """Slices and rays of one beam, and the arrays of `Sum`."""
-
-        slices: int
-        height: int
-        width: int
-        rows: int
-        columns: int
-        first_row: int
-        first_column: int
-        start: int
-        slice_stride: int
-        row_stride: int
-        window_slice: int
-        window_row: int
-        is_slices_first: bool
-        has_refinements: bool
-        light: int
-        varies: bool
-        numbers: wp.array(dtype=F)
-        field: wp.array(dtype=F)
-        entered: wp.array(dtype=F)
-        masses: wp.array(dtype=F)
-        refinements: wp.array(dtype=F)
-        entered_bar: wp.array(dtype=F)
-        corrections_bar: wp.array(dtype=F)
-        field_bar: wp.array(dtype=F)
-        by_cells: wp.array(dtype=wp.float64)
-        by_rays: wp.array(dtype=wp.float64)
-        by_field: wp.array(dtype=wp.float64)
-
-    def kernel(body: str) -> Any:
-        @wp.func_native(program(bits, body))
-        def do_item(item: int, beam: Beam): ...
-
-        @wp.kernel(enable_backward=False, module="unique")
-        def do_items(first: int, beam: Beam):
-            do_item(first + wp.tid(), beam)
-
-        return do_items
-
+    """The kernels for numbers of so many `bits`."""
+    texts = {
+        "rays": code.RAYS,
+        "cells": code.CELLS,
+        "cells_adjoint": adjoint_code.CELLS_ADJOINT,
+        "rays_adjoint": adjoint_code.RAYS_ADJOINT,
+        "field_adjoint": adjoint_code.FIELD_ADJOINT,
+    }
     return SimpleNamespace(
-        Beam=Beam,
-        rays=kernel(code.RAYS),
-        cells=kernel(code.CELLS),
-        cells_adjoint=kernel(adjoint_code.CELLS_ADJOINT),
-        rays_adjoint=kernel(adjoint_code.RAYS_ADJOINT),
-        field_adjoint=kernel(adjoint_code.FIELD_ADJOINT),
+        **{name: TextKernel(f"shear_{name}", bits, text, _GIVEN) for name, text in texts.items()}
     )

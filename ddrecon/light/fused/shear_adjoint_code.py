@@ -15,8 +15,8 @@ CELLS_ADJOINT = (
     + CELL_ITEM
     + BLENDS
     + """
-const F* __restrict bar = &beam.entered_bar.data[at];
-F* __restrict out = &beam.corrections_bar.data[at];
+const F* __restrict bar = &entered_bar[at];
+F* __restrict out = &corrections_bar[at];
 for (int t = 0; t < count; ++t) {
 """
     + CORRECTION
@@ -27,8 +27,8 @@ if (!varies) return;
 F linear_slope[BLOCK + 3], bent_slope[BLOCK + 3];
 clear(linear_slope, count + 3), clear(bent_slope, count + 3);
 for (int u = 0; u < 4; ++u) {
-    add_row(linear_slope, p0 + u * beam.window_row, 0, count + 3, count + 3, rt.linear_slope[u]);
-    add_row(bent_slope, p0 + u * beam.window_row, 0, count + 3, count + 3, rt.bend_slope[u]);
+    add_row(linear_slope, p0 + u * window_row_stride, 0, count + 3, count + 3, rt.linear_slope[u]);
+    add_row(bent_slope, p0 + u * window_row_stride, 0, count + 3, count + 3, rt.bend_slope[u]);
 }
 auto tap = [](const F* weights, const F* values) -> F {
     return weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2]
@@ -51,7 +51,7 @@ if (begin == 0) {
     const Taps first = taps_of(c, COLUMNS, true);
     of_column[0] -= out[0] * (tap(first.bend_slope, linear) - tap(ct.bend_slope, linear));
 }
-double* const sums = &beam.by_cells.data[4 * item];
+double* const sums = &by_cells[4 * item];
 sums[0] = -k * total(of_row, count);
 sums[1] = -k * total(of_column, count);
 sums[3] = total(of_bound, count);
@@ -79,7 +79,7 @@ for (int k = N - 1; k >= 0; --k) {
     if (is_ghost || from < lo || to > hi)
         for (int j = from; j < to; ++j)
             if (is_ghost || j < 0 || j >= COLUMNS)
-                beam.masses.data[at + j - c.n + 1] = beam.refinements.data[at + j - c.n + 1] = F(0);
+                masses[at + j - c.n + 1] = refinements[at + j - c.n + 1] = F(0);
     if (is_ghost) continue;
 
     // Of rays, by gathering from cells: rows first, then columns.
@@ -90,8 +90,8 @@ for (int k = N - 1; k >= 0; --k) {
         for (int t = 0; t < 4; ++t) {
             const int y = m - t;
             if (y < 0 || y >= H) continue;
-            const F* whole = &beam.entered_bar.data[cell_row(channel, k, y)];
-            const F* part = &beam.corrections_bar.data[cell_row(channel, k, y)];
+            const F* whole = &entered_bar[cell_row(channel, k, y)];
+            const F* part = &corrections_bar[cell_row(channel, k, y)];
             add_row(linear, whole, left, size + 3, W, rt.linear[t]);
             add_row(linear, part, left, size + 3, W, -rt.bend[t]);
             add_row(bent, part, left, size + 3, W, rt.linear[t]);
@@ -110,8 +110,8 @@ for (int k = N - 1; k >= 0; --k) {
     for (int j = hi; j < to; ++j) bar[hi - 1 - from] += bar[j - from];
 
     // Back along the sums.
-    F* __restrict mass = &beam.masses.data[at + lo - c.n + 1];
-    F* __restrict refinement = &beam.refinements.data[at + lo - c.n + 1];
+    F* __restrict mass = &masses[at + lo - c.n + 1];
+    F* __restrict refinement = &refinements[at + lo - c.n + 1];
     F* __restrict sum = passed + (lo - begin);
     F* __restrict bend = bends + (lo - begin);
     const F* __restrict of_mass = bar + (lo - from);
@@ -136,8 +136,8 @@ for (int k = N - 1; k >= 0; --k) {
     if (k == 0) for (int t = 0; t < hi - lo; ++t) mass[t] += F(0.25) * step * bend[t];
 }
 if (varies) {
-    beam.by_rays.data[4 * item + 2] = by_step / (double)(step);
-    beam.by_rays.data[4 * item + 3] = by_bound;
+    by_rays[4 * item + 2] = by_step / (double)(step);
+    by_rays[4 * item + 3] = by_bound;
 }
 """
 )
@@ -150,7 +150,7 @@ FIELD_ADJOINT = (
 F linear[BLOCK + 3], slopes[BLOCK + 3], of_row[BLOCK], of_column[BLOCK];
 double by_row = 0, by_column = 0;
 const size_t at = cell_row(channel, k, row) + begin;
-F* __restrict out = &beam.field_bar.data[at];
+F* __restrict out = &field_bar[at];
 // Rays of slice `s` at `shift` from it, whose cotangents are `bars`, that meet cells of slice k.
 auto gather = [&](const F* bars, int s, double shift, F weight) {
     const Place r = row_place(s + shift), c = column_place(s + shift);
@@ -168,7 +168,7 @@ auto gather = [&](const F* bars, int s, double shift, F weight) {
         out[t] += ct.linear[1] * linear[t + 1] + ct.linear[2] * linear[t + 2];
     if (!varies) return;
     blend(slopes, rt.linear_slope);
-    const F* cells = &beam.field.data[at];
+    const F* cells = &field[at];
     for (int t = 0; t < count; ++t) {
         const F* weights = ct.linear_slope;
         of_row[t] = cells[t] * (ct.linear[1] * slopes[t + 1] + ct.linear[2] * slopes[t + 2]);
@@ -178,12 +178,12 @@ auto gather = [&](const F* bars, int s, double shift, F weight) {
     by_row -= (s + shift) * total(of_row, count);
     by_column -= (s + shift) * total(of_column, count);
 };
-gather(&beam.masses.data[0], k, 0, F(1));
-if (k + 1 < N) gather(&beam.refinements.data[0], k, 0.5, F(0.5));
-if (k > 0) gather(&beam.refinements.data[0], k - 1, 0.5, F(0.5));
+gather(&masses[0], k, 0, F(1));
+if (k + 1 < N) gather(&refinements[0], k, 0.5, F(0.5));
+if (k > 0) gather(&refinements[0], k - 1, 0.5, F(0.5));
 if (varies) {
-    beam.by_field.data[4 * item] = by_row;
-    beam.by_field.data[4 * item + 1] = by_column;
+    by_field[4 * item] = by_row;
+    by_field[4 * item + 1] = by_column;
 }
 """
 )

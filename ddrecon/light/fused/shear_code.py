@@ -17,11 +17,9 @@ enum { BLOCK = 1 };
 #else
 enum { BLOCK = 256 };
 #endif
-const int N = beam.slices, H = beam.height, W = beam.width;
-const int ROWS = beam.rows, COLUMNS = beam.columns;
-const F* const number = &beam.numbers.data[4 * beam.light];
+const int N = slices, H = height, W = width, ROWS = rows, COLUMNS = columns;
+const F* const number = &numbers[4 * light];
 const F slope_row = number[0], slope_column = number[1], step = number[2], bound = number[3];
-const bool varies = beam.varies;
 
 // Cell 0 of slice k among rays: q = n + a, n whole.
 struct Place { int n; F a; double q; };
@@ -31,8 +29,8 @@ auto place_of = [](F slope, int first, double k) -> Place {
     n -= n > q;
     return Place{n, (F)(q - n), q};
 };
-auto row_place = [&](double k) -> Place { return place_of(slope_row, beam.first_row, k); };
-auto column_place = [&](double k) -> Place { return place_of(slope_column, beam.first_column, k); };
+auto row_place = [&](double k) -> Place { return place_of(slope_row, first_row, k); };
+auto column_place = [&](double k) -> Place { return place_of(slope_column, first_column, k); };
 
 // What the four rays n - 1 to n + 2 around a cell count for: in linear interpolation, in what third
 // order takes off it, and the slopes of both by q, on a kink the mean of both sides'. `end` is 1 on
@@ -71,12 +69,12 @@ auto add_row = [](F* __restrict to, const F* __restrict from, int begin, int cou
 };
 auto clear = [](F* to, int count) { for (int t = 0; t < count; ++t) to[t] = F(0); };
 auto window_row = [&](int channel, int k, int m) -> size_t {
-    return size_t(channel) * N * (H + 3) * (W + 3) + size_t(k) * beam.window_slice
-        + size_t(m) * beam.window_row;
+    return size_t(channel) * N * (H + 3) * (W + 3) + size_t(k) * window_slice_stride
+        + size_t(m) * window_row_stride;
 };
 auto cell_row = [&](int channel, int k, int row) -> size_t {
-    return size_t(channel) * N * H * W + beam.start + (long long)k * beam.slice_stride
-        + (long long)row * beam.row_stride;
+    return size_t(channel) * N * H * W + start + (long long)k * slice_stride
+        + (long long)row * row_stride;
 };
 """
 # An item is a block of rays of one row, ghosts of the outermost rows included, on all slices.
@@ -94,8 +92,8 @@ const int blocks = (W + BLOCK - 1) / BLOCK;
 const int begin = item % blocks * BLOCK;
 const int count = begin + BLOCK < W ? BLOCK : W - begin;
 const int line = item / blocks % (N * H), channel = item / blocks / (N * H);
-const int row = beam.is_slices_first ? line / N : line % H;
-const int k = beam.is_slices_first ? line % N : line / H;
+const int row = is_slices_first ? line / N : line % H;
+const int k = is_slices_first ? line % N : line / H;
 """
 
 RAYS = (
@@ -116,7 +114,7 @@ for (int k = 0; k < N; ++k) {
         for (int up = 0; up < 2; ++up) {
             const int y = ray - r.n - 1 + up;
             if (y < 0 || y >= H) continue;
-            const F* from = &beam.field.data[cell_row(channel, s, y)];
+            const F* from = &field[cell_row(channel, s, y)];
             add_row(to, from, lo - c.n - 1, size + 1, W, weight * (up ? F(1) - r.a : r.a));
         }
     };
@@ -131,9 +129,9 @@ for (int k = 0; k < N; ++k) {
     // The mass of the slices passed, and of trapezoids over half steps less those over whole ones.
     const bool is_kept = m >= 0 && m < H + 3;  // a ghost may not be, where its ray is
     const size_t at = is_kept ? window_row(channel, k, m) : 0;
-    F* __restrict mass = is_kept ? &beam.masses.data[at + lo - c.n + 1] : unused;
-    F* __restrict refinement = is_kept && beam.has_refinements
-        ? &beam.refinements.data[at + lo - c.n + 1] : unused + BLOCK;
+    F* __restrict mass = is_kept ? &masses[at + lo - c.n + 1] : unused;
+    F* __restrict refinement = is_kept && refinements
+        ? &refinements[at + lo - c.n + 1] : unused + BLOCK;
     F* __restrict sum = passed + (lo - begin);
     F* __restrict bend = bends + (lo - begin);
     const F half = k > 0 ? F(0.5) : F(0), keep = k > 0 ? F(1) : F(0);
@@ -147,9 +145,9 @@ for (int k = 0; k < N; ++k) {
         bend[t] = bent + (between - F(0.5) * value);
         sum[t] += value;
     }
-    if (is_kept && lo == 0 && c.n == 0) beam.masses.data[at] = mass[0];
+    if (is_kept && lo == 0 && c.n == 0) masses[at] = mass[0];
     if (is_kept && hi == COLUMNS)
-        for (int q = COLUMNS - c.n + 1; q < W + 3; ++q) beam.masses.data[at + q] = mass[size - 1];
+        for (int q = COLUMNS - c.n + 1; q < W + 3; ++q) masses[at + q] = mass[size - 1];
 }
 """
 )
@@ -158,10 +156,10 @@ BLENDS = """
 // Rows of rays around the cells, blended: linearly, and as third order's correction for rows.
 const Place r = row_place(k), c = column_place(k);
 const Taps rt = taps_of(r, ROWS, row == 0), ct = taps_of(c, COLUMNS, false);
-const F* __restrict p0 = &beam.masses.data[window_row(channel, k, row) + begin];
-const F* __restrict p1 = p0 + beam.window_row;
-const F* __restrict p2 = p1 + beam.window_row;
-const F* __restrict p3 = p2 + beam.window_row;
+const F* __restrict p0 = &masses[window_row(channel, k, row) + begin];
+const F* __restrict p1 = p0 + window_row_stride;
+const F* __restrict p2 = p1 + window_row_stride;
+const F* __restrict p3 = p2 + window_row_stride;
 F linear[BLOCK + 3], bent[BLOCK + 3];
 for (int t = 0; t < count + 3; ++t) {
     linear[t] = rt.linear[1] * p1[t] + rt.linear[2] * p2[t];
@@ -180,7 +178,7 @@ CELLS = (
     + CELL_ITEM
     + BLENDS
     + """
-F* __restrict out = &beam.entered.data[at];
+F* __restrict out = &entered[at];
 for (int t = 0; t < count; ++t) {
 """
     + CORRECTION

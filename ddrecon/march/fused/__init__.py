@@ -5,8 +5,8 @@ Rays that meet slices go in packets, a ray a lane of a processor's vectors: `pac
 `packet_spread` have values at nodes and their adjoint, `packet_optics` the formulas, `packet_rays`
 what a node emits, and `packet_walks` the kernels.
 A ray a thread, in Warp's own language, are equal steps, derivatives by the rays themselves, and
-forward mode: `lines`, `planes` and `sampling` find the values at a node, `nodes` what it emits (by
-the formulas of `optics`), and `segments` what arrives from between two; `walks` and `adjoint` are
-the kernels.
+forward mode: `lines`, `planes` and `sampling` find values among cells, `stops` those at a node,
+`emission` what it emits (by `node_phases` and the formulas of `optics`), and `segments` what
+arrives from between two; `walks` and `adjoint` are the kernels.
 `integrate` makes of all that one function of tensors, and `march` calls it for an `Emission`.
 """

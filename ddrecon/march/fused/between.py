@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.text import cut
 from ddrecon.march.fused.pixels import interpolation_kernel, judge_kernel, spread_kernel
 from ddrecon.march.lattice import DOUBT, interpolate
 from ddrecon.numerics.autodiff import differentiate_once, keep
@@ -44,16 +45,17 @@ class _Interpolate(torch.autograd.Function):
         bits, (channels, rows, columns) = torch.finfo(values.dtype).bits, values.shape
         uneven = values.new_empty(rows, columns)
         squares = values.new_empty(rows, dtype=torch.float64)
-        judged = [array(x) for x in (values, behind, uneven, squares)]
-        launch(judge_kernel(bits), rows, judged, values, _threads(values))
+        seen = _lattice(values) | {"behind": behind}
+        judged = {"uneven": uneven, "squares": squares}
+        judge_kernel(bits).launch(rows, seen, judged, _threads(values))
         brightness = (squares.sum() / (channels // 2 * rows * columns)).sqrt()
         bound = (tolerance / DOUBT * brightness).to(values.dtype).view(1)
         out = values.new_zeros(channels, count)
         is_rough = hit.new_empty(hit.shape, dtype=torch.bool)
-        arguments = [array(x) for x in (values, places, hit, uneven, bound, out, is_rough)]
-        items, length = _shares(places)
-        threads = _threads(places, channels)
-        launch(interpolation_kernel(bits), items, [length, *arguments], values, threads)
+        items, given = _pixels(values, places, hit, count)
+        given |= {"uneven": uneven, "bound": bound}
+        made = {"out": out, "rough": is_rough}
+        interpolation_kernel(bits).launch(items, given, made, _threads(places, channels))
         return out, is_rough
 
     @staticmethod
@@ -68,10 +70,9 @@ class _Interpolate(torch.autograd.Function):
         values, places, hit = ctx.saved_tensors
         bits, threads = torch.finfo(values.dtype).bits, _threads(places, len(values))
         shares = [values.new_zeros(values.shape) for _ in range(threads)]
-        items, length = _shares(places)
-        fixed = [length, *(array(x) for x in (values, places, hit, out_bar))]
-        given = [[*fixed, array(share)] for share in shares]
-        launch(spread_kernel(bits), items, given.__getitem__, values, threads)
+        items, given = _pixels(values, places, hit, ctx.count)
+        own = [{"values_bar": share} for share in shares]
+        spread_kernel(bits).launch(items, given | {"out_bar": out_bar}, own[0], shares=own)
         return functools.reduce(Tensor.add_, shares), None, None, None, None, None
 
     @staticmethod
@@ -87,7 +88,14 @@ def _threads(pixels: Tensor, channels: int = 1) -> int:
     return 1 if pixels.numel() * channels < FEW else thread_count(pixels)
 
 
-def _shares(places: Tensor) -> tuple[int, int]:
-    """Items of a launch, and how many pixels each of them does."""
-    length = 1 if places.is_cuda else LENGTH
-    return -(-len(places) // length), length
+def _lattice(values: Tensor) -> dict[str, Any]:
+    """The lattice's values and sizes, as kernels call them."""
+    channels, rows, columns = values.shape
+    return {"values": values, "channels": channels, "rows": rows, "columns": columns}
+
+
+def _pixels(values: Tensor, places: Tensor, hit: Tensor, count: int) -> tuple[int, dict[str, Any]]:
+    """Items of a launch, and what they are given of `count` pixels, those in `hit` at `places`."""
+    items, length = cut(len(places), LENGTH, places)
+    sizes = {"length": length, "total": len(places), "pixels": count}
+    return items, _lattice(values) | sizes | {"places": places, "hit": hit}

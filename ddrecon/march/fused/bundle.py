@@ -13,7 +13,8 @@ from ddrecon.light.beam import Beam, leaving_cosine
 from ddrecon.march.box import intersect_box
 from ddrecon.march.emission import Emission, is_field
 from ddrecon.march.lattice import Lattice
-from ddrecon.medium.phase import fit_peaked_phase, henyey_greenstein
+from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.chebyshev import COEFFICIENTS
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
@@ -32,7 +33,7 @@ class Along(NamedTuple):
 
     `angles` [2 beams, R]: of each the foot, then of each the square distance, or cosine and 1;
     `polynomials` of E13; `factors`: p of a beam whose phase function is the same all along a ray
-    [R], else None.
+    [C, R], else None.
     """
 
     angles: Tensor
@@ -100,13 +101,21 @@ def _bundle(
 def see_beams(emission: Emission, packed: Packed) -> Along:
     """The beams of `emission` along rays."""
     has_peak = emission.peak is not None
+    phase, degree = emission.seen.phase, emission.seen.degree
+
+    def see(*towards: Tensor) -> Along:
+        numbers = len(phase.numbers)
+        return _see_directional(
+            packed.direction, type(phase), degree, has_peak, numbers, *phase.numbers, *towards
+        )
+
     towards = [beam.direction for beam in emission.beams if isinstance(beam, Beam)]
     if len(towards) == len(emission.beams):
-        return _see_directional(packed.direction, emission.g, has_peak, *towards)
+        return see(*towards)
     seen = []
     for beam in emission.beams:
         if isinstance(beam, Beam):
-            seen.append(_see_directional(packed.direction, emission.g, has_peak, beam.direction))
+            seen.append(see(beam.direction))
         else:
             angles = torch.stack(beam.passing(packed.origin, packed.direction))
             unused = angles.new_zeros(COEFFICIENTS, angles.shape[1])
@@ -120,17 +129,29 @@ def see_beams(emission: Emission, packed: Packed) -> Along:
 
 
 @remember
-def _see_directional(direction: Tensor, g: Tensor, has_peak: bool, *towards: Tensor) -> Along:
-    """Beams that go `towards` what are unit vectors, along rays of `direction` [R, 3]."""
+def _see_directional(
+    direction: Tensor,
+    kind: type[PhaseFunction],
+    degree: int,
+    has_peak: bool,
+    numbers: int,
+    *tensors: Tensor,
+) -> Along:
+    """Beams along rays of `direction` [R, 3], scattered by the phase function `kind`.
+
+    `tensors`: its `numbers`, and the unit vectors along which beams go.
+    """
+    seen, towards = SeenPhase(kind(*tensors[:numbers]), degree), tensors[numbers:]
     rays = len(direction)
     cosines = [leaving_cosine(direction, each) for each in towards]
     ones = direction.new_ones(len(towards), rays)
     none = direction.new_zeros(0, rays)
     if not has_peak:
         unused = direction.new_zeros(len(towards) * COEFFICIENTS, rays)
-        factors = tuple(henyey_greenstein(cosine, g) for cosine in cosines)
+        factors = tuple(seen.value(cosine) for cosine in cosines)
         return Along(torch.cat([none, *(c[None] for c in cosines), ones]), unused, factors)
-    fitted = [fit_peaked_phase(cosine, g) for cosine in cosines]
+    # By beam, then by color, then by power.
+    fitted = [seen.polynomials(cosine).movedim(1, 0).flatten(0, 1) for cosine in cosines]
     angles = torch.cat([none, *(cosine[None] for cosine in cosines), ones])
     return Along(angles, torch.cat([none, *fitted]), (None,) * len(towards))
 
@@ -140,13 +161,11 @@ def numbers_of(emission: Emission, bound: Tensor | float) -> Tensor:
     peak = emission.peak
     if peak is not None and is_field(peak):
         peak = None
-    return _numbers(emission.colors, emission.extinction.scale, peak, emission.g, bound)
+    return _numbers(emission.colors, emission.extinction.scale, peak, bound)
 
 
 @remember
-def _numbers(
-    colors: int, scale: Tensor, peak: Tensor | None, g: Tensor, bound: Tensor | float
-) -> Tensor:
+def _numbers(colors: int, scale: Tensor, peak: Tensor | None, bound: Tensor | float) -> Tensor:
     scale = scale.view(-1).expand(colors)
     peak = 0 * scale if peak is None else peak.view(-1).expand(colors)
-    return torch.cat([scale, peak, g.view(1), torch.as_tensor(bound).to(scale).view(1)])
+    return torch.cat([scale, peak, 0 * scale[:1], torch.as_tensor(bound).to(scale).view(1)])

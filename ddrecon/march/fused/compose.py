@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.kernels.launch import array, launch
+from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.march.fused.compose_kernels import compose_kernel, decompose_kernel
 from ddrecon.numerics.autodiff import differentiate_once, is_forward
 from ddrecon.numerics.remember import remember
@@ -32,12 +32,13 @@ def compose(
 
     `out` [C (1 + beams), R] and `masses` [K, R] are the integrals; `scale` and `scattering` [C or
     1] those of both coefficients. What does not change along a ray is multiplied in here: the
-    `irradiances` of beams [C or 1], and p where it is one of the `factors` [R] (E2); the scale of
-    kappa_s; and E1's 1 - tau of what is behind.
+    `irradiances` of beams [C or 1], and p where it is one of the `factors` [1 or C, R] (E2); the
+    scale of kappa_s; and E1's 1 - tau of what is behind.
     """
     fixed = [scale, scattering, *irradiances, *(each for each in factors if each is not None)]
     colors = len(out) // (1 + len(irradiances))
-    if is_forward() or any(each.requires_grad for each in fixed):
+    has_colors = any(each is not None and len(each) > 1 for each in factors)
+    if has_colors or is_forward() or any(each.requires_grad for each in fixed):
         return _compose(colors, out, masses, scale, scattering, irradiances, factors)
     weights = _weights(colors, scale, scattering, *irradiances)
     composed: Tensor = _Compose.apply(out, masses, weights, _phases(out.shape[1], *factors))
@@ -76,7 +77,7 @@ def _phases(rays: int, *factors: Tensor | None) -> Tensor | None:
     known = [each for each in factors if each is not None]
     if not known:
         return None
-    return torch.stack([torch.ones_like(known[0]) if f is None else f for f in factors])
+    return torch.cat([torch.ones_like(known[0]) if f is None else f for f in factors])
 
 
 class _Compose(torch.autograd.Function):
@@ -89,8 +90,8 @@ class _Compose(torch.autograd.Function):
         ctx.save_for_backward(masses, weights, phases)
         ctx.outputs = len(out)
         composed = out.new_empty(2 * weights.shape[1], out.shape[1])
-        kernel = compose_kernel(torch.finfo(out.dtype).bits)
-        _launch(kernel, (out, masses, weights, phases, composed))
+        given = {"out": out, "masses": masses, "weights": weights, "phases": phases}
+        _launch(compose_kernel(torch.finfo(out.dtype).bits), given, {"composed": composed})
         return composed
 
     @staticmethod
@@ -101,15 +102,17 @@ class _Compose(torch.autograd.Function):
             masses.new_empty(ctx.outputs, masses.shape[1]),
             masses.new_empty(masses.shape),
         )
-        kernel = decompose_kernel(torch.finfo(masses.dtype).bits)
-        _launch(kernel, (composed_bar, masses, weights, phases, out_bar, masses_bar))
+        given = {"composed": composed_bar, "masses": masses, "weights": weights, "phases": phases}
+        made = {"out": out_bar, "masses_bar": masses_bar}
+        _launch(decompose_kernel(torch.finfo(masses.dtype).bits), given, made)
         return out_bar, masses_bar, None, None
 
 
-def _launch(kernel: Any, tensors: Sequence[Tensor | None]) -> None:
-    like = tensors[1]
-    assert like is not None
-    rays = like.shape[1]
-    length = 1 if like.is_cuda else LENGTH
-    given = [array(like[:0] if each is None else each) for each in tensors]
-    launch(kernel, -(-rays // length), [length, *given], like, 1 if rays < FEW else None)
+def _launch(kernel: TextKernel, given: dict[str, Tensor | None], made: dict[str, Tensor]) -> None:
+    masses, weights = given["masses"], given["weights"]
+    assert masses is not None and weights is not None
+    rays = masses.shape[1]
+    items, length = cut(rays, LENGTH, masses)
+    numbers = {"length": length, "total": rays, "channels": len(masses)}
+    numbers |= {"colors": weights.shape[1], "beams": len(weights) - 2}
+    kernel.launch(items, given | numbers, made, 1 if rays < FEW else None)

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import array, launch, thread_count
 from ddrecon.kernels.packets import LANES
+from ddrecon.kernels.text import cut
 from ddrecon.march.fused.adjoint import adjoint_kernel
 from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_walks import (
     packet_adjoint_kernel,
     packet_integral_kernel,
-    packet_types,
 )
 from ddrecon.march.fused.rays import ray_types
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
@@ -45,12 +45,12 @@ class Integrate(torch.autograd.Function):
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
         varied = rays, angles, coefficients, numbers
         if cells.is_sliced:
-            given, _kept = _packets(layout, cells, varied, fields)
-            kernel, count = packet_integral_kernel(layout), _packet_count(rays)
+            given, made = _packets(cells, varied, fields), {"out": out, "masses": masses}
+            packet_integral_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
         else:
-            given = _bundle(layout, cells.planes, cells.pack(fields), *varied)
-            kernel, count = integral_kernel(layout), len(rays)
-        launch(kernel, count, [given, array(out), array(masses)], rays)
+            bundle = _bundle(layout, cells.planes, cells.pack(fields), *varied)
+            arguments = [bundle, array(out), array(masses)]
+            launch(integral_kernel(layout), len(rays), arguments, rays)
         return out, masses.to(rays.dtype, copy=True), masses
 
     @staticmethod
@@ -134,57 +134,43 @@ def _transpose_packets(
     """The same in packets of rays, but of rays; of polynomials and fields those it `needs`."""
     layout, cells, (needs_polynomials, needs_fields) = ctx.layout, ctx.cells, needs
     masses, rays, angles, coefficients, numbers, *fields = ctx.saved_tensors
-    given, _kept = _packets(layout, cells, (rays, angles, coefficients, numbers), fields)
-    wanted = list(zip(fields, needs_fields, strict=True))
-    polynomials_bar = coefficients.new_empty(len(coefficients) * needs_polynomials, len(rays))
-    numbers_bar = masses.new_empty(len(numbers), _packet_count(rays))
+    packets, _ = cut(len(rays), LANES, rays)
+    polynomials_bar = rays.new_empty(coefficients.shape) if needs_polynomials else None
+    numbers_bar = masses.new_empty(len(numbers), packets)
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
+    wanted = list(zip(fields, needs_fields, strict=True))
     shares = [
         [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
         for _ in range(thread_count(rays))
     ]
-    pointers = [_pointers(layout, share, fields) for share in shares]
-    fixed = [given, *map(array, (masses, out_bar, masses_bar))]
-    rest = [array(polynomials_bar), array(numbers_bar)]
-    kernel = packet_adjoint_kernel(layout)
-    launch(kernel, _packet_count(rays), lambda i: [*fixed, pointers[i], *rest], rays)
+    given = _packets(cells, (rays, angles, coefficients, numbers), fields)
+    given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
+    made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar}
+    own = [{"bars": _channels(share, fields)} for share in shares]
+    packet_adjoint_kernel(layout).launch(packets, given, made, shares=own)
     for share in shares[1:]:
         for total, part in zip(shares[0], share, strict=True):
             if total is not None:
                 total += part
-    found = polynomials_bar if needs_polynomials else None
-    return [None, None, found, numbers_bar.sum(1).to(numbers.dtype), *shares[0]]
+    return [None, None, polynomials_bar, numbers_bar.sum(1).to(numbers.dtype), *shares[0]]
 
 
-def _packet_count(rays: Tensor) -> int:
-    lanes = 1 if rays.is_cuda else LANES
-    return -(-len(rays) // lanes)
-
-
-def _packets(
-    layout: Layout, cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]
-) -> tuple[Any, list[Tensor]]:
-    """What kernels of packets are given, and tensors that must live as long as it does."""
-    given = packet_types(layout).Given()
-    kept = [field.contiguous() for field in fields]
-    assert cells.order is not None, "rays meet no slices"
+def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -> dict[str, Any]:
+    """What kernels of packets are given, by name."""
     names = "planes", "slices", "rays", "angles", "coefficients", "numbers"
-    for name, tensor in zip(names, (cells.planes, cells.order, *varied), strict=True):
-        setattr(given, name, array(tensor))
-    given.fields = _pointers(layout, kept, fields)
-    for name, number in cells.strides(fields[0].shape).items():
-        setattr(given, name, number)
-    return given, kept
+    given: dict[str, Any] = dict(zip(names, (cells.planes, cells.order, *varied), strict=True))
+    given |= cells.strides(fields[0].shape)
+    given |= {"ray_count": len(varied[0]), "node_count": len(cells.planes)}
+    return given | {"fields": _channels(fields, fields)}
 
 
-def _pointers(layout: Layout, tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> Any:
-    """Where each channel of contiguous `tensors`, which are as `like`, begins; 0 of those None."""
-    places: list[int] = []
-    for tensor, field in zip(tensors, like, strict=True):
-        size = field[0].numel() * field.element_size()
-        begin = None if tensor is None else tensor.data_ptr()
-        places += [0 if begin is None else begin + c * size for c in range(len(field))]
-    return packet_types(layout).Fields(*places)
+def _channels(tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[Tensor | None]:
+    """Each channel of `tensors`, which have as many as those `like` them."""
+    return [
+        channel
+        for tensor, field in zip(tensors, like, strict=True)
+        for channel in ([None] * len(field) if tensor is None else tensor.unbind())
+    ]
 
 
 def _bundle(layout: Layout, *tensors: Tensor) -> Any:

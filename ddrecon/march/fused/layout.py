@@ -45,6 +45,31 @@ class Layout:
         return self.first_scattering + self.scattering
 
     @property
+    def scattering_from(self) -> int:
+        """Where the field of kappa_s begins, its own or the extinction's."""
+        return self.first_scattering if self.scattering else 0
+
+    @property
+    def mass_step(self) -> int:
+        """From the extinction of a color to that of the next one: 0 where all share one field."""
+        return int(self.extinction > 1)
+
+    @property
+    def diffuse_step(self) -> int:
+        """The same of diffuse light."""
+        return int(self.diffuse > 1)
+
+    @property
+    def scattering_step(self) -> int:
+        """The same of scattering."""
+        return int(self.scattering > 1) if self.scattering else self.mass_step
+
+    @property
+    def peak_step(self) -> int:
+        """The same of the peak."""
+        return int((self.peak or 0) > 1)
+
+    @property
     def channels(self) -> int:
         """All channels of a node."""
         return self.first_peak + (self.peak or 0)

@@ -1,10 +1,12 @@
 """Formulas of the view-ray integral for single numbers, inside fused kernels.
 
-They are those of `numerics.decay`, `numerics.chebyshev` and `medium.phase` for tensors. The files
-of kernels have no postponed annotations: Warp reads the types of their arguments.
+They are those of `numerics.decay`, `numerics.chebyshev` and `medium.phase` for tensors; `scalar` is
+wp.float32 or wp.float64, and `role` is `_named`'s. The files of kernels have no postponed
+annotations: Warp reads the types of their arguments.
 """
 
 import functools
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,20 +20,18 @@ TERMS = {wp.float32: 7, wp.float64: 13}
 """Terms of that series, by precision: the last is beyond the last digit."""
 
 
-@functools.cache
-def optics(scalar: Any, role: str) -> SimpleNamespace:
-    """The functions below for `scalar`, wp.float32 or wp.float64.
-
-    `role` tells apart those that kernels call ("value") from those that they differentiate by
-    `wp.grad` ("derivative"): Warp 1.19 makes no derivative of a function that is called as well.
+def _named(role: str) -> Callable[[Any], Any]:
+    """What makes functions that kernels call ("value"), or that they differentiate by `wp.grad`
+    ("derivative"): Warp 1.19 makes no derivative of a function that is called as well.
     """
-    F = scalar
-    count = TERMS[scalar]
-    inverses = wp.types.vector(length=count, dtype=F)(*(1.0 / (k + 2) for k in range(count, 0, -1)))
-    Triple = wp.types.vector(length=3, dtype=F)
+    return lambda function: wp.func(function, name=f"{function.__name__}_{role}")
 
-    def named(function: Any) -> Any:
-        return wp.func(function, name=f"{function.__name__}_{role}")
+
+@functools.cache
+def _series(scalar: Any, role: str) -> Any:
+    """The function psi."""
+    F, named, count = scalar, _named(role), TERMS[scalar]
+    inverses = wp.types.vector(length=count, dtype=F)(*(1.0 / (k + 2) for k in range(count, 0, -1)))
 
     @named
     def psi_series(depth: F) -> F:
@@ -40,6 +40,16 @@ def optics(scalar: Any, role: str) -> SimpleNamespace:
         for k in range(wp.static(count)):
             series = F(1.0) - depth * series * wp.static(inverses)[k]
         return F(0.5) * series
+
+    return psi_series
+
+
+@functools.cache
+def decays(scalar: Any, role: str) -> SimpleNamespace:
+    """The mean of exp(-depth) over a segment (E2), and its derivatives."""
+    F, named = scalar, _named(role)
+    psi_series = _series(scalar, role)
+    Triple = wp.types.vector(length=3, dtype=F)
 
     @named
     def mean_decay(begin: F, end: F, decay_begin: F, decay_end: F) -> F:
@@ -70,6 +80,15 @@ def optics(scalar: Any, role: str) -> SimpleNamespace:
             return Triple(mean, by_lower, -mean - by_lower)
         return Triple(mean, -mean - by_lower, by_lower)
 
+    return SimpleNamespace(mean_decay=mean_decay, mean_decay_slopes=mean_decay_slopes)
+
+
+@functools.cache
+def phases(scalar: Any, role: str) -> SimpleNamespace:
+    """p of E2 and of E13 by their formulas."""
+    F, named = scalar, _named(role)
+    psi_series = _series(scalar, role)
+
     @named
     def henyey_greenstein(depth: F, cosine: F, g: F) -> F:
         """p of E2, which has no peak: `depth` does not matter."""
@@ -97,6 +116,14 @@ def optics(scalar: Any, role: str) -> SimpleNamespace:
         rest = (F(1.0) - g * g) * (F(1.0) + F(3.0) * g / (F(1.0) + g) * cosine)
         return wp.max(rest + g * g * unscattered * peak, F(0.0))
 
+    return SimpleNamespace(henyey_greenstein=henyey_greenstein, peaked_phase=peaked_phase)
+
+
+@functools.cache
+def polynomials(scalar: Any, role: str) -> SimpleNamespace:
+    """E13 along a ray, by its polynomial."""
+    F, named = scalar, _named(role)
+
     @named
     def place_of(depth: F) -> F:
         """The variable of the polynomials that stand for E13 along a ray."""
@@ -123,6 +150,16 @@ def optics(scalar: Any, role: str) -> SimpleNamespace:
         away = F(1.0) - place
         return slope * away * away * F(wp.static(0.5 / SCALE))
 
+    return SimpleNamespace(
+        place_of=place_of, polynomial=polynomial, polynomial_slope=polynomial_slope
+    )
+
+
+@functools.cache
+def points(scalar: Any, role: str) -> SimpleNamespace:
+    """Light from a point as a ray sees it."""
+    F, named = scalar, _named(role)
+
     @named
     def point_cosine(foot: F, across: F, t: F) -> F:
         """Cosine between light from a point and a ray at distance `t`.
@@ -138,14 +175,4 @@ def optics(scalar: Any, role: str) -> SimpleNamespace:
         apart = wp.sqrt(across)
         return wp.atan2(apart * (t1 - t0), across + (foot + t0) * (foot + t1)) / apart
 
-    return SimpleNamespace(
-        mean_decay=mean_decay,
-        mean_decay_slopes=mean_decay_slopes,
-        henyey_greenstein=henyey_greenstein,
-        peaked_phase=peaked_phase,
-        place_of=place_of,
-        polynomial=polynomial,
-        polynomial_slope=polynomial_slope,
-        point_cosine=point_cosine,
-        subtended=subtended,
-    )
+    return SimpleNamespace(point_cosine=point_cosine, subtended=subtended)

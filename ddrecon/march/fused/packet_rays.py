@@ -1,13 +1,22 @@
 """C++ of packets of rays: what a ray and a node are, where nodes lie, and what they emit.
 
-The text of a kernel is that of `program(layout, walk)`: constants of the layout, all structs, and
-what comes before every walk.
+The text of a kernel is constants of the layout, all structs, what comes before every walk, and the
+walk.
 """
 
+from __future__ import annotations
+
 from ddrecon.kernels.packets import packet_program
+from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
 from ddrecon.march.fused.packet_optics import DECAYS, PHASES, POLYNOMIALS
+
+GIVEN = """
+F *planes, *rays, *angles, *coefficients, *numbers; int *slices;
+int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride;
+"""
+"""As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells."""
 
 _RECORDS = """
 struct Ray {
@@ -28,43 +37,41 @@ struct Node {
 };
 """
 _BEGIN = """
-const int last = given.rays.shape[0] - 1, begin = packet * LANES;
-const F* numbers = given.numbers.data;
+const int last = ray_count - 1, begin = item * LANES;
 const F* scale = numbers;
 const F* peaks = numbers + C;
 const F g = numbers[2 * C], bound = numbers[2 * C + 1];
 Ray ray;
-const F* of_rays = given.rays.data;
-ray.o0 = P::load(of_rays, begin, 8, last);
-ray.o1 = P::load(of_rays + 1, begin, 8, last);
-ray.o2 = P::load(of_rays + 2, begin, 8, last);
-ray.d0 = P::load(of_rays + 3, begin, 8, last);
-ray.d1 = P::load(of_rays + 4, begin, 8, last);
-ray.d2 = P::load(of_rays + 5, begin, 8, last);
-ray.near = P::load(of_rays + 6, begin, 8, last);
-ray.far = P::load(of_rays + 7, begin, 8, last);
+ray.o0 = P::load(rays, begin, 8, last);
+ray.o1 = P::load(rays + 1, begin, 8, last);
+ray.o2 = P::load(rays + 2, begin, 8, last);
+ray.d0 = P::load(rays + 3, begin, 8, last);
+ray.d1 = P::load(rays + 4, begin, 8, last);
+ray.d2 = P::load(rays + 5, begin, 8, last);
+ray.near = P::load(rays + 6, begin, 8, last);
+ray.far = P::load(rays + 7, begin, 8, last);
 for (int b = 0; b < BEAMS; ++b) {
-    ray.foot[b] = P::load(given.angles.data + b * (last + 1), begin, 1, last);
-    ray.across[b] = P::load(given.angles.data + (BEAMS + b) * (last + 1), begin, 1, last);
+    ray.foot[b] = P::load(angles + b * (last + 1), begin, 1, last);
+    ray.across[b] = P::load(angles + (BEAMS + b) * (last + 1), begin, 1, last);
 }
 if (HAS_PEAK)
     for (int k = 0; k < BEAMS * COEFFICIENTS; ++k)
-        ray.coefficients[k] = P::load(given.coefficients.data + k * (last + 1), begin, 1, last);
-auto distance = [&](int n) -> V { return (given.planes.data[n] - ray.o0) / ray.d0; };
+        ray.coefficients[k] = P::load(coefficients + k * (last + 1), begin, 1, last);
+auto distance = [&](int n) -> V { return (planes[n] - ray.o0) / ray.d0; };
 // Nodes before the box and behind it are held at its faces: between them nothing is added.
-int first_node = 0, last_node = given.planes.shape[0] - 1;
+int first_node = 0, last_node = node_count - 1;
 while (first_node < last_node && P::every(distance(first_node + 1) <= ray.near)) ++first_node;
 while (last_node > first_node && P::every(distance(last_node - 1) >= ray.far)) --last_node;
 if (P::every(ray.near >= ray.far)) last_node = first_node;
 // Along y the packet's rays are closer together than along x.
-Lines lines = {given.rows, given.columns, given.row_stride, given.column_stride};
+Lines lines = {rows, columns, row_stride, column_stride};
 if (LANES > 1) {
     const V s = distance((first_node + last_node) / 2);
     const V y = ray.o1 + s * ray.d1, x = ray.o2 + s * ray.d2;
     const int end = begin + LANES <= last ? LANES - 1 : last - begin;
     const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
     if (high * high > wide * wide) {
-        lines = {given.columns, given.rows, given.column_stride, given.row_stride};
+        lines = {columns, rows, column_stride, row_stride};
         const V o = ray.o1, d = ray.d1;
         ray.o1 = ray.o2;
         ray.d1 = ray.d2;
@@ -72,13 +79,11 @@ if (LANES > 1) {
         ray.d2 = d;
     }
 }
-auto slice = [&](int n) -> long long {
-    return (long long)given.slices.data[n] * given.plane_stride;
-};
+auto slice = [&](int n) -> long long { return (long long)slices[n] * plane_stride; };
 // Values of channels `from` to before `to`, of each lane by itself.
 auto sample_lanes = [&](Node& node, long long offset, int from, int to) {
     for (int c = from; c < to; ++c) {
-        const F* field = (const F*)given.fields[c] + offset;
+        const F* field = fields[c] + offset;
         const int k = c - FIRST_MASS;
         node.v[c] = k >= 0 && k < MASSES
             ? Values::curved(field, node.q, node.y, node.x, lines, node.bend[k])
@@ -101,7 +106,7 @@ auto sample_runs = [&](Node& node, long long offset, int from, int to) {
         const long long at_j = (long long)y.j[run.begin] * lines.row;
         const long long at_p = (long long)y.p[run.begin] * lines.row;
         for (int c = from; c < to; ++c) {
-            const F* field = (const F*)given.fields[c] + offset;
+            const F* field = fields[c] + offset;
             const int k = c - FIRST_MASS;
             const V row_i = Rows::read(field + at_i, run.first, lines.column);
             const V row_j = Rows::read(field + at_j, run.first, lines.column);
@@ -206,32 +211,16 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 """
 
 
-def program(layout: Layout, walk: str) -> str:
-    """C++ of `walk` along the rays number `packet` of `given`, of `layout`."""
-    parts = [
-        _constants(layout),
-        PLACES,
-        RUNS,
-        ROWS,
-        VALUES,
-        DECAYS,
-        POLYNOMIALS,
-        PHASES,
-        _RECORDS,
-        _BEGIN,
-        walk,
-    ]
-    return packet_program(layout.bits, "".join(parts))
+def packet_kernel(name: str, layout: Layout, walk: str, given: str) -> TextKernel:
+    """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`."""
+    structs = PLACES + RUNS + ROWS + VALUES + DECAYS + POLYNOMIALS + PHASES + _RECORDS
+    text = _constants(layout) + structs + _BEGIN + walk
+    declared = f"{GIVEN} F *fields[{layout.channels}]; {given}"
+    return TextKernel(name, layout.bits, text, declared, packet_program)
 
 
 def _constants(layout: Layout) -> str:
     """Where in a node the channels of color c are: the first of a kind plus c times its step."""
-    mass_step = int(layout.extinction > 1)
-    first_scattering, scattering_step = (
-        (layout.first_scattering, int(layout.scattering > 1))
-        if layout.scattering
-        else (0, mass_step)
-    )
     numbers = {
         "MOST_RUNS": 5,
         "C": layout.colors,
@@ -240,16 +229,16 @@ def _constants(layout: Layout) -> str:
         "MASSES": layout.masses,
         "CHANNELS": layout.channels,
         "OUT": layout.outputs,
-        "MASS_STEP": mass_step,
+        "MASS_STEP": layout.mass_step,
         "FIRST_DIFFUSE": layout.extinction,
-        "DIFFUSE_STEP": int(layout.diffuse > 1),
+        "DIFFUSE_STEP": layout.diffuse_step,
         "FIRST_MASS": layout.first_mass,
-        "FIRST_SCATTERING": first_scattering,
-        "SCATTERING_STEP": scattering_step,
+        "FIRST_SCATTERING": layout.scattering_from,
+        "SCATTERING_STEP": layout.scattering_step,
         "SCATTERING": layout.scattering,
         "FIRST_OWN_SCATTERING": layout.first_scattering,
         "FIRST_PEAK": layout.first_peak,
-        "PEAK_STEP": int((layout.peak or 0) > 1),
+        "PEAK_STEP": layout.peak_step,
         "HAS_PEAK": int(layout.peak is not None),
         "IS_PEAK_FIELD": int(bool(layout.peak)),
     }

@@ -24,7 +24,7 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
     const V x_bend[4] = {1 - xa, 3 * xa - 2, 1 - 3 * xa, xa};
     for (int c = 0; c < CHANNELS; ++c) {
         if (!bars[c]) continue;
-        F* field = (F*)bars[c] + offset;
+        F* field = bars[c] + offset;
         const int k = c - FIRST_MASS;
         const V bend = k >= 0 && k < MASSES ? bend_bar[k] : V(0);
         for (int j = 0; j < 4; ++j)
@@ -90,7 +90,7 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
         for (int c = 0; c < CHANNELS; ++c) {
             const int k = c - FIRST_MASS;
             if (!is_wanted[c]) continue;
-            F* field = (F*)bars[c] + offset;
+            F* field = bars[c] + offset;
             V in_j = v_bar[c] * y.a, in_i = v_bar[c] - in_j, sum_i = P::all(F(0)), sum_j = sum_i;
             if (k >= 0 && k < MASSES) {
                 const V bend_j = bend_bar[k] * y.a, bend_i = bend_bar[k] - bend_j;

@@ -4,15 +4,13 @@ They compute what `walks` and `adjoint` do for one ray a thread, in vector lanes
 rays themselves are left to those.
 """
 
+from __future__ import annotations
+
 import functools
-from types import SimpleNamespace
-from typing import Any
 
-import warp as wp
-
-from ddrecon.kernels.native import number_type
+from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.packet_rays import program
+from ddrecon.march.fused.packet_rays import packet_kernel
 from ddrecon.march.fused.packet_spread import SPREAD
 
 _INTEGRATE = """
@@ -46,9 +44,9 @@ for (int n = first_node + 1; n <= last_node; ++n) {
 }
 for (int l = 0; l < LANES && begin + l <= last; ++l) {
     for (int i = 0; i < OUT; ++i)
-        out.data[(long long)i * (last + 1) + begin + l] = P::lane(total[i], l);
+        out[(long long)i * (last + 1) + begin + l] = P::lane(total[i], l);
     for (int k = 0; k < EXTINCTION; ++k)
-        masses.data[(long long)k * (last + 1) + begin + l] = P::lane_of(m[k], l);
+        masses[(long long)k * (last + 1) + begin + l] = P::lane_of(m[k], l);
 }
 """
 _TRANSPOSE = """
@@ -57,14 +55,14 @@ V inside = none;
 for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
 V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], g_bar = none, bound_bar = none;
 V polynomial_bar[BEAMS * COEFFICIENTS + 1];
-const bool varies_polynomials = polynomials_bar.shape[0] > 0;
+const bool varies_polynomials = polynomials_bar;
 for (int i = 0; i < OUT; ++i)
-    bar[i] = inside * P::load(out_bar.data + (long long)i * (last + 1), begin, 1, last);
+    bar[i] = inside * P::load(out_bar + (long long)i * (last + 1), begin, 1, last);
 W m[EXTINCTION];
 for (int k = 0; k < EXTINCTION; ++k) {
     const long long row = (long long)k * (last + 1);
-    m_bar[k] = inside * P::load(masses_bar.data + row, begin, 1, last);
-    m[k] = P::load_wide(masses.data + row, begin, last);
+    m_bar[k] = inside * P::load(masses_bar + row, begin, 1, last);
+    m[k] = P::load_wide(masses + row, begin, last);
 }
 for (int c = 0; c < C; ++c) scale_bar[c] = peak_bar[c] = none;
 for (int k = 0; k < BEAMS * COEFFICIENTS; ++k) polynomial_bar[k] = none;
@@ -181,111 +179,35 @@ if (first_node < last_node) {
     finish(first_node, *b, m, b_bar, wb_bar, ub_bar, m_bar);
     spread(first_node, *b, b_bar);
 }
-const int packets = numbers_bar.shape[1];
 for (int c = 0; c < C; ++c) {
-    numbers_bar.data[c * packets + packet] = P::sum(scale_bar[c]);
-    numbers_bar.data[(C + c) * packets + packet] = P::sum(peak_bar[c]);
+    numbers_bar[c * packets + item] = P::sum(scale_bar[c]);
+    numbers_bar[(C + c) * packets + item] = P::sum(peak_bar[c]);
 }
-numbers_bar.data[2 * C * packets + packet] = P::sum(g_bar);
-numbers_bar.data[(2 * C + 1) * packets + packet] = P::sum(bound_bar);
+numbers_bar[2 * C * packets + item] = P::sum(g_bar);
+numbers_bar[(2 * C + 1) * packets + item] = P::sum(bound_bar);
 if (varies_polynomials)
     for (int k = 0; k < BEAMS * COEFFICIENTS; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
-            polynomials_bar.data[(long long)k * (last + 1) + begin + l] =
+            polynomials_bar[(long long)k * (last + 1) + begin + l] =
                 P::lane(polynomial_bar[k], l);
 """
 
 
 @functools.cache
-def packet_types(layout: Layout) -> SimpleNamespace:
-    """The records that kernels of packets are given."""
-    F: Any = number_type(layout.bits)
-    Fields = wp.types.vector(length=layout.channels, dtype=wp.uint64)
-
-    @wp.struct
-    class Given:
-        """As `rays.Bundle`; `slices` [N] of `fields`, which are pointers to channels of cells."""
-
-        planes: wp.array(dtype=F)
-        slices: wp.array(dtype=wp.int32)
-        rays: wp.array2d(dtype=F)
-        angles: wp.array2d(dtype=F)
-        coefficients: wp.array2d(dtype=F)
-        numbers: wp.array(dtype=F)
-        fields: Fields
-        plane_stride: int
-        row_stride: int
-        column_stride: int
-        rows: int
-        columns: int
-
-    return SimpleNamespace(F=F, Fields=Fields, Given=Given)
-
-
-@functools.cache
-def packet_integral_kernel(layout: Layout) -> Any:
+def packet_integral_kernel(layout: Layout) -> TextKernel:
     """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
-    types = packet_types(layout)
-    F: Any = types.F
-    Given = types.Given
-
-    @wp.func_native(program(layout, _INTEGRATE))
-    def integrate_packet(
-        given: Given, out: wp.array2d(dtype=F), masses: wp.array2d(dtype=wp.float64), packet: int
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def integrate(
-        first: int, given: Given, out: wp.array2d(dtype=F), masses: wp.array2d(dtype=wp.float64)
-    ):
-        integrate_packet(given, out, masses, first + wp.tid())
-
-    return integrate
+    return packet_kernel("integrate", layout, _INTEGRATE, "F *out; double *masses")
 
 
 @functools.cache
-def packet_adjoint_kernel(layout: Layout) -> Any:
-    """The kernel that adds to cells `bars` what bars of outputs and masses are for them.
+def packet_adjoint_kernel(layout: Layout) -> TextKernel:
+    """The kernel that adds to `bars`, of `fields`, what bars of outputs and masses are for them.
 
-    `bars` are pointers as `fields` are, 0 where none are asked for. Each packet has its own
-    `numbers_bar` [2 C + 2, packets]; `polynomials_bar` [10 beams, R] may be empty.
+    These are left out where none are asked for. Each packet has its own `numbers_bar`
+    [2 C + 2, packets]; `polynomials_bar` [10 beams, R] may be left out.
     """
-    types = packet_types(layout)
-    F: Any = types.F
-    Given, Fields = types.Given, types.Fields
-
-    @wp.func_native(program(layout, SPREAD + _TRANSPOSE))
-    def transpose_packet(
-        given: Given,
-        masses: wp.array2d(dtype=wp.float64),
-        out_bar: wp.array2d(dtype=F),
-        masses_bar: wp.array2d(dtype=F),
-        bars: Fields,
-        polynomials_bar: wp.array2d(dtype=F),
-        numbers_bar: wp.array2d(dtype=wp.float64),
-        packet: int,
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def transpose(
-        first: int,
-        given: Given,
-        masses: wp.array2d(dtype=wp.float64),
-        out_bar: wp.array2d(dtype=F),
-        masses_bar: wp.array2d(dtype=F),
-        bars: Fields,
-        polynomials_bar: wp.array2d(dtype=F),
-        numbers_bar: wp.array2d(dtype=wp.float64),
-    ):
-        transpose_packet(
-            given,
-            masses,
-            out_bar,
-            masses_bar,
-            bars,
-            polynomials_bar,
-            numbers_bar,
-            first + wp.tid(),
-        )
-
-    return transpose
+    given = f"""
+    double *masses, *numbers_bar; int packets;
+    F *out_bar, *masses_bar, *polynomials_bar, *bars[{layout.channels}]
+    """
+    return packet_kernel("transpose", layout, SPREAD + _TRANSPOSE, given)

@@ -1,15 +1,16 @@
 """Kernels of pixels between the rays of a lattice: values, where they are in doubt, the adjoint.
 
-A thread does `length` pixels, or a row of the lattice.
+An item is `length` pixels, or a row of the lattice.
 """
 
+from __future__ import annotations
+
 import functools
-from typing import Any
 
-import warp as wp
+from ddrecon.kernels.text import BLOCK, TextKernel
 
-from ddrecon.kernels.native import number_type, program
-
+_LATTICE = "F *values; int channels, rows, columns;"
+_PIXELS = _LATTICE + "int length, total, pixels; F *places; long *hit;"
 # A pixel's 12 neighbors in the lattice, and their weights: linear weights less a (1 - a) / 2 times
 # second differences along each axis (`numerics.third_order`); beyond its ends the lattice repeats.
 _STENCIL = """
@@ -42,36 +43,34 @@ auto stencil_at = [](F row, F column, int rows, int columns) -> Stencil {
 };
 """
 _INTERPOLATE = """
-const int rows = values.shape[1], columns = values.shape[2], size = rows * columns;
-const long long rays = out.shape[1];
-for (int n = first; n < last; ++n) {
-    const long long r = hit.data[n];
-    const Stencil s = stencil_at(places.data[2 * n], places.data[2 * n + 1], rows, columns);
-    for (int k = 0; k < values.shape[0]; ++k) {
-        const F* __restrict v = &values.data[k * size];
+const int size = rows * columns;
+for (int n = begin; n < end; ++n) {
+    const long long r = hit[n];
+    const Stencil s = stencil_at(places[2 * n], places[2 * n + 1], rows, columns);
+    for (int k = 0; k < channels; ++k) {
+        const F* __restrict v = &values[k * size];
         F total = F(0);
         for (int m = 0; m < 12; ++m) total += s.weight[m] * v[s.index[m]];
-        out.data[k * rays + r] = total < F(0) ? F(0) : total;
+        out[k * (long long)pixels + r] = total < F(0) ? F(0) : total;
     }
-    const F* __restrict u = &uneven.data[s.corner];
+    const F* __restrict u = &uneven[s.corner];
     const F one = u[0] > u[1] ? u[0] : u[1], other = u[columns] > u[columns + 1] ? u[columns]
         : u[columns + 1];
-    rough.data[n] = (one > other ? one : other) > bound.data[0];
+    rough[n] = (one > other ? one : other) > bound[0];
 }
 """
 _SPREAD = """
-const int rows = values.shape[1], columns = values.shape[2], size = rows * columns;
-const long long rays = out_bar.shape[1];
-for (int n = first; n < last; ++n) {
-    const long long r = hit.data[n];
-    const Stencil s = stencil_at(places.data[2 * n], places.data[2 * n + 1], rows, columns);
-    for (int k = 0; k < values.shape[0]; ++k) {
-        const F* __restrict v = &values.data[k * size];
-        F* __restrict v_bar = &values_bar.data[k * size];
+const int size = rows * columns;
+for (int n = begin; n < end; ++n) {
+    const long long r = hit[n];
+    const Stencil s = stencil_at(places[2 * n], places[2 * n + 1], rows, columns);
+    for (int k = 0; k < channels; ++k) {
+        const F* __restrict v = &values[k * size];
+        F* __restrict v_bar = &values_bar[k * size];
         F total = F(0);
         for (int m = 0; m < 12; ++m) total += s.weight[m] * v[s.index[m]];
         // What was held at zero does not move.
-        const F bar = total < F(0) ? F(0) : out_bar.data[k * rays + r];
+        const F bar = total < F(0) ? F(0) : out_bar[k * (long long)pixels + r];
 #if defined(__CUDA_ARCH__)
         for (int m = 0; m < 12; ++m) atomicAdd(&v_bar[s.index[m]], s.weight[m] * bar);
 #else
@@ -83,9 +82,9 @@ for (int n = first; n < last; ++n) {
 # Fourth differences of radiance and of what is seen of `behind`, their magnitudes summed; and the
 # sum of the squares of what is seen, of a row.
 _JUDGE = """
-const int rows = values.shape[1], columns = values.shape[2], size = rows * columns;
-const int colors = values.shape[0] / 2;
-const F light = behind.data[0];
+const int size = rows * columns;
+const int colors = channels / 2, row = item;
+const F light = behind[0];
 auto fourth = [](const F* v, int at, int count, int stride) -> F {
     auto value = [&](int i) -> F {
         return v[(i < 0 ? 0 : (i < count ? i : count - 1)) * stride];
@@ -101,119 +100,42 @@ double square = 0.0;
 for (int j = 0; j < columns; ++j) {
     F total = F(0);
     for (int k = 0; k < 2 * colors; ++k) {
-        const F* __restrict v = &values.data[k * size];
+        const F* __restrict v = &values[k * size];
         const F part = fourth(v + j, row, rows, columns) + fourth(v + row * columns, j, columns, 1);
         total += (k < colors ? F(1) : light) * part;
     }
-    uneven.data[row * columns + j] = total;
+    uneven[row * columns + j] = total;
     for (int k = 0; k < colors; ++k) {
         const int cell = k * size + row * columns + j;
-        const F seen = values.data[cell] + light * (F(1) - values.data[colors * size + cell]);
+        const F seen = values[cell] + light * (F(1) - values[colors * size + cell]);
         square += (double)(seen * seen);
     }
 }
-squares.data[row] = square;
+squares[row] = square;
 """
 
 
 @functools.cache
-def judge_kernel(bits: int) -> Any:
+def judge_kernel(bits: int) -> TextKernel:
     """The kernel that finds `uneven` [r, c], and sums of `squares` [r] of what is seen.
 
     Of `values` [2 C, r, c], radiance and opacity, with light `behind` [1].
     """
-    F: Any = number_type(bits)
-
-    @wp.func_native(program(bits, _JUDGE))
-    def judge_row(
-        row: int,
-        values: wp.array3d(dtype=F),
-        behind: wp.array(dtype=F),
-        uneven: wp.array2d(dtype=F),
-        squares: wp.array(dtype=wp.float64),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def judge(
-        first: int,
-        values: wp.array3d(dtype=F),
-        behind: wp.array(dtype=F),
-        uneven: wp.array2d(dtype=F),
-        squares: wp.array(dtype=wp.float64),
-    ):
-        judge_row(first + wp.tid(), values, behind, uneven, squares)
-
-    return judge
+    return TextKernel("judge", bits, _JUDGE, _LATTICE + "F *behind, *uneven; double *squares")
 
 
 @functools.cache
-def interpolation_kernel(bits: int) -> Any:
-    """The kernel of values at `places` [P, 2]: those of `out` [2 C, R] at rays `hit` [P].
+def interpolation_kernel(bits: int) -> TextKernel:
+    """The kernel of values at `places` [P, 2]: those of `out` [2 C, pixels] at rays `hit` [P].
 
     And which of them are `rough` [P]: whose neighbors are more `uneven` than `bound` [1].
     """
-    F: Any = number_type(bits)
-
-    @wp.func_native(program(bits, _STENCIL + _INTERPOLATE))
-    def interpolate_some(
-        first: int,
-        last: int,
-        values: wp.array3d(dtype=F),
-        places: wp.array2d(dtype=F),
-        hit: wp.array(dtype=wp.int64),
-        uneven: wp.array2d(dtype=F),
-        bound: wp.array(dtype=F),
-        out: wp.array2d(dtype=F),
-        rough: wp.array(dtype=wp.bool),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def interpolate(
-        first: int,
-        length: int,
-        values: wp.array3d(dtype=F),
-        places: wp.array2d(dtype=F),
-        hit: wp.array(dtype=wp.int64),
-        uneven: wp.array2d(dtype=F),
-        bound: wp.array(dtype=F),
-        out: wp.array2d(dtype=F),
-        rough: wp.array(dtype=wp.bool),
-    ):
-        begin = (first + wp.tid()) * length
-        end = wp.min(begin + length, places.shape[0])
-        interpolate_some(begin, end, values, places, hit, uneven, bound, out, rough)
-
-    return interpolate
+    text, more = BLOCK + _STENCIL + _INTERPOLATE, "F *uneven, *bound, *out; bool *rough"
+    return TextKernel("interpolate", bits, text, _PIXELS + more)
 
 
 @functools.cache
-def spread_kernel(bits: int) -> Any:
-    """The kernel that adds to `values_bar` [2 C, r, c] what `out_bar` [2 C, R] is for them."""
-    F: Any = number_type(bits)
-
-    @wp.func_native(program(bits, _STENCIL + _SPREAD))
-    def spread_some(
-        first: int,
-        last: int,
-        values: wp.array3d(dtype=F),
-        places: wp.array2d(dtype=F),
-        hit: wp.array(dtype=wp.int64),
-        out_bar: wp.array2d(dtype=F),
-        values_bar: wp.array3d(dtype=F),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def spread(
-        first: int,
-        length: int,
-        values: wp.array3d(dtype=F),
-        places: wp.array2d(dtype=F),
-        hit: wp.array(dtype=wp.int64),
-        out_bar: wp.array2d(dtype=F),
-        values_bar: wp.array3d(dtype=F),
-    ):
-        begin = (first + wp.tid()) * length
-        end = wp.min(begin + length, places.shape[0])
-        spread_some(begin, end, values, places, hit, out_bar, values_bar)
-
-    return spread
+def spread_kernel(bits: int) -> TextKernel:
+    """The kernel that adds to `values_bar` [2 C, r, c] what `out_bar` [2 C, pixels] is for them."""
+    text, more = BLOCK + _STENCIL + _SPREAD, "F *out_bar, *values_bar"
+    return TextKernel("spread", bits, text, _PIXELS + more)

@@ -6,6 +6,7 @@ each axis), the slopes of both, and their adjoint.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -15,20 +16,17 @@ from ddrecon.march.fused.rays import vectors
 
 
 @functools.cache
-def planes(layout: Layout) -> SimpleNamespace:
-    """Functions of cells [n, h, w, channels], the slice n, and places along h and w."""
-    types = vectors(layout)
-    F, Node, Bent = types.F, types.Node, types.Bent
-    Place, Pair = lines(F).Place, wp.types.vector(length=2, dtype=F)
-    channels, first = layout.channels, layout.first_mass
-    last = first + layout.masses
+def values(layout: Layout) -> SimpleNamespace:
+    """Linear values of cells [n, h, w, channels] in slice n, at places along h and w; slopes."""
+    t, Place = vectors(layout), lines(vectors(layout).F).Place
+    channels = layout.channels
 
     @wp.func
-    def linear(f: wp.array4d(dtype=F), n: int, y: Place, x: Place) -> Node:
-        v = Node()
-        w00 = (F(1.0) - y.a) * (F(1.0) - x.a)
-        w01 = (F(1.0) - y.a) * x.a
-        w10 = y.a * (F(1.0) - x.a)
+    def linear(f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place) -> t.Node:
+        v = t.Node()
+        w00 = (t.F(1.0) - y.a) * (t.F(1.0) - x.a)
+        w01 = (t.F(1.0) - y.a) * x.a
+        w10 = y.a * (t.F(1.0) - x.a)
         w11 = y.a * x.a
         for c in range(wp.static(channels)):
             v[c] = (
@@ -40,88 +38,126 @@ def planes(layout: Layout) -> SimpleNamespace:
         return v
 
     @wp.func
-    def linear_slope(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, along_y: bool) -> Node:
-        v = Node()
+    def linear_slope(f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, along_y: bool) -> t.Node:
+        v = t.Node()
         for c in range(wp.static(channels)):
             if along_y:
                 v[c] = y.live * (
-                    (F(1.0) - x.a) * (f[n, y.j, x.i, c] - f[n, y.i, x.i, c])
+                    (t.F(1.0) - x.a) * (f[n, y.j, x.i, c] - f[n, y.i, x.i, c])
                     + x.a * (f[n, y.j, x.j, c] - f[n, y.i, x.j, c])
                 )
             else:
                 v[c] = x.live * (
-                    (F(1.0) - y.a) * (f[n, y.i, x.j, c] - f[n, y.i, x.i, c])
+                    (t.F(1.0) - y.a) * (f[n, y.i, x.j, c] - f[n, y.i, x.i, c])
                     + y.a * (f[n, y.j, x.j, c] - f[n, y.j, x.i, c])
                 )
         return v
 
-    @wp.func
-    def weights(x: Place) -> Pair:
-        """Those of linear interpolation between the cells i and j."""
-        return Pair(F(1.0) - x.a, x.a)
+    return SimpleNamespace(linear=linear, linear_slope=linear_slope)
+
+
+@functools.cache
+def _bends(layout: Layout) -> SimpleNamespace:
+    """Second differences of masses in cells i and j of both lines, weighted v and w."""
+    t, Place = vectors(layout), lines(vectors(layout).F).Place
+    Pair = wp.types.vector(length=2, dtype=t.F)
+    first = layout.first_mass
 
     @wp.func
-    def bends_along_y(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, v: Pair, w: Pair) -> Bent:
-        """Second differences of masses along y in cells i and j of both lines, weighted v and w."""
-        out = Bent()
+    def bends_along_y(
+        f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, v: Pair, w: Pair
+    ) -> t.Bent:
+        """Those along y."""
+        out = t.Bent()
         for k in range(wp.static(layout.masses)):
             c = wp.static(first) + k
             f00 = f[n, y.i, x.i, c]
             f01 = f[n, y.i, x.j, c]
             f10 = f[n, y.j, x.i, c]
             f11 = f[n, y.j, x.j, c]
-            before = w[0] * (f[n, y.m, x.i, c] - F(2.0) * f00 + f10)
-            before += w[1] * (f[n, y.m, x.j, c] - F(2.0) * f01 + f11)
-            behind = w[0] * (f00 - F(2.0) * f10 + f[n, y.p, x.i, c])
-            behind += w[1] * (f01 - F(2.0) * f11 + f[n, y.p, x.j, c])
+            before = w[0] * (f[n, y.m, x.i, c] - t.F(2.0) * f00 + f10)
+            before += w[1] * (f[n, y.m, x.j, c] - t.F(2.0) * f01 + f11)
+            behind = w[0] * (f00 - t.F(2.0) * f10 + f[n, y.p, x.i, c])
+            behind += w[1] * (f01 - t.F(2.0) * f11 + f[n, y.p, x.j, c])
             out[k] = v[0] * before + v[1] * behind
         return out
 
     @wp.func
-    def bends_along_x(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, v: Pair, w: Pair) -> Bent:
-        """The same along x."""
-        out = Bent()
+    def bends_along_x(
+        f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, v: Pair, w: Pair
+    ) -> t.Bent:
+        """Those along x."""
+        out = t.Bent()
         for k in range(wp.static(layout.masses)):
             c = wp.static(first) + k
             f00 = f[n, y.i, x.i, c]
             f01 = f[n, y.i, x.j, c]
             f10 = f[n, y.j, x.i, c]
             f11 = f[n, y.j, x.j, c]
-            before = v[0] * (f[n, y.i, x.m, c] - F(2.0) * f00 + f01)
-            before += v[1] * (f[n, y.j, x.m, c] - F(2.0) * f10 + f11)
-            behind = v[0] * (f00 - F(2.0) * f01 + f[n, y.i, x.p, c])
-            behind += v[1] * (f10 - F(2.0) * f11 + f[n, y.j, x.p, c])
+            before = v[0] * (f[n, y.i, x.m, c] - t.F(2.0) * f00 + f01)
+            before += v[1] * (f[n, y.j, x.m, c] - t.F(2.0) * f10 + f11)
+            behind = v[0] * (f00 - t.F(2.0) * f01 + f[n, y.i, x.p, c])
+            behind += v[1] * (f10 - t.F(2.0) * f11 + f[n, y.j, x.p, c])
             out[k] = w[0] * before + w[1] * behind
         return out
 
+    return SimpleNamespace(along_y=bends_along_y, along_x=bends_along_x)
+
+
+@functools.cache
+def corrections(layout: Layout) -> SimpleNamespace:
+    """The third-order corrections of masses there, and their slopes."""
+    t, Place = vectors(layout), lines(vectors(layout).F).Place
+    Pair = wp.types.vector(length=2, dtype=t.F)
+    bends = _bends(layout)
+
     @wp.func
-    def correction(f: wp.array4d(dtype=F), n: int, y: Place, x: Place) -> Bent:
+    def weights(x: Place) -> Pair:
+        """Those of linear interpolation between the cells i and j."""
+        return Pair(t.F(1.0) - x.a, x.a)
+
+    @wp.func
+    def correction(f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place) -> t.Bent:
         """What linear interpolation is off by: a (1 - a) / 2 second differences an axis."""
         v = weights(y)
         w = weights(x)
-        along_y = bends_along_y(f, n, y, x, v, w)
-        return y.excess * along_y + x.excess * bends_along_x(f, n, y, x, v, w)
+        along_y = bends.along_y(f, n, y, x, v, w)
+        return y.excess * along_y + x.excess * bends.along_x(f, n, y, x, v, w)
 
     @wp.func
-    def correction_slope(f: wp.array4d(dtype=F), n: int, y: Place, x: Place, along_y: bool) -> Bent:
+    def correction_slope(
+        f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, along_y: bool
+    ) -> t.Bent:
         """Its derivative along y, or x: of the excess there, and of the weights."""
         v = weights(y)
         w = weights(x)
-        step = Pair(F(-1.0), F(1.0))
+        step = Pair(t.F(-1.0), t.F(1.0))
         if along_y:
-            by_excess = y.excess_slope * bends_along_y(f, n, y, x, v, w)
-            by_weights = y.excess * bends_along_y(f, n, y, x, step, w)
-            return y.live * (by_excess + by_weights + x.excess * bends_along_x(f, n, y, x, step, w))
-        by_excess = x.excess_slope * bends_along_x(f, n, y, x, v, w)
-        by_weights = x.excess * bends_along_x(f, n, y, x, v, step)
-        return x.live * (by_excess + by_weights + y.excess * bends_along_y(f, n, y, x, v, step))
+            by_excess = y.excess_slope * bends.along_y(f, n, y, x, v, w)
+            by_weights = y.excess * bends.along_y(f, n, y, x, step, w)
+            return y.live * (by_excess + by_weights + x.excess * bends.along_x(f, n, y, x, step, w))
+        by_excess = x.excess_slope * bends.along_x(f, n, y, x, v, w)
+        by_weights = x.excess * bends.along_x(f, n, y, x, v, step)
+        return x.live * (by_excess + by_weights + y.excess * bends.along_y(f, n, y, x, v, step))
+
+    return SimpleNamespace(correction=correction, correction_slope=correction_slope)
+
+
+@functools.cache
+def spreading(layout: Layout) -> Any:
+    """The adjoint of linear values and corrections."""
+    t, Place = vectors(layout), lines(vectors(layout).F).Place
+    channels, first = layout.channels, layout.first_mass
+    last = first + layout.masses
 
     @wp.func
-    def scatter(g: wp.array4d(dtype=F), n: int, y: Place, x: Place, bar: Node, t: Bent):
-        """Adds what `bar` of linear values and `t` of corrections mean for the cells."""
-        w00 = (F(1.0) - y.a) * (F(1.0) - x.a)
-        w01 = (F(1.0) - y.a) * x.a
-        w10 = y.a * (F(1.0) - x.a)
+    def scatter(
+        g: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, bar: t.Node, bent_bar: t.Bent
+    ):
+        """Adds what `bar` of linear values and `bent_bar` of corrections mean for the cells."""
+        w00 = (t.F(1.0) - y.a) * (t.F(1.0) - x.a)
+        w01 = (t.F(1.0) - y.a) * x.a
+        w10 = y.a * (t.F(1.0) - x.a)
         w11 = y.a * x.a
         for c in range(wp.static(channels)):
             g00 = w00 * bar[c]
@@ -130,8 +166,8 @@ def planes(layout: Layout) -> SimpleNamespace:
             g11 = w11 * bar[c]
             if wp.static(layout.masses > 0):  # noqa: SIM102 - static conditions stand alone
                 if c >= wp.static(first) and c < wp.static(last):
-                    ty = y.excess * t[c - wp.static(first)]
-                    tx = x.excess * t[c - wp.static(first)]
+                    ty = y.excess * bent_bar[c - wp.static(first)]
+                    tx = x.excess * bent_bar[c - wp.static(first)]
                     wp.atomic_add(g, n, y.m, x.i, c, ty * w00)
                     wp.atomic_add(g, n, y.m, x.j, c, ty * w01)
                     wp.atomic_add(g, n, y.p, x.i, c, ty * w10)
@@ -140,19 +176,13 @@ def planes(layout: Layout) -> SimpleNamespace:
                     wp.atomic_add(g, n, y.j, x.m, c, tx * w10)
                     wp.atomic_add(g, n, y.i, x.p, c, tx * w01)
                     wp.atomic_add(g, n, y.j, x.p, c, tx * w11)
-                    g00 += ty * (w10 - F(2.0) * w00) + tx * (w01 - F(2.0) * w00)
-                    g01 += ty * (w11 - F(2.0) * w01) + tx * (w00 - F(2.0) * w01)
-                    g10 += ty * (w00 - F(2.0) * w10) + tx * (w11 - F(2.0) * w10)
-                    g11 += ty * (w01 - F(2.0) * w11) + tx * (w10 - F(2.0) * w11)
+                    g00 += ty * (w10 - t.F(2.0) * w00) + tx * (w01 - t.F(2.0) * w00)
+                    g01 += ty * (w11 - t.F(2.0) * w01) + tx * (w00 - t.F(2.0) * w01)
+                    g10 += ty * (w00 - t.F(2.0) * w10) + tx * (w11 - t.F(2.0) * w10)
+                    g11 += ty * (w01 - t.F(2.0) * w11) + tx * (w10 - t.F(2.0) * w11)
             wp.atomic_add(g, n, y.i, x.i, c, g00)
             wp.atomic_add(g, n, y.i, x.j, c, g01)
             wp.atomic_add(g, n, y.j, x.i, c, g10)
             wp.atomic_add(g, n, y.j, x.j, c, g11)
 
-    return SimpleNamespace(
-        linear=linear,
-        linear_slope=linear_slope,
-        correction=correction,
-        correction_slope=correction_slope,
-        scatter=scatter,
-    )
+    return scatter

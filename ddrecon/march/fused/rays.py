@@ -35,9 +35,8 @@ def vectors(layout: Layout) -> SimpleNamespace:
 
 @functools.cache
 def ray_types(layout: Layout) -> SimpleNamespace:
-    """The records `Bundle` (what a kernel is given), `Ray` and `Change`."""
-    types = vectors(layout)
-    F, Color, PerBeam, Triple = types.F, types.Color, types.PerBeam, types.Triple
+    """The records `Bundle` (what a kernel is given), `Ray`, and `Stop`, a ray at a node."""
+    t = vectors(layout)
 
     @wp.struct
     class Bundle:
@@ -49,121 +48,122 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         E13; `numbers`: scale and peak by color, g, bound of third-order corrections.
         """
 
-        planes: wp.array(dtype=F)
-        cells: wp.array4d(dtype=F)
-        rays: wp.array2d(dtype=F)
-        angles: wp.array2d(dtype=F)
-        coefficients: wp.array2d(dtype=F)
-        numbers: wp.array(dtype=F)
+        planes: wp.array(dtype=t.F)
+        cells: wp.array4d(dtype=t.F)
+        rays: wp.array2d(dtype=t.F)
+        angles: wp.array2d(dtype=t.F)
+        coefficients: wp.array2d(dtype=t.F)
+        numbers: wp.array(dtype=t.F)
 
     @wp.struct
     class Ray:
         """One of them; its cotangent and its tangent have the same fields."""
 
         index: int
-        origin: Triple
-        direction: Triple
-        near: F
-        far: F
-        foot: PerBeam
-        across: PerBeam
-        scale: Color
-        peak: Color
-        g: F
-        bound: F
+        origin: t.Triple
+        direction: t.Triple
+        near: t.F
+        far: t.F
+        foot: t.PerBeam
+        across: t.PerBeam
+        scale: t.Color
+        peak: t.Color
+        g: t.F
+        bound: t.F
 
-    return SimpleNamespace(Bundle=Bundle, Ray=Ray)
+    @wp.struct
+    class Stop:
+        """A ray at a node; its cotangent and its tangent have the same fields.
+
+        Distances: `s` that it is sampled at, `held` within the box. The place `q` in cells; values
+        `v`, those of masses less corrections by `bent`. Of each output: emission `w`, depth `u`,
+        `decay` exp(-u), and `p`.
+        """
+
+        s: t.F
+        held: t.F
+        q: t.Triple
+        v: t.Node
+        bent: t.Bent
+        w: t.Out
+        u: t.Out
+        decay: t.Out
+        p: t.Out
+
+    return SimpleNamespace(Bundle=Bundle, Ray=Ray, Stop=Stop)
 
 
 @functools.cache
-def steps(layout: Layout, is_sliced: bool) -> SimpleNamespace:
-    """The functions below for rays of `layout`, whose nodes lie in slices or at equal steps."""
-    types, records = vectors(layout), ray_types(layout)
-    F, Node, Mass, Out, Bent = types.F, types.Node, types.Mass, types.Out, types.Bent
-    Total = types.Total
-    Bundle, Ray = records.Bundle, records.Ray
-    C, K, BEAMS, FIRST, MASSES = (
-        layout.colors,
-        layout.extinction,
-        len(layout.beams),
-        layout.first_mass,
-        layout.masses,
-    )
+def loading(layout: Layout) -> Any:
+    """The function that reads a ray of `layout`."""
+    records = ray_types(layout)
 
     @wp.func
-    def load_ray(given: Bundle, r: int) -> Ray:
-        ray = Ray()
+    def load_ray(given: records.Bundle, r: int) -> records.Ray:
+        ray = records.Ray()
         ray.index = r
         for axis in range(3):
             ray.origin[axis] = given.rays[r, axis]
             ray.direction[axis] = given.rays[r, 3 + axis]
         ray.near = given.rays[r, 6]
         ray.far = given.rays[r, 7]
-        for b in range(wp.static(BEAMS)):
+        for b in range(wp.static(len(layout.beams))):
             ray.foot[b] = given.angles[b, r]
-            ray.across[b] = given.angles[wp.static(BEAMS) + b, r]
-        for c in range(wp.static(C)):
+            ray.across[b] = given.angles[wp.static(len(layout.beams)) + b, r]
+        for c in range(wp.static(layout.colors)):
             ray.scale[c] = given.numbers[c]
-            ray.peak[c] = given.numbers[wp.static(C) + c]
-        ray.g = given.numbers[wp.static(2 * C)]
-        ray.bound = given.numbers[wp.static(2 * C + 1)]
+            ray.peak[c] = given.numbers[wp.static(layout.colors) + c]
+        ray.g = given.numbers[wp.static(2 * layout.colors)]
+        ray.bound = given.numbers[wp.static(2 * layout.colors + 1)]
         return ray
 
+    return load_ray
+
+
+@functools.cache
+def places(layout: Layout, is_sliced: bool) -> SimpleNamespace:
+    """Where nodes of rays of `layout` are: in slices, or at equal steps."""
+    t, Ray = vectors(layout), ray_types(layout).Ray
+
     @wp.func
-    def place(ray: Ray, plane: F) -> F:
+    def place(ray: Ray, plane: t.F) -> t.F:
         """The distance at which a node is sampled [u]."""
         if wp.static(is_sliced):
             return (plane - ray.origin[0]) / ray.direction[0]
         return ray.near + plane * (ray.far - ray.near)
 
     @wp.func
-    def hold(ray: Ray, distance: F) -> F:
+    def hold(ray: Ray, distance: t.F) -> t.F:
         """The same held within the box: the distance of the node."""
         if wp.static(is_sliced):
             return wp.min(wp.max(distance, ray.near), ray.far)
         return distance
 
-    @wp.func
-    def subtract_corrections(v: Node, x: Bent, bound: F) -> Node:
-        """Values `v` with masses to third order: less x / sqrt(1 + (bound x)^2)."""
-        for k in range(wp.static(MASSES)):
-            root = wp.sqrt(F(1.0) + bound * bound * x[k] * x[k])
-            v[wp.static(FIRST) + k] = v[wp.static(FIRST) + k] - x[k] / root
-        return v
+    return SimpleNamespace(place=place, hold=hold)
+
+
+@functools.cache
+def masses(layout: Layout) -> SimpleNamespace:
+    """Masses along rays of `layout` (E1)."""
+    t = vectors(layout)
 
     @wp.func
-    def add_mass(total: Total, v0: Node, v1: Node, length: F) -> Total:
+    def add_mass(total: t.Total, v0: t.Node, v1: t.Node, length: t.F) -> t.Total:
         """The mass `total` with that of a segment, in which extinction is linear.
 
         Masses are added up in double precision: on the walk back they are subtracted again, and in
         front of an opaque volume little is left of much.
         """
-        for k in range(wp.static(K)):
-            total[k] = total[k] + wp.float64(F(0.5) * (v0[k] + v1[k]) * length)
+        for k in range(wp.static(layout.extinction)):
+            total[k] = total[k] + wp.float64(t.F(0.5) * (v0[k] + v1[k]) * length)
         return total
 
     @wp.func
-    def mass_of(total: Total) -> Mass:
+    def mass_of(total: t.Total) -> t.Mass:
         """The same in the precision of all else."""
-        m = Mass()
-        for k in range(wp.static(K)):
-            m[k] = F(total[k])
+        m = t.Mass()
+        for k in range(wp.static(layout.extinction)):
+            m[k] = t.F(total[k])
         return m
 
-    @wp.func
-    def decays(depth: Out) -> Out:
-        """exp(-depth) of each output."""
-        out = Out()
-        for i in range(wp.static(layout.outputs)):
-            out[i] = wp.exp(-depth[i])
-        return out
-
-    return SimpleNamespace(
-        load_ray=load_ray,
-        place=place,
-        hold=hold,
-        subtract_corrections=subtract_corrections,
-        add_mass=add_mass,
-        mass_of=mass_of,
-        decays=decays,
-    )
+    return SimpleNamespace(add_mass=add_mass, mass_of=mass_of)

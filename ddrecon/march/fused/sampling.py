@@ -1,4 +1,7 @@
-"""Values at a node, inside fused kernels: in the slice it lies in, or between two slices."""
+"""Values at a node, inside fused kernels: in the slice it lies in, or between two slices.
+
+Functions of cells [n, h, w, channels] and a place q (plane, row, column) in them, in cells.
+"""
 
 import functools
 from types import SimpleNamespace
@@ -7,174 +10,218 @@ import warp as wp
 
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.lines import lines
-from ddrecon.march.fused.planes import planes
+from ddrecon.march.fused.planes import corrections, spreading, values
 from ddrecon.march.fused.rays import vectors
 
 
 @functools.cache
 def sampling(layout: Layout, is_sliced: bool) -> SimpleNamespace:
-    """Functions of cells [n, h, w, channels] and a place q (plane, row, column) in them, in cells.
+    """`sample` for linear values, `correct` for masses' corrections, `spread` for their adjoint."""
+    return _in_slices(layout) if is_sliced else _between_slices(layout)
 
-    `sample` are linear values and `correct` the third-order corrections of masses, `slope` and
-    `correct_slope` their derivatives along an axis, and `spread` the adjoint of both.
-    """
-    types, line, plane = vectors(layout), lines(vectors(layout).F), planes(layout)
-    F, Node, Bent, Triple = types.F, types.Node, types.Bent, types.Triple
-    MASSES, first = layout.masses, layout.first_mass
-    Place, at, at_side, is_on_kink = line.Place, line.at, line.at_side, line.is_on_kink
-    linear, linear_slope, scatter = plane.linear, plane.linear_slope, plane.scatter
-    correction, correction_slope = plane.correction, plane.correction_slope
 
-    if is_sliced:
-
-        @wp.func
-        def sample(f: wp.array4d(dtype=F), n: int, q: Triple) -> Node:
-            return linear(f, n, at(q[1], f.shape[1]), at(q[2], f.shape[2]))
-
-        @wp.func
-        def correct(f: wp.array4d(dtype=F), n: int, q: Triple) -> Bent:
-            return correction(f, n, at(q[1], f.shape[1]), at(q[2], f.shape[2]))
-
-        @wp.func
-        def spread(g: wp.array4d(dtype=F), n: int, q: Triple, bar: Node, t: Bent):
-            scatter(g, n, at(q[1], g.shape[1]), at(q[2], g.shape[2]), bar, t)
-
-        @wp.func
-        def side_slope(f: wp.array4d(dtype=F), n: int, q: Triple, axis: int, side: F) -> Node:
-            return linear_slope(
-                f, n, at_side(q[1], f.shape[1], side), at_side(q[2], f.shape[2], side), axis == 1
-            )
-
-        @wp.func
-        def side_correction_slope(
-            f: wp.array4d(dtype=F), n: int, q: Triple, axis: int, side: F
-        ) -> Bent:
-            return correction_slope(
-                f, n, at_side(q[1], f.shape[1], side), at_side(q[2], f.shape[2], side), axis == 1
-            )
-    else:
-
-        @wp.func
-        def sample(f: wp.array4d(dtype=F), n: int, q: Triple) -> Node:
-            z = at(q[0], f.shape[0])
-            y = at(q[1], f.shape[1])
-            x = at(q[2], f.shape[2])
-            return (F(1.0) - z.a) * linear(f, z.i, y, x) + z.a * linear(f, z.j, y, x)
-
-        @wp.func
-        def pick(v: Node) -> Bent:
-            out = Bent()
-            for k in range(wp.static(MASSES)):
-                out[k] = v[wp.static(first) + k]
-            return out
-
-        @wp.func
-        def across(f: wp.array4d(dtype=F), z: Place, y: Place, x: Place, z0: F, z1: F) -> Bent:
-            m = pick(linear(f, z.m, y, x))
-            i = pick(linear(f, z.i, y, x))
-            j = pick(linear(f, z.j, y, x))
-            p = pick(linear(f, z.p, y, x))
-            return z0 * (m - F(2.0) * i + j) + z1 * (i - F(2.0) * j + p)
-
-        @wp.func
-        def across_slope(
-            f: wp.array4d(dtype=F), z: Place, y: Place, x: Place, along_y: bool
-        ) -> Bent:
-            m = pick(linear_slope(f, z.m, y, x, along_y))
-            i = pick(linear_slope(f, z.i, y, x, along_y))
-            j = pick(linear_slope(f, z.j, y, x, along_y))
-            p = pick(linear_slope(f, z.p, y, x, along_y))
-            return (F(1.0) - z.a) * (m - F(2.0) * i + j) + z.a * (i - F(2.0) * j + p)
-
-        @wp.func
-        def correct(f: wp.array4d(dtype=F), n: int, q: Triple) -> Bent:
-            z = at(q[0], f.shape[0])
-            y = at(q[1], f.shape[1])
-            x = at(q[2], f.shape[2])
-            return (
-                (F(1.0) - z.a) * correction(f, z.i, y, x)
-                + z.a * correction(f, z.j, y, x)
-                + z.excess * across(f, z, y, x, F(1.0) - z.a, z.a)
-            )
-
-        @wp.func
-        def spread(g: wp.array4d(dtype=F), n: int, q: Triple, bar: Node, t: Bent):
-            z = at(q[0], g.shape[0])
-            y = at(q[1], g.shape[1])
-            x = at(q[2], g.shape[2])
-            z0 = F(1.0) - z.a
-            bar_i = z0 * bar
-            bar_j = z.a * bar
-            if wp.static(MASSES > 0):
-                bar_m = Node()
-                bar_p = Node()
-                for k in range(wp.static(MASSES)):
-                    s = z.excess * t[k]
-                    bar_m[wp.static(first) + k] = s * z0
-                    bar_p[wp.static(first) + k] = s * z.a
-                    bar_i[wp.static(first) + k] += s * (z.a - F(2.0) * z0)
-                    bar_j[wp.static(first) + k] += s * (z0 - F(2.0) * z.a)
-                none = Bent()
-                scatter(g, z.m, y, x, bar_m, none)
-                scatter(g, z.p, y, x, bar_p, none)
-            scatter(g, z.i, y, x, bar_i, z0 * t)
-            scatter(g, z.j, y, x, bar_j, z.a * t)
-
-        @wp.func
-        def side_slope(f: wp.array4d(dtype=F), n: int, q: Triple, axis: int, side: F) -> Node:
-            z = at_side(q[0], f.shape[0], side)
-            y = at_side(q[1], f.shape[1], side)
-            x = at_side(q[2], f.shape[2], side)
-            if axis == 0:
-                return z.live * (linear(f, z.j, y, x) - linear(f, z.i, y, x))
-            return (F(1.0) - z.a) * linear_slope(f, z.i, y, x, axis == 1) + z.a * linear_slope(
-                f, z.j, y, x, axis == 1
-            )
-
-        @wp.func
-        def side_correction_slope(
-            f: wp.array4d(dtype=F), n: int, q: Triple, axis: int, side: F
-        ) -> Bent:
-            z = at_side(q[0], f.shape[0], side)
-            y = at_side(q[1], f.shape[1], side)
-            x = at_side(q[2], f.shape[2], side)
-            if axis == 0:
-                return z.live * (
-                    correction(f, z.j, y, x)
-                    - correction(f, z.i, y, x)
-                    + z.excess_slope * across(f, z, y, x, F(1.0) - z.a, z.a)
-                    + z.excess * across(f, z, y, x, F(-1.0), F(1.0))
-                )
-            return (
-                (F(1.0) - z.a) * correction_slope(f, z.i, y, x, axis == 1)
-                + z.a * correction_slope(f, z.j, y, x, axis == 1)
-                + z.excess * across_slope(f, z, y, x, axis == 1)
-            )
+@functools.cache
+def slopes(layout: Layout, is_sliced: bool) -> SimpleNamespace:
+    """Derivatives of `sample` and `correct` along an axis; on a kink the mean of both sides."""
+    t, line = vectors(layout), lines(vectors(layout).F)
+    side = _slopes_in_slices(layout) if is_sliced else _slopes_between_slices(layout)
 
     @wp.func
-    def any_kink(f: wp.array4d(dtype=F), q: Triple) -> bool:
+    def any_kink(f: wp.array4d(dtype=t.F), q: t.Triple) -> bool:
         return (
-            is_on_kink(q[1], f.shape[1])
-            or is_on_kink(q[2], f.shape[2])
-            or (wp.static(not is_sliced) and is_on_kink(q[0], f.shape[0]))
+            line.is_on_kink(q[1], f.shape[1])
+            or line.is_on_kink(q[2], f.shape[2])
+            or (wp.static(not is_sliced) and line.is_on_kink(q[0], f.shape[0]))
         )
 
     @wp.func
-    def slope(f: wp.array4d(dtype=F), n: int, q: Triple, axis: int) -> Node:
-        """The mean of both sides where the place is on a kink."""
+    def slope(f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int) -> t.Node:
         if any_kink(f, q):
-            return F(0.5) * (side_slope(f, n, q, axis, F(-1.0)) + side_slope(f, n, q, axis, F(1.0)))
-        return side_slope(f, n, q, axis, F(0.0))
+            before = side.slope(f, n, q, axis, t.F(-1.0))
+            return t.F(0.5) * (before + side.slope(f, n, q, axis, t.F(1.0)))
+        return side.slope(f, n, q, axis, t.F(0.0))
 
     @wp.func
-    def correct_slope(f: wp.array4d(dtype=F), n: int, q: Triple, axis: int) -> Bent:
+    def correct_slope(f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int) -> t.Bent:
         if any_kink(f, q):
-            return F(0.5) * (
-                side_correction_slope(f, n, q, axis, F(-1.0))
-                + side_correction_slope(f, n, q, axis, F(1.0))
-            )
-        return side_correction_slope(f, n, q, axis, F(0.0))
+            before = side.correct_slope(f, n, q, axis, t.F(-1.0))
+            return t.F(0.5) * (before + side.correct_slope(f, n, q, axis, t.F(1.0)))
+        return side.correct_slope(f, n, q, axis, t.F(0.0))
 
-    return SimpleNamespace(
-        sample=sample, correct=correct, spread=spread, slope=slope, correct_slope=correct_slope
-    )
+    return SimpleNamespace(slope=slope, correct_slope=correct_slope)
+
+
+@functools.cache
+def _in_slices(layout: Layout) -> SimpleNamespace:
+    """Slice n is that of the node."""
+    t, line = vectors(layout), lines(vectors(layout).F)
+    plane, bend, scatter = values(layout), corrections(layout), spreading(layout)
+
+    @wp.func
+    def sample(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Node:
+        return plane.linear(f, n, line.at(q[1], f.shape[1]), line.at(q[2], f.shape[2]))
+
+    @wp.func
+    def correct(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Bent:
+        return bend.correction(f, n, line.at(q[1], f.shape[1]), line.at(q[2], f.shape[2]))
+
+    @wp.func
+    def spread(g: wp.array4d(dtype=t.F), n: int, q: t.Triple, bar: t.Node, bent_bar: t.Bent):
+        scatter(g, n, line.at(q[1], g.shape[1]), line.at(q[2], g.shape[2]), bar, bent_bar)
+
+    return SimpleNamespace(sample=sample, correct=correct, spread=spread)
+
+
+@functools.cache
+def _slopes_in_slices(layout: Layout) -> SimpleNamespace:
+    """As seen from one `side` of a kink, -1 or 1."""
+    t, line = vectors(layout), lines(vectors(layout).F)
+    plane, bend = values(layout), corrections(layout)
+
+    @wp.func
+    def slope(f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int, side: t.F) -> t.Node:
+        y = line.at_side(q[1], f.shape[1], side)
+        x = line.at_side(q[2], f.shape[2], side)
+        return plane.linear_slope(f, n, y, x, axis == 1)
+
+    @wp.func
+    def correct_slope(
+        f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int, side: t.F
+    ) -> t.Bent:
+        y = line.at_side(q[1], f.shape[1], side)
+        x = line.at_side(q[2], f.shape[2], side)
+        return bend.correction_slope(f, n, y, x, axis == 1)
+
+    return SimpleNamespace(slope=slope, correct_slope=correct_slope)
+
+
+@functools.cache
+def _across(layout: Layout) -> SimpleNamespace:
+    """Second differences of masses across slices, weighted z0 and z1; and their slopes."""
+    t, Place = vectors(layout), lines(vectors(layout).F).Place
+    plane = values(layout)
+
+    @wp.func
+    def pick(v: t.Node) -> t.Bent:
+        out = t.Bent()
+        for k in range(wp.static(layout.masses)):
+            out[k] = v[wp.static(layout.first_mass) + k]
+        return out
+
+    @wp.func
+    def across(f: wp.array4d(dtype=t.F), z: Place, y: Place, x: Place, z0: t.F, z1: t.F) -> t.Bent:
+        m = pick(plane.linear(f, z.m, y, x))
+        i = pick(plane.linear(f, z.i, y, x))
+        j = pick(plane.linear(f, z.j, y, x))
+        p = pick(plane.linear(f, z.p, y, x))
+        return z0 * (m - t.F(2.0) * i + j) + z1 * (i - t.F(2.0) * j + p)
+
+    @wp.func
+    def across_slope(
+        f: wp.array4d(dtype=t.F), z: Place, y: Place, x: Place, along_y: bool
+    ) -> t.Bent:
+        m = pick(plane.linear_slope(f, z.m, y, x, along_y))
+        i = pick(plane.linear_slope(f, z.i, y, x, along_y))
+        j = pick(plane.linear_slope(f, z.j, y, x, along_y))
+        p = pick(plane.linear_slope(f, z.p, y, x, along_y))
+        return (t.F(1.0) - z.a) * (m - t.F(2.0) * i + j) + z.a * (i - t.F(2.0) * j + p)
+
+    return SimpleNamespace(across=across, across_slope=across_slope)
+
+
+@functools.cache
+def _between_slices(layout: Layout) -> SimpleNamespace:
+    """The node lies between slices z.i and z.j."""
+    t, line = vectors(layout), lines(vectors(layout).F)
+    plane, bend, over = values(layout), corrections(layout), _across(layout)
+
+    @wp.func
+    def sample(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Node:
+        z = line.at(q[0], f.shape[0])
+        y = line.at(q[1], f.shape[1])
+        x = line.at(q[2], f.shape[2])
+        below = (t.F(1.0) - z.a) * plane.linear(f, z.i, y, x)
+        return below + z.a * plane.linear(f, z.j, y, x)
+
+    @wp.func
+    def correct(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Bent:
+        z = line.at(q[0], f.shape[0])
+        y = line.at(q[1], f.shape[1])
+        x = line.at(q[2], f.shape[2])
+        return (
+            (t.F(1.0) - z.a) * bend.correction(f, z.i, y, x)
+            + z.a * bend.correction(f, z.j, y, x)
+            + z.excess * over.across(f, z, y, x, t.F(1.0) - z.a, z.a)
+        )
+
+    return SimpleNamespace(sample=sample, correct=correct, spread=_spread_between(layout))
+
+
+def _spread_between(layout: Layout):
+    """The adjoint of `sample` and `correct` there."""
+    t, line, scatter = vectors(layout), lines(vectors(layout).F), spreading(layout)
+
+    @wp.func
+    def spread(g: wp.array4d(dtype=t.F), n: int, q: t.Triple, bar: t.Node, bent_bar: t.Bent):
+        z = line.at(q[0], g.shape[0])
+        y = line.at(q[1], g.shape[1])
+        x = line.at(q[2], g.shape[2])
+        z0 = t.F(1.0) - z.a
+        bar_i = z0 * bar
+        bar_j = z.a * bar
+        if wp.static(layout.masses > 0):
+            bar_m = t.Node()
+            bar_p = t.Node()
+            for k in range(wp.static(layout.masses)):
+                at = wp.static(layout.first_mass) + k
+                s = z.excess * bent_bar[k]
+                bar_m[at] = s * z0
+                bar_p[at] = s * z.a
+                bar_i[at] += s * (z.a - t.F(2.0) * z0)
+                bar_j[at] += s * (z0 - t.F(2.0) * z.a)
+            none = t.Bent()
+            scatter(g, z.m, y, x, bar_m, none)
+            scatter(g, z.p, y, x, bar_p, none)
+        scatter(g, z.i, y, x, bar_i, z0 * bent_bar)
+        scatter(g, z.j, y, x, bar_j, z.a * bent_bar)
+
+    return spread
+
+
+@functools.cache
+def _slopes_between_slices(layout: Layout) -> SimpleNamespace:
+    """As seen from one `side` of a kink, -1 or 1."""
+    t, line = vectors(layout), lines(vectors(layout).F)
+    plane, bend, over = values(layout), corrections(layout), _across(layout)
+
+    @wp.func
+    def slope(f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int, side: t.F) -> t.Node:
+        z = line.at_side(q[0], f.shape[0], side)
+        y = line.at_side(q[1], f.shape[1], side)
+        x = line.at_side(q[2], f.shape[2], side)
+        if axis == 0:
+            return z.live * (plane.linear(f, z.j, y, x) - plane.linear(f, z.i, y, x))
+        below = (t.F(1.0) - z.a) * plane.linear_slope(f, z.i, y, x, axis == 1)
+        return below + z.a * plane.linear_slope(f, z.j, y, x, axis == 1)
+
+    @wp.func
+    def correct_slope(
+        f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int, side: t.F
+    ) -> t.Bent:
+        z = line.at_side(q[0], f.shape[0], side)
+        y = line.at_side(q[1], f.shape[1], side)
+        x = line.at_side(q[2], f.shape[2], side)
+        if axis == 0:
+            return z.live * (
+                bend.correction(f, z.j, y, x)
+                - bend.correction(f, z.i, y, x)
+                + z.excess_slope * over.across(f, z, y, x, t.F(1.0) - z.a, z.a)
+                + z.excess * over.across(f, z, y, x, t.F(-1.0), t.F(1.0))
+            )
+        return (
+            (t.F(1.0) - z.a) * bend.correction_slope(f, z.i, y, x, axis == 1)
+            + z.a * bend.correction_slope(f, z.j, y, x, axis == 1)
+            + z.excess * over.across_slope(f, z, y, x, axis == 1)
+        )
+
+    return SimpleNamespace(slope=slope, correct_slope=correct_slope)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.text import cut
 from ddrecon.losses import ROUNDING
 from ddrecon.numerics.autodiff import differentiate_once
 from ddrecon.reconstruct.fused.kernels import step_kernel, variation_kernel
@@ -34,14 +35,24 @@ def step_adam(
     """The new value, within its bounds, and the new moments, after `steps` with this one."""
     new = [value.new_empty(value.shape) for _ in range(3)]
     weights = [1 - beta**steps for beta in betas]
-    arrays = [array(tensor.contiguous().view(-1)) for tensor in (value, gradient, *moments)]
-    arrays += [array(tensor.view(-1)) for tensor in new]
-    length = 1 if value.is_cuda else LENGTH
-    forget = [1 - beta for beta in betas]
-    numbers = [*forget, weights[1] ** -0.5, epsilon, rate / weights[0], *bounds]
-    kernel = step_kernel(torch.finfo(value.dtype).bits)
-    items = -(-value.numel() // length)
-    launch(kernel, items, [length, *arrays, *numbers], value, _threads(value))
+    items, length = cut(value.numel(), LENGTH, value)
+    given = {
+        "length": length,
+        "total": value.numel(),
+        "value": value,
+        "gradient": gradient,
+        "first_moment": moments[0],
+        "second_moment": moments[1],
+        "forget_first": 1 - betas[0],
+        "forget_second": 1 - betas[1],
+        "root": weights[1] ** -0.5,
+        "epsilon": epsilon,
+        "rate": rate / weights[0],
+        "low": bounds[0],
+        "high": bounds[1],
+    }
+    made = dict(zip(("new_value", "new_first", "new_second"), new, strict=True))
+    step_kernel(torch.finfo(value.dtype).bits).launch(items, given, made, _threads(value))
     return new[0], (new[1], new[2])
 
 
@@ -57,17 +68,17 @@ class _Variation(torch.autograd.Function):
 
     @staticmethod
     def forward(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
-        side, columns = min(grid.extent), field.shape[-1]
-        cells = field.reshape(-1, *field.shape[-3:]).contiguous()
-        slope = cells.new_empty(cells.shape)
-        length = PART if field.is_cuda else columns
-        items = field.numel() // columns * -(-columns // length)
+        side, (nz, ny, nx) = min(grid.extent), field.shape[-3:]
+        slope = field.new_empty(field.shape)
+        length = PART if field.is_cuda else nx
+        items = field.numel() // nx * -(-nx // length)
         totals = field.new_empty(items, dtype=torch.float64)
-        arguments = [length, *map(array, (cells, slope, totals))]
-        factors = [side / spacing for spacing in grid.spacing]
-        kernel = variation_kernel(torch.finfo(field.dtype).bits)
-        launch(kernel, items, [*arguments, *factors, ROUNDING], field, _threads(field))
-        return (totals.sum() / field.numel()).to(field.dtype), slope.view(field.shape)
+        kz, ky, kx = (side / spacing for spacing in grid.spacing)
+        given = {"length": length, "nz": nz, "ny": ny, "nx": nx, "field": field}
+        given |= {"kz": kz, "ky": ky, "kx": kx, "rounding": ROUNDING}
+        made = {"slope": slope, "totals": totals}
+        variation_kernel(torch.finfo(field.dtype).bits).launch(items, given, made, _threads(field))
+        return (totals.sum() / field.numel()).to(field.dtype), slope
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:

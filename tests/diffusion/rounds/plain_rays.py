@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -14,6 +15,7 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
 Direction = tuple[float, float, float]
@@ -71,23 +73,20 @@ def quadrature(directions: int) -> list[tuple[Direction, float]]:
     return list(zip(map(tuple, points.tolist()), weights.tolist(), strict=True))
 
 
-def sweep_by_loops(medium: Medium, light: Moments, inflow: float, directions: int) -> Moments:
-    """L0' = mean of I and L1' = 3 mean of I w (E12), gray, one direction after another."""
-    mean, z, y, x = (torch.zeros(medium.grid.shape, dtype=torch.float64) for _ in range(4))
+def sweep_by_loops(medium: Medium, source: Tensor, inflow: float, directions: int) -> Tensor:
+    """The means of I Y_k [K, 1, z, y, x] (E17), gray, one direction after another."""
+    total = torch.zeros_like(source)
+    degree = math.isqrt(len(source)) - 1
     for w, weight in quadrature(directions):
-        scatters = light.mean[0]
-        for component, cosine in zip(light.flux or (), w, strict=bool(light.flux)):
-            scatters = scatters + cosine * component[0]
-        radiance = by_cells(medium, scatters, w, inflow)
-        for moment, factor in zip((mean, z, y, x), (1, 3 * w[0], 3 * w[1], 3 * w[2]), strict=True):
-            moment += weight * factor * radiance
-    return Moments(mean[None], (z[None], y[None], x[None]) if light.flux else None)
+        values = harmonics(torch.tensor(w, dtype=torch.float64), degree).view(-1, 1, 1, 1, 1)
+        total += weight * values * by_cells(medium, (values * source).sum(0)[0], w, inflow)
+    return total
 
 
-def share_by_loops(medium: Medium, directions: int) -> Tensor:
+def share_by_loops(medium: Medium, degree: int) -> Tensor:
     """theta = 1 / (1 + rho^2), rho = (d/2) coth(d/2) - 1, at the depth d of the mean step."""
     length = weights = 0.0
-    for w, weight in quadrature(directions):
+    for w, weight in quadrature({3: 26, 5: 50}[degree]):
         axis, step = fastest_axis(medium.grid, w)
         if medium.grid.shape[axis] > 1:
             length, weights = length + weight * step, weights + weight
@@ -99,26 +98,45 @@ def share_by_loops(medium: Medium, directions: int) -> Tensor:
     return share
 
 
-def round_by_loops(problem: DiffusionProblem, light: Moments, directions: int) -> Moments:
-    """One round of E12 from `light`, gray, by `sweep_by_loops` and a dense solve."""
+def remaining_by_formula(g: float, degree: int) -> list[float]:
+    """p_l of E18, and what scaling leaves of a g below 0."""
+    f = max(g, 0.0) ** (degree + 1)
+    return [(g**ell - f) / (1 - f) for ell in range(degree + 1)]
+
+
+def factors_by_formula(g: float, rounds: int) -> list[float]:
+    """1 / (1 - nu) at Chebyshev's nodes nu (E19)."""
+    _, _, second, third = remaining_by_formula(g, 3)
+    high, low = 0.9 * second, 0.9 * min(third, 0.0)
+    nodes = [math.cos((k + 0.5) * math.pi / rounds) for k in range(rounds)]
+    return [1 / (1 - ((low + high) / 2 + (high - low) / 2 * node)) for node in nodes]
+
+
+def round_by_loops(problem: DiffusionProblem, light: Moments, g: float, degree: int) -> Moments:
+    """One round of E12 from `light`, gray, by `sweep_by_loops` and dense solves."""
     medium, (operator, right) = problem.medium, problem.system
-    matrix, g, theta = (
-        dense_matrix(operator)[0],
-        medium.mean_cosine,
-        share_by_loops(medium, directions),
-    )
-    scatters = light.scaled(1.0, g).plus(problem.source)
-    swept = sweep_by_loops(medium, scatters, float(problem.outside), directions)
+    directions, angles = {3: 26, 5: 50}[degree], degree if problem.has_flux else 0
+    matrix, theta = dense_matrix(operator)[0], share_by_loops(medium, degree)
+    p = remaining_by_formula(g, angles)
+    each = light.mean.new_tensor([p[math.isqrt(k)] for k in range((angles + 1) ** 2)])
+    source = each.view(-1, 1, 1, 1, 1) * light.harmonics(angles) + problem.source.harmonics(angles)
+    swept = Moments.of_harmonics(sweep_by_loops(medium, source, float(problem.outside), directions))
     gain = theta * (swept.mean - light.mean)
     imbalance = right - (matrix @ light.mean.flatten()).view_as(right)
-    source = right + medium.remaining_scattering * gain - theta * imbalance
-    u = torch.linalg.solve(matrix, source.flatten()).view_as(right)
-    if light.flux is None or swept.flux is None:
-        return Moments(u + gain)
-    before, after = problem.flux(light.mean), problem.flux(u)
-    assert before is not None and after is not None
-    z, y, x = (
-        new + theta * (change - old)
-        for new, change, old in zip(after, swept.flux, before, strict=True)
+    total = right + medium.remaining_scattering * gain - theta * imbalance
+    if light.flux is None or swept.flux is None or swept.higher is None:
+        return Moments(torch.linalg.solve(matrix, total.flatten()).view_as(right) + gain)
+    turned = tuple(
+        theta * p[1] * (new - old) for new, old in zip(swept.flux, light.flux, strict=True)
     )
-    return Moments(u + gain, (z, y, x))
+    # the same problem with this flux as its only source: what E4 adds to the right side
+    alone = replace(
+        problem, source=Moments(torch.zeros_like(gain), turned), outside=0 * problem.outside
+    )
+    total = total + alone.system[1]
+    u = torch.linalg.solve(matrix, total.flatten()).view_as(right)
+    parts = zip(
+        problem.flux(u), alone.flux(0 * u), swept.flux, problem.flux(light.mean), strict=True
+    )
+    z, y, x = (flux + extra + theta * (new - old) for flux, extra, new, old in parts)
+    return Moments(u + gain, (z, y, x), theta * swept.higher)

@@ -13,11 +13,10 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.rounds.sweep import sweep
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep
 from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import reduced_light
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.numerics.quadrature import DEGREES
 from ddrecon.renderer import render, solve_light
 from ddrecon.scene import Scene
 from ddrecon.variables.tangents import render_tangent
@@ -45,12 +44,11 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
         sigma_s=(3.0,),
         directional=(3.0,),
         tolerance=1e-10,
-        transport_directions=26,
     )
     medium = scale_medium(scene.volume)
-    source = reduced_light(medium, scene.lights, False).source
+    source = reduced_light(medium, scene.lights, 0).source
     last = light_after(scene, 12)
-    swept = sweep(medium, Moments(last).plus(source), None, 26).mean
+    swept = sweep(medium, Moments(last).plus(source).harmonics(0), None, 3)[0]
     torch.testing.assert_close(swept, last, rtol=0, atol=3e-5 * float(last.max()))
     left = [float((light_after(scene, rounds) - last).norm()) for rounds in range(4)]
     assert all(after < 0.4 * before for before, after in pairwise(left)), left
@@ -92,7 +90,7 @@ def test_in_the_limit_of_thick_cells_rounds_leave_diffusion_as_it_is():
     assert changes[2] < 0.2 * changes[1] < 0.04 * changes[0] < 0.04, changes
 
 
-@pytest.mark.parametrize("g", [0.0, 0.6, -0.5])
+@pytest.mark.parametrize("g", [0.0, 0.6, -0.5, -0.9])
 def test_a_white_furnace_is_exact_after_any_rounds(g: float):
     density = half_empty(5, 6, 4)
     scene = make_scene(
@@ -109,7 +107,7 @@ def test_a_white_furnace_is_exact_after_any_rounds(g: float):
 
 
 def test_no_rounds_are_no_work(monkeypatch):
-    monkeypatch.setattr("ddrecon.diffusion.rounds.transport.sweep", None)
+    monkeypatch.setattr("ddrecon.diffusion.rounds.transport.sweep_scattered", None)
     memory = SolveMemory()
     render(make_scene(ball(6), directional=(3.0,)), memory=memory)
     assert len(memory.records) == 1
@@ -137,8 +135,8 @@ def test_light_from_two_beams_is_the_sum_of_both():
 def test_directions_agree_the_better_the_more_there_are():
     scene = make_scene(ball(12), **WHITE, directional=(3.0,), transport_rounds=2, tolerance=1e-8)
     few, some, many = (
-        render(replace(scene, diffusion=replace(scene.diffusion, transport_directions=count)))
-        for count in sorted(DEGREES)
+        render(replace(scene, diffusion=replace(scene.diffusion, degree=degree)))
+        for degree in sorted(DIRECTIONS)
     )
     assert (
         float((some - many).norm()) < 0.6 * float((few - many).norm()) < 0.02 * float(many.norm())
@@ -148,17 +146,14 @@ def test_directions_agree_the_better_the_more_there_are():
 def test_memory_does_not_grow_with_directions():
     """What is alive at once, of arrays of cells, while a sweep and its backward pass are made."""
 
-    def peak(directions: int) -> int:
+    def peak(degree: int) -> int:
         scene = make_scene(ball(10).requires_grad_(), directional=(3.0,))
-        medium, light = (
-            scale_medium(scene.volume),
-            Moments(torch.ones(3, 10, 10, 10, dtype=torch.float64)),
-        )
+        medium, source = scale_medium(scene.volume), torch.ones(1, 3, 10, 10, 10).double()
         with ArrayCount(1000) as count:
-            sweep(medium, light, None, directions).mean.sum().backward()
+            sweep(medium, source, None, degree).sum().backward()
         return count.most
 
-    assert peak(86) == peak(26)
+    assert peak(7) == peak(3)
 
 
 class ArrayCount(TorchDispatchMode):
@@ -178,7 +173,7 @@ class ArrayCount(TorchDispatchMode):
         return out
 
 
-@pytest.mark.parametrize("g", [0.0, 0.4])
+@pytest.mark.parametrize("g", [0.0, 0.4, -0.6])
 def test_tangent_adjoint_and_differences_agree_through_rounds(g: float):
     scene = make_scene(
         half_empty(4, 5, 6),
@@ -200,9 +195,9 @@ def test_tangent_adjoint_and_differences_agree_through_rounds(g: float):
     assert (2 * image * tangent).sum().item() == pytest.approx(gradient.sum().item(), rel=1e-10)
     cell = (leaf.detach() == 0).nonzero()[0]
     step = torch.zeros_like(leaf)
-    step[tuple(cell)] = 1e-5
+    step[tuple(cell)] = 5e-5
     with torch.no_grad():
         difference = (
             4 * (loss(leaf + step) - loss(leaf)) - (loss(leaf + 2 * step) - loss(leaf))
-        ) / 2e-5
+        ) / 1e-4
     assert difference.item() == pytest.approx(gradient[tuple(cell)].item(), rel=1e-6)

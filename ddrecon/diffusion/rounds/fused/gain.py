@@ -1,146 +1,241 @@
-"""The gains of a sweep as one differentiable function of tensors, by fused kernels (E12, E14)."""
+"""What a sweep changed, and what of it is a source to diffusion, by fused kernels (E12, E14, E17)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.gains import gain_kernels, gain_records
-from ddrecon.diffusion.rounds.fused.kernels import records
-from ddrecon.kernels.launch import array, launch
-from ddrecon.light.moments import Moments
+from ddrecon.diffusion.rounds.fused.share import (
+    ROW_SUM,
+    SHARE,
+    SHARE_SLOPE,
+    constants,
+    numbers_by_color,
+)
+from ddrecon.grid import Grid
+from ddrecon.kernels.rows import launch_rows, row_kernel
+from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once
 
-LEAST = 2e-3
-"""Depths of steps are at least that: theta is 1 there, but its formula 0 / 0 in empty cells."""
+_FLUX = "z", "y", "x"
+_SWEPT = "swept", *(f"swept_{axis}" for axis in _FLUX)
+_DIFFUSE = "diffuse", *(f"diffuse_{axis}" for axis in _FLUX)
+_LIGHT = tuple(f"light_{axis}" for axis in _FLUX)
+_FOUND = "source", "gain", *(f"gain_{a}" for a in _FLUX), *(f"turned_{a}" for a in _FLUX)
+_OF_MEDIUM = "extinction", "scattering", "numbers"
+# The row's part of each array; those that light has not are the first.
+_ROWS = """
+const long long at = c * size + start;
+const F *e_row = extinction + color(extinction_colors, size) + start;
+const F *s_row = scattering + color(scattering_colors, size) + start;
+const F strength = numbers[colors + c], cosine = numbers[2 * colors + c];
+const F *new_mean = swept + at, *old_mean = diffuse + at, *off = imbalance + at;
+const F *const fluxes[9] = {swept_z + at, swept_y + at, swept_x + at, diffuse_z + at,
+    diffuse_y + at, diffuse_x + at, light_z + at, light_y + at, light_x + at};
+"""
+_GAIN = (
+    _ROWS
+    + """
+F *source_row = source + at, *gain_row = gain + at;
+F *const gains[3] = {gain_z + at, gain_y + at, gain_x + at};
+F *const turns[3] = {turned_z + at, turned_y + at, turned_x + at};
+INDEPENDENT
+for (int i = begin; i < end; ++i) {"""
+    + SHARE
+    + """
+    const F s = SHARES_FIELD ? e : s_row[i], change = new_mean[i] - old_mean[i];
+    gain_row[i] = share * change;
+    source_row[i] = share * (strength * s * change - (HAS_IMBALANCE ? off[i] : F(0)));
+    if (HAS_FLUX)
+        for (int a = 0; a < 3; ++a) {
+            gains[a][i] = share * (fluxes[a][i] - fluxes[3 + a][i]);
+            turns[a][i] = share * cosine * (fluxes[a][i] - fluxes[6 + a][i]);
+        }
+}
+"""
+)
+_ADJOINT = (
+    ROW_SUM
+    + _ROWS
+    + """
+const F *source_bars = source_bar + at, *gain_bars = gain_bar + at;
+const F *const flux_bars[6] = {gain_z_bar + at, gain_y_bar + at, gain_x_bar + at,
+    turned_z_bar + at, turned_y_bar + at, turned_x_bar + at};
+F *swept_bars = swept_bar + at, *off_bars = imbalance_bar + at;
+F *const to[9] = {swept_z_bar + at, swept_y_bar + at, swept_x_bar + at, diffuse_z_bar + at,
+    diffuse_y_bar + at, diffuse_x_bar + at, light_z_bar + at, light_y_bar + at, light_x_bar + at};
+F *diffuse_bars = diffuse_bar + at;
+F *e_bars = extinction_bar + at, *s_bars = scattering_bar + at;
+F depth_sum = F(0), strength_sum = F(0), cosine_sum = F(0);
+INDEPENDENT
+for (int i = begin; i < end; ++i) {"""
+    + SHARE
+    + SHARE_SLOPE
+    + """
+    const F s = SHARES_FIELD ? e : s_row[i], change = new_mean[i] - old_mean[i];
+    // by the gains, of which the mean's is scattered into the source
+    const F mean_bar = gain_bars[i] + strength * s * source_bars[i];
+    swept_bars[i] = share * mean_bar;
+    diffuse_bars[i] = -share * mean_bar;
+    F share_bar = mean_bar * change;
+    if (HAS_FLUX)
+        for (int a = 0; a < 3; ++a) {
+            const F by_gain = flux_bars[a][i], turn = fluxes[a][i] - fluxes[6 + a][i];
+            const F by_turn = cosine * flux_bars[3 + a][i];
+            share_bar += by_gain * (fluxes[a][i] - fluxes[3 + a][i]) + by_turn * turn;
+            cosine_sum += share * turn * flux_bars[3 + a][i];
+            to[a][i] = share * (by_gain + by_turn);
+            to[3 + a][i] = -share * by_gain;
+            to[6 + a][i] = -share * by_turn;
+        }
+    if (HAS_IMBALANCE) {
+        share_bar -= source_bars[i] * off[i];
+        off_bars[i] = -share * source_bars[i];
+    }
+    const F depth_bar = share_bar * share_slope, scattering_bar = source_bars[i] * share * change;
+    e_bars[i] = depth_bar * numbers[c] + (SHARES_FIELD ? scattering_bar * strength : F(0));
+    if (!SHARES_FIELD) s_bars[i] = scattering_bar * strength;
+    depth_sum += depth_bar * e;
+    strength_sum += scattering_bar * s;
+}
+const long long items = (long long)rows * parts * colors;
+sums[item] = depth_sum;
+sums[items + item] = strength_sum;
+sums[2 * items + item] = cosine_sum;
+}
+"""
+)
 
 
 def gain_fused(
-    medium: Medium, swept: Moments, diffuse: Moments, imbalance: Tensor | None, length: float
-) -> tuple[Moments, Tensor]:
-    """theta (`swept` - `diffuse`), and kappa_s times its mean less theta `imbalance` (E12).
+    medium: Medium,
+    swept: Moments,
+    light: Moments,
+    diffuse: Moments,
+    imbalance: Tensor | None,
+    cosine: Tensor,
+    length: float,
+) -> tuple[Moments, Tensor, Vector | None]:
+    """theta (`swept` - `diffuse`), what diffusion receives of it, and by how much flux is turned.
 
-    `length`: of the mean step [u], by which theta is (E14); `imbalance` [C, z, y, x]: S - A L0,
-    None where that is zero.
+    The second is kappa_s times the mean's gain less theta `imbalance`, S - A L0, where that is not
+    None (E12); the third theta `cosine` times the change of the flux of `light` (E17). `length`: of
+    the mean step [u], by which theta is (E14).
     """
-    colors = swept.mean.shape[0]
     strength = (1 - medium.forward_fraction) * medium.scattering.scale
-    numbers = torch.stack(
-        [each.reshape(-1).expand(colors) for each in (medium.extinction.scale, strength)]
-    )
+    numbers = numbers_by_color(medium, length, [strength, cosine])
     shares_field = medium.scattering.field is medium.extinction.field
     source, mean, *flux = _Gain.apply(
-        length,
+        medium.grid,
         numbers,
         medium.extinction.field,
         None if shares_field else medium.scattering.field,
         imbalance,
         swept.mean,
-        *(swept.flux or ()),
         diffuse.mean,
+        *(swept.flux or ()),
         *(diffuse.flux or ()),
+        *(light.flux or ()),
     )
-    return Moments(mean, (flux[0], flux[1], flux[2]) if flux else None), source
+    if not flux:
+        return Moments(mean), source, None
+    z, y, x, *turned = flux
+    return Moments(mean, (z, y, x)), source, (turned[0], turned[1], turned[2])
 
 
 class _Gain(torch.autograd.Function):
-    """The source, then the gains."""
+    """The source, the gains and what is turned."""
 
     @staticmethod
-    def forward(ctx: Any, length: float, *tensors: Any) -> tuple[Tensor, ...]:
-        ctx.length = length
+    def forward(ctx: Any, grid: Grid, *tensors: Any) -> tuple[Tensor, ...]:
+        ctx.grid = grid
         ctx.save_for_backward(*tensors)
-        cells = _Cells(length, *tensors)
-        source, *gains = (_room_for(cells.like) for _ in range(1 + cells.moments))
-        found = cells.found(source, gains)
-        cells.launch(cells.kernels.gain, [cells.given, found])
-        return source, *gains
+        given, is_so = _given(*tensors)
+        like = given["swept"]
+        names = _FOUND if is_so[0] else _FOUND[:2]
+        found = {name: like.new_empty(like.shape) for name in names}
+        kernel = functools.partial(gain_kernel, is_so)
+        launch_rows(kernel, grid, len(like), given | dict.fromkeys(_FOUND, like), found)
+        return tuple(found.values())
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, source_bar: Tensor, *gain_bars: Tensor) -> tuple[Any, ...]:
-        cells = _Cells(ctx.length, *ctx.saved_tensors)
-        _, extinction, scattering, imbalance, *light = ctx.saved_tensors
-        found = cells.types.Bars()
-        light_bars = [_room_for(moment) for moment in light]
-        imbalance_bar = None if imbalance is None else _room_for(imbalance)
-        field_bars = [None if f is None else _room_for(f).zero_() for f in (extinction, scattering)]
-        numbers_bar = light[0].new_empty(cells.items, 2, cells.colors, dtype=torch.float64)
-        found.swept = cells.light(light_bars[: cells.moments])
-        found.diffuse = cells.light(light_bars[cells.moments :])
-        found.imbalance = _flat(light_bars[0] if imbalance_bar is None else imbalance_bar)
-        found.extinction, found.scattering = (
-            _flat(light_bars[0] if bar is None else bar) for bar in field_bars
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
+        given, is_so = _given(*ctx.saved_tensors)
+        has_flux, shares_field, has_imbalance = is_so
+        like = given["swept"]
+        names = [*_SWEPT, *_DIFFUSE, *_LIGHT] if has_flux else ["swept", "diffuse"]
+        names += ["extinction"] + ["scattering"] * (not shares_field)
+        names += ["imbalance"] * has_imbalance
+        found = {f"{name}_bar": like.new_empty(like.shape) for name in names}
+        depth, height, width = ctx.grid.shape
+        rows = len(like) * depth * height * (width if like.is_cuda else 1)
+        found["sums"] = like.new_zeros(3, rows)
+        given |= {f"{name}_bar": bar for name, bar in zip(_FOUND, bars, strict=False)}
+        every = (*_FOUND, *_SWEPT, *_DIFFUSE, *_LIGHT, *_OF_MEDIUM, "imbalance")
+        unused = {f"{name}_bar": like for name in every}
+        kernel = functools.partial(gain_adjoint_kernel, is_so)
+        launch_rows(kernel, ctx.grid, len(like), unused | given, found)
+        numbers, extinction, scattering, imbalance, *_ = ctx.saved_tensors
+        e_bar = found["extinction_bar"].sum_to_size(extinction.shape)
+        s_bar = (
+            None if scattering is None else found["scattering_bar"].sum_to_size(scattering.shape)
         )
-        found.numbers = _flat(numbers_bar)
-        bars = cells.found(source_bar, gain_bars)
-        cells.launch(cells.kernels.transpose, [cells.given, bars, found])
-        return (
-            None,
-            numbers_bar.sum(0).to(source_bar.dtype),
-            *field_bars,
-            imbalance_bar,
-            *light_bars,
-        )
+        sums = found["sums"].double().view(*numbers.shape, -1).sum(-1).to(numbers.dtype)
+        off_bar = None if imbalance is None else found["imbalance_bar"]
+        light = ("swept", "diffuse", *_SWEPT[1:], *_DIFFUSE[1:], *_LIGHT)
+        light_bars = (found[f"{name}_bar"] for name in light[: 11 if has_flux else 2])
+        return None, sums, e_bar, s_bar, off_bar, *light_bars
 
 
-class _Cells:
-    """What the kernels are given, and how their items share the cells."""
+def _given(
+    numbers: Tensor,
+    extinction: Tensor,
+    scattering: Tensor | None,
+    imbalance: Tensor | None,
+    swept: Tensor,
+    diffuse: Tensor,
+    *flux: Tensor,
+) -> tuple[dict[str, Any], tuple[bool, bool, bool]]:
+    """What both kernels are given, and whether flux, one field and an imbalance are.
 
-    def __init__(
-        self,
-        length: float,
-        numbers: Tensor,
-        extinction: Tensor,
-        scattering: Tensor | None,
-        imbalance: Tensor | None,
-        *light: Tensor,
-    ):
-        self.like, self.moments = light[0], len(light) // 2
-        bits = torch.finfo(self.like.dtype).bits
-        self.types, self.bits = gain_records(bits), bits
-        self.kernels = gain_kernels(
-            bits, self.moments > 1, scattering is None, imbalance is not None
-        )
-        self.colors, depth, height, width = self.like.shape
-        # a slice each, so that rows are long; on a GPU a cell each
-        self.items = depth * height * width if self.like.is_cuda else depth
-        self.size = depth * height * width // self.items
-        given = self.types.Given()
-        given.swept = self.light(light[: self.moments])
-        given.diffuse = self.light(light[self.moments :])
-        given.imbalance = _flat(self.like if imbalance is None else imbalance)
-        given.extinction = _flat(extinction)
-        given.scattering = _flat(extinction if scattering is None else scattering)
-        given.numbers = _flat(numbers)
-        given.length, given.least = length, LEAST
-        given.cells, given.colors = depth * height * width, self.colors
-        given.extinction_channels = len(extinction)
-        given.scattering_channels = len(extinction if scattering is None else scattering)
-        self.given = given
-
-    def light(self, moments: Sequence[Tensor]) -> Any:
-        light = records(self.bits).Light()
-        for i, name in enumerate(("mean", "z", "y", "x")):
-            setattr(light, name, _flat(moments[i if len(moments) > 1 else 0]))
-        return light
-
-    def found(self, source: Tensor, gains: Sequence[Tensor]) -> Any:
-        found = self.types.Found()
-        found.gain, found.source = self.light(gains), _flat(source)
-        return found
-
-    def launch(self, kernel: Any, arguments: list[Any]) -> None:
-        launch(kernel, self.items, [*arguments, self.size], self.like)
+    The mean stands for arrays that are not.
+    """
+    shares_field = scattering is None
+    scattering = extinction if scattering is None else scattering
+    vectors = (*_SWEPT[1:], *_DIFFUSE[1:], *_LIGHT)
+    given = {
+        "numbers": numbers, "extinction": extinction, "scattering": scattering,
+        "extinction_colors": len(extinction), "scattering_colors": len(scattering),
+        "colors": len(swept), "swept": swept, "diffuse": diffuse,
+        "imbalance": swept if imbalance is None else imbalance,
+        **dict(zip(vectors, flux or [swept] * len(vectors), strict=True)),
+    }  # fmt: skip
+    return given, (bool(flux), shares_field, imbalance is not None)
 
 
-def _room_for(tensor: Tensor) -> Tensor:
-    return tensor.new_empty(tensor.shape)
+_ARRAYS = " ".join((*_OF_MEDIUM, "imbalance", *_SWEPT, *_DIFFUSE, *_LIGHT))
+_COLORS = "extinction_colors scattering_colors colors"
 
 
-def _flat(tensor: Tensor) -> Any:
-    return array(tensor.detach().reshape(-1))
+@functools.cache
+def gain_kernel(is_so: tuple[bool, bool, bool], bits: int) -> Any:
+    """The kernel of gains; `is_so`: whether there are flux, one field for both, an imbalance."""
+    arrays = f"{_ARRAYS} {' '.join(_FOUND)}"
+    return row_kernel("gain", bits, _told(is_so) + _GAIN, arrays, _COLORS)
+
+
+@functools.cache
+def gain_adjoint_kernel(is_so: tuple[bool, bool, bool], bits: int) -> Any:
+    """The kernel of the cotangents of all that gains are of."""
+    bars = (f"{name}_bar" for name in f"{_ARRAYS} {' '.join(_FOUND)}".split())
+    arrays = f"{_ARRAYS} {' '.join(bars)} sums"
+    return row_kernel("gain_adjoint", bits, _told(is_so) + _ADJOINT, arrays, _COLORS)
+
+
+def _told(is_so: tuple[bool, bool, bool]) -> str:
+    return constants(HAS_FLUX=is_so[0], SHARES_FIELD=is_so[1], HAS_IMBALANCE=is_so[2])

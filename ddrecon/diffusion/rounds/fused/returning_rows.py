@@ -1,212 +1,200 @@
 """Rows of cells along which radiance is followed backward: the adjoint of `rows.py`, in C++.
 
-Of all slices only the last one is kept, which is the next one that light crosses:
+`rows.FOLLOW` kept what scatters and I of all slices. Of a row and a direction there are these lines
+of the last slice, which is the next one that light crosses:
 
-    near                 what scatters along a direction, here of the slice before
-    returning            exp(-depth) source_bar, which P^T takes to the slice before
-    far_bar, mass_bar    cotangents of q and of the field where rays were one slice earlier
+    RETURNING            exp(-depth) source_bar, which goes to the cells where the step began
+    FAR, MASS            cotangents of q and of extinction's field at these cells
+    SCATTERED            that of scattering's field, where it is another
 
-I of all slices was kept by `rows.FOLLOW`. `upstream` is P, `downstream` its transpose P^T. Where
-neither this step nor the next meets a medium, nothing returns to what scatters.
+Where a step meets no medium, nothing returns to what scatters.
 """
 
-from ddrecon.diffusion.rounds.fused.rows import DIRECTION, PLACES, STEP, UPSTREAM
+from ddrecon.diffusion.rounds.fused.rows import (
+    DECAYED,
+    DIRECTION,
+    ENDS,
+    GROUP,
+    MULTIPLY,
+    PLACES,
+    SLOPES,
+    UPSTREAM,
+)
 
-_DOWNSTREAM = """
-auto downstream = [&](auto whole, const F* here, const F* ahead, F here_part, int c) -> F {
-    if constexpr (decltype(whole)::value) {
-        return (row_part > F(0.5) ? ahead : here)[c + whole_columns];
-    } else {
-        const F a = (F(1) - column_part) * here[c] + column_part * here[c + column_sign];
-        const F b = (F(1) - column_part) * ahead[c] + column_part * ahead[c + column_sign];
-        return here_part * a + row_part * b;
-    }
-};
+# Cells whose steps begin at this one. What begins beyond a face of the box took q at the face: then
+# there may be two for each slice, row and column.
+_TARGETS = """
+struct Target { int s, t, shift; F part; bool is_real; };
+Target targets[16];
+int target_count = 0;
+for (int i = 0; i < point_count; ++i) {
+    const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
+    for (int a = 0; a <= (dk && s == 0); ++a)
+        for (int b = 0; b <= (dr && t == 0); ++b) {
+            const int to_s = a ? s : s + dk, to_t = b ? t : t + dr;
+            if (to_s < depth && to_t < height)
+                targets[target_count++] = {to_s, to_t, shift, part[i], !a && !b};
+        }
+}
 """
 RETURN = (
     PLACES
     + """
-for (int s = slice_last - 1; s >= slice_first; --s) {
-    // Slice -1 is the first one again, which receives what its q was repeated for.
-    const int k = forward > 0 ? (s < 0 ? 0 : s) : slices - 1 - (s < 0 ? 0 : s);
-    for (int r = row_first; r < row_last; ++r) {
-        const long long inner = k * slice_step + r * row_step, at = color * cells + inner;
-        const long long at_flux = HAS_FLUX ? at : 0;
-        // What scatters two slices before, which takes the place of this slice's in the buffer.
-        const int two_before = s < 2 ? 0 : s - 2;
-        const int k_early = forward > 0 ? two_before : slices - 1 - two_before;
-        const long long early = color * cells + k_early * slice_step + r * row_step;
-        const F* __restrict q = given.light.mean.data + early;
-        const F* __restrict q_z = given.light.z.data + (HAS_FLUX ? early : 0);
-        const F* __restrict q_y = given.light.y.data + (HAS_FLUX ? early : 0);
-        const F* __restrict q_x = given.light.x.data + (HAS_FLUX ? early : 0);
-        const F* __restrict mean_bar = bars.mean.data + at;
-        const F* __restrict z_bar = bars.z.data + at_flux;
-        const F* __restrict y_bar = bars.y.data + at_flux;
-        const F* __restrict x_bar = bars.x.data + at_flux;
-        F* __restrict q_bar = work.light.mean.data + at;
-        F* __restrict q_z_bar = work.light.z.data + at_flux;
-        F* __restrict q_y_bar = work.light.y.data + at_flux;
-        F* __restrict q_x_bar = work.light.x.data + at_flux;
-        F* __restrict e_bar = work.extinction.data
-            + (work.extinction_channels > 1 ? color * cells : 0) + inner;
-        F* __restrict sc_bar = work.scattering.data
-            + (SHARES_FIELD ? 0 : (work.scattering_channels > 1 ? color * cells : 0) + inner);
-        const long long sum_row = (color * (long long)given.rows + r) * width;
-        const long long sums = (long long)given.colors * given.rows * width;
-        F* __restrict scale_bar = work.numbers.data + sum_row;
-        F* __restrict strength_bar = work.numbers.data + sums + sum_row;
-        F* __restrict inflow_bar = work.numbers.data + 2 * sums + sum_row;
-        if (item[5] && s >= 0) {
-            for (int c = first; c < last; ++c) q_bar[c] = F(0);
-            if (HAS_FLUX)
-                for (int c = first; c < last; ++c) q_z_bar[c] = q_y_bar[c] = q_x_bar[c] = F(0);
-        }
-        for (int j = 0; j < count; ++j) {"""
+enum { NEAR, LIGHT };
+enum { RETURNING, FAR, MASS, SCATTERED };
+const long long stride = 2LL * most * pitch, places = (long long)depth * height;
+const int kinds = SHARES_FIELD ? 3 : 4;
+const long long back_stride = (long long)kinds * most * pitch;
+const F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
+F* own_back = returning + lane * ((height + 2) * back_stride + MARGIN) + MARGIN;
+double* own_sums = sums + 3 * job[8];
+F* e_bars = e_bar + job[9] * cells;
+F* sc_bars = sc_bar + job[10] * cells;
+for (int s = slice_to - 1; s >= slice_from; --s)
+for (int g = group_to - 1; g >= group_from; --g) {"""
+    + GROUP
+    + "const int ahead = -y_way * width;"
+    + MULTIPLY
+    + """
+const int k = way > 0 ? s : depth - 1 - s;
+for (int t = height - 1; t >= 0; --t) {
+    const int r = y_way > 0 ? t : height - 1 - t;
+    const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
+    auto line = [&](int slice, int turn, int which, int j) -> const F* {
+        const long long place = (long long)slice * height + turn;
+        return own_lines + place * stride + (2 * (before + j) + which) * (long long)pitch;
+    };
+    auto back = [&](int slice, int turn, int which, int j) -> F* {
+        const int place = (height - 1 - turn + 2LL * slice) % (height + 2);
+        return own_back + place * back_stride + (kinds * (before + j) + which) * (long long)pitch;
+    };
+    const int own = 3 * POINTERS;
+    auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
+    // E12 transposed: I_bar.
+    auto read = [&](int k, F* row, int from, int to) {
+        const F* moment = bars + k * all + color * cells + at;
+        INDEPENDENT
+        for (int c = from; c < to; ++c) row[c] = moment[c];
+        ask_for(moment, from, to);
+    };
+    to_directions(to_weighted_light, read, bar_of, 0, width);
+    const int* range = ranges + 4 * (k * height + r);
+    const int from = range[0], to = range[1];
+    const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
+    F *__restrict source_bars = scratch_row(own + 0), *__restrict passing = scratch_row(own + 1);
+    F *__restrict scale_bar = scratch_row(own + 2), *__restrict strength_bar = scratch_row(own + 3);
+    F* __restrict inflow_bar = scratch_row(own + 4);
+    if (VARIES_NUMBERS)
+        for (int c = 0; c < width; ++c) scale_bar[c] = strength_bar[c] = inflow_bar[c] = F(0);
+    for (int j = 0; j < members; ++j) {"""
     + DIRECTION
-    + _DOWNSTREAM
-    + """
-            // Rows to which rays went on; the last slice has none.
-            const int next = r + row_sign;
-            const bool is_last = s == slices - 1, is_inside = next >= 0 && next < rows && !is_last;
-            auto here_of = [&](int which) -> const F* {
-                return is_last ? nothing : row_of(which, s + 1, j, r);
-            };
-            auto ahead_of = [&](int which) -> const F* {
-                return is_inside ? row_of(which, s + 1, j, next) : nothing;
-            };
-            const F* far_here = here_of(FAR_BAR);
-            const F* far_ahead = ahead_of(FAR_BAR);
-            // q at an edge stands for what is beyond it as well.
-            const bool is_edge = r == (row_sign > 0 ? 0 : rows - 1);
-            const int edge = column_sign > 0 ? 0 : width - 1;
-            const F all_here = is_edge ? F(1) : F(1) - row_part;
-            if (s < 0) {
-                INDEPENDENT
-                for (int c = first; c < last; ++c) {
-                    const F bar = downstream(Between(), far_here, far_ahead, all_here, c);
-                    q_bar[c] += bar;
-                    if (HAS_FLUX) {
-                        q_z_bar[c] += w_z * bar;
-                        q_y_bar[c] += w_y * bar;
-                        q_x_bar[c] += w_x * bar;
-                    }
-                }
-            } else {
-                const F* back_here = here_of(RETURNING);
-                const F* back_ahead = ahead_of(RETURNING);
-                const F* mass_here = here_of(MASS_BAR);
-                const F* mass_ahead = ahead_of(MASS_BAR);
-                const F* scattered_here = here_of(SCATTERED_BAR);
-                const F* scattered_ahead = ahead_of(SCATTERED_BAR);
-                F* __restrict returning_row = row_of(RETURNING, s, j, r);
-                F* __restrict far_bar_row = row_of(FAR_BAR, s, j, r);
-                F* __restrict mass_bar_row = row_of(MASS_BAR, s, j, r);
-                F* __restrict scattered_row = row_of(SCATTERED_BAR, s, j, r);
-                const long long there = (k + 1) * far_slice + (r + 1) * far_row + MARGIN;
-                const long long before = there - forward * far_slice;
-                const F* __restrict e = extinction + there;
-                const F* e_here = extinction + before;
-                const F* e_behind = e_here - row_sign * far_row;
-                const F* __restrict sc = scattering + there;
-                const F* sc_here = scattering + before;
-                const F* sc_behind = sc_here - row_sign * far_row;
-                F* __restrict near_row = row_of(NEAR, s, j, r);
-                const int behind = r - row_sign;
-                const F* near_here = row_of(NEAR, s - 1, j, r);
-                const F* near_behind = behind >= 0 && behind < rows
-                    ? row_of(NEAR, s - 1, j, behind) : near_here;
-                const F* __restrict arriving_kept = work.arriving.data + kept_of(s, r);
-                const F own_part = F(1) - row_part;"""
     + UPSTREAM
+    + _TARGETS
     + """
-                Range met = {width, 0};
-                for (int ahead = -1; ahead <= 1; ++ahead) {
-                    include(met, k + ahead * forward, r);
-                    if (ahead <= 0) include(met, k + ahead * forward, behind);
-                    if (ahead >= 0) include(met, k + ahead * forward, next);
+        F* __restrict bar = bar_of(j);
+        F *__restrict returning_row = back(s, t, RETURNING, j), *__restrict far_row
+            = back(s, t, FAR, j);
+        F *__restrict mass_row = back(s, t, MASS, j), *__restrict scattered_row
+            = back(s, t, SHARES_FIELD ? MASS : SCATTERED, j);
+        const F* near_row = line(s, t, NEAR, j);
+        for (int which = 0; which < kinds; ++which) {
+            F* own = back(s, t, which, j);
+            own[-1] = own[width] = F(0);
+        }
+        // What returns from the cells to which light went on, but for those of this row.
+        const F *back_from[4];
+        for (int i = 0; i < 4; ++i) {
+            const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
+            const bool is_inside = s + dk < depth && t + dr < height && (dk || dr);
+            back_from[i]
+                = (is_inside ? back(s + dk, t + dr, RETURNING, j) : empty_row) + shift;
+        }
+        auto pass = [&](auto points, auto along, auto empty, int from, int to) {
+            constexpr bool is_empty = decltype(empty)::value;
+            INDEPENDENT
+            for (int c = from; c < to; ++c) {"""
+    + ENDS
+    + DECAYED
+    + """
+                const F arriving = gather(points, light_from, part, c);
+                const F radiance_bar = bar[c];
+                // That of the source: what goes on, returns.
+                F source_bar;
+                if constexpr (decltype(along)::value) source_bar = source_bars[c];
+                else source_bar = radiance_bar + gather(points, back_from, part, c);
+"""
+    + SLOPES
+    + """
+                mass_row[c] = half_step * (depth_bar * scale)
+                    + (SHARES_FIELD ? scattered : F(0));
+                if (!SHARES_FIELD) scattered_row[c] = scattered;
+                returning_row[c] = is_empty ? source_bar : passed * source_bar;
+                far_row[c] = is_empty ? F(0) : line_bar * (phi - psi);
+                bar[c] = is_empty ? F(0) : line_bar * psi;
+                if (VARIES_NUMBERS) {
+                    scale_bar[c] += depth_bar * mass;
+                    strength_bar[c] += scattering_depth_bar * scattering_mass;
+                    inflow_bar[c] += radiance_bar - source_bar * lost;
                 }
-                met = widen(met, 2);
-                auto pass = [&](auto whole, auto empty, int from, int to) {
-                    constexpr bool is_empty = decltype(empty)::value;
-                    INDEPENDENT
-                    for (int c = from; c < to; ++c) {
-                        const F near = near_row[c], arriving = arriving_kept[c];
-                        const F far = upstream(whole, near_here, near_behind, c);
-                        const F mass = half * (e[c] + upstream(whole, e_here, e_behind, c));
-                        const F scattering_mass = SHARES_FIELD
-                            ? mass : half * (sc[c] + upstream(whole, sc_here, sc_behind, c));"""
-    + STEP
-    + """
-                        const F slope_series = psi_slope_series(is_thin ? depth : F(0));
-                        const F psi_slope = is_thin ? slope_series : (phi - F(2) * psi) * inverse;
-                        // E12 transposed: I_bar; then that of the source: what goes on, returns.
-                        F radiance_bar = by_mean * mean_bar[c];
-                        if (HAS_FLUX)
-                            radiance_bar += by_z * z_bar[c] + by_y * y_bar[c] + by_x * x_bar[c];
-                        const F source_bar = radiance_bar
-                            + downstream(whole, back_here, back_ahead, own_part, c);
-                        // E11 transposed: the source is line times scattering depth.
-                        const F line_bar = source_bar * (scattering_mass * strength);
-                        const F lost_bar = -source_bar * (arriving + inflow);
-                        const F line_slope = far * (psi - phi) + (near - far) * psi_slope;
-                        const F depth_bar
-                            = is_empty ? lost_bar : line_bar * line_slope + lost_bar * passed;
-                        const F scattering_depth_bar = source_bar * line;
-                        const F scattering_mass_bar = half * (scattering_depth_bar * strength);
-                        const F mass_bar = half * (depth_bar * scale)
-                            + (SHARES_FIELD ? scattering_mass_bar : F(0));
-                        // By q at the near end, and by q where rays will be.
-                        if (!is_empty) {
-                            const F bar = line_bar * psi
-                                + downstream(whole, far_here, far_ahead, all_here, c);
-                            q_bar[c] += bar;
-                            if (HAS_FLUX) {
-                                q_z_bar[c] += w_z * bar;
-                                q_y_bar[c] += w_y * bar;
-                                q_x_bar[c] += w_x * bar;
-                            }
-                        }
-                        // By the fields, likewise.
-                        e_bar[c] += mass_bar
-                            + downstream(whole, mass_here, mass_ahead, own_part, c);
-                        if (!SHARES_FIELD) {
-                            sc_bar[c] += scattering_mass_bar
-                                + downstream(whole, scattered_here, scattered_ahead, own_part, c);
-                            scattered_row[c] = scattering_mass_bar;
-                        }
-                        if (VARIES_NUMBERS) {
-                            scale_bar[c] += depth_bar * mass;
-                            strength_bar[c] += scattering_depth_bar * scattering_mass;
-                            inflow_bar[c] += radiance_bar - source_bar * lost;
-                        }
-                        returning_row[c] = is_empty ? source_bar : passed * source_bar;
-                        far_bar_row[c] = is_empty ? F(0) : line_bar * (phi - psi);
-                        mass_bar_row[c] = mass_bar;
-                        near_row[c] = light_along(q, q_z, q_y, q_x, c);
-                    }
-                };
-                auto pass_all = [&](auto whole) {
-                    pass(whole, Empty(), first, met.from);
-                    pass(whole, Filled(), met.from, met.to);
-                    pass(whole, Empty(), met.to, last);
-                };
-                if (signs[2] && !is_edge) pass_all(Whole()); else pass_all(Between());
-                if (first == 0) near_row[-1] = near_row[0];
-                if (last == width) near_row[width] = near_row[width - 1];
             }
-            if (edge >= first && edge < last) {
-                const F bar
-                    = column_part * (all_here * far_here[edge] + row_part * far_ahead[edge]);
-                q_bar[edge] += bar;
-                if (HAS_FLUX) {
-                    q_z_bar[edge] += w_z * bar;
-                    q_y_bar[edge] += w_y * bar;
-                    q_x_bar[edge] += w_x * bar;
-                }
+        };
+        auto pass_all = [&](auto points, auto along) {
+            pass(points, along, Empty(), 0, from);
+            pass(points, along, Filled(), from, to);
+            pass(points, along, Empty(), to, width);
+        };
+        if (is_along) {
+            INDEPENDENT
+            for (int c = 0; c < width; ++c) {
+                const F mass = half_step * (e[c] + gather(Four(), e_from, part, c));
+                passing[c] = part[0] * decay(scale * mass);
+                source_bars[c] = bar[c] + gather(Four(), back_from, part, c);
+            }
+            F last = F(0);
+            for (int n = 0; n < width; ++n) {
+                const int c = x_way > 0 ? width - 1 - n : n;
+                source_bars[c] += last;
+                last = passing[c] * source_bars[c];
+            }
+            pass_all(Four(), Along());
+        }
+        else if (point_count == 1) pass_all(One(), Across());
+        else pass_all(Four(), Across());
+        // By q and by the fields where steps begin.
+        F* __restrict e_bar_row = e_bars + at;
+        F* __restrict sc_bar_row = sc_bars + at;
+        INDEPENDENT
+        for (int c = 0; c < width; ++c) {
+            e_bar_row[c] += mass_row[c];
+            if (!SHARES_FIELD) sc_bar_row[c] += scattered_row[c];
+        }
+        for (int i = 0; i < target_count; ++i) {
+            const Target target = targets[i];
+            const F* far = back(target.s, target.t, FAR, j) + target.shift;
+            INDEPENDENT
+            for (int c = 0; c < width; ++c) bar[c] += target.part * far[c];
+            const int edge = target.shift > 0 ? 0 : width - 1;
+            if (target.shift) bar[edge] += target.part * far[edge - target.shift];
+            if (!target.is_real) continue;
+            const F* mass = back(target.s, target.t, MASS, j) + target.shift;
+            const F* scattered_from
+                = back(target.s, target.t, SHARES_FIELD ? MASS : SCATTERED, j) + target.shift;
+            INDEPENDENT
+            for (int c = 0; c < width; ++c) {
+                e_bar_row[c] += target.part * mass[c];
+                if (!SHARES_FIELD) sc_bar_row[c] += target.part * scattered_from[c];
             }
         }
     }
+    if (VARIES_NUMBERS) {
+        own_sums[0] += total(scale_bar, width);
+        own_sums[1] += total(strength_bar, width);
+        own_sums[2] += total(inflow_bar, width);
+    }
+    const bool is_adding = adds || g < group_to - 1;
+    F* found_row = found + job[11] * count * all + color * cells + at;
+    to_moments(to_sums, found_row, bar_of, is_adding, 0, width);
+}
 }
 """
 )

@@ -1,200 +1,339 @@
 """Rows of cells along which radiance is followed, in C++ (E11, E12).
 
-Slices lie across z or y, so that rows lie along x. Directions that cross the same slices the same
-way are a piece; they go through a row one after another, while what they share is at hand. Of all
-slices only the last one is kept: `near`, what scatters along a direction, and `radiance`, I less
-the light from outside. `upstream` is P, the move from one slice to the next. Where a step meets no
-medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row.
+A job goes through the slices across z in the way that its light takes, s counting them, and in each
+through the rows, t counting them in the way of a group of directions. A step begins at a mean of up
+to four cells, which lie in this slice or the one before, in this row or the one before: wherever a
+direction goes, they were done already. Of a row and a direction there are two lines of numbers:
+`NEAR`, what scatters along it, and `LIGHT`, I less the light from outside. Lines of the last slice
+are kept, each in the place of one that no step needs any more; or, for the adjoint, of all slices.
+
+Behind each row there are at least two cells that hold what is beyond its ends. Where a step meets
+no medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row.
 """
 
 MARGIN = 16
-"""Cells before each row, and at least so many behind it: rows begin where vectors do."""
+"""Cells before an array of lines, whose rows begin where vectors do."""
+POINTERS = 64
+"""Moments and pairs of a group at most: so many rows are multiplied at once."""
+JOB = 12
+"""Whole numbers of a job: see `by_rows.py`."""
+GIVEN = """
+    F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
+    F *found, *bars, *returning, *e_bar, *sc_bar; double *sums; long *addresses;
+    int *ranges, *jobs, *groups, *points, *pairs, *order;
+    int depth, height, width, pitch, colors, count, even, most, scratch_rows;
+    int extinction_channels, scattering_channels
+"""
+"""What kernels of rows are given; what is not used, is none."""
+
 PLACES = (
-    f"const int MARGIN = {MARGIN};"
+    f"const int MARGIN = {MARGIN}, POINTERS = {POINTERS}, JOB = {JOB};"
     + """
-const int* item = given.items.data + 6 * number;
-const int axis = item[0], forward = item[1], begin = item[2], count = item[3], color = item[4];
-const int width = given.width, wide = given.stretch;
-const int slices = axis == 0 ? given.depth : given.height;
-const int rows = axis == 0 ? given.height : given.depth;
-const long long plane = (long long)given.height * width, cells = given.depth * plane;
-const long long slice_step = axis == 0 ? plane : width, row_step = axis == 0 ? width : plane;
+const int* job = jobs + JOB * item;
+const int color = job[0], way = job[1], group_from = job[2], group_to = job[3];
+const int slice_from = job[4], slice_to = job[5], adds = job[6], lane = job[7];
+const long long plane = (long long)height * width, cells = depth * plane, all = colors * cells;
+const int odd = count - even;
 // fields have a layer of empty cells around them
-const long long sheet = (long long)(given.height + 2) * wide, padded = (given.depth + 2) * sheet;
-const long long far_slice = axis == 0 ? sheet : wide, far_row = axis == 0 ? wide : sheet;
-const F* extinction = given.extinction.data + (given.extinction_channels > 1 ? color * padded : 0);
-const F* scattering = SHARES_FIELD
-    ? extinction : given.scattering.data + (given.scattering_channels > 1 ? color * padded : 0);
-const F scale = given.numbers.data[color];
-const F strength = given.numbers.data[given.colors + color];
-const F inflow = given.numbers.data[2 * given.colors + color];
-const int lane = given.lanes > 1 ? color : 0;
-// What goes together lies together: rows of many arrays would take each other's cache lines.
-enum { NEAR, RADIANCE, RETURNING = RADIANCE, FAR_BAR, MASS_BAR, SCATTERED_BAR };
-auto row_of = [&](int which, int slice, int j, int row) -> F* {
-    const long long line = ((lane * 2LL + (slice & 1)) * given.rows + row) * given.group + j;
-    return work.buffers.data + (line * work.slots + which) * wide + MARGIN;
-};
-const F* nothing = work.nothing.data + MARGIN;
-struct Whole { enum { value = 1 }; };
-struct Between { enum { value = 0 }; };
-struct Filled { enum { value = 0 }; };
+const long long sheet = (long long)(height + 2) * pitch, padded = (depth + 2) * sheet;
+const long long inner = MARGIN + sheet + pitch;
+const F* e_cells = extinction + inner + (extinction_channels > 1 ? color * padded : 0);
+const F* sc_cells = scattering + inner + (scattering_channels > 1 ? color * padded : 0);
+const F scale = scales[color], strength = scales[colors + color];
+const F inflow = scales[2 * colors + color];
+const F* empty_row = nothing + MARGIN;
+F* own_scratch = scratch + ((long long)lane * scratch_rows) * pitch;
+auto scratch_row = [&](int i) -> F* { return own_scratch + (long long)i * pitch; };
 struct Empty { enum { value = 1 }; };
-// cells of rows that have a medium, `wider` by so many cells, from and to where vectors begin
-struct Range { int from, to; };
-const int wider_slice = axis == 0 ? given.height + 2 : 1;
-const int wider_row = axis == 0 ? 1 : given.height + 2;
-auto include = [&](Range& range, int k, int row) {
-    const int* own = given.occupied.data + 2 * ((k + 1) * wider_slice + (row + 1) * wider_row);
-    range.from = own[0] < range.from ? own[0] : range.from;
-    range.to = own[1] > range.to ? own[1] : range.to;
-};
-auto clamp = [&](int c) { return c < first ? first : c > last ? last : c; };
-auto widen = [&](Range range, int by) -> Range {
-    if (range.from >= range.to) return {first, first};
-    const int end = range.to + by + MARGIN - 1;
-    return {clamp((range.from - by) & -MARGIN), clamp(end & -MARGIN)};
+struct Filled { enum { value = 0 }; };
+struct One { enum { value = 1 }; };
+struct Two { enum { value = 2 }; };
+struct Four { enum { value = 4 }; };
+struct Along { enum { value = 1 }; };
+struct Across { enum { value = 0 }; };
+// what reaches a cell from those that its step begins at
+auto gather = [](auto points, const F* const* from, const F* part, int c) -> F {
+    if constexpr (decltype(points)::value == 1) return from[0][c];
+    else return part[0] * from[0][c] + part[1] * from[1][c]
+              + part[2] * from[2][c] + part[3] * from[3][c];
 };
 """
 )
-# v where rays were, `here` and `behind` being the rows from which they come
-UPSTREAM = """
-auto upstream = [&](auto whole, const F* here, const F* behind, int c) -> F {
-    if constexpr (decltype(whole)::value) {
-        return (row_part > F(0.5) ? behind : here)[c - whole_columns];
-    } else {
-        const F a = (F(1) - column_part) * here[c] + column_part * here[c - column_sign];
-        const F b = (F(1) - column_part) * behind[c] + column_part * behind[c - column_sign];
-        return (F(1) - row_part) * a + row_part * b;
+# Sums of rows: out_i = sum_j matrix_ij in_j, from one cell to another.
+MULTIPLY = """
+typedef F V __attribute__((vector_size(64), aligned(sizeof(F))));
+const int LANES = 64 / sizeof(F);
+auto multiply_block = [&](auto tall, auto wide, const F* matrix, int ins, F* const* out,
+                          const F* const* in, int c) {
+    constexpr int R = decltype(tall)::value, N = decltype(wide)::value;
+    V sum[R][N];
+#pragma clang loop unroll(full)
+    for (int a = 0; a < R; ++a)
+#pragma clang loop unroll(full)
+        for (int b = 0; b < N; ++b)
+            sum[a][b] = V{};
+    for (int j = 0; j < ins; ++j) {
+        const F* from = in[j] + c;
+#pragma clang loop unroll(full)
+        for (int a = 0; a < R; ++a)
+#pragma clang loop unroll(full)
+            for (int b = 0; b < N; ++b)
+                sum[a][b] += matrix[a * ins + j] * *(const V*)(from + b * LANES);
+    }
+#pragma clang loop unroll(full)
+    for (int a = 0; a < R; ++a)
+#pragma clang loop unroll(full)
+        for (int b = 0; b < N; ++b) *(V*)(out[a] + c + b * LANES) = sum[a][b];
+};
+auto multiply_rows = [&](auto tall, const F* matrix, int ins, F* const* out, const F* const* in,
+                         int from, int to) {
+    int c = from;
+    for (; c + 4 * LANES <= to; c += 4 * LANES)
+        multiply_block(tall, Four(), matrix, ins, out, in, c);
+    for (; c + LANES <= to; c += LANES)
+        multiply_block(tall, One(), matrix, ins, out, in, c);
+    for (; c < to; ++c)
+        for (int a = 0; a < decltype(tall)::value; ++a) {
+            F sum = F(0);
+            for (int j = 0; j < ins; ++j) sum += matrix[a * ins + j] * in[j][c];
+            out[a][c] = sum;
+        }
+};
+auto multiply = [&](const F* matrix, int outs, int ins, F* const* out, const F* const* in,
+                    int from, int to) __attribute__((noinline)) {
+    int i = 0;
+    for (; i + 4 <= outs; i += 4)
+        multiply_rows(Four(), matrix + i * ins, ins, out + i, in, from, to);
+    for (; i + 2 <= outs; i += 2)
+        multiply_rows(Two(), matrix + i * ins, ins, out + i, in, from, to);
+    for (; i < outs; ++i)
+        multiply_rows(One(), matrix + i * ins, ins, out + i, in, from, to);
+};
+// Rows of moments, which lie far apart, are copied to where they do not take each other's places in
+// a processor's cache; the next row is asked for in time.
+auto moment_row = [&](int k) -> F* { return scratch_row(k); };
+auto pair_row = [&](int i) -> F* { return scratch_row(POINTERS + i); };
+auto ask_for = [&](const F* row, int from, int to) {
+    for (int c = from; c < to; c += 64 / (int)sizeof(F)) __builtin_prefetch(row + ahead + c);
+};
+// One of the moments that scatter, from a cell on; those of `bars` and of light follow each other.
+auto read_scattering = [&](long long at, int k, F* row, int from, int to) {
+    const F *light = (const F*)addresses[2 * k], *source = (const F*)addresses[2 * k + 1];
+    const F by_light = light ? factors[k * colors + color] : F(0);
+    const F by_source = source ? factors[(count + k) * colors + color] : F(0);
+    const F *one = (light ? light : source) + at, *other = (source ? source : light) + at;
+    if (!light && !source) {
+        for (int c = from; c < to; ++c) row[c] = F(0);
+        return;
+    }
+    INDEPENDENT
+    for (int c = from; c < to; ++c) row[c] = by_light * one[c] + by_source * other[c];
+    ask_for(one, from, to);
+    if (other != one) ask_for(other, from, to);
+};
+// Radiance of a group's directions, `light(j)`, from rows of moments that `read` gets.
+auto to_directions = [&](const F* matrix, auto read, auto light, int from, int to) {
+    const F* in[POINTERS];
+    F* out[POINTERS];
+    for (int k = 0; k < count; ++k) {
+        read(order[k], moment_row(k), from, to);
+        in[k] = moment_row(k);
+    }
+    for (int p = 0; p < pair_count; ++p)
+        out[p] = p < odd_count ? pair_row(2 * p) : light(pair[2 * p]);
+    multiply(matrix, pair_count, even, out, in, from, to);
+    for (int p = 0; p < odd_count; ++p) out[p] = pair_row(2 * p + 1);
+    multiply(matrix + pair_count * even, odd_count, odd, out, in + even, from, to);
+    for (int p = 0; p < odd_count; ++p) {
+        const F *sum = pair_row(2 * p), *difference = pair_row(2 * p + 1);
+        F *one = light(pair[2 * p]), *other = pair[2 * p + 1] < 0 ? one : light(pair[2 * p + 1]);
+        INDEPENDENT
+        for (int c = from; c < to; ++c) {
+            const F a = sum[c], b = difference[c];
+            other[c] = a - b;
+            one[c] = a + b;
+        }
+    }
+};
+// The transpose: moments that `begin` at a cell, or what is added to them, from radiance.
+auto to_moments = [&](const F* matrix, F* begin, auto light, bool is_adding, int from, int to) {
+    const F *sums[POINTERS], *differences[POINTERS];
+    F* out[POINTERS];
+    for (int k = 0; k < count && is_adding; ++k) ask_for(begin + k * all, from, to);
+    for (int p = 0; p < pair_count; ++p) {
+        const F* one = light(pair[2 * p]);
+        sums[p] = differences[p] = one;
+        if (pair[2 * p + 1] < 0) continue;
+        const F* other = light(pair[2 * p + 1]);
+        F *sum = pair_row(2 * p), *difference = pair_row(2 * p + 1);
+        sums[p] = sum, differences[p] = difference;
+        INDEPENDENT
+        for (int c = from; c < to; ++c) {
+            const F a = one[c], b = other[c];
+            sum[c] = a + b;
+            difference[c] = a - b;
+        }
+    }
+    for (int k = 0; k < count; ++k) out[k] = moment_row(k);
+    multiply(matrix, even, pair_count, out, sums, from, to);
+    multiply(matrix + even * pair_count, odd, odd_count, out + even, differences, from, to);
+    for (int k = 0; k < count; ++k) {
+        F* moment = begin + order[k] * all;
+        const F* row = moment_row(k);
+        INDEPENDENT
+        for (int c = from; c < to; ++c) moment[c] = is_adding ? moment[c] + row[c] : row[c];
     }
 };
 """
-DIRECTION = """
-const F* numbers = given.directions.data + 10 * (begin + j);
-const int* signs = given.signs.data + 3 * (begin + j);
-const F half = numbers[0], row_part = numbers[1], column_part = numbers[2];
-const F w_z = numbers[3], w_y = numbers[4], w_x = numbers[5];
-const F by_mean = numbers[6], by_z = numbers[7], by_y = numbers[8], by_x = numbers[9];
-const int row_sign = signs[0], column_sign = signs[1];
-const int whole_columns = column_part > F(0.5) ? column_sign : 0;
-// q + q1 . w
-auto light_along = [&](const F* q, const F* q_z, const F* q_y, const F* q_x, int c) -> F {
-    return HAS_FLUX ? q[c] + w_z * q_z[c] + w_y * q_y[c] + w_x * q_x[c] : q[c];
-};
-// where I of a slice and row is kept
-auto kept_of = [&](int s, int r) -> long long {
-    return (((lane * (long long)slices + s) * rows + r) * given.group + j) * width;
-};
+# The group of which rows are gone through.
+GROUP = """
+const int* group = groups + 8 * g;
+const int y_way = group[0], begin = group[1], members = group[2], before = group[7];
+const int* pair = pairs + 2 * group[3];
+const int pair_count = group[4], odd_count = group[5], half = pair_count * even + odd_count * odd;
+const F *to_light = matrices + group[6], *to_sums = to_light + half;
+const F *to_weighted_light = to_sums + half, *to_weighted_sums = to_weighted_light + half;
 """
-# phi, psi and what is lost, of the depth of a step
-STEP = """
-const F depth = is_empty ? F(0) : scale * mass, passed = is_empty ? F(1) : decay(depth);
-const bool is_thin = is_empty || depth < F(0.5);
-const F inverse = F(1) / (is_thin ? F(0.5) : depth), series = psi_series(is_thin ? depth : F(0));
-const F phi = is_empty ? F(1) : is_thin ? F(1) - depth * series : (F(1) - passed) * inverse;
+# Of a direction: the cells where its step begins, and their parts in the mean.
+DIRECTION = """
+const int* point = points + 16 * (begin + j) + 3;
+const int point_count = point[-3], x_way = point[-2], is_along = point[-1];
+const F half_step = parts[5 * (begin + j)];
+const F part[4] = {parts[5 * (begin + j) + 1], parts[5 * (begin + j) + 2],
+                   parts[5 * (begin + j) + 3], parts[5 * (begin + j) + 4]};
+"""
+# Lines of earlier slices and rows. Beyond the faces of the box are neither medium nor I; q is
+# repeated there.
+UPSTREAM = """
+const F *near_from[4], *light_from[4], *e_from[4], *sc_from[4];
+for (int i = 0; i < 4; ++i) {
+    const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
+    const bool is_inside = s >= dk && t >= dr;
+    near_from[i] = line(s >= dk ? s - dk : 0, t >= dr ? t - dr : 0, NEAR, j) - shift;
+    light_from[i] = (is_inside ? line(s - dk, t - dr, LIGHT, j) : empty_row) - shift;
+    const long long back = dk * way * sheet + dr * y_way * pitch + shift;
+    e_from[i] = e - back;
+    sc_from[i] = sc - back;
+}
+"""
+# The two ends of a step.
+ENDS = """
+const F near_here = near_row[c], far = gather(points, near_from, part, c);
+const F mass = half_step * (e[c] + gather(points, e_from, part, c));
+const F scattering_mass
+    = SHARES_FIELD ? mass : half_step * (sc[c] + gather(points, sc_from, part, c));
+"""
+# phi, psi and what is lost, of the depth of a step; and what of its source reaches its end.
+DECAYED = """
+const F depth_of_step = is_empty ? F(0) : scale * mass;
+const F passed = is_empty ? F(1) : decay(depth_of_step);
+const bool is_thin = is_empty || depth_of_step < F(0.5);
+const F inverse = F(1) / (is_thin ? F(0.5) : depth_of_step);
+const F series = psi_series(is_thin ? depth_of_step : F(0));
+const F phi = is_empty ? F(1) : is_thin ? F(1) - depth_of_step * series : (F(1) - passed) * inverse;
 const F psi = is_empty ? F(0.5) : is_thin ? series : (F(1) - phi) * inverse;
-const F lost = depth * phi;
-const F line = far * phi + (near - far) * psi;
+const F lost = depth_of_step * phi;
+const F line_mean = far * phi + (near_here - far) * psi;
+"""
+# E11 transposed, the source being line times scattering depth: cotangents of the step's numbers.
+SLOPES = """
+const F slope_series = psi_slope_series(is_thin ? depth_of_step : F(0));
+const F psi_slope = is_thin ? slope_series : (phi - F(2) * psi) * inverse;
+const F line_bar = source_bar * (scattering_mass * strength);
+const F lost_bar = -source_bar * (arriving + inflow);
+const F line_slope = far * (psi - phi) + (near_here - far) * psi_slope;
+const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * passed;
+const F scattering_depth_bar = source_bar * line_mean;
+const F scattered = half_step * (scattering_depth_bar * strength);
 """
 FOLLOW = (
     PLACES
     + """
-const bool is_first = item[5];
-for (int s = slice_first; s < slice_last; ++s) {
-    // Slice -1 is the first one again: beyond the box q is that at its face, and I is zero.
-    const int k = forward > 0 ? (s < 0 ? 0 : s) : slices - 1 - (s < 0 ? 0 : s);
-    for (int r = row_first; r < row_last; ++r) {
-        const long long at = color * cells + k * slice_step + r * row_step;
-        const F* __restrict q = given.light.mean.data + at;
-        const F* __restrict q_z = given.light.z.data + (HAS_FLUX ? at : 0);
-        const F* __restrict q_y = given.light.y.data + (HAS_FLUX ? at : 0);
-        const F* __restrict q_x = given.light.x.data + (HAS_FLUX ? at : 0);
-        F* __restrict mean = work.light.mean.data + (KEEPS ? 0 : at);
-        F* __restrict flux_z = work.light.z.data + (HAS_FLUX && !KEEPS ? at : 0);
-        F* __restrict flux_y = work.light.y.data + (HAS_FLUX && !KEEPS ? at : 0);
-        F* __restrict flux_x = work.light.x.data + (HAS_FLUX && !KEEPS ? at : 0);
-        if (!KEEPS && is_first && s >= 0) {
-            for (int c = first; c < last; ++c) mean[c] = F(0);
-            if (HAS_FLUX)
-                for (int c = first; c < last; ++c) flux_z[c] = flux_y[c] = flux_x[c] = F(0);
-        }
-        for (int j = 0; j < count; ++j) {"""
+enum { NEAR, LIGHT };
+const long long stride = 2LL * most * pitch;
+const long long places = KEEPS ? (long long)depth * height : height + 2;
+F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
+for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_to; ++g) {"""
+    + GROUP
+    + "const int ahead = y_way * width;"
+    + MULTIPLY
+    + """
+const int k = way > 0 ? s : depth - 1 - s;
+for (int t = 0; t < height; ++t) {
+    const int r = y_way > 0 ? t : height - 1 - t;
+    const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
+    auto line = [&](int slice, int turn, int which, int j) -> F* {
+        const long long place = KEEPS
+            ? (long long)slice * height + turn
+            : (turn + 2LL * (depth - slice)) % (height + 2);
+        return own_lines + place * stride + (2 * (before + j) + which) * (long long)pitch;
+    };
+    auto near_of = [&](int j) -> F* { return line(s, t, NEAR, j); };
+    auto light_of = [&](int j) -> F* { return line(s, t, LIGHT, j); };
+    // Where steps meet a medium, and where what scatters is asked for.
+    const int* range = ranges + 4 * (k * height + r);
+    const int from = range[0], to = range[1];
+    const int near_begin = KEEPS ? 0 : range[2], near_end = KEEPS ? width : range[3];
+    auto read = [&](int k, F* row, int from, int to) {
+        read_scattering(color * cells + at, k, row, from, to);
+    };
+    to_directions(to_light, read, near_of, near_begin, near_end);
+    const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
+    F* __restrict carried = scratch_row(3 * POINTERS);
+    for (int j = 0; j < members; ++j) {"""
     + DIRECTION
+    + """
+        F *near_row = near_of(j), *__restrict light_row = light_of(j);
+        light_row[-1] = light_row[width] = F(0);
+        if (x_way > 0) near_row[-1] = near_row[0];
+        else near_row[width] = near_row[width - 1];"""
     + UPSTREAM
     + """
-            F* __restrict near_row = row_of(NEAR, s, j, r);
-            F* __restrict radiance_row = row_of(RADIANCE, s, j, r);
-            if (s < 0) {
-                INDEPENDENT
-                for (int c = first; c < last; ++c) {
-                    near_row[c] = light_along(q, q_z, q_y, q_x, c);
-                    radiance_row[c] = F(0);
-                }
-            } else {
-                // Beyond the faces of the box are neither medium nor I; q is repeated there.
-                const int behind = r - row_sign;
-                const bool is_inside = behind >= 0 && behind < rows;
-                const F* near_here = row_of(NEAR, s - 1, j, r);
-                const F* near_behind = is_inside ? row_of(NEAR, s - 1, j, behind) : near_here;
-                const F* radiance_here = row_of(RADIANCE, s - 1, j, r);
-                const F* radiance_behind
-                    = is_inside ? row_of(RADIANCE, s - 1, j, behind) : nothing;
-                const long long there = (k + 1) * far_slice + (r + 1) * far_row + MARGIN;
-                const long long before = there - forward * far_slice;
-                const F* __restrict e = extinction + there;
-                const F* e_here = extinction + before;
-                const F* e_behind = e_here - row_sign * far_row;
-                const F* __restrict sc = scattering + there;
-                const F* sc_here = scattering + before;
-                const F* sc_behind = sc_here - row_sign * far_row;
-                const long long kept = KEEPS ? kept_of(s, r) : 0;
-                F* __restrict arriving_kept = work.arriving.data + kept;
-                Range met = {width, 0};
-                include(met, k, r);
-                include(met, k - forward, r);
-                include(met, k - forward, behind);
-                met = widen(met, 1);
-                auto pass = [&](auto whole, auto empty, int from, int to) {
-                    constexpr bool is_empty = decltype(empty)::value;
-                    INDEPENDENT
-                    for (int c = from; c < to; ++c) {
-                        const F near = light_along(q, q_z, q_y, q_x, c);
-                        const F far = upstream(whole, near_here, near_behind, c);
-                        const F arriving = upstream(whole, radiance_here, radiance_behind, c);
-                        const F mass = half * (e[c] + upstream(whole, e_here, e_behind, c));
-                        const F scattering_mass = SHARES_FIELD
-                            ? mass : half * (sc[c] + upstream(whole, sc_here, sc_behind, c));"""
-    + STEP
+        auto pass = [&](auto points, auto along, auto empty, int from, int to) {
+            constexpr bool is_empty = decltype(empty)::value;
+            INDEPENDENT
+            for (int c = from; c < to; ++c) {
+                const F arriving = gather(points, light_from, part, c);
+                if constexpr (is_empty) {
+                    light_row[c] = arriving;
+                    if (decltype(along)::value) carried[c] = part[0];
+                } else {"""
+    + ENDS
+    + DECAYED
     + """
-                        // Light from outside is there without a medium; I is what differs from it.
-                        const F source = line * (scattering_mass * strength) - inflow * lost;
-                        const F radiance = is_empty ? arriving : passed * arriving + source;
-                        near_row[c] = near;
-                        radiance_row[c] = radiance;
-                        if (KEEPS) {
-                            arriving_kept[c] = arriving;
-                        } else {
-                            const F whole_radiance = radiance + inflow;
-                            mean[c] += by_mean * whole_radiance;
-                            if (HAS_FLUX) {
-                                flux_z[c] += by_z * whole_radiance;
-                                flux_y[c] += by_y * whole_radiance;
-                                flux_x[c] += by_x * whole_radiance;
-                            }
-                        }
-                    }
-                };
-                auto pass_all = [&](auto whole) {
-                    pass(whole, Empty(), first, met.from);
-                    pass(whole, Filled(), met.from, met.to);
-                    pass(whole, Empty(), met.to, last);
-                };
-                if (signs[2]) pass_all(Whole()); else pass_all(Between());
+                    // Light from outside is there without a medium; I is what differs from it.
+                    const F source = line_mean * (scattering_mass * strength) - inflow * lost;
+                    light_row[c] = passed * arriving + source;
+                    if (decltype(along)::value) carried[c] = part[0] * passed;
+                }
             }
-            if (first == 0) near_row[-1] = near_row[0];
-            if (last == width) near_row[width] = near_row[width - 1];
+        };
+        auto pass_all = [&](auto points, auto along) {
+            pass(points, along, Empty(), 0, from);
+            pass(points, along, Filled(), from, to);
+            pass(points, along, Empty(), to, width);
+        };
+        if (is_along) {
+            // What comes along the row itself is carried on cell by cell.
+            for (int i = 0; i < 4; ++i)
+                if (!point[3 * i] && !point[3 * i + 1]) light_from[i] = empty_row;
+            pass_all(Four(), Along());
+            F last = F(0);
+            for (int n = 0; n < width; ++n) {
+                const int c = x_way > 0 ? n : width - 1 - n;
+                last = light_row[c] = light_row[c] + carried[c] * last;
+            }
         }
+        else if (point_count == 1) pass_all(One(), Across());
+        else pass_all(Four(), Across());
     }
+    if (KEEPS) continue;
+    F* found_row = found + job[11] * count * all + color * cells + at;
+    const bool is_adding = adds || g > group_from;
+    to_moments(to_weighted_sums, found_row, light_of, is_adding, 0, width);
+    if (!is_adding && job[11] == 0)
+        for (int c = 0; c < width; ++c) found_row[c] += inflow;
+}
 }
 """
 )

@@ -1,121 +1,234 @@
-"""Which directions of a sweep go together, and in which thread."""
+"""Which directions of a sweep go together, and the numbers that kernels have of them.
+
+Light that goes up or down in z is a way of its own; of directions within slices each has its
+mirror image in the other. On a way all directions go through the cells slice by slice, some with
+y and others against it: groups. In a group a direction and its mirror image in x are a pair: their
+sums of harmonics of either parity in x differ in signs alone.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
+
+import torch
+from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Course, Direction
 from ddrecon.grid import Grid
+from ddrecon.numerics.harmonics import harmonics
+from ddrecon.numerics.quadrature import sphere_quadrature
 
-PIECE = {True: 5, False: 9}
-"""Directions at most that go side by side: fewer where I of all slices is kept for the adjoint."""
-EVEN = 1.05
-"""A thread may have this many times the mean work."""
+X = 2
+POINTS = 4
+"""Cells at most where a step begins."""
 
 
 @dataclass(frozen=True)
-class Piece:
-    """Directions `begin` to `begin + count` that cross slices across `axis` in the same way."""
+class Step:
+    """The step to a cell along a direction: from a mean of up to four cells, of given `weights`.
 
+    Slices lie across `axis`. Each of `points` tells how many cells it lies before the cell along z,
+    y and x, none or one, of light with the `signs`. Where `is_along` the first lies in the same
+    row: a recurrence in x.
+    """
+
+    direction: Direction
     axis: int
-    forward: int
-    begin: int
-    count: int
+    half: float
+    signs: tuple[int, int, int]
+    points: tuple[tuple[int, ...], ...]
+    weights: tuple[float, ...]
+    is_along: bool
+
+    @staticmethod
+    def of(grid: Grid, direction: Direction) -> Step:
+        """The step of `direction` through `grid`, of which half is `half` [u] long (E11)."""
+        course = Course.of(grid, direction)
+        axis = course.order[0] - 1
+        moved: list[float] = [0.0, 0.0, 0.0]
+        moved[axis] = float(course.forward)
+        for drift, dim in zip(course.drift, course.order[2:], strict=True):
+            moved[dim - 1] = drift
+        # The cells around where light was, first that on the row itself where it goes along x.
+        found: dict[tuple[int, ...], float] = {}
+        for point in product(*((1,) if i == axis else (0, 1) for i in range(3))):
+            parts = (abs(m) if p else 1 - abs(m) for m, p in zip(moved, point, strict=True))
+            found[point] = math.prod(parts)
+        is_along = found.get((0, 0, 1), 0.0) > 0 and axis == X
+        kept = {point: weight for point, weight in found.items() if weight > 0}
+        z, y, x = (1 if m > 0 else -1 if m < 0 else 0 for m in moved)
+        return Step(
+            direction,
+            axis,
+            0.5 * course.step,
+            (z, y, x),
+            tuple(kept),
+            tuple(kept.values()),
+            is_along,
+        )
+
+    @property
+    def is_up(self) -> bool:
+        """Whether it belongs to the way up in z; within slices of each direction or its mirror."""
+        return self.signs > (0, 0, 0)
+
+
+@functools.cache
+def steps_of(grid: Grid, count: int) -> tuple[tuple[Step, float], ...]:
+    """The step along each of `count` directions, and the quadrature's weight."""
+    points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
+    steps = (Step.of(grid, (z, y, x)) for z, y, x in points.tolist())
+    return tuple(zip(steps, weights.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
-class Schedule:
-    """What crosses slices across z and y; or across z and x, then of cells with y and x exchanged.
+class Tables:
+    """What kernels are given of directions; numbers of a group or direction lie side by side.
 
-    `directions`: their numbers in the quadrature; `numbers` and `signs`: their rows of
-    `kernels.records.Given`, but for the weights of moments; `pieces` of them.
+    `groups` [G, 8]: the way in y, first direction, how many, first pair, how many, how many of
+    these with harmonics odd in x, where their `matrices` are, directions before it in its chunk;
+    `points` [D, 16]: how many, the sign of x, whether along x, then z, y, x of each; `parts`
+    [D, 5]: half a step and weights; `pairs` [P, 2]: places in the group, the second -1 for none;
+    `moments` [K]: those even in x first, `even` of them. `chunks`: by way, and then by piece,
+    ranges of groups that go through the cells together, of at most `most` directions.
     """
 
-    directions: tuple[int, ...]
-    numbers: tuple[tuple[float, ...], ...]
-    signs: tuple[tuple[int, int, int], ...]
-    pieces: tuple[Piece, ...]
-
-    def cut(self, most: int) -> list[Piece]:
-        """The pieces, cut into about equal ones of at most so many directions."""
-        found = []
-        for piece in self.pieces:
-            parts = -(-piece.count // most)
-            bounds = [i * piece.count // parts for i in range(parts + 1)]
-            for a, b in pairwise(bounds):
-                found.append(Piece(piece.axis, piece.forward, piece.begin + a, b - a))
-        return found
+    groups: Tensor
+    points: Tensor
+    parts: Tensor
+    pairs: Tensor
+    matrices: Tensor
+    moments: Tensor
+    even: int
+    most: int
+    chunks: tuple[tuple[tuple[tuple[int, int], ...], ...], ...]
 
 
 @functools.cache
-def schedules(grid: Grid, directions: tuple[Direction, ...]) -> tuple[Schedule, ...]:
-    """The schedule across z and y, and that across x: a quadrature has directions of both."""
-    courses = [Course.of(grid, direction) for direction in directions]
-    axes = [course.order[0] - 1 for course in courses]
-    across = ({i: a for i, a in enumerate(axes) if (a == 2) == is_x} for is_x in (False, True))
-    return tuple(_schedule(directions, courses, each) for each in across)
+def make_tables(
+    grid: Grid, count: int, moments: int, most: int, pieces: int, dtype: torch.dtype
+) -> Tables:
+    """The tables of `count` directions through `grid`, of light with so many `moments`.
 
-
-def _schedule(
-    directions: tuple[Direction, ...], courses: list[Course], axes: dict[int, int]
-) -> Schedule:
-    order: list[int] = []
-    pieces = []
-    for axis, forward in product((0, 1, 2), (1, -1)):
-        group = [i for i, a in axes.items() if a == axis and courses[i].forward == forward]
-        if group:
-            pieces.append(Piece(min(axis, 1), forward, len(order), len(group)))
-            order += group
-    numbers, signs = [], []
-    for i in order:
-        row, column = courses[i].drift
-        numbers.append((0.5 * courses[i].step, abs(row), abs(column), *directions[i]))
-        is_whole = {abs(row), abs(column)} <= {0.0, 1.0}
-        signs.append((1 if row >= 0 else -1, 1 if column >= 0 else -1, int(is_whole)))
-    return Schedule(tuple(order), tuple(numbers), tuple(signs), tuple(pieces))
-
-
-Item = tuple[int, int, int, int, int, int]
-"""Axis, way, first direction, how many, color, and whether it is its thread's first of the color.
-"""
-
-
-@functools.cache
-def share_items(
-    schedule: Schedule, colors: int, threads: int, is_kept: bool, is_apart: bool
-) -> tuple[list[Item], list[int]]:
-    """Each piece in each color, in the order of threads, and where each thread's begin.
-
-    Pieces are cut until all threads have about as much to do; where colors are kept `is_apart`,
-    each has one thread.
+    On each way the directions are cut into chunks of about `most` at most, in `pieces`.
     """
-    for most in range(PIECE[is_kept], 0, -1):
-        shares, work = _deal(schedule.cut(most), colors, threads, is_apart)
-        if is_apart or max(work) <= EVEN * sum(work) / threads:
-            break
-    items: list[Item] = []
-    bounds = [0]
-    for share in shares:
-        seen: set[int] = set()
-        for piece, color in share:
-            is_first = color not in seen
-            seen.add(color)
-            items.append((piece.axis, piece.forward, piece.begin, piece.count, color, is_first))
-        bounds.append(len(items))
-    return items, bounds
+    made = _Maker(moments)
+    chunks = []
+    steps = steps_of(grid, count)
+    for is_up in (True, False):
+        units = _pairs([each for each in steps if each[0].is_up == is_up], made.odd > 0)
+        chunks.append(made.add_way(units, most, pieces))
+
+    def whole(rows: list[list[int]]) -> Tensor:
+        return torch.tensor(rows, dtype=torch.int32)
+
+    return Tables(
+        whole(made.groups),
+        whole(made.points),
+        torch.tensor(made.parts, dtype=dtype),
+        whole(made.pairs),
+        torch.cat(made.matrices).to(dtype),
+        torch.tensor(made.order, dtype=torch.int32),
+        moments - made.odd,
+        made.most,
+        tuple(chunks),
+    )
 
 
-def _deal(
-    pieces: list[Piece], colors: int, threads: int, is_apart: bool
-) -> tuple[list[list[tuple[Piece, int]]], list[int]]:
-    """What each thread gets, and how much: the largest pieces first, each to who has least."""
-    shares: list[list[tuple[Piece, int]]] = [[] for _ in range(threads)]
-    work = [0] * threads
-    for piece in sorted(pieces, key=lambda piece: -piece.count):
-        for color in range(colors):
-            least = color % threads if is_apart else work.index(min(work))
-            shares[least].append((piece, color))
-            work[least] += piece.count
-    return shares, work
+Unit = list[tuple[Step, float]]
+"""A direction with its weight, and perhaps its mirror image in x."""
+
+
+def _pairs(steps: list[tuple[Step, float]], is_paired: bool) -> list[Unit]:
+    """The directions, those along y first, mirror images together."""
+    units: dict[tuple[float, ...], Unit] = {}
+    for step, weight in sorted(steps, key=lambda each: each[0].signs[1] < 0):
+        z, y, x = step.direction
+        key = (z, y, abs(x)) if is_paired else (z, y, x)
+        units.setdefault(key, []).append((step, weight))
+    return list(units.values())
+
+
+class _Maker:
+    """Tables while they are made, as lists."""
+
+    def __init__(self, moments: int):
+        self.degree = round(moments**0.5) - 1
+        # A direction and its mirror image tell which harmonics are odd in x.
+        point = torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
+        image = point * point.new_tensor([1, 1, -1])
+        is_odd = (harmonics(point, self.degree) * harmonics(image, self.degree) < 0).tolist()
+        self.order = sorted(range(moments), key=lambda k: is_odd[k])
+        self.odd, self.most = sum(is_odd), 0
+        self.groups, self.points, self.pairs = (
+            list[list[int]](),
+            list[list[int]](),
+            list[list[int]](),
+        )
+        self.parts, self.matrices = list[list[float]](), list[Tensor]()
+
+    def add_way(
+        self, units: list[Unit], most: int, pieces: int
+    ) -> tuple[tuple[tuple[int, int], ...], ...]:
+        """Adds a way's directions; the chunks of each piece, as ranges of groups."""
+        total = sum(map(len, units))
+        count = math.ceil(total / most / pieces) * pieces
+        chunks: list[list[Unit]] = [[] for _ in range(count)]
+        done = 0
+        for unit in units:
+            chunks[min(done * count // total, count - 1)].append(unit)
+            done += len(unit)
+        ranges = [self._add_chunk(chunk) for chunk in chunks if chunk]
+        per_piece = -(-len(ranges) // pieces)
+        return tuple(tuple(ranges[i : i + per_piece]) for i in range(0, len(ranges), per_piece))
+
+    def _add_chunk(self, units: list[Unit]) -> tuple[int, int]:
+        begin, before = len(self.groups), 0
+        for y_way in (1, -1):
+            group = [unit for unit in units if (unit[0][0].signs[1] < 0) == (y_way < 0)]
+            if group:
+                self._add_group(group, y_way, before)
+                before += sum(map(len, group))
+        self.most = max(self.most, before)
+        return begin, len(self.groups)
+
+    def _add_group(self, units: list[Unit], y_way: int, before: int) -> None:
+        # Pairs with harmonics odd in x come first.
+        has_odd = [self.odd > 0 and unit[0][0].direction[2] != 0 for unit in units]
+        units = sorted(units, key=lambda unit: -abs(unit[0][0].direction[2]))
+        first, first_pair = len(self.points), len(self.pairs)
+        for unit in units:
+            place = len(self.points) - first
+            self.pairs.append([place, place + 1 if len(unit) > 1 else -1])
+            for step, _ in unit:
+                self._add_step(step)
+        at = sum(map(len, self.matrices))
+        members = len(self.points) - first
+        group = y_way, first, members, first_pair, len(units), sum(has_odd), at, before
+        self.groups.append(list(group))
+        # Y_k of pairs as sums over moments, and as sums over pairs; the same with weights.
+        ways = torch.tensor([unit[0][0].direction for unit in units], dtype=torch.float64)
+        values = harmonics(ways, self.degree)[self.order].T
+        weighted = values * values.new_tensor([unit[0][1] for unit in units])[:, None]
+        even = len(self.order) - self.odd
+        for matrix in (values, weighted):
+            parts = matrix[:, :even], matrix[: sum(has_odd), even:]
+            self.matrices += [part.reshape(-1) for part in parts]
+            self.matrices += [part.T.reshape(-1) for part in parts]
+
+    def _add_step(self, step: Step) -> None:
+        fill = POINTS - len(step.points)
+        points = step.points + step.points[:1] * fill
+        self.points.append(
+            [
+                len(step.points),
+                step.signs[2],
+                step.is_along,
+                *(n for point in points for n in point),
+                0,
+            ]
+        )
+        self.parts.append([step.half, *step.weights, *[0.0] * fill])

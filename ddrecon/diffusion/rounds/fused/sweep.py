@@ -1,93 +1,95 @@
-"""A sweep as one differentiable function of tensors, by fused kernels (E11, E12)."""
+"""A sweep as one differentiable function of tensors, by fused kernels (E11, E17)."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.part import Part, Plan, Swept, Weighted
-from ddrecon.diffusion.rounds.fused.schedule import schedules
-from ddrecon.diffusion.rounds.fused.turning import add_turned
-from ddrecon.kernels.spare import give_back
+from ddrecon.diffusion.rounds.fused.by_cells import Cells
+from ddrecon.diffusion.rounds.fused.by_rows import Rows
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, parts_of
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.harmonics import count_harmonics, degrees_of_harmonics
 
 
 def sweep_fused(
     medium: Medium,
-    light: Moments,
+    light: Moments | None,
+    factors: Tensor,
+    source: Moments,
     inflow: Tensor | None,
-    weighted: Weighted,
+    directions: int,
     by_cells: bool | None = None,
-) -> tuple[Tensor, ...]:
-    """The moments of E12 of radiance along `weighted` directions, as `sweep` returns them.
+) -> Moments:
+    """The moments of the radiance that `light`, by `factors`, and `source` scatter (E17).
 
-    `by_cells`: whether a thread does a cell of a slice, not directions; None: on a GPU.
+    As `sweep_scattered` has it. `directions`: how many the quadrature has; `by_cells`: whether a
+    thread does a cell of a slice, not rows of directions; None: on a GPU.
     """
-    colors = light.mean.shape[0]
+    colors = len(medium.extinction.value) if light is None else len(light.mean)
     strength = (1 - medium.forward_fraction) * medium.scattering.scale
-    entering = light.mean.new_zeros(1) if inflow is None else inflow
-    numbers = torch.stack(
+    entering = source.mean.new_zeros(1) if inflow is None else inflow
+    scales = torch.stack(
         [each.reshape(-1).expand(colors) for each in (medium.extinction.scale, strength, entering)]
     )
     shares_field = medium.scattering.field is medium.extinction.field
-    moments: tuple[Tensor, ...] = _Sweep.apply(
-        Plan(medium.grid, weighted, light.mean.is_cuda if by_cells is None else by_cells),
-        numbers,
+    moments: Tensor = _Sweep.apply(
+        source.mean.is_cuda if by_cells is None else by_cells,
+        medium.grid,
+        directions,
+        scales,
         medium.extinction.field,
         None if shares_field else medium.scattering.field,
-        light.mean,
-        *(light.flux or ()),
+        _spread_factors(factors, colors),
+        *((None,) * PARTS if light is None else parts_of(light, colors)),
+        *parts_of(source, colors),
     )
-    return moments
+    return Moments.of_harmonics(moments)
+
+
+def _spread_factors(factors: Tensor, colors: int) -> Tensor:
+    """`factors` [L + 1, 1 or C, 1, 1, 1] of light and those of sources, by harmonic: [2, K, C].
+
+    A flux is sqrt(3) times as large as the moments of degree 1.
+    """
+    degree = len(factors) - 1
+    each = factors.reshape(degree + 1, -1).expand(-1, colors)[list(degrees_of_harmonics(degree))]
+    units = each.new_ones(count_harmonics(degree), 1)
+    units[1:4] = 3**-0.5
+    return torch.stack([each * units, units.expand(-1, colors)])
 
 
 class _Sweep(torch.autograd.Function):
-    """The moments of light, and their derivatives by `numbers` [3, C], fields and light."""
+    """The moments [K, C, z, y, x] of light, and their derivatives by all tensors of `Swept`."""
 
     @staticmethod
-    def forward(ctx: Any, plan: Plan, *tensors: Any) -> tuple[Tensor, ...]:
-        ctx.plan = plan
+    def forward(ctx: Any, by_cells: bool, *given: Any) -> Tensor:
+        grid, directions, *tensors = given
+        ctx.by_cells, ctx.of = by_cells, (grid, directions)
         ctx.save_for_backward(*tensors)
-        parts = _parts(plan, Swept.of(*tensors))
-        shares, turned = (part.follow() for part in parts)
-        moments = _add_up(shares, turned)
-        give_back(*shares[1:], *turned)
-        return moments.unbind(0)
+        swept = Swept.of(*given)
+        return Cells(swept).follow() if by_cells else Rows(swept, is_kept=False).follow()
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
-        varies_numbers = ctx.needs_input_grad[1]
-        parts = _parts(ctx.plan, Swept.of(*ctx.saved_tensors))
-        (one, *cells), (other, *turned) = (part.transpose(bars, varies_numbers) for part in parts)
-        light_bars = _add_up(cells[0], turned[0])
-        give_back(*cells[0][1:], *turned[0])
-        field_bars = [_add_up(*each) for each in zip(cells[1:], turned[1:], strict=True)]
-        numbers_bar = None
-        if varies_numbers:
-            sums = (part.double().sum((2, 3)) for part in (*one, *other))
-            numbers_bar = functools.reduce(Tensor.add, sums).to(light_bars)
-        # A field of one channel for all colors, or none where extinction's serves scattering too.
-        of_fields = [
-            None if field is None or bar is None else bar.sum_to_size(field.shape)
-            for bar, field in zip((*field_bars, None), ctx.saved_tensors[1:3], strict=False)
-        ]
-        return None, numbers_bar, *of_fields, *light_bars.unbind(0)
-
-
-def _add_up(shares: list[Tensor], turned: list[Tensor]) -> Tensor:
-    """The sum of threads' `shares` of both parts, in the memory of the first."""
-    return add_turned(*(functools.reduce(Tensor.add_, each) for each in (shares, turned)))
-
-
-def _parts(plan: Plan, swept: Swept) -> Iterator[Part]:
-    """What crosses slices across z or y, and what crosses those across x: one after the other."""
-    directions = tuple(direction for direction, _ in plan.weighted)
-    for i, schedule in enumerate(schedules(plan.grid, directions)):
-        yield Part(plan, schedule, swept, bool(i))
+    def backward(ctx: Any, bars: Tensor) -> tuple[Any, ...]:
+        swept = Swept.of(*ctx.of, *ctx.saved_tensors)
+        _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
+        sweep = Cells(swept) if ctx.by_cells else Rows(swept, is_kept=True)
+        scales_bar, moments_bar, fields = sweep.transpose(bars, needs_scales)
+        extinction_bar, *scattering_bar = fields
+        return (
+            None,
+            None,
+            None,
+            scales_bar if needs_scales else None,
+            extinction_bar,
+            scattering_bar[0] if scattering_bar else None,
+            swept.factor_bar(moments_bar) if needs_factors else None,
+            *swept.part_bars(0, moments_bar, needs_parts[:PARTS]),
+            *swept.part_bars(1, moments_bar, needs_parts[PARTS:]),
+        )

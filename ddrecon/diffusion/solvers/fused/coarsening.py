@@ -21,7 +21,7 @@ const auto weigh = [&](int s, int color, int first, int last) APART {
         const int z = r / c.ny, y = r - z * c.ny;
         F* below = in_data(s, BELOW, color, c.cells) + (Size)r * c.nx;
         F* above = in_data(s, ABOVE, color, c.cells) + (Size)r * c.nx;
-        F* along = &work.data[at(s + 1, CZ + a) + color * c.cells + (Size)r * c.nx];
+        F* along = &work[at(s + 1, CZ + a) + color * c.cells + (Size)r * c.nx];
         const int pair = a == 0 ? z : y, cells = a == 0 ? g.nz : g.ny;
         if (a < 2 && 2 * pair + 2 < cells) {
             const F* start = g.faces[a] + (a == 0 ? 2 * z : z) * g.zs[a] + (a == 1 ? 2 * y : y) *
@@ -67,7 +67,7 @@ const auto coarsen_cells = [&](int s, int color, int first, int last) APART {
         // across the axis in parallel, and losses: sums of pairs
         for (int b = 0; b < 4; ++b) {
             if (b == a) continue;
-            F* __restrict out = &work.data[at(s + 1, CZ + b) + color * c.cells + (Size)r * nx];
+            F* __restrict out = &work[at(s + 1, CZ + b) + color * c.cells + (Size)r * nx];
             const F* __restrict one = b < 3 ? row_of(g, b, z1, y1, own)
                                             : g.loss + ((Size)z1 * g.ny + y1) * g.nx;
             if (a < 2) {
@@ -81,7 +81,7 @@ const auto coarsen_cells = [&](int s, int color, int first, int last) APART {
             }
         }
         // Galerkin: energy of what runs across the axis, of both neighbors along b
-        F* along = &work.data[at(s + 1, CZ + a) + color * c.cells + (Size)r * nx];
+        F* along = &work[at(s + 1, CZ + a) + color * c.cells + (Size)r * nx];
         const F* below = in_data(s, BELOW, color, c.cells) + (Size)r * nx;
         const F* above = in_data(s, ABOVE, color, c.cells) + (Size)r * nx;
         const int count = a == 2 ? nx - 1 : nx;

@@ -6,17 +6,16 @@ Down: two relaxations from zero, the residual and its restriction. Up: the same 
 again, the correction, and two relaxations more (`solvers/hierarchy.py` has the formulas).
 """
 
-import functools
-from typing import Any
+from __future__ import annotations
 
-import warp as wp
+import functools
 
 from ddrecon.diffusion.solvers.fused import sums
-from ddrecon.diffusion.solvers.fused.level import LEVEL
+from ddrecon.diffusion.solvers.fused.level import GIVEN, LEVEL
 from ddrecon.diffusion.solvers.fused.stages import ENUM
 from ddrecon.diffusion.solvers.fused.transfers import TRANSFERS
 from ddrecon.diffusion.solvers.hierarchy import STEPS
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.text import TextKernel
 
 SLOTS = 13
 """Slices that a share of a leg keeps."""
@@ -191,9 +190,9 @@ const auto go_up = [&](int s, int matrix, const F* source, const F* u, F* out, F
 if (is_done) return;
 const int matrix = matrices > 1 ? color : 0;
 const Size finest = at(0, NZ) * at(0, NY) * at(0, NX);
-F* const mine = &coarser.data[color * share];
-F* const W = &scratch.data[item * scratch_size];
-const F* const residual = &vectors.data[residual_at + color * finest];
+F* const mine = &coarser[color * share];
+F* const W = &scratch[item * scratch_size];
+const F* const residual = vector_at(R) + color * finest;
 const int after = (int)at(0, NEXT);
 const auto divide = [&](Size count, int k) { return (int)(count * k / parts); };
 if (leg == DOWN && after >= 0) {
@@ -209,7 +208,7 @@ if (leg == COARSER && after >= 0) {
         levels[count++] = s;
     }
     const int n = (int)(at(s, NZ) * at(s, NY) * at(s, NX));
-    const F* inverse = &data.data[at(s, INVERSE) + (Size)matrix * n * n];
+    const F* inverse = &data[at(s, INVERSE) + (Size)matrix * n * n];
     for (int i = 0; i < n; ++i)
         mine[at(s, U) + i] = (F)inner(inverse + i * n, mine + at(s, SOURCE), n);
     while (count > 0) {
@@ -220,16 +219,16 @@ if (leg == COARSER && after >= 0) {
     }
 }
 if (leg == UP) {
-    F* const out = &vectors.data[result_at + color * finest];
+    F* const out = vector_at(P) + color * finest;
     const int slices = (int)at(0, NZ);
     if (after >= 0)
-        sums.data[(CORRECTED_ROW + now) * all_colors * shares + item] = go_up(0, matrix, residual,
+        sums[(CORRECTED_ROW + now) * all_colors * shares + item] = go_up(0, matrix, residual,
             mine + at(after, U), out, W,
                                 divide(slices, part), divide(slices, part + 1), true);
     else {
         // A single cell: S A S is 1.
         out[0] = residual[0];
-        sums.data[(CORRECTED_ROW + now) * all_colors * shares + item] = (double)out[0] *
+        sums[(CORRECTED_ROW + now) * all_colors * shares + item] = (double)out[0] *
             (double)out[0];
     }
 }
@@ -238,57 +237,6 @@ if (leg == UP) {
 
 
 @functools.cache
-def cycle_kernel(bits: int) -> Any:
-    """A leg of the cycle, for a share of the slices of a color."""
-    F = number_type(bits)
-
-    @wp.func_native(program(bits, BODY))
-    def run(
-        item: int,
-        leg: int,
-        iteration: int,
-        matrices: int,
-        all_colors: int,
-        parts: int,
-        shares: int,
-        tolerance: wp.float64,
-        tiny: wp.float64,
-        table: wp.array(dtype=wp.int64),
-        data: wp.array(dtype=F),
-        vectors: wp.array(dtype=F),
-        residual_at: wp.int64,
-        result_at: wp.int64,
-        coarser: wp.array(dtype=F),
-        share: wp.int64,
-        scratch: wp.array(dtype=F),
-        scratch_size: wp.int64,
-        sums: wp.array(dtype=wp.float64),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def cycle(
-        first: int,
-        leg: int,
-        iteration: int,
-        matrices: int,
-        all_colors: int,
-        parts: int,
-        shares: int,
-        tolerance: wp.float64,
-        tiny: wp.float64,
-        table: wp.array(dtype=wp.int64),
-        data: wp.array(dtype=F),
-        vectors: wp.array(dtype=F),
-        residual_at: wp.int64,
-        result_at: wp.int64,
-        coarser: wp.array(dtype=F),
-        share: wp.int64,
-        scratch: wp.array(dtype=F),
-        scratch_size: wp.int64,
-        sums: wp.array(dtype=wp.float64),
-    ):
-        run(first + wp.tid(), leg, iteration, matrices, all_colors, parts, shares,
-            tolerance, tiny, table, data, vectors, residual_at, result_at, coarser, share,
-            scratch, scratch_size, sums)  # fmt: skip
-
-    return cycle
+def cycle_kernel(bits: int) -> TextKernel:
+    """A `leg` of the cycle, for one of the `parts` of the slices of a color."""
+    return TextKernel("cycle", bits, BODY, GIVEN + "int leg, parts; F *coarser; long share")

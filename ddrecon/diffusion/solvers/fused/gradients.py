@@ -1,24 +1,19 @@
 """The kernel of conjugate gradients: start, directions, steps (`solvers/multigrid.py`)."""
 
-import functools
-from typing import Any
+from __future__ import annotations
 
-import warp as wp
+import functools
 
 from ddrecon.diffusion.solvers.fused import sums
-from ddrecon.diffusion.solvers.fused.level import LEVEL
+from ddrecon.diffusion.solvers.fused.level import GIVEN, LEVEL
 from ddrecon.diffusion.solvers.fused.stages import ENUM
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.text import TextKernel
 
 ACTS = "enum { START, CHOOSE, DIRECT, ADVANCE };"
 """What a launch does: residual of a guess, which start is better, a direction, a step along it."""
-VECTORS = "enum { Y, R, D, D_ODD, P, Q };"
-"""Solution, residual, directions of even and odd iterations, what the cycle makes, A d."""
-
 BODY = (
     ENUM
     + ACTS
-    + VECTORS
     + LEVEL
     + "const int color = item / shares, part = item - color * shares;"
     + sums.TEXT
@@ -29,16 +24,16 @@ const Size nx = l.nx, slice = l.slice, margin = (nx + 16) / 16 * 16,
     length = (slice + 15) / 16 * 16 + 2 * margin;
 const int from = (int)((Size)l.nz * part / shares), to = (int)((Size)l.nz * (part + 1) / shares);
 const Size start = color * l.cells, first_cell = from * slice, count = (to - from) * slice;
-F* const W = &scratch.data[item * scratch_size];
+F* const W = &scratch[item * scratch_size];
 const auto slot = [&](int k) { return W + k * length + margin; };
-const auto vector = [&](int k) { return &vectors.data[places.data[k] + start]; };
+const auto vector = [&](int k) { return vector_at(k) + start; };
 const auto sum = [&](int row) -> double& {
-    return sums.data[(row * all_colors + color) * shares + part];
+    return sums[(row * all_colors + color) * shares + part];
 };
 F *const y = vector(Y), *const r = vector(R), *const p = vector(P);
 F *const q = vector(Q), *const d = vector(D + now);
 F* const d_new = vector(D + later);
-const F* const b = source.data + start;
+const F* const b = source + start;
 const auto take = [&](const F* __restrict s, const F* __restrict b, F* __restrict r, Size n) {
     for (Size i = 0; i < n; ++i) r[i] = s[i] * b[i];
 };
@@ -50,7 +45,7 @@ if (act == START) {
         for (Size i = 0; i < margin; ++i) r[l.cells + i] = F(0);
     double square = 0.0, norm = 0.0;
     if (has_guess) for (Size i = 0; i < 4 * length; ++i) W[i] = F(0);
-    const F* const guessed = guess.data + (has_guess ? start : 0);
+    const F* const guessed = guess + (has_guess ? start : 0);
     int ready = from > 0 ? from - 1 : 0;
     for (int z = from; z < to; ++z) {
         const Size at_ = z * slice;
@@ -136,55 +131,7 @@ if (act == ADVANCE) {
 
 
 @functools.cache
-def gradient_kernel(bits: int) -> Any:
-    """An act of conjugate gradients, for a share of the slices of a color."""
-    F = number_type(bits)
-
-    @wp.func_native(program(bits, BODY))
-    def run(
-        item: int,
-        act: int,
-        iteration: int,
-        matrices: int,
-        all_colors: int,
-        shares: int,
-        tolerance: wp.float64,
-        tiny: wp.float64,
-        table: wp.array(dtype=wp.int64),
-        data: wp.array(dtype=F),
-        vectors: wp.array(dtype=F),
-        places: wp.array(dtype=wp.int64),
-        source: wp.array(dtype=F),
-        guess: wp.array(dtype=F),
-        has_guess: int,
-        scratch: wp.array(dtype=F),
-        scratch_size: wp.int64,
-        sums: wp.array(dtype=wp.float64),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def advance(
-        first: int,
-        act: int,
-        iteration: int,
-        matrices: int,
-        all_colors: int,
-        shares: int,
-        tolerance: wp.float64,
-        tiny: wp.float64,
-        table: wp.array(dtype=wp.int64),
-        data: wp.array(dtype=F),
-        vectors: wp.array(dtype=F),
-        places: wp.array(dtype=wp.int64),
-        source: wp.array(dtype=F),
-        guess: wp.array(dtype=F),
-        has_guess: int,
-        scratch: wp.array(dtype=F),
-        scratch_size: wp.int64,
-        sums: wp.array(dtype=wp.float64),
-    ):
-        run(first + wp.tid(), act, iteration, matrices, all_colors, shares, tolerance,
-            tiny, table, data, vectors, places, source, guess, has_guess, scratch, scratch_size,
-            sums)  # fmt: skip
-
-    return advance
+def gradient_kernel(bits: int) -> TextKernel:
+    """An `act` of conjugate gradients, for one of the `shares` of the slices of a color."""
+    given = GIVEN + "int act, has_guess; F *source, *guess"
+    return TextKernel("advance", bits, BODY, given)

@@ -22,7 +22,7 @@ from ddrecon.diffusion.solvers.fused.stages import (
     stages_of,
     strong_axes,
 )
-from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.spare import borrow, give_back
 
 SMALL = 30_000
@@ -107,9 +107,9 @@ def shares_of(cells: int, colors: int, like: Tensor) -> tuple[int, int]:
 
 
 @functools.cache
-def table_of(stages: Stages, device: torch.device) -> Any:
+def table_of(stages: Stages, device: torch.device) -> Tensor:
     """The table of `stages` for kernels on `device`."""
-    return array(torch.tensor(stages.table, dtype=torch.int64, device=device))
+    return torch.tensor(stages.table, dtype=torch.int64, device=device)
 
 
 def _shape(operator: Operator) -> tuple[Shape, int]:
@@ -123,24 +123,24 @@ def _make(operator: Operator, axes: Axes) -> Hierarchy:
     shape, colors = _shape(operator)
     stages, loss = stages_of(shape, colors, axes), operator.loss
     shares, threads = shares_of(math.prod(shape), colors, loss)
-    given = (*operator.conductances, loss)
     levels, few = len(stages.levels) - 1, math.prod(stages.shape(stages.levels[-1]))
     data, work = borrow(stages.data, loss), borrow(stages.work, loss)
-    scratch = loss.new_empty(colors * shares * 3 * (shape[2] + 3))
     strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
-    dense = loss.new_empty(2 * colors * few**2 if levels else 0, dtype=torch.float64)
-    arrays = [array(tensor) for tensor in (data, work, scratch, strengths, dense)]
-    fixed = [
-        table_of(stages, loss.device),
-        *(array(tensor.reshape(-1)) for tensor in given),
-        *(int(len(tensor) < colors) for tensor in given),
-        *arrays,
-    ]
-    kernel = prepare_kernel(loss.element_size() * 8)
+    made = {
+        "data": data,
+        "work": work,
+        "scratch": loss.new_empty(colors * shares * 3 * (shape[2] + 3)),
+        "strengths": strengths,
+        "dense": loss.new_empty(2 * colors * few**2 if levels else 0, dtype=torch.float64),
+    }
+    given: dict[str, Any] = {"table": table_of(stages, loss.device), "colors": colors}
+    given["finest_parts"] = shares
+    for name, tensor in zip(("z", "y", "x", "loss"), (*operator.conductances, loss), strict=True):
+        given |= {f"given_{name}": tensor, f"shared_{name}": int(len(tensor) < colors)}
+    kernel = prepare_kernel(loss.element_size() * 8).bind(given, made)
 
     def do(step: str, stage: int, parts: int, threads: int) -> None:
-        numbers = [STEPS[step], stage, colors, parts, shares]
-        launch(kernel, colors * parts, [*numbers, *fixed], loss, threads)
+        kernel.launch(colors * parts, threads, step=STEPS[step], stage=stage, parts=parts)
 
     do("scale cells", 0, shares, threads)
     do("scale faces", 0, shares, threads)
@@ -151,6 +151,6 @@ def _make(operator: Operator, axes: Axes) -> Hierarchy:
     if levels:
         do("all but first", second, 1, min(threads, colors))
     give_back(work)
-    made = Hierarchy(stages, shares, data, strengths)
-    weakref.finalize(made, give_back, data)
-    return made
+    hierarchy = Hierarchy(stages, shares, data, strengths)
+    weakref.finalize(hierarchy, give_back, data)
+    return hierarchy

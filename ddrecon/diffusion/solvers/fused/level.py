@@ -7,14 +7,25 @@ APART = """
 #define APART __attribute__((noinline))  // compiled once, however often it is called
 #endif
 """
+VECTORS = "enum { Y, R, D, D_ODD, P, Q, VECTORS };"
+"""Solution, residual, directions of even and odd iterations, what the cycle makes, A d."""
+
+GIVEN = """
+long *table; F *data, *vectors, *scratch; double *sums;
+long first_vector, vector_size, scratch_size; double tolerance, tiny;
+int iteration, matrices, all_colors, shares;
+"""
+"""What both kernels of a solve are given."""
 
 # What neighbors send to cell i: conductance times value, faces lying at the cell below them.
 LEVEL = (
     APART
+    + VECTORS
     + """
+const auto vector_at = [&](int k) { return vectors + first_vector + k * vector_size; };
 typedef long long Size;
 const auto at = [&](int stage, int column) -> Size {
-    return table.data[(Size)stage * COLUMNS + column];
+    return table[(Size)stage * COLUMNS + column];
 };
 struct Level { int nz, ny, nx; Size slice, cells; const F *cz, *cy, *cx, *scale, *taken; };
 const auto level_of = [&](int s, int matrix) {
@@ -22,11 +33,11 @@ const auto level_of = [&](int s, int matrix) {
     l.nz = (int)at(s, NZ); l.ny = (int)at(s, NY); l.nx = (int)at(s, NX);
     l.slice = (Size)l.ny * l.nx;
     l.cells = l.nz * l.slice;
-    l.cz = &data.data[at(s, SZ) + matrix * l.cells];
-    l.cy = &data.data[at(s, SY) + matrix * l.cells];
-    l.cx = &data.data[at(s, SX) + matrix * l.cells];
-    l.scale = &data.data[at(s, SCALE) + matrix * l.cells];
-    l.taken = &data.data[at(s, TAKEN) + matrix * l.cells];
+    l.cz = &data[at(s, SZ) + matrix * l.cells];
+    l.cy = &data[at(s, SY) + matrix * l.cells];
+    l.cx = &data[at(s, SX) + matrix * l.cells];
+    l.scale = &data[at(s, SCALE) + matrix * l.cells];
+    l.taken = &data[at(s, TAKEN) + matrix * l.cells];
     return l;
 };
 #define NEIGHBORS(u) (cx[i] * u[i + 1] + cx[i - 1] * u[i - 1] + cy[i] * u[i + nx] \\

@@ -21,9 +21,7 @@ from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, tabl
 from ddrecon.diffusion.solvers.fused.stages import margin
 from ddrecon.diffusion.solvers.fused.sums import ROWS
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.kernels.launch import array, launch
 from ddrecon.kernels.spare import borrow, give_back
-from ddrecon.numerics.remember import remember
 
 DOWN, COARSER, UP = range(3)
 START, CHOOSE, DIRECT, ADVANCE = range(4)
@@ -32,11 +30,6 @@ MOST_AHEAD = 16
 """So many iterations are launched at most before the residual is looked at."""
 _counts: dict[torch.Size, deque[int]] = defaultdict(lambda: deque([3], maxlen=6))
 """How many iterations solves of a shape took: how many to launch ahead. No result depends on it."""
-
-
-@remember
-def _on_device(device: torch.device, *numbers: int) -> Tensor:
-    return torch.tensor(numbers, device=device)
 
 
 def solve(
@@ -103,38 +96,26 @@ class _Run:
         slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
         self.scratch = borrow(self.colors * self.shares * slots, source)
         self.sums = source.new_empty(len(ROWS) * self.colors * self.shares, dtype=torch.float64)
-        self.tiny = torch.finfo(source.dtype).tiny
+        self.tiny, self.tolerance = torch.finfo(source.dtype).tiny, tolerance
+        given = {
+            "table": table_of(stages, source.device),
+            "data": hierarchy.data,
+            "first_vector": edge,
+            "vector_size": size,
+            "scratch_size": slots,
+            "tolerance": tolerance,
+            "tiny": self.tiny,
+            "matrices": stages.colors,
+            "all_colors": self.colors,
+            "shares": self.shares,
+        }
+        made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
+        guessed = None if guess is None or guess.shape != source.shape else guess
+        guesses = {"source": source, "guess": guessed, "has_guess": int(guessed is not None)}
         bits = source.element_size() * 8
-        self.cycle, self.gradient = cycle_kernel(bits), gradient_kernel(bits)
-        table, data, vectors = (
-            table_of(stages, source.device),
-            array(hierarchy.data),
-            array(self.vectors),
-        )
-        self.scalars = [stages.colors, self.colors]
-        rest = [array(self.scratch), slots, array(self.sums)]
-        self.for_cycle = [
-            table,
-            data,
-            vectors,
-            self.places[1],
-            self.places[4],
-            array(self.coarser),
-            stages.vectors,
-            *rest,
-        ]
-        start = source if guess is None or guess.shape != source.shape else guess
-        places = _on_device(source.device, *self.places)
-        self.for_gradient = [
-            table,
-            data,
-            vectors,
-            array(places),
-            *(array(each.reshape(-1)) for each in (source, start)),
-            int(start is not source),
-            *rest,
-        ]
-        self.tolerance = tolerance
+        self.gradient = gradient_kernel(bits).bind(given | guesses, made)
+        coarser = {"coarser": self.coarser}
+        self.cycle = cycle_kernel(bits).bind(given | {"share": stages.vectors}, made | coarser)
 
     def iterate(self, first: int, last: int) -> None:
         """Launches these iterations."""
@@ -175,14 +156,11 @@ class _Run:
         return value
 
     def _cycle(self, leg: int, iteration: int) -> None:
-        shares, threads = self.shares, self.threads
+        parts, threads = self.shares, self.threads
         if leg == COARSER:
-            shares, threads = 1, min(self.threads, self.colors)
-        numbers = [leg, iteration, *self.scalars, shares, self.shares, self.tolerance, self.tiny]
-        items = self.colors * shares
-        launch(self.cycle, items, [*numbers, *self.for_cycle], self.source, threads)
+            parts, threads = 1, min(self.threads, self.colors)
+        self.cycle.launch(self.colors * parts, threads, leg=leg, iteration=iteration, parts=parts)
 
     def _advance(self, act: int, iteration: int) -> None:
-        numbers = [act, iteration, *self.scalars, self.shares, self.tolerance, self.tiny]
         items = self.colors * self.shares
-        launch(self.gradient, items, [*numbers, *self.for_gradient], self.source, self.threads)
+        self.gradient.launch(items, self.threads, act=act, iteration=iteration)

@@ -3,15 +3,14 @@
 The formulas are those of `solvers/scaled.py`, `coarsening.py` and `hierarchy.py`.
 """
 
-import functools
-from typing import Any
+from __future__ import annotations
 
-import warp as wp
+import functools
 
 from ddrecon.diffusion.solvers.fused.coarsening import COARSENING
 from ddrecon.diffusion.solvers.fused.level import APART
 from ddrecon.diffusion.solvers.fused.stages import ENUM
-from ddrecon.kernels.native import number_type, program
+from ddrecon.kernels.text import TextKernel
 
 STEPS = """enum { SCALE_CELLS, SCALE_FACES, WEIGHTS, COARSE_CELLS, ALL_BUT_FIRST };"""
 """What a launch does: one step for the finest grid, or all that coarser ones need."""
@@ -23,11 +22,11 @@ BODY = (
     + """
 typedef long long Size;
 const auto at = [&](int stage, int column) -> Size {
-    return table.data[(Size)stage * COLUMNS + column];
+    return table[(Size)stage * COLUMNS + column];
 };
 struct Grid { int nz, ny, nx; Size cells; const F* faces[3]; Size zs[3], ys[3]; const F* loss; };
 const int widest = (int)at(0, NX) + 2;
-F* __restrict const own = &scratch.data[(Size)item * 3 * (widest + 1)];
+F* __restrict const own = &scratch[(Size)item * 3 * (widest + 1)];
 F* const zero = own + 2 * widest;
 for (int i = 0; i <= widest; ++i) zero[i] = F(0);
 
@@ -36,18 +35,18 @@ const auto grid_of = [&](int s, int color) {
     Grid g;
     g.nz = (int)at(s, NZ); g.ny = (int)at(s, NY); g.nx = (int)at(s, NX);
     g.cells = (Size)g.nz * g.ny * g.nx;
-    const F* given[3] = {given_z.data, given_y.data, given_x.data};
+    const F* given[3] = {given_z, given_y, given_x};
     const int shared[3] = {shared_z, shared_y, shared_x};
     for (int a = 0; a < 3; ++a) {
         const int ny = g.ny - (s == 0 && a == 1), nx = g.nx - (s == 0 && a == 2);
         const Size faces = s > 0 ? g.cells : (Size)(g.nz - (a == 0)) * ny * nx;
         g.ys[a] = nx;
         g.zs[a] = (Size)ny * nx;
-        g.faces[a] = s > 0 ? &work.data[at(s, CZ + a) + color * faces]
+        g.faces[a] = s > 0 ? &work[at(s, CZ + a) + color * faces]
                            : given[a] + (shared[a] ? 0 : color * faces);
     }
-    g.loss = s > 0 ? &work.data[at(s, LOSS) + color * g.cells]
-                   : given_loss.data + (shared_loss ? 0 : color * g.cells);
+    g.loss = s > 0 ? &work[at(s, LOSS) + color * g.cells]
+                   : given_loss + (shared_loss ? 0 : color * g.cells);
     return g;
 };
 // Faces above the cells of a row; those on the box are zero. Along x they are copied to say so.
@@ -60,7 +59,7 @@ const auto row_of = [&](const Grid& g, int a, int z, int y, F* copy) -> const F*
     return copy;
 };
 const auto in_data = [&](int s, int column, int color, Size cells) -> F* {
-    return &data.data[at(s, column) + color * cells];
+    return &data[at(s, column) + color * cells];
 };
 
 // S = diagonal^(-1/2), and S times what a cell exchanges with its neighbors
@@ -126,7 +125,7 @@ const auto scale_faces = [&](int s, int color, int first, int last, double* sums
 const auto invert = [&](int s, int color) {
     const Grid g = grid_of(s, color);
     const int n = (int)g.cells, slice = g.ny * g.nx, band = g.nz > 1 ? slice : g.ny > 1 ? g.nx : 1;
-    double* __restrict L = &dense.data[(Size)color * 2 * n * n];
+    double* __restrict L = &dense[(Size)color * 2 * n * n];
     double* __restrict X = L + (Size)n * n;
     for (Size i = 0; i < (Size)2 * n * n; ++i) L[i] = 0.0;
     const int across[3] = {slice, g.nx, 1};
@@ -158,14 +157,14 @@ const auto invert = [&](int s, int color) {
             for (int c = 0; c < n; ++c) X[i * n + c] -= L[k * n + i] * X[k * n + c];
         for (int c = 0; c < n; ++c) X[i * n + c] /= L[i * n + i];
     }
-    F* out = &data.data[at(s, INVERSE) + (Size)color * n * n];
+    F* out = &data[at(s, INVERSE) + (Size)color * n * n];
     for (int i = 0; i < n * n; ++i) out[i] = (F)X[i];
 };
 
 const int color = item / parts, part = item - color * parts;
 const auto rows_of = [&](int s) { return (int)(at(s, NZ) * at(s, NY)); };
 const auto share = [&](int rows, int k) { return (int)((Size)rows * k / parts); };
-double* const sums = &strengths.data[(Size)item * 3];
+double* const sums = &strengths[(Size)item * 3];
 if (step == SCALE_CELLS) scale_cells(stage, color, share(rows_of(stage), part),
     share(rows_of(stage), part + 1));
 if (step == SCALE_FACES) {
@@ -180,7 +179,7 @@ if (step == WEIGHTS || step == COARSE_CELLS) {
 if (step == ALL_BUT_FIRST) {
     // Strengths of a level lie behind those of all shares of the finest.
     int s = stage;
-    double* level = &strengths.data[(Size)colors * finest_parts * 3 + color * 3];
+    double* level = &strengths[(Size)colors * finest_parts * 3 + color * 3];
     for (; at(s, AXIS) >= 0; ++s) {
         if (at(s, NEXT) >= 0) {
             for (int a = 0; a < 3; ++a) level[a] = 0.0;
@@ -197,60 +196,14 @@ if (step == ALL_BUT_FIRST) {
 )
 
 
+_GIVEN = """
+int step, stage, colors, parts, finest_parts, shared_z, shared_y, shared_x, shared_loss;
+long *table; F *given_z, *given_y, *given_x, *given_loss, *data, *work, *scratch;
+double *strengths, *dense;
+"""
+
+
 @functools.cache
-def prepare_kernel(bits: int) -> Any:
+def prepare_kernel(bits: int) -> TextKernel:
     """A step of making a hierarchy, for a share of the cells of a color."""
-    F = number_type(bits)
-
-    @wp.func_native(program(bits, BODY))
-    def make(
-        item: int,
-        step: int,
-        stage: int,
-        colors: int,
-        parts: int,
-        finest_parts: int,
-        table: wp.array(dtype=wp.int64),
-        given_z: wp.array(dtype=F),
-        given_y: wp.array(dtype=F),
-        given_x: wp.array(dtype=F),
-        given_loss: wp.array(dtype=F),
-        shared_z: int,
-        shared_y: int,
-        shared_x: int,
-        shared_loss: int,
-        data: wp.array(dtype=F),
-        work: wp.array(dtype=F),
-        scratch: wp.array(dtype=F),
-        strengths: wp.array(dtype=wp.float64),
-        dense: wp.array(dtype=wp.float64),
-    ): ...
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def prepare(
-        first: int,
-        step: int,
-        stage: int,
-        colors: int,
-        parts: int,
-        finest_parts: int,
-        table: wp.array(dtype=wp.int64),
-        given_z: wp.array(dtype=F),
-        given_y: wp.array(dtype=F),
-        given_x: wp.array(dtype=F),
-        given_loss: wp.array(dtype=F),
-        shared_z: int,
-        shared_y: int,
-        shared_x: int,
-        shared_loss: int,
-        data: wp.array(dtype=F),
-        work: wp.array(dtype=F),
-        scratch: wp.array(dtype=F),
-        strengths: wp.array(dtype=wp.float64),
-        dense: wp.array(dtype=wp.float64),
-    ):
-        make(first + wp.tid(), step, stage, colors, parts, finest_parts, table, given_z, given_y,
-             given_x, given_loss, shared_z, shared_y, shared_x, shared_loss, data, work, scratch,
-             strengths, dense)  # fmt: skip
-
-    return prepare
+    return TextKernel("prepare", bits, BODY, _GIVEN)

@@ -21,7 +21,7 @@ TEXT = (
     + """
 const auto total_of = [&](int row) -> double {
     double total = 0.0;
-    for (int k = 0; k < shares; ++k) total += sums.data[(row * all_colors + color) * shares + k];
+    for (int k = 0; k < shares; ++k) total += sums[(row * all_colors + color) * shares + k];
     return total;
 };
 const auto above = [](double a, double b) { return a > b ? a : b; };

@@ -13,7 +13,7 @@ const auto ways_of = [&](int s) {
 };
 const auto weights_of = [&](int s, int column, int matrix) -> const F* {
     const int c = s + 1;
-    return &data.data[at(s, column) + matrix * at(c, NZ) * at(c, NY) * at(c, NX)];
+    return &data[at(s, column) + matrix * at(c, NZ) * at(c, NY) * at(c, NX)];
 };
 // Sum of a pair, less what its outer cells send to the pairs beside it, plus what those send
 const auto restrict_pair = [](const F* __restrict before, const F* __restrict one,

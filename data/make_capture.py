@@ -1,0 +1,228 @@
+"""Makes data/capture: smoke as five cameras on tripods film it, with all that cameras do to it.
+
+    python data/make_capture.py [--paths 256] [--keep TRACED.npz] [-o FOLDER]
+
+The smoke is that of `make_smoke.py`; Mitsuba 3 traces its pictures along ddrecon's own view rays,
+`--paths` a pixel; `--keep` is where they are kept, and taken from where they are there (with
+DRJIT_LIBLLVM_PATH Mitsuba is some ten times faster). Then each picture is spoiled: exposure, white
+balance, black level, shot noise, sRGB of 8 bits, JPEG; and each training camera is told a little
+wrong. What is true stands in truth.json and density.npz.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import torch
+from make_smoke import simulate
+from torch import Tensor
+
+from ddrecon.cameras import Camera, cast_rays, look_at, subpixel_offsets, twist
+from ddrecon.grid import Grid
+from ddrecon.io.images.srgb import encode
+from ddrecon.light.lights import AmbientLight, DirectionalLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import HenyeyGreenstein
+from ddrecon.reference.trace import Tracer, open_tracer
+from ddrecon.scene import Scene, View
+from ddrecon.settings import RenderSettings
+
+FOLDER = Path(__file__).parent / "capture"
+CELLS = (48, 72, 48)
+BOX = ((-0.5, 0.0, -0.5), (0.5, 1.5, 0.5))
+"""The volume [m], y up."""
+STEPS, SEED = 108, 1
+SIGMA_T, ALBEDO, G = 10.0, 0.92, 0.3
+SUN, IRRADIANCE = (0.8, -0.45, -0.4), (7.3, 7.0, 6.4)
+AMBIENT = (0.08, 0.1, 0.13)
+SIZE = (240, 160)
+ANGLES = {"cam_0": -55.0, "cam_1": -19.0, "cam_2": 18.0, "cam_3": 55.0, "held_out": 36.0}
+"""Where each camera stands around the smoke [degrees from +z towards +x]."""
+HEIGHTS, DISTANCES = (0.9, 0.5, 1.2, 0.7, 0.95), (2.6, 2.75, 2.5, 2.65, 2.6)
+FOCAL = 368.0
+"""Focal length [pixels], but for a percent from camera to camera."""
+LENS = (-0.25, 0.08, 0.0, 0.0, 0.001, -0.0015)
+TURNED, MOVED = 0.3, 0.003
+"""Errors of calibration: degrees, and meters per meter of distance."""
+PHOTONS = 8000
+"""Electrons of a pixel that is just white."""
+SUBPIXELS = 16
+QUALITY = 90
+
+
+def true_cameras() -> dict[str, Camera]:
+    """The five cameras as they stand, in float64."""
+    generator = np.random.default_rng(SEED)
+    cameras = {}
+    for (name, angle), height, distance in zip(ANGLES.items(), HEIGHTS, DISTANCES, strict=True):
+        turn = np.radians(angle)
+        eye = (distance * np.sin(turn), height, distance * np.cos(turn))
+        target = (generator.normal(0, 0.02), 0.74 + generator.normal(0, 0.02), 0.0)
+        lean = np.radians(generator.normal(0, 1.0))
+        up = (np.sin(lean) * np.cos(turn), np.cos(lean), -np.sin(lean) * np.sin(turn))
+        pose = look_at(*(torch.tensor(vector, dtype=torch.float64) for vector in (eye, target, up)))
+        focal = FOCAL * (1 + 0.01 * generator.normal())
+        middle = tuple(0.5 + 0.01 * generator.normal(size=2))
+        lens = torch.tensor(LENS, dtype=torch.float64) * (1 + 0.05 * generator.normal())
+        half = SIZE[1] / 2 / focal
+        cameras[name] = Camera(pose, SIZE, half, True, middle, 1.0, "opencv", lens)
+    return cameras
+
+
+def told_cameras(cameras: dict[str, Camera]) -> dict[str, Camera]:
+    """The cameras as their calibration has them.
+
+    What all training cameras err in together is no error but another choice of the world's axes,
+    origin and unit: it is taken off. The held-out camera is told right, since it is the ruler.
+    """
+    generator = torch.Generator().manual_seed(SEED)
+    center = torch.tensor([(low + high) / 2 for low, high in zip(*BOX, strict=True)]).double()
+    names = [name for name in cameras if name != "held_out"]
+    turns, shifts, arms = [], [], []
+    for name in names:
+        arm = cameras[name].pose[:, 3] - center
+        turn = np.radians(TURNED) * _random_way(generator)
+        shift = MOVED * arm.norm() * _random_way(generator)
+        # A turn about the camera is one about the center, and a shift back.
+        turns.append(turn)
+        shifts.append(shift - torch.linalg.cross(turn, arm))
+        arms.append(arm)
+    turn, shift, arm = (torch.stack(vectors) for vectors in (turns, shifts, arms))
+    turn, shift = turn - turn.mean(0), shift - shift.mean(0)
+    shift = shift - arm * (shift * arm).sum() / (arm**2).sum()
+    told = dict(cameras)
+    for index, name in enumerate(names):
+        axes = cameras[name].pose[:, :3]
+        change = torch.cat([axes.T @ turn[index], axes.T @ shift[index]])
+        told[name] = twist(cameras[name], change, tuple(center.tolist()))
+    return told
+
+
+def _random_way(generator: torch.Generator) -> Tensor:
+    """A vector of unit length."""
+    vector = torch.randn(3, generator=generator, dtype=torch.float64)
+    return vector / vector.norm()
+
+
+def scene_of(density: Tensor, cameras: dict[str, Camera]) -> Scene:
+    """The smoke of `density` in its light."""
+    sigma = torch.tensor([SIGMA_T], dtype=torch.float64)
+    grid = Grid.from_xyz(CELLS, *BOX)
+    phase = HenyeyGreenstein(torch.tensor(G, dtype=torch.float64))
+    volume = Volume(grid, density.double(), (1 - ALBEDO) * sigma, ALBEDO * sigma, phase)
+    vectors = (torch.tensor(vector, dtype=torch.float64) for vector in (SUN, IRRADIANCE, AMBIENT))
+    direction, irradiance, radiance = vectors
+    lights = [DirectionalLight(direction, irradiance), AmbientLight(radiance)]
+    views = [View(name, camera) for name, camera in cameras.items()]
+    return Scene(volume, lights, views, RenderSettings(background=False))
+
+
+def trace(tracer: Tracer, camera: Camera, paths: int, seed: int) -> np.ndarray:
+    """The picture [h, w, 3] of `camera`, whose rays Mitsuba's cameras cannot cast."""
+    mitsuba, (scene,) = tracer.module, tracer.scenes
+    total = np.zeros((*camera.size, 3))
+    count = max(1, paths // SUBPIXELS)
+    for index, offset in enumerate(subpixel_offsets(SUBPIXELS)):
+        rays = cast_rays(camera, offset)
+        origin, direction = (
+            mitsuba.Point3f(*np.repeat(vectors.flip(1).numpy().T.astype(np.float32), count, 1))
+            for vectors in (rays.origin, rays.direction)
+        )
+        sampler = mitsuba.load_dict({"type": "independent"})
+        sampler.seed(SUBPIXELS * seed + index, count * camera.size[0] * camera.size[1])
+        ray = mitsuba.RayDifferential3f(mitsuba.Ray3f(origin, mitsuba.Vector3f(direction)))
+        radiance, _, _ = scene.integrator().sample(scene, sampler, ray)
+        total += np.array(radiance).T.reshape(*camera.size, count, 3).mean(2)
+    return total / SUBPIXELS
+
+
+def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) -> bytes:
+    """The JPEG that a camera makes of the radiance `picture`."""
+    generator = np.random.default_rng(seed)
+    exposed = picture * exposure + black
+    noisy = generator.poisson(PHOTONS * exposed.clip(0)) / PHOTONS
+    encoded = np.round(255 * encode(noisy.clip(0, 1))).astype(np.uint8)
+    stream = io.BytesIO()
+    imageio.imwrite(stream, encoded, extension=".jpg", quality=QUALITY)
+    return stream.getvalue()
+
+
+def exposures() -> dict[str, tuple[np.ndarray, float]]:
+    """The gain by color and the black level of each camera.
+
+    Gains have a mean of 1 over the training cameras in each color: the light has the rest. The
+    held-out camera is the ruler, and has neither.
+    """
+    generator = np.random.default_rng(SEED + 1)
+    gains = generator.uniform(0.7, 1.3, (len(ANGLES), 1)) * generator.uniform(
+        0.9, 1.1, (len(ANGLES), 3)
+    )
+    gains /= gains[:4].mean(0)
+    blacks = generator.uniform(0.0005, 0.0025, len(ANGLES))
+    gains[-1], blacks[-1] = 1, 0
+    return {name: (gains[i], blacks[i]) for i, name in enumerate(ANGLES)}
+
+
+def frame(camera: Camera, **others: object) -> dict[str, object]:
+    """`camera` as a frame of a transforms.json."""
+    height, width = camera.size
+    focal = width / 2 / float(camera.half_width)
+    x, y = camera.principal_point
+    lens = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), camera.distortion.tolist(), strict=True))
+    numbers = {"fl_x": focal, "fl_y": focal, "cx": x * width, "cy": y * height} | lens
+    matrix = [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    return others | {"w": width, "h": height} | numbers | {"transform_matrix": matrix}
+
+
+def write_cameras(path: Path, frames: list[dict[str, object]], folder: str) -> None:
+    """A transforms.json whose last frame is held out."""
+    names = [frame["file_path"] for frame in frames]
+    splits = {"train_filenames": names[:-1], "test_filenames": names[-1:]}
+    path.write_text(json.dumps({"camera_model": "OPENCV", **splits, "frames": frames}, indent=1))
+
+
+def main() -> None:
+    """Writes all of it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--paths", type=int, default=256)
+    parser.add_argument("--keep", type=Path)
+    parser.add_argument("-o", "--output", type=Path, default=FOLDER)
+    given = parser.parse_args()
+    folder, cameras = given.output, true_cameras()
+    if given.keep and given.keep.exists():
+        kept = dict(np.load(given.keep))
+    else:
+        density = np.round(simulate(CELLS[::-1], STEPS, SEED) * 256) / 256
+        scene = scene_of(torch.from_numpy(density), cameras)
+        tracer = open_tracer(scene, [])
+        kept = {"density": density} | {
+            name: trace(tracer, camera, given.paths, seed)
+            for seed, (name, camera) in enumerate(cameras.items())
+        }
+        if given.keep:
+            np.savez(given.keep, **kept)
+    (folder / "clean").mkdir(parents=True, exist_ok=True)
+    box = np.array(BOX)
+    np.savez_compressed(
+        folder / "density.npz", density=kept["density"].astype(np.float16), bounds=box
+    )
+    told, truth, wrong = told_cameras(cameras), [], []
+    for seed, (name, (exposure, black)) in enumerate(exposures().items()):
+        (folder / f"{name}.jpg").write_bytes(spoil(kept[name], exposure, black, seed))
+        np.save(folder / "clean" / f"{name}.npy", kept[name].astype(np.float16))
+        known = {"exposure": exposure.tolist(), "black": black}
+        truth.append(frame(cameras[name], file_path=f"clean/{name}.npy", **known))
+        wrong.append(frame(told[name], file_path=f"{name}.jpg"))
+    write_cameras(folder / "truth.json", truth, "clean")
+    write_cameras(folder / "transforms.json", wrong, "")
+
+
+if __name__ == "__main__":
+    main()

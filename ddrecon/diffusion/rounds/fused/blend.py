@@ -1,0 +1,205 @@
+"""Light after a round, in one pass over its moments, by fused kernels (E12, E19)."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.rounds.fused.share import ROW_SUM, SHARE, SHARE_SLOPE, numbers_by_color
+from ddrecon.grid import Grid
+from ddrecon.kernels.rows import launch_rows, row_kernel
+from ddrecon.light.moments import Moments
+from ddrecon.medium.coefficients import Medium
+from ddrecon.numerics.autodiff import differentiate_once
+
+_FIRST = "mean", "z", "y", "x"
+_PARTS = *_FIRST, "higher"
+# Of the row: parts of light, of diffusion's and of gains; theta goes to `shares`.
+_ROWS = """
+const long long at = c * size + start;
+const F *e_row = extinction + color(extinction_colors, size) + start;
+const F far = numbers[colors + c];
+const F *const light[4] = {light_mean + at, light_z + at, light_y + at, light_x + at};
+const F *const diffuse[4] = {diffuse_mean + at, diffuse_z + at, diffuse_y + at, diffuse_x + at};
+const F *const gain[4] = {gain_mean + at, gain_z + at, gain_y + at, gain_x + at};
+F* share_row = shares + at;
+"""
+_BLEND = (
+    _ROWS
+    + """
+F *const found[4] = {new_mean + at, new_z + at, new_y + at, new_x + at};
+INDEPENDENT
+for (int i = begin; i < end; ++i) {"""
+    + SHARE
+    + """
+    share_row[i] = far * share;
+    for (int a = 0; a < 4; ++a)
+        found[a][i] = light[a][i] + far * (diffuse[a][i] + gain[a][i] - light[a][i]);
+}
+for (int k = 0; k < higher; ++k) {
+    const long long there = (long long)k * colors * size + at;
+    const F *swept = swept_higher + there, *old = light_higher + (is_begun ? there : at);
+    const F kept = is_begun ? F(1) - far : F(0);
+    F* found_row = new_higher + there;
+    INDEPENDENT
+    for (int i = begin; i < end; ++i) found_row[i] = kept * old[i] + share_row[i] * swept[i];
+}
+"""
+)
+_ADJOINT = (
+    ROW_SUM
+    + _ROWS
+    + """
+const F *const bars[4] = {new_mean_bar + at, new_z_bar + at, new_y_bar + at, new_x_bar + at};
+F *const light_bars[4] = {light_mean_bar + at, light_z_bar + at, light_y_bar + at, light_x_bar + at};
+F *const diffuse_bars[4]
+    = {diffuse_mean_bar + at, diffuse_z_bar + at, diffuse_y_bar + at, diffuse_x_bar + at};
+F *e_bars = extinction_bar + at, *share_bars = share_bar + at;
+F far_sum = F(0), depth_sum = F(0);
+INDEPENDENT
+for (int i = begin; i < end; ++i) {"""
+    + SHARE
+    + """
+    share_row[i] = share;
+    share_bars[i] = F(0);
+    for (int a = 0; a < 4; ++a) {
+        far_sum += bars[a][i] * (diffuse[a][i] + gain[a][i] - light[a][i]);
+        light_bars[a][i] = (F(1) - far) * bars[a][i];
+        diffuse_bars[a][i] = far * bars[a][i];
+    }
+}
+for (int k = 0; k < higher; ++k) {
+    const long long there = (long long)k * colors * size + at;
+    const F *swept = swept_higher + there, *old = light_higher + (is_begun ? there : at);
+    const F *bar = new_higher_bar + there, kept = is_begun ? F(1) : F(0);
+    F *swept_bar = swept_higher_bar + there, *light_bar = light_higher_bar + there;
+    INDEPENDENT
+    for (int i = begin; i < end; ++i) {
+        const F moved = bar[i] * swept[i];
+        share_bars[i] += moved;
+        far_sum += share_row[i] * moved - kept * bar[i] * old[i];
+        swept_bar[i] = far * share_row[i] * bar[i];
+        if (is_begun) light_bar[i] = (F(1) - far) * bar[i];
+    }
+}
+INDEPENDENT
+for (int i = begin; i < end; ++i) {"""
+    + SHARE
+    + SHARE_SLOPE
+    + """
+    const F depth_bar = far * share_bars[i] * share_slope;
+    e_bars[i] = depth_bar * numbers[c];
+    depth_sum += depth_bar * e;
+}
+sums[item] = depth_sum;
+sums[(long long)rows * parts * colors + item] = far_sum;
+}
+"""
+)
+_GIVEN = [
+    "extinction", "numbers", "shares", "swept_higher", "light_higher",
+    *(f"{of}_{part}" for of in ("light", "diffuse", "gain") for part in _FIRST),
+]  # fmt: skip
+_FOUND = [f"new_{part}" for part in _PARTS]
+_BARS = [
+    "extinction_bar", "share_bar", "swept_higher_bar", "light_higher_bar",
+    *(f"{of}_{part}_bar" for of in ("light", "diffuse") for part in _FIRST),
+]  # fmt: skip
+_NUMBERS = "extinction_colors colors higher is_begun"
+
+
+def blend_fused(
+    medium: Medium,
+    light: Moments,
+    diffuse: Moments,
+    gain: Moments,
+    swept: Tensor,
+    factor: Tensor,
+    length: float,
+) -> Moments:
+    """From `light` to `diffuse` plus `gain`, and of what is higher to theta `swept`, by `factor`.
+
+    As `blend` in `transport.py` has it; `length`: of the mean step [u], by which theta is (E14).
+    """
+    numbers = numbers_by_color(medium, length, [factor])
+    numbers = numbers.expand(-1, len(light.mean))
+    first = (part for one in (light, diffuse, gain) for part in (one.mean, *(one.flux or ())))
+    mean, z, y, x, higher = _Blend.apply(
+        medium.grid, numbers, medium.extinction.field, light.higher, swept, *first
+    )
+    return Moments(mean, (z, y, x), higher)
+
+
+class _Blend(torch.autograd.Function):
+    """The parts of new light."""
+
+    @staticmethod
+    def forward(ctx: Any, grid: Grid, *tensors: Any) -> tuple[Tensor, ...]:
+        ctx.grid = grid
+        ctx.save_for_backward(*tensors)
+        given, mean, swept = _given(*tensors)
+        found = dict(zip(_FOUND, (mean.new_empty(mean.shape) for _ in _FIRST), strict=False))
+        found["new_higher"] = swept.new_empty(swept.shape)
+        launch_rows(blend_kernel, grid, len(mean), given, found)
+        return tuple(found.values())
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
+        numbers, extinction, old, swept, *_ = ctx.saved_tensors
+        given, mean, _ = _given(*ctx.saved_tensors)
+        found = {name: mean.new_empty(mean.shape) for name in _BARS}
+        found["swept_higher_bar"] = swept.new_empty(swept.shape)
+        if old is not None:
+            found["light_higher_bar"] = old.new_empty(old.shape)
+        depth, height, width = ctx.grid.shape
+        rows = len(mean) * depth * height * (width if mean.is_cuda else 1)
+        found["sums"] = mean.new_zeros(2, rows)
+        given |= {f"{name}_bar": bar for name, bar in zip(_FOUND, bars, strict=True)}
+        launch_rows(blend_adjoint_kernel, ctx.grid, len(mean), given, found)
+        sums = found["sums"].double().view(*numbers.shape, -1).sum(-1).to(mean.dtype)
+        light_bars, diffuse_bars = (
+            [found[f"{of}_{part}_bar"] for part in _FIRST] for of in ("light", "diffuse")
+        )
+        # Gains have the cotangents of what they are added to.
+        return (
+            None,
+            sums,
+            found["extinction_bar"].sum_to_size(extinction.shape),
+            None if old is None else found["light_higher_bar"],
+            found["swept_higher_bar"],
+            *light_bars,
+            *diffuse_bars,
+            *diffuse_bars,
+        )
+
+
+def _given(
+    numbers: Tensor, extinction: Tensor, old: Tensor | None, swept: Tensor, *first: Tensor
+) -> tuple[dict[str, Any], Tensor, Tensor]:
+    """What both kernels are given; the mean of light, and what was swept."""
+    mean = first[0]
+    names = (f"{of}_{part}" for of in ("light", "diffuse", "gain") for part in _FIRST)
+    given = {
+        "numbers": numbers, "extinction": extinction, "swept_higher": swept,
+        "light_higher": mean if old is None else old, "shares": mean.new_empty(mean.shape),
+        "extinction_colors": len(extinction), "colors": len(mean), "higher": len(swept),
+        "is_begun": int(old is not None), **dict(zip(names, first, strict=True)),
+    }  # fmt: skip
+    return given, mean, swept
+
+
+@functools.cache
+def blend_kernel(bits: int) -> Any:
+    """The kernel of new light. What `light` had of higher moments counts if it `is_begun`."""
+    return row_kernel("blend", bits, _BLEND, " ".join([*_GIVEN, *_FOUND]), _NUMBERS)
+
+
+@functools.cache
+def blend_adjoint_kernel(bits: int) -> Any:
+    """The kernel of the cotangents of all that new light is of."""
+    arrays = [*_GIVEN, *(f"{name}_bar" for name in _FOUND), *_BARS, "sums"]
+    return row_kernel("blend_adjoint", bits, _ADJOINT, " ".join(arrays), _NUMBERS)

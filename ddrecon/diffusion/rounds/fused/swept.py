@@ -1,0 +1,108 @@
+"""What is swept, as kernels are given it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.light.moments import Moments
+
+Parts = tuple[Tensor | None, ...]
+"""The mean of light, its flux along z, y, x, and what is higher; None for what is missing."""
+PARTS = 5
+_OF_HARMONIC = 0, 2, 1, 3
+"""Which part each of the first harmonics is: those of degree 1 are along y, z and x."""
+
+
+def parts_of(light: Moments, colors: int) -> Parts:
+    """The parts of `light`, in so many `colors`."""
+    flux = light.flux or (None, None, None)
+    parts = light.mean, *flux, light.higher
+    return tuple(
+        part if part is None else part.expand(*part.shape[:-4], colors, *part.shape[-3:])
+        for part in parts
+    )
+
+
+@dataclass(frozen=True)
+class Swept:
+    """Light along so many `directions` through the cells of `grid`.
+
+    `scales` [3, C]: of extinction, of scattering, and inflow; `extinction` and `scattering`: fields
+    [1 or C, z, y, x], None where the second is the first. What scatters has the moments
+    `factors`[0, k] times those of `light` and `factors`[1, k] times those of `source`, [2, K, C].
+    """
+
+    grid: Grid
+    directions: int
+    scales: Tensor
+    extinction: Tensor
+    scattering: Tensor | None
+    factors: Tensor
+    light: Parts
+    source: Parts
+
+    @staticmethod
+    def of(
+        grid: Grid,
+        directions: int,
+        scales: Tensor,
+        extinction: Tensor,
+        scattering: Tensor | None,
+        factors: Tensor,
+        *parts: Tensor | None,
+    ) -> Swept:
+        """From tensors as autograd must be given them: one by one."""
+        light, source = parts[:PARTS], parts[PARTS:]
+        return Swept(grid, directions, scales, extinction, scattering, factors, light, source)
+
+    @property
+    def like(self) -> Tensor:
+        """A tensor [C, z, y, x] of the right kind."""
+        (like, *_) = (part for part in (*self.source, *self.light) if part is not None)
+        return like
+
+    @property
+    def moments(self) -> list[tuple[Tensor | None, Tensor | None]]:
+        """The moments [C, z, y, x] of `light` and of `source`, harmonic by harmonic."""
+        count = self.factors.shape[1]
+        return [(_moment(self.light, k), _moment(self.source, k)) for k in range(count)]
+
+    def total(self) -> Tensor:
+        """The moments of what scatters, [K, C, z, y, x]."""
+        found = self.like.new_zeros(self.factors.shape[1], *self.like.shape)
+        for total, pair, factors in zip(found, self.moments, self.factors.unbind(1), strict=True):
+            for moment, factor in zip(pair, factors, strict=True):
+                if moment is not None:
+                    total += factor.view(-1, 1, 1, 1) * moment
+        return found
+
+    def part_bars(self, which: int, bar: Tensor, needs: Sequence[bool]) -> list[Tensor | None]:
+        """Cotangents of parts of light (0) or source (1) that need them, of `bar` of moments."""
+        factors = self.factors[which].view(*self.factors.shape[1:], 1, 1, 1)
+        found: list[Tensor | None] = []
+        for part, need in zip(range(PARTS), needs, strict=True):
+            ks = slice(4, None) if part == PARTS - 1 else _OF_HARMONIC.index(part)
+            found.append(factors[ks] * bar[ks] if need else None)
+        return found
+
+    def factor_bar(self, bar: Tensor) -> Tensor:
+        """The cotangent of `factors`, of `bar` of moments."""
+        found = torch.zeros_like(self.factors, dtype=torch.float64)
+        for k, pair in enumerate(self.moments):
+            for which, moment in enumerate(pair):
+                if moment is not None:
+                    terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
+                    found[which, k] = torch.stack([torch.dot(*each) for each in terms])
+        return found.to(bar.dtype)
+
+
+def _moment(parts: Parts, k: int) -> Tensor | None:
+    if k < PARTS - 1:
+        return parts[_OF_HARMONIC[k]]
+    higher = parts[PARTS - 1]
+    return None if higher is None else higher[k - 4]

@@ -1,0 +1,175 @@
+"""Kernels whose items do a text in C++, which finds all it is given by name.
+
+    scale = TextKernel("scale", bits, "out[item] = factor * x[item];", "F *x, *out; F factor")
+    scale.launch(count, {"x": x, "factor": 2.0}, {"out": out})
+
+What the text is given is declared as in C: pointers and numbers of type `F` (the kernel's own),
+`double`, `int`, `long` or `bool`; `F *fields[3]` are three pointers. It all goes into one record:
+a launch takes the same few microseconds, however much that is.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ddrecon.kernels.launch import launch
+from ddrecon.kernels.native import number_type, program
+
+_TYPES = {
+    "double": ("double", wp.float64, torch.float64),
+    "int": ("int", wp.int32, torch.int32),
+    "long": ("long long", wp.int64, torch.int64),
+    "bool": ("bool", wp.bool, torch.bool),
+}
+BLOCK = """
+const int begin = item * length, end = begin + length < total ? begin + length : total;
+"""
+"""Before a text: its item does the numbers `begin` to `end` of a `total`, `length` of them."""
+
+
+class TextKernel:
+    """The kernel `name` that does `text` for each `item`, in numbers of so many `bits`.
+
+    `given` declares what the text has besides; `write` puts before it what both need.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        bits: int,
+        text: str,
+        given: str,
+        write: Callable[[int, str], str] = program,
+    ):
+        F = number_type(bits)
+        types = _TYPES | {"F": ("F", F, torch.float64 if bits == 64 else torch.float32)}
+        members, locals_, self.arrays = {}, [], {}
+        self.lists: dict[str, list[str]] = {}
+        for word, is_array, one, count in _declared(given):
+            written, number, dtype = types[word]
+            entries = [f"{one}_{k}" for k in range(count)] or [one]
+            members |= dict.fromkeys(entries, wp.uint64 if is_array else number)
+            if is_array:
+                written += "*"
+                self.arrays |= dict.fromkeys(entries, dtype)
+            casts = ", ".join(f"({written})given.{entry}" for entry in entries)
+            if count:
+                self.lists[one] = entries
+                locals_.append(f"{written} const {one}[] = {{{casts}}};\n")
+            else:
+                locals_.append(f"{written} const {one} = {casts};\n")
+        # Pointers go as numbers: their addresses.
+        Record = wp.struct(type("Record", (), {"__annotations__": members, "__module__": __name__}))
+
+        @wp.func_native(write(bits, "".join(locals_) + text))
+        def do_item(item: int, given: Record): ...
+
+        @wp.kernel(enable_backward=False, module="unique", name=name)
+        def do_items(first: int, given: Record):
+            do_item(first + wp.tid(), given)
+
+        self.names, self.kernel, self.module = set(members), do_items, do_items.module
+        # Warp's own records check each value that they are given, which takes longer than the rest.
+        plain = type(Record().__ctype__())
+        self.new_record: Any = type("Record", (plain,), {"__ctype__": lambda self: self})
+
+    def launch(
+        self,
+        count: int,
+        given: Mapping[str, Any],
+        made: Mapping[str, Any],
+        threads: int | None = None,
+        shares: Sequence[Mapping[str, Any]] = (),
+        work: int | None = None,
+    ) -> None:
+        """Does `count` items with arrays and numbers `given`, and writes to arrays `made`.
+
+        Those that are made are contiguous. A thread has what is in its own of `shares` as well.
+        `work` as of `launch.launch`.
+        """
+        bound = self.bind(given, made)
+        if not shares:
+            bound.launch(count, threads, work)
+            return
+        own = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
+        for record, share in zip(own, shares, strict=True):
+            for name, value in share.items():
+                self.write(record, name, value)
+        launch(self.kernel, count, lambda i: [own[i]], bound.like, len(own))
+
+    def bind(self, given: Mapping[str, Any], made: Mapping[str, Any]) -> "Bound":
+        """The kernel with all that `launch` is given, for many launches."""
+        record, held = self.new_record(), []
+        for name, value in given.items():
+            ready = value
+            if name in self.lists:
+                entries = zip(self.lists[name], value, strict=True)
+                ready = [self._ready(entry, each) for entry, each in entries]
+            elif isinstance(value, Tensor):
+                ready = self._ready(name, value)
+            self.write(record, name, ready)
+            held.append(ready)
+        for name, value in made.items():
+            self.write(record, name, value)
+        like = next(value for value in made.values() if isinstance(value, Tensor))
+        return Bound(self, record, [held, made], like)
+
+    def _ready(self, name: str, array: Tensor | None) -> Tensor | None:
+        """`array` as the text reads it."""
+        return None if array is None else array.to(self.arrays.get(name)).contiguous()
+
+    def write(self, record: Any, name: str, value: Any) -> None:
+        """Writes a number into `record`, or the address of an array; 0 of one that is None."""
+        if isinstance(value, Tensor):
+            wanted = self.arrays.get(name)
+            if value.dtype is not wanted or not value.is_contiguous():
+                raise ValueError(f"{name} is declared as {wanted}, and is to be contiguous")
+            setattr(record, name, value.data_ptr())
+        elif name in self.lists:
+            for entry, each in zip(self.lists[name], value, strict=True):
+                self.write(record, entry, each)
+        elif name in self.names:
+            setattr(record, name, 0 if value is None else value)
+        else:
+            raise ValueError(f"the kernel declares no {name}")
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A kernel with the `record` it is given; `held` keeps what this points to."""
+
+    kernel: TextKernel
+    record: Any
+    held: Any
+    like: Tensor
+
+    def launch(
+        self, count: int, threads: int | None = None, work: int | None = None, **numbers: float
+    ) -> None:
+        """Does `count` items, with these `numbers` changed."""
+        for name, number in numbers.items():
+            self.kernel.write(self.record, name, number)
+        launch(self.kernel.kernel, count, [self.record], self.like, threads, work)
+
+
+def _declared(given: str) -> Iterator[tuple[str, bool, str, int]]:
+    """Of each name declared: the word for its type, whether it is an array, of how many in a list.
+
+    0 is no list.
+    """
+    for declaration in filter(str.strip, given.split(";")):
+        word, names = declaration.split(maxsplit=1)
+        for name in names.split(","):
+            star, one, count = re.fullmatch(r"(\*?)(\w+)(?:\[(\d+)\])?", name.strip()).groups()
+            yield word, bool(star), one, int(count or 0)
+
+
+def cut(total: int, length: int, like: Tensor) -> tuple[int, int]:
+    """Items that do `total` numbers, and how many each: `length`, or one on a GPU."""
+    length = 1 if like.is_cuda else length
+    return -(-total // length), length

@@ -1,0 +1,125 @@
+"""Beams that a backward peak turns back and forth: pairs of beams against each other (E20).
+
+The part b of scattering turns light exactly back. So light of a directional light goes on as two
+beams, F along its direction and G against it, with their optical depth t from where it enters:
+
+    dF/dt = -F + beta G,    -dG/dt = -G + beta F,    F = 1 at t = 0,  G = 0 at t = T,
+
+where beta = b kappa_s / kappa_t. With lambda = sqrt(1 - beta^2), r = beta / (1 + lambda) and u the
+depth that is left, T - t:
+
+    F = (exp(-lambda t) - r^2 exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
+    G = r (exp(-lambda t) - exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
+
+Where albedo varies from cell to cell, beta is that of the cell.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import array_order
+from ddrecon.light.beam import Beam
+from ddrecon.light.lights import DirectionalLight
+from ddrecon.light.moments import Moments, beam_moments
+from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.remaining import backward_fraction, unturned_moments
+from ddrecon.numerics.autodiff import recompute
+from ddrecon.numerics.decay import decay_mean
+
+
+@dataclass(frozen=True)
+class TurnedBeam:
+    """Light of a beam that its backward peak has turned at least once.
+
+    `radiance` [C, z, y, x]: mean over the sphere; `direction` [3]: the way it goes, in array order;
+    `turns`: 1 where it was turned an odd number of times, 2 where an even one.
+    """
+
+    radiance: Tensor
+    direction: Tensor
+    turns: int
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The beams `along` a light's `direction` [3] and `against` it, E / (4 pi) times F and G.
+
+    Both are [C, z, y, x], averaged over each cell; `received` is the part of F never scattered.
+    """
+
+    direction: Tensor
+    received: Tensor
+    along: Tensor
+    against: Tensor
+
+    def source(self, medium: Medium) -> Moments:
+        """What both scatter but for their backward peak (E20)."""
+        factors = unturned_moments(medium)
+        both = [
+            beam_moments(radiance, direction, medium.degree).weighted(factors)
+            for radiance, direction in (
+                (self.along, self.direction),
+                (self.against, -self.direction),
+            )
+        ]
+        return both[0].plus(both[1])
+
+    @property
+    def turned(self) -> tuple[TurnedBeam, TurnedBeam]:
+        """Light turned an odd, and an even number of times."""
+        return (
+            TurnedBeam(self.against, -self.direction, 1),
+            TurnedBeam(self.along - self.received, self.direction, 2),
+        )
+
+
+def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
+    """The beam of `light` in `medium`, and the pair that it becomes."""
+    extinction = medium.extinction
+    direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
+    irradiance = light.irradiance.view(-1, 1, 1, 1)
+    (entered, step), (behind, _) = (
+        recompute(sum_mass_to_cells, extinction.field, medium.grid, way, extinction.mass_bound)
+        for way in (direction, -direction)
+    )
+    beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
+    shares = recompute(_pair, medium, entered, behind, step, backward_fraction(medium))
+    received, along, against = (irradiance / (4 * math.pi) * share for share in shares)
+    return beam, Pair(direction, received, along, against)
+
+
+def _pair(
+    medium: Medium, entered: Tensor, behind: Tensor, step: Tensor, turned: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """tau, F and G, averaged over each cell; `entered` and `behind` are the mass on both sides."""
+    extinction = medium.extinction
+    depth = extinction.scale * (extinction.field * step)
+    before, after = extinction.scale * entered, extinction.scale * behind
+    beta = _turned_part(medium, turned)
+    rate = (1 - beta * beta).sqrt()
+    reflected = beta / (1 + rate)
+    # means of exp(-lambda t) and of exp(-lambda (T + u)) over the cell
+    share = decay_mean(rate * depth)
+    total = before + depth + after
+    forth = torch.exp(-rate * before) * share
+    back = torch.exp(-rate * (total + after)) * share
+    again = 1 / (1 - reflected**2 * torch.exp(-2 * rate * total))
+    tau = extinction.mean_transmittance(entered, step)
+    return tau, (forth - reflected**2 * back) * again, reflected * (forth - back) * again
+
+
+def _turned_part(medium: Medium, turned: Tensor) -> Tensor:
+    """beta = b kappa_s / kappa_t, [C, 1, 1, 1] or [C, z, y, x]; 0 where there is no medium."""
+    extinction, scattering = medium.extinction, medium.scattering
+    if extinction.field is scattering.field:
+        above, below = turned * scattering.scale, extinction.scale
+    else:
+        above, below = torch.broadcast_tensors(turned * scattering.value, extinction.value)
+    is_there = below > 0
+    return torch.where(is_there, above / torch.where(is_there, below, 1), 0)

@@ -1,1 +1,0 @@
-"""Functions of the medium by fused kernels."""

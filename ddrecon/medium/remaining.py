@@ -1,0 +1,79 @@
+"""Moments of the scattering that remains once peaks count as not scattered, or as turned back."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.phase import PhaseFunction
+from ddrecon.numerics.angle_table import STEPS
+from ddrecon.numerics.legendre import legendre_at_even_angles, series_weights
+from ddrecon.numerics.remember import is_any_nonzero, remember
+
+
+def remaining_moments(medium: Medium) -> Tensor:
+    """p_l = (chi_l - f) / (1 - f) for l up to the medium's degree (E18), [L + 1, C or 1, 1, 1, 1].
+
+    chi_l are the moments of the phase function of `medium`, f the part of its forward peak.
+    """
+    phase = medium.seen.phase
+    return _remaining(type(phase), medium.forward_fraction, medium.seen.degree, *phase.numbers)
+
+
+def unturned_moments(medium: Medium) -> Tensor:
+    """p_l - (-1)^l b / (1 - f), of what beams scatter that keep their backward peak b (E20).
+
+    As `remaining_moments`.
+    """
+    turned = backward_fraction(medium) / (1 - medium.forward_fraction)
+    moments = remaining_moments(medium)
+    sign = 1 - 2 * (torch.arange(len(moments), device=turned.device) % 2).to(turned)
+    return moments - sign.view(-1, 1, 1, 1, 1) * turned
+
+
+def backward_fraction(medium: Medium) -> Tensor:
+    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E20)."""
+    phase = medium.seen.phase
+    return _backward_fraction(type(phase), medium.seen.degree, *phase.numbers)
+
+
+def has_backward_peak(medium: Medium) -> bool:
+    """Whether a part of scattering counts as turned back."""
+    return is_any_nonzero(backward_fraction(medium))
+
+
+def turned_phase(medium: Medium, turns: int) -> Tensor:
+    """How light that a backward peak has turned scatters once more, towards a camera (E21).
+
+    A table [C, steps + 1, 2, 1] for `look_up` over the angle from the way that light goes. Its
+    moments are chi_l up to the degree of the medium, and chi_l r_l^turns beyond, where r_l are the
+    backward peak's.
+    """
+    phase = medium.seen.phase
+    return _turned_phase(type(phase), medium.seen.degree, turns, *phase.numbers)
+
+
+@remember
+def _remaining(
+    kind: type[PhaseFunction], fraction: Tensor, degree: int, *numbers: Tensor
+) -> Tensor:
+    moments = kind(*numbers).moments(degree + 1).T[..., None, None, None]
+    return (moments - fraction) / (1 - fraction)
+
+
+@remember
+def _backward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+    return kind(*numbers).backward_fraction(degree).view(-1, 1, 1, 1) + 0
+
+
+@remember
+def _turned_phase(kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor) -> Tensor:
+    phase = kind(*numbers)
+    count = phase.length()
+    tail = phase.backward_tail(degree, count - degree - 1).double()
+    spread = tail / torch.where(tail[:, :1] > 0, tail[:, :1], 1)
+    spread = torch.cat([torch.ones_like(spread[:, :1]).expand(-1, degree + 1), spread], 1)
+    weights = series_weights(phase.moments(count).double() * spread**turns)
+    curves = legendre_at_even_angles(STEPS, count)
+    return torch.stack([weights @ rows.to(weights).T for rows in curves], -1)[..., None]

@@ -1,0 +1,95 @@
+"""Smooth functions of an angle, kept as values and slopes at even angles from 0 to pi.
+
+Between two of them a function is the cubic with their values and slopes (Hermite), fourth order in
+the step and with a continuous slope.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+from ddrecon.numerics.autodiff import is_forward
+
+STEPS = 1024
+"""Steps of a table: a Henyey-Greenstein peak of g = 0.95 is 16 of them wide."""
+NEAREST = 1e-14
+"""Cosines are held so far from -1 and 1, where the angle has no slope."""
+
+
+def angle_of(cosine: Tensor) -> Tensor:
+    """The angle in double precision; its derivative by `cosine` is finite, at -1 and 1 as well."""
+    return cosine.double().clamp(NEAREST - 1, 1 - NEAREST).acos()
+
+
+def look_up(table: Tensor, angle: Tensor) -> Tensor:
+    """Values [C, *angle.shape, K] at `angle` of the functions in `table` [C, steps + 1, 2, K].
+
+    The two entries are value and slope by the angle. Values have the precision of `table`.
+    """
+    colors, steps = len(table), table.shape[1] - 1
+    place = angle.flatten() * (steps / math.pi)
+    first = place.detach().long().clamp(0, steps - 1)
+    part = (place - first).to(table.dtype)
+    rest, step = 1 - part, math.pi / steps
+    # Hermite's cubic: values by (1 + 2 t)(1 - t)^2, slopes by t (1 - t)^2, and mirrored.
+    low = (1 + 2 * part) * rest**2, step * part * rest**2
+    high = (1 + 2 * rest) * part**2, -step * rest * part**2
+    weights = torch.stack([*low, *high], -1)
+    # Both entries of both angles stand beside each other.
+    rows = 2 * first[:, None] + torch.arange(4, device=angle.device)
+    found = torch.stack([_weigh(curves.flatten(0, 1), rows, weights) for curves in table])
+    return found.view(colors, *angle.shape, table.shape[-1])
+
+
+def _weigh(values: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
+    """The sums over j of `weights` [R, J] times the `rows` [R, J] of `values` [N, K], [R, K]."""
+    if is_forward():
+        return (values[rows] * weights[..., None]).sum(1)
+    # Several times as fast, but without forward mode.
+    return embedding_bag(rows, values, mode="sum", per_sample_weights=weights)
+
+
+def with_slopes(values: Tensor) -> Tensor:
+    """`values` [C, steps + 1] at even angles as a table [C, steps + 1, 2, 1].
+
+    Slopes are differences of fourth order; functions are even about both ends.
+    """
+    steps = values.shape[1] - 1
+    before, after = values[:, 1:3].flip(1), values[:, -3:-1].flip(1)
+    wide = torch.cat([before, values, after], 1)
+    near, far = wide[:, 3:-1] - wide[:, 1:-3], wide[:, 4:] - wide[:, :-4]
+    slopes = (8 * near - far) * (steps / (12 * math.pi))
+    return torch.stack([values, slopes], -1)[..., None]
+
+
+def at_even_angles(angles: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """`values` [C, n] >= 0 given at `angles` [n] from 0 to pi, at even angles: [C, STEPS + 1].
+
+    Between neighbors they are monotone, by the piecewise cubics of Fritsch and Butland 1984
+    (doi:10.1137/0905021), which are even about both ends.
+    """
+    widths = np.diff(angles)
+    rises = np.diff(values, axis=1) / widths
+    before, after = widths[:-1], widths[1:]
+    weights = (2 * after + before), (after + 2 * before)
+    is_monotone = rises[:, :-1] * rises[:, 1:] > 0
+    one, other = (np.where(is_monotone, rise, 1) for rise in (rises[:, :-1], rises[:, 1:]))
+    inner = sum(weights) / (weights[0] / one + weights[1] / other)
+    slopes = np.pad(np.where(is_monotone, inner, 0), ((0, 0), (1, 1)))
+    places = np.linspace(0, math.pi, STEPS + 1)
+    left = np.searchsorted(angles, places, side="right").clip(1, len(angles) - 1) - 1
+    width = widths[left]
+    part = (places - angles[left]) / width
+    rest = 1 - part
+    value = (1 + 2 * part) * rest**2 * values[:, left] + (1 + 2 * rest) * part**2 * values[
+        :, left + 1
+    ]
+    found: np.ndarray = value + width * part * rest * (
+        rest * slopes[:, left] - part * slopes[:, left + 1]
+    )
+    return found

@@ -1,0 +1,58 @@
+"""Legendre series over the angle between two directions."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+COUNTS = tuple(2**power for power in range(5, 12))
+"""Lengths of series: few of them, so that few matrices are kept."""
+
+
+def even_angles(steps: int) -> Tensor:
+    """Angles [`steps` + 1] from 0 to pi in even steps, in double precision."""
+    return torch.linspace(0, math.pi, steps + 1, dtype=torch.float64)
+
+
+@functools.lru_cache(maxsize=4)
+@torch.inference_mode(False)
+def legendre_at_even_angles(steps: int, count: int) -> tuple[Tensor, Tensor]:
+    """P_l(cos angle) for l < `count` at `even_angles`, and its derivatives by the angle.
+
+    Both are [`steps` + 1, `count`].
+    """
+    angle = even_angles(steps)
+    cosine, sine = angle.cos(), angle.sin()
+    rows = legendre(cosine, count)
+    # sin(angle) dP_l / d angle = l (cos(angle) P_l - P_(l-1)); at both ends the slope is 0.
+    degree = torch.arange(count, dtype=torch.float64)
+    before = torch.cat([torch.zeros_like(rows[:, :1]), rows[:, :-1]], 1)
+    slopes = degree * (cosine[:, None] * rows - before) / sine[:, None]
+    slopes[0] = slopes[-1] = 0
+    return rows, slopes
+
+
+def legendre(cosine: Tensor, count: int) -> Tensor:
+    """P_l(`cosine`) for l < `count`, as a new last axis."""
+    before, here = torch.zeros_like(cosine), torch.ones_like(cosine)
+    rows = [here]
+    for degree in range(count - 1):
+        before, here = here, ((2 * degree + 1) * cosine * here - degree * before) / (degree + 1)
+        rows.append(here)
+    return torch.stack(rows, -1)
+
+
+def series_weights(moments: Tensor) -> Tensor:
+    """(2 l + 1) times `moments` [..., l]: the coefficients of their Legendre series."""
+    degree = torch.arange(moments.shape[-1], dtype=moments.dtype, device=moments.device)
+    return (2 * degree + 1) * moments
+
+
+@functools.cache
+def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cosines and weights [`count`] of Gauss's rule on [-1, 1], exact to degree 2 `count` - 1."""
+    return np.polynomial.legendre.leggauss(count)

@@ -1,0 +1,104 @@
+"""What cameras do to radiance, found from pictures: exposures and offsets that fit best.
+
+A picture is linear in both (E28), so that they need no slow descent: for a volume as it is, they
+are the solution of a small least-squares problem. A volume whose cameras answer at once does not
+learn their exposures as differences between its sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.losses import Target
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.scene import View
+from ddrecon.variables.values import RESPONSE
+
+LARGEST_STEP = 2.0
+"""An exposure changes at most by this factor in a step: a volume may still be nearly empty."""
+PART = 0.5
+"""How far a step goes."""
+SWEEPS = 32
+"""Times that exposure and offset are found in turn, each for the other as it is."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a camera makes of radiance: `exposure` times it plus `offset`, each [1] or [3].
+
+    `has_gain` and `has_offset` say which of them are sought.
+    """
+
+    exposure: Tensor
+    offset: Tensor
+    has_gain: bool
+    has_offset: bool
+
+
+def fit_response(picture: Tensor, target: Target, response: Response) -> Response:
+    """The response that takes `picture` [3, h, w], rendered with `response`, nearest to `target`.
+
+    Nearest by least squares, weighed as the target's loss weighs small errors. A background behind
+    the volume counts as if it were exposed with it; what is found is right where nothing changes.
+    """
+    # The sums of the normal equations by color, over pixels that count.
+    light = picture.detach() - response.offset.detach().view(-1, 1, 1)
+    weight = target.slope.square().expand_as(light)
+    weight = weight if target.seen is None else weight * target.seen
+    products = [weight, weight * light, weight * light * light]
+    products += [weight * target.image, weight * light * target.image]
+    sums = torch.stack(products).double().sum((-2, -1)).cpu()
+    w, wx, wxx, wt, wxt = sums
+    gain, offset = torch.ones(3).double(), response.offset.detach().double().cpu().expand(3)
+    for _ in range(SWEEPS if response.has_gain and response.has_offset else 1):
+        if response.has_gain:
+            gain = _quotient(wxt - offset * wx, wxx, response.exposure, gain)
+            gain = gain.clamp(1 / LARGEST_STEP, LARGEST_STEP)
+        if response.has_offset:
+            offset = _quotient(wt - gain * wx, w, response.offset, offset)
+    like, colors, shifts = response.exposure, len(response.exposure), len(response.offset)
+    return Response(
+        response.exposure.detach() * gain[:colors].to(like),
+        offset[:shifts].to(like),
+        response.has_gain,
+        response.has_offset,
+    )
+
+
+def step_responses(
+    fitted: Sequence[Parameter], view: View, picture: Tensor, target: Target
+) -> None:
+    """Takes the parameters `fitted` of a `view` part of the way to what fits its `picture` best."""
+    if not fitted:
+        return
+    keys = {parameter.name.rpartition(".")[2]: parameter for parameter in fitted}
+    like = view.camera.pose
+    exposure, offset = (
+        keys[key].value if key in keys else _value(getattr(view, key), default, like)
+        for key, default in RESPONSE.items()
+    )
+    response = Response(exposure, offset, "exposure" in keys, "offset" in keys)
+    found = fit_response(picture, target, response)
+    for key, parameter in keys.items():
+        before, after = parameter.value.detach(), getattr(found, key)
+        value = before.lerp(after, PART).clamp(parameter.low, parameter.high)
+        parameter.value = value.requires_grad_()
+
+
+def _value(value: Tensor | None, default: float, like: Tensor) -> Tensor:
+    return like.new_full((1,), default) if value is None else value
+
+
+def _quotient(above: Tensor, below: Tensor, like: Tensor, otherwise: Tensor) -> Tensor:
+    """`above` over `below` by color, [3]; of their sums where `like` has one value for all.
+
+    `otherwise` where there is nothing to divide by.
+    """
+    if len(like) == 1:
+        above, below = above.sum().expand(3), below.sum().expand(3)
+    tiny = torch.finfo(torch.float32).tiny
+    return torch.where(below > tiny, above / below.clamp(min=tiny), otherwise)

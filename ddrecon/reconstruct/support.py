@@ -1,0 +1,145 @@
+"""Where medium may be: the visual hull of what the training views show.
+
+A cell is left out where any view that sees it sees nothing there (Laurentini 1994,
+doi:10.1109/34.273735). Pictures are taken at full resolution, whatever the grid's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from ddrecon.cameras import Camera, project
+from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
+from ddrecon.reconstruct.levels import resample
+from ddrecon.scene import View
+from ddrecon.settings import FieldFile, ParameterSettings
+
+KEY = "optimize.parameters.density.support"
+
+
+@dataclass(frozen=True)
+class Support:
+    """What says where medium may be: `views` with what they show, or the cells of a file.
+
+    `shown` [h, w] of each view is whether a pixel shows something. `margin` is how many pixels what
+    they show is widened by. `cells` [z, y, x] are above 0 where medium may be.
+    """
+
+    views: Sequence[View]
+    shown: Sequence[Tensor]
+    margin: float
+    cells: Tensor | None = None
+
+    def on(self, grid: Grid) -> Tensor:
+        """Whether medium may be in each cell of `grid`: bool [z, y, x].
+
+        Raises SceneError where it may be in none.
+        """
+        if self.cells is not None:
+            return resample((self.cells > 0).to(self.cells.dtype), grid) > 0
+        pairs = [
+            hull_of(view.camera, shown, grid, self.margin)
+            for view, shown in zip(self.views, self.shown, strict=True)
+        ]
+        hulls, seen = (torch.stack(cells) for cells in zip(*pairs, strict=True))
+        hull = hulls.all(0)
+        if not bool((hull & seen.any(0)).any()):
+            parts = hulls.float().mean((1, 2, 3)).tolist()
+            part, view = min(zip(parts, (view.name for view in self.views), strict=True))
+            raise SceneError(
+                f"{KEY}: no cell is left: of each that is seen, some training view shows nothing"
+                f" (view {view!r} alone leaves {100 * part:.2g} %); check the cameras and masks,"
+                " lower the threshold, or raise support_margin"
+            )
+        return hull
+
+
+def describe_support(support: Support | None, grid: Grid) -> dict[str, float] | None:
+    """What a report says of `support`: the part of the cells of `grid` that it keeps."""
+    return None if support is None else {"cells": float(support.on(grid).float().mean())}
+
+
+def support_text(support: dict[str, float]) -> str:
+    """What `describe_support` says, as a line."""
+    part = 100 * support["cells"]
+    return f"support: density in {part:.3g} % of the cells, where every view may show some"
+
+
+def find_support(
+    views: Sequence[View], settings: ParameterSettings, cells: Tensor | None
+) -> Support | None:
+    """The support that `settings` of density ask for; None where medium may be anywhere.
+
+    `views` are the training views; `cells` [z, y, x] are those of the file where they name one.
+    Raises SceneError where a view shows nothing at all, or the file has no cell.
+    """
+    wanted = settings.support
+    if wanted is None:
+        return None
+    if isinstance(wanted, FieldFile):
+        if cells is None or not bool((cells > 0).any()):
+            raise SceneError(f"{KEY}: the file has no cell above 0, where medium may be")
+        return Support((), (), 0.0, cells)
+    shown = [_shown(view, wanted) for view in views]
+    empty = [view.name for view, pixels in zip(views, shown, strict=True) if not pixels.any()]
+    if empty:
+        what = "its mask or alpha" if wanted == "masks" else f"a displayed value of {wanted:g}"
+        raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {what}")
+    return Support(views, shown, settings.support_margin)
+
+
+def _shown(view: View, wanted: str | float) -> Tensor:
+    """Which pixels of `view` show something: bool [h, w].
+
+    By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
+    where the brightest color is above `wanted`, a value as displayed, or is not known.
+    """
+    if wanted == "masks" and view.mask is not None:
+        return view.mask > 0
+    if view.image is None:
+        raise ValueError(f"view {view.name} has no image")
+    shown = view.image.amax(0) > (0.0 if wanted == "masks" else _linear(float(wanted)))
+    return shown if view.mask is None else shown | (view.mask == 0)
+
+
+def _linear(displayed: float) -> float:
+    """The radiance that is displayed as a value of sRGB (IEC 61966-2-1)."""
+    return displayed / 12.92 if displayed <= 0.04045 else ((displayed + 0.055) / 1.055) ** 2.4
+
+
+def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:
+    """Which cells of `grid` may hold medium, by `camera`, and which it sees: bool [z, y, x] each.
+
+    What it does not see may. `shown` [h, w] is whether a pixel shows something; a cell may hold it
+    where a pixel does within `margin` pixels of those that the cell covers.
+    """
+    z, y, x = torch.meshgrid(*(line.flatten() for line in grid.centers(camera.pose)), indexing="ij")
+    places, distance = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
+    height, width = camera.size
+    # The pixels that a cell covers lie within its half diagonal of its center; nearer cells cover
+    # more, and one that the camera may be inside of covers any.
+    half = math.hypot(*grid.spacing) / 2
+    pixel = 2 * float(camera.half_width) / width
+    near = distance.min() - half if camera.is_perspective else distance.new_ones(())
+    reach = math.inf if float(near) <= 0 else half / (float(near) * pixel) + margin
+    wide = _widen(shown, math.ceil(min(reach, max(height, width))))
+    column, row = places.nan_to_num(-1.0).clamp(-1, max(height, width)).floor().long().unbind(-1)
+    is_seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    index = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    may_hold = ~is_seen | wide.flatten()[index]
+    return may_hold.view(grid.shape), is_seen.view(grid.shape)
+
+
+def _widen(shown: Tensor, reach: int) -> Tensor:
+    """Where any pixel of `shown` [h, w] within `reach` rows and columns is true."""
+    pixels = shown.float()[None, None]
+    side = 2 * reach + 1
+    rows = max_pool2d(pixels, (side, 1), 1, (reach, 0))
+    return max_pool2d(rows, (1, side), 1, (0, reach))[0, 0] > 0

@@ -1,0 +1,104 @@
+"""Kernels that are a text in C++: what they are given arrives, whatever threads launch them."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from media import random_values
+
+pytest.importorskip("warp")
+
+from ddrecon.kernels.text import BLOCK, TextKernel, cut
+
+TEXT = """
+for (int i = begin; i < end; ++i) {
+    F sum = shift;
+    for (int k = 0; k < 2; ++k) if (fields[k]) sum += weights[k] * fields[k][i];
+    out[i] = sum;
+    is_large[i] = sum > F(1);
+}
+"""
+GIVEN = "int length, total; F shift, *fields[2], *out; double *weights; bool *is_large"
+
+
+@pytest.fixture(scope="module")
+def kernel() -> TextKernel:
+    return TextKernel("weighted_sum", 64, BLOCK + TEXT, GIVEN)
+
+
+def given(fields: list[torch.Tensor | None], weights: torch.Tensor, shift: float = 0.0) -> dict:
+    return {"total": 37, "fields": fields, "weights": weights, "shift": shift}
+
+
+def made() -> dict[str, torch.Tensor]:
+    return {
+        "out": torch.empty(37, dtype=torch.float64),
+        "is_large": torch.empty(37, dtype=torch.bool),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 2])
+def test_arrays_numbers_and_lists_arrive(kernel, threads):
+    fields, weights = random_values(2, 37), random_values(2, seed=1)
+    items, length = cut(37, 4, weights)
+    found = made()
+    strided = [random_values(37, 2)[:, 0], fields[1].float()]  # copied and converted first
+    kernel.launch(items, given(strided, weights, 0.5) | {"length": length}, found, threads)
+    known = 0.5 + weights[0] * strided[0] + weights[1] * strided[1].double()
+    torch.testing.assert_close(found["out"], known, rtol=1e-14, atol=0)
+    assert torch.equal(found["is_large"], found["out"] > 1)
+
+
+@pytest.mark.slow
+def test_none_is_an_array_that_is_not_there(kernel):
+    fields, weights, found = random_values(2, 37), random_values(2, seed=1), made()
+    kernel.launch(1, given([None, fields[1]], weights) | {"length": 37}, found)
+    torch.testing.assert_close(found["out"], weights[1] * fields[1], rtol=1e-14, atol=0)
+
+
+@pytest.mark.slow
+def test_each_share_writes_to_its_own(kernel):
+    fields, weights = random_values(2, 37), random_values(2, seed=1)
+    own = [made() for _ in range(3)]
+    kernel.launch(37, given(list(fields), weights) | {"length": 1}, own[0], shares=own)
+    known, bounds = weights @ fields, [0, 12, 24, 37]
+    for share, first, last in zip(own, bounds, bounds[1:], strict=False):
+        torch.testing.assert_close(share["out"][first:last], known[first:last])
+
+
+@pytest.mark.slow
+def test_threads_launch_the_same_kernel_at_once(kernel):
+    """Each has a recorded launch for itself while it lasts."""
+
+    def run(seed: int) -> bool:
+        fields, weights, found = random_values(2, 37, seed=seed), random_values(2), made()
+        kernel.launch(37, given(list(fields), weights) | {"length": 1}, found, threads=1)
+        return torch.allclose(found["out"], weights @ fields, rtol=1e-14)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(run, range(200)))
+
+
+@pytest.mark.slow
+def test_a_bound_kernel_takes_other_numbers(kernel):
+    fields, weights, found = random_values(2, 37), random_values(2, seed=1), made()
+    bound = kernel.bind(given(list(fields), weights) | {"length": 37}, found)
+    for shift in (0.0, 2.0):
+        bound.launch(1, shift=shift)
+        torch.testing.assert_close(found["out"], weights @ fields + shift)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"out": torch.empty(37)}, "out is declared as torch.float64"),
+        ({"out": torch.empty(37, 2, dtype=torch.float64)[:, 0]}, "is to be contiguous"),
+        ({"other": torch.empty(37)}, "other is declared as None"),
+        ({"other": 3}, "declares no other"),
+    ],
+    ids=["type", "stride", "array", "number"],
+)
+def test_what_does_not_fit_is_refused(kernel, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        kernel.launch(1, given([None, None], random_values(2)) | {"length": 37}, made() | wrong)

@@ -1,0 +1,191 @@
+"""Support: no medium where a view that sees a cell sees nothing, and none comes back there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from media import box_grid, make_camera
+
+from ddrecon.cameras import cast_rays, project
+from ddrecon.errors import SceneError
+from ddrecon.grid import Grid
+from ddrecon.io.volumes.table import write_field
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.support import hull_of
+from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
+
+BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
+CAMERAS = {
+    "pinhole": make_camera(size=(30, 36)),
+    "oblong": replace(make_camera(size=(30, 36)), principal_point=(0.4, 0.55), pixel_aspect=1.2),
+    "parallel": make_camera(size=(30, 36), half_width=0.7, is_perspective=False),
+    "opencv": replace(
+        make_camera(size=(30, 36)),
+        lens="opencv",
+        distortion=torch.tensor([-0.2, 0.05, 0, 0, 0.002, -0.001], dtype=torch.float64),
+    ),
+    "fisheye": replace(
+        make_camera(eye=(0.1, 0.2, 0.9), size=(30, 36), half_width=1.2),
+        lens="fisheye",
+        distortion=torch.tensor([0.02, -0.01, 0, 0], dtype=torch.float64),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_projection_is_the_inverse_of_casting_rays(name: str) -> None:
+    """A point on a pixel's ray is seen at the pixel's center, as far off as it was put."""
+    camera = CAMERAS[name]
+    rays = cast_rays(camera)
+    far = torch.linspace(0.5, 3, len(rays.direction), dtype=torch.float64)
+    points = (rays.origin + far[:, None] * rays.direction).flip(1)
+    places, distance = project(camera, points)
+    height, width = camera.size
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    expected = torch.stack([columns, rows], -1).view(-1, 2) + 0.5
+    torch.testing.assert_close(places, expected.double(), rtol=0, atol=1e-9)
+    if camera.is_perspective:
+        torch.testing.assert_close(distance, far, rtol=1e-12, atol=0)
+
+
+def test_what_lies_behind_or_far_outside_is_not_seen() -> None:
+    """Also where a polynomial would fold it back into the image."""
+    camera = replace(CAMERAS["opencv"], distortion=torch.tensor([-0.5, 0, 0, 0, 0, 0]).double())
+    backward, origin = camera.pose[:, 2], camera.pose[:, 3]
+    right = camera.pose[:, 0]
+    points = torch.stack([origin + backward, origin - backward + math.sqrt(2) * right])
+    assert project(camera, points)[0].isnan().all()
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_a_hull_holds_every_cell_that_a_shown_pixel_looks_through(name: str) -> None:
+    """Every ray of a pixel that shows something passes only through cells of the hull; with nothing
+    shown, only cells stay that are not seen.
+    """
+    camera, grid = CAMERAS[name], box_grid((7, 6, 8))
+    shown = torch.rand(camera.size, generator=torch.Generator().manual_seed(1)) > 0.995
+    hull, _ = hull_of(camera, shown, grid, 0.0)
+    rays = cast_rays(camera)
+    low, high = (torch.tensor(corner).double() for corner in (grid.lower, grid.upper))
+    for index in shown.flatten().nonzero()[:, 0].tolist():
+        steps = torch.linspace(0, 4, 400, dtype=torch.float64)[:, None]
+        points = rays.origin[index] + steps * rays.direction[index]
+        inside = points[((points > low) & (points < high)).all(1)]
+        cells = ((inside - low) / torch.tensor(grid.spacing).double()).long()
+        assert bool(hull[tuple(cells.unbind(1))].all())
+    assert not bool(hull.all())
+    nothing, is_seen = hull_of(camera, torch.zeros_like(shown), grid, 0.0)
+    z, y, x = torch.meshgrid(*(c.flatten() for c in grid.centers(camera.pose)), indexing="ij")
+    places, _ = project(camera, torch.stack([x, y, z], -1).view(-1, 3))
+    size = torch.tensor([camera.size[1], camera.size[0]])
+    seen = ((places >= 0) & (places < size)).all(1)
+    assert torch.equal(nothing.flatten(), ~seen) and torch.equal(is_seen, ~nothing)
+
+
+def test_a_hull_grows_with_margin_and_with_cells() -> None:
+    camera = CAMERAS["pinhole"]
+    shown = torch.zeros(camera.size, dtype=torch.bool)
+    shown[15, 18] = True
+    grids = [box_grid((8, 8, 8)), box_grid((4, 4, 4))]
+    hulls = [hull_of(camera, shown, grids[0], margin)[0] for margin in (0.0, 1.0, 4.0)]
+    for small, large in pairwise(hulls):
+        assert bool((large | ~small).all()) and large.sum() > small.sum()
+    coarse, _ = hull_of(camera, shown, grids[1], 0.0)
+    fine = coarse.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    _, is_seen = hull_of(camera, shown, grids[0], 0.0)
+    assert bool((fine | ~(hulls[0] & is_seen)).all())
+
+
+def ball(*overrides: str) -> Scene:
+    return load_scene(BALL, overrides=["optimize.iterations=8", *overrides])
+
+
+def test_outside_of_its_support_a_volume_stays_empty() -> None:
+    """At every level, whatever `min` says; and the ball itself is inside."""
+    run = Reconstruction(
+        ball("optimize.parameters.density={support: 0.55, support_margin: 1, min: 0.01}")
+    )
+    assert run.support is not None
+    grids = set()
+    while not run.is_done:
+        run.step()
+        (density,) = run.parameters
+        hull = run.support.on(density.grid)
+        grids.add(density.grid)
+        assert not density.value[~hull].any() and density.value[hull].min() >= 0.01
+        assert 0.1 < float(hull.float().mean()) < 1
+    assert len(grids) > 1
+    truth = np.load(BALL.parents[1] / "data" / "ball" / "density.npz")["density"]
+    assert truth[~hull.numpy()].sum() < 0.03 * truth.sum()
+
+
+def test_support_from_a_file(tmp_path: Path) -> None:
+    """A field of any resolution; a cell stays where any of it is above 0."""
+    cells = np.zeros((4, 4, 4), np.float32)
+    cells[1, 2, 3] = 1
+    write_field(tmp_path / "hull.npz", "hull", cells, np.array([[-0.5] * 3, [0.5] * 3]))
+    file = f"{{file: {tmp_path / 'hull.npz'}, name: hull}}"
+    run = Reconstruction(ball(f"optimize.parameters.density={{support: {file}}}"))
+    assert run.support is not None
+    coarse, grid = run.support.on(run.scene.volume.grid.coarsen(8)), run.scene.volume.grid
+    assert coarse.shape == (2, 2, 2) and bool(coarse[0, 1, 1])
+    assert bool(run.support.on(Grid((4, 4, 4), grid.lower, grid.upper))[1, 2, 3])
+    run.step()
+    assert run.parameters[0].value.any()
+
+
+def test_masks_say_what_is_empty() -> None:
+    scene = ball("optimize.parameters.density={support: masks, support_margin: 0}")
+    masks = [torch.zeros(32, 32) for _ in scene.views]
+    for mask in masks:
+        mask[12:20, 12:20] = 1
+    views = [replace(view, mask=mask) for view, mask in zip(scene.views, masks, strict=True)]
+    run = Reconstruction(replace(scene, views=views))
+    assert run.support is not None
+    part = float(run.support.on(scene.volume.grid).float().mean())
+    assert 0 < part < 0.2
+
+
+def refusal(scene: Scene) -> str:
+    with pytest.raises(SceneError) as caught:
+        Reconstruction(scene)
+    (line,) = caught.value.problems
+    return line
+
+
+def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
+    scene = ball("optimize.parameters.density={support: masks, support_margin: 0}")
+    views = []
+    for index, view in enumerate(scene.views):
+        mask = torch.zeros(32, 32)
+        mask[4:6, 14:18] = float(index != 1)
+        mask[26:28, 14:18] = float(index == 1)
+        views.append(replace(view, mask=mask))
+    line = refusal(replace(scene, views=views))
+    assert "no cell is left" in line and "support_margin" in line
+    views = [replace(view, mask=torch.zeros(32, 32)) for view in scene.views]
+    assert "shows nothing at all, by its mask" in refusal(replace(scene, views=views))
+    bright = ball("optimize.parameters.density={support: 0.999}")
+    assert "shows nothing at all, by a displayed value of 0.999" in refusal(bright)
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ("density={support: alpha}", "density.support: expected one of masks, found"),
+        ("density={support: 1.5}", "density.support: must be below 1, found 1.5"),
+        ("g={support: masks}", "g.support: 'masks' is for density alone"),
+        ("density={support: {file: none.npz}}", "support.file: "),
+    ],
+)
+def test_what_is_no_support_is_refused(settings: str, problem: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        ball(f"optimize.parameters.{settings}")
+    assert problem in str(caught.value) and len(caught.value.problems) == 1

@@ -1,0 +1,170 @@
+"""COLMAP's models: rays as its manual has them, text and binary alike, and refusals in one line."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from example_scene import changed
+
+from ddrecon.cameras import cast_rays, project
+from ddrecon.errors import FormatError, SceneError
+from ddrecon.scene_file.build import build_scene
+from ddrecon.scene_file.colmap import MODELS
+from ddrecon.scene_file.load import SceneFile
+
+Read = Callable[..., SceneFile]
+CAMERAS: dict[str, list[float]] = {
+    "SIMPLE_PINHOLE": [20.0, 4.2, 3.1],
+    "PINHOLE": [20.0, 19.0, 4.2, 3.1],
+    "SIMPLE_RADIAL": [20.0, 4.2, 3.1, -0.2],
+    "RADIAL": [20.0, 4.2, 3.1, -0.2, 0.1],
+    "OPENCV": [20.0, 19.0, 4.2, 3.1, -0.2, 0.1, 0.01, -0.02],
+    "OPENCV_FISHEYE": [20.0, 19.0, 4.2, 3.1, 0.05, -0.02, 0.01, 0.0],
+}
+QUATERNION = np.array([0.2, 0.9, -0.3, 0.1])
+SHIFT = np.array([0.1, -0.2, 3.0])
+"""Of a camera that looks at the world's origin from 3 u away, nearly."""
+
+
+def rotation(quaternion: np.ndarray) -> np.ndarray:
+    """By the sandwich q v q*, vector by vector."""
+    w, *axis = quaternion / np.linalg.norm(quaternion)
+    u = np.array(axis)
+    columns = [2 * (u @ v) * u + (w * w - u @ u) * v + 2 * w * np.cross(u, v) for v in np.eye(3)]
+    return np.stack(columns, 1)
+
+
+def write_text(folder: Path, model: str, name: str = "b c.png") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = " ".join(map(str, CAMERAS[model]))
+    (folder / "cameras.txt").write_text(f"# cameras\n7 {model} 8 6 {numbers}\n")
+    pose = " ".join(map(str, [*QUATERNION, *SHIFT]))
+    points = "1.5 2.5 -1 3.5 4.5 12"
+    (folder / "images.txt").write_text(
+        f"# images\n3 {pose} 7 {name}\n{points}\n4 {pose} 7 a.png\n\n"
+    )
+
+
+def write_binary(folder: Path, model: str, name: str = "b c.png") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = CAMERAS[model]
+    header = struct.pack("<QiiQQ", 1, 7, list(MODELS).index(model), 8, 6)
+    (folder / "cameras.bin").write_bytes(header + struct.pack(f"<{len(numbers)}d", *numbers))
+    content = struct.pack("<Q", 2)
+    for index, label, points in ((3, name, 2), (4, "a.png", 0)):
+        content += struct.pack("<i7di", index, *QUATERNION, *SHIFT, 7) + label.encode() + b"\0"
+        content += struct.pack("<Q", points) + bytes(24 * points)
+    (folder / "images.bin").write_bytes(content)
+
+
+def scene_text(**others: Any) -> str:
+    return changed(views={"colmap": "sparse/0", "images": "pictures", **others})
+
+
+@pytest.mark.parametrize("store", [write_text, write_binary])
+@pytest.mark.parametrize("model", CAMERAS)
+def test_points_are_seen_where_the_manual_says(
+    read: Read, tmp_path: Path, model: str, store: Callable[..., None]
+) -> None:
+    """x = R X + t, divided by its depth, distorted, and times the focal lengths plus the center."""
+    store(tmp_path / "sparse/0", model)
+    scene_file = read(scene_text())
+    first, second = scene_file.tree.views
+    assert (first.name, second.name) == ("a", "b_c")
+    assert second.image == tmp_path / "pictures" / "b c.png"
+    views = [view.__class__(**{**vars(view), "image": None}) for view in scene_file.tree.views]
+    tree = scene_file.tree.__class__(**{**vars(scene_file.tree), "views": tuple(views)})
+    scene = build_scene(SceneFile(tree, scene_file.path, scene_file.marks), dtype=torch.float64)
+    camera = scene.views[1].camera
+    for point in np.random.default_rng(0).uniform(-0.4, 0.4, (10, 3)):
+        x, y, z = rotation(QUATERNION) @ point + SHIFT
+        u, v = x / z, y / z
+        given = dict(zip(MODELS[model], CAMERAS[model], strict=True))
+        k1, k2, p1, p2 = (given.get(key, 0.0) for key in ("k1", "k2", "p1", "p2"))
+        r2 = u * u + v * v
+        if model == "OPENCV_FISHEYE":
+            angle = math.atan(math.sqrt(r2))
+            bent = angle * (1 + k1 * angle**2 + k2 * angle**4 + given["k3"] * angle**6)
+            du, dv = u * bent / math.sqrt(r2), v * bent / math.sqrt(r2)
+        else:
+            radial = 1 + k1 * r2 + k2 * r2 * r2
+            du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+            dv = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+        focal = given.get("f", 0.0)
+        expected = [
+            given.get("fx", focal) * du + given["cx"],
+            given.get("fy", focal) * dv + given["cy"],
+        ]
+        (seen,), _ = project(camera, torch.tensor(point)[None])
+        if not bool(seen.isnan().any()):
+            torch.testing.assert_close(seen, torch.tensor(expected).double(), atol=1e-5, rtol=0)
+    center = -rotation(QUATERNION).T @ SHIFT
+    torch.testing.assert_close(cast_rays(camera).eye.flip(0), torch.tensor(center))
+
+
+def test_one_in_so_many_is_a_test_view(read: Read, tmp_path: Path) -> None:
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    views = read(scene_text(test_every=2)).tree.views
+    assert [view.split for view in views] == ["test", "train"]
+
+
+@pytest.mark.parametrize(
+    ("views", "problem"),
+    [
+        ({"colmap": "sparse/1", "images": "p"}, "sparse/1 has no COLMAP model; expected cameras"),
+        ({"colmap": "sparse/0"}, "colmap: missing key 'images', the folder of its pictures"),
+        ({"colmap": "sparse/0", "transforms": "t.json", "images": "p"}, "give only one of"),
+    ],
+)
+def test_what_is_no_model_is_refused(
+    refusal: Callable[..., list[str]], tmp_path: Path, views: dict[str, Any], problem: str
+) -> None:
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    (line,) = refusal(changed(views=views))
+    assert problem in line
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "problem"),
+    [
+        ("cameras.txt", "PINHOLE", "FOV", "camera 7: lens model FOV is not known; undistort"),
+        ("cameras.txt", " 3.1", "", "camera 7: PINHOLE has 4 parameters, fx, fy, cx, cy"),
+        ("cameras.txt", "8 6", "8 x", "line 2: expected CAMERA_ID MODEL WIDTH"),
+        ("cameras.txt", "8 6", "8 0", "camera 7: 8 x 0 is no size of an image"),
+        ("cameras.txt", "20.0", "-20", "its focal lengths must be above 0"),
+        ("cameras.txt", "20.0", "nan", "all finite"),
+        ("images.txt", " 7 b", " 8 b", "image 'b c.png': there is no camera 8"),
+        ("images.txt", "3 0.2", "3 x", "line 2: expected IMAGE_ID QW QX"),
+        ("images.txt", "0.2 0.9 -0.3 0.1 0.1", "0 0 0 0 0.1", "not finite, or no rotation"),
+    ],
+)
+def test_a_damaged_text_is_refused(
+    read: Read, tmp_path: Path, file: str, old: str, new: str, problem: str
+) -> None:
+    write_text(tmp_path / "sparse/0", "PINHOLE")
+    path = tmp_path / "sparse/0" / file
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises((FormatError, SceneError)) as caught:
+        read(scene_text())
+    assert problem in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
+def test_a_damaged_binary_is_refused(read: Read, tmp_path: Path, file: str) -> None:
+    """Cut anywhere but where points are skipped, or claiming more than there is."""
+    write_binary(tmp_path / "sparse/0", "OPENCV")
+    path = tmp_path / "sparse/0" / file
+    whole = path.read_bytes()
+    for damaged in (whole[:5], whole[:30], whole[:60], b"\xff" * 8 + whole[8:], b""):
+        path.write_bytes(damaged)
+        with pytest.raises((FormatError, SceneError)) as caught:
+            read(scene_text())
+        assert "\n" not in str(caught.value)

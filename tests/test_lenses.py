@@ -1,0 +1,161 @@
+"""Lenses: rays go where OpenCV's formulas take them, and derivatives are those of the inverse."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from media import make_camera, make_scene, random_values
+
+from ddrecon.cameras import Camera, cast_rays, image_places
+from ddrecon.lenses import distort, is_folded, ray_through
+from ddrecon.renderer import render
+from ddrecon.settings import RenderSettings
+from ddrecon.variables.values import with_values
+
+LENSES = {
+    "opencv": [-0.25, 0.08, -0.01, 0.004, 0.002, -0.003],
+    "fisheye": [0.04, -0.006, 6e-4, -2e-5],
+}
+
+
+def lens_of(model: str, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    return torch.tensor(LENSES[model], dtype=dtype)
+
+
+def plainly(model: str, k: list[float], x: float, y: float, z: float) -> tuple[float, float]:
+    """The image of a direction, as OpenCV's manual writes it; k4 of `opencv` as nerfstudio's."""
+    a, b = x / z, y / z
+    if model == "opencv":
+        k1, k2, k3, k4, p1, p2 = k
+        r2 = a * a + b * b
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+        return (
+            a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
+            b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
+        )
+    r = math.hypot(a, b)
+    theta = math.atan(r)
+    bent = theta * (1 + sum(c * theta ** (2 * n + 2) for n, c in enumerate(k)))
+    return (bent / r * a, bent / r * b) if r else (0.0, 0.0)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_direction_meets_the_image_where_the_manual_says(model: str) -> None:
+    rays = [(0.0, 0.0, 1.0), (0.3, -0.2, 1.0), (-0.5, 0.4, 1.2), (0.01, 0.6, 0.9)]
+    found = distort(model, lens_of(model), torch.tensor(rays, dtype=torch.float64))
+    expected = [plainly(model, LENSES[model], *ray) for ray in rays]
+    torch.testing.assert_close(found, torch.tensor(expected).to(found), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("model", LENSES)
+def test_there_and_back(model: str, dtype: torch.dtype) -> None:
+    """To rounding, from the axis to the corners; for a fisheye also sideways and behind."""
+    steps = torch.linspace(-0.7, 0.7, 15, dtype=dtype)
+    places = torch.cartesian_prod(steps, steps) * (3.0 if model == "fisheye" else 1.0)
+    rays = ray_through(model, lens_of(model, dtype), places)
+    again = distort(model, lens_of(model, dtype), rays)
+    torch.testing.assert_close(again, places, rtol=0, atol=30 * torch.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_derivatives_are_those_of_the_inverse(model: str) -> None:
+    """In both modes; on the axis too, where a fisheye's angle has a kink that its rays have not."""
+    places = torch.tensor([[0.0, 0.0], [0.4, -0.3], [-0.1, 0.5]], dtype=torch.float64)
+    inputs = (lens_of(model).requires_grad_(), places.requires_grad_())
+    assert torch.autograd.gradcheck(
+        lambda *given: ray_through(model, *given), inputs, check_forward_ad=True, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_without_distortion_it_is_a_pinhole_or_a_perfect_fisheye(model: str) -> None:
+    places = torch.tensor([[0.0, 0.0], [0.6, 0.0], [0.3, -0.4]], dtype=torch.float64)
+    ray = ray_through(model, torch.zeros_like(lens_of(model)), places)
+    cosine = ray[:, 2] / ray.norm(dim=1)
+    off = places.norm(dim=1)
+    torch.testing.assert_close(cosine, off.cos() if model == "fisheye" else off.atan().cos())
+
+
+def test_folding_is_seen_where_the_slope_along_the_radius_is_zero() -> None:
+    """r (1 + k1 r^2) turns back at r^2 = -1 / (3 k1), where it is two thirds of r."""
+    lens = torch.tensor([-0.5, 0, 0, 0, 0, 0], dtype=torch.float64)
+    turn = 2 / 3 * (2 / 3) ** 0.5
+    places = torch.tensor([[0.99 * turn, 0], [0, 1.01 * turn], [0.99 * turn, 0.3], [0, 0]])
+    assert is_folded("opencv", lens, places.double()).tolist() == [False, True, True, False]
+    bent = torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64)
+    turn = 2 / 3 * (10 / 3) ** 0.5
+    places = torch.tensor([[0.99 * turn, 0], [1.01 * turn, 0]]).double()
+    assert is_folded("fisheye", bent, places).tolist() == [False, True]
+
+
+def test_folding_is_seen_beyond_a_branch_that_rises_again() -> None:
+    """r (1 - r^2 + 0.4 r^4) falls between two rises: what lies beyond is seen twice or thrice."""
+    lens = torch.tensor([-1.0, 0.4, 0, 0, 0, 0], dtype=torch.float64)
+    places = torch.tensor([[0.2, 0.0], [1.5, 0.0]], dtype=torch.float64)
+    assert is_folded("opencv", lens, places).tolist() == [False, True]
+
+
+def lens_camera(model: str | None, **changes: object) -> Camera:
+    distortion = None if model is None else lens_of(model)
+    camera = make_camera(size=(40, 36), half_width=0.35)
+    return replace(camera, lens=model, distortion=distortion, **changes)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_rays_of_pixels(model: str) -> None:
+    """Off-center axis and oblong pixels; a coarser image has the same rays at its corners."""
+    camera = lens_camera(model, principal_point=(0.45, 0.53), pixel_aspect=1.1)
+    right, up, backward = camera.pose[:, :3].unbind(1)
+    direction = cast_rays(camera).direction.flip(1)
+    ray = torch.stack([direction @ right, -direction @ up, -direction @ backward], 1)
+    found = distort(model, lens_of(model), ray)
+    torch.testing.assert_close(found, image_places(camera), rtol=0, atol=1e-14)
+    coarse = cast_rays(camera.resize(2), (0.0, 0.0)).direction[19]
+    torch.testing.assert_close(coarse, cast_rays(camera, (0.0, 0.0)).direction[36 * 2 + 2])
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_interpolated_pixels_are_those_of_their_own_rays(model: str) -> None:
+    """All rays meet in the eye, distorted or not: a lattice of rays serves them as well."""
+    camera = lens_camera(model)
+    lines = (torch.linspace(0.1, 3.0, n, dtype=torch.float64).sin() for n in (6, 8, 7))
+    density = torch.einsum("z,y,x->zyx", *lines)
+    scene = make_scene(density, camera=replace(camera, size=(120, 108)))
+    own = render(replace(scene, render=RenderSettings(tolerance=0)))
+    between = render(replace(scene, render=RenderSettings(tolerance=0.02)))
+    assert not torch.equal(own, between)
+    assert (own - between).square().mean().sqrt() < 0.02 * own.square().mean().sqrt()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", LENSES)
+def test_images_differentiate_by_every_number_of_a_lens(model: str) -> None:
+    """With both engines: reverse mode against central differences of the image."""
+    scene = make_scene(random_values(3, 4, 3), camera=replace(lens_camera(model), size=(6, 5)))
+    name = scene.views[0].name
+    values = {
+        f"views.{name}.focal": torch.tensor(1.4, dtype=torch.float64),
+        f"views.{name}.principal_point": torch.tensor([0.48, 0.51], dtype=torch.float64),
+        f"views.{name}.distortion": lens_of(model),
+    }
+    weights = torch.linspace(-1, 1, 30, dtype=torch.float64).view(1, 1, 6, 5)
+
+    def loss(moved: dict[str, torch.Tensor]) -> torch.Tensor:
+        return (weights * render(with_values(scene, moved))).sum()
+
+    leaves = {key: value.clone().requires_grad_() for key, value in values.items()}
+    gradients = torch.autograd.grad(loss(leaves), list(leaves.values()))
+    step = 1e-6
+    for (key, value), gradient in zip(values.items(), gradients, strict=True):
+        for index in range(value.numel()):
+            moved = torch.zeros_like(value).view(-1)
+            moved[index] = step
+            moved = moved.view(value.shape)
+            rise = loss(values | {key: value + moved}) - loss(values | {key: value - moved})
+            difference = float(rise) / (2 * step)
+            found = float(gradient.view(-1)[index])
+            assert abs(found - difference) <= 1e-5 * float(gradient.abs().max()), (key, index)
