@@ -15,13 +15,13 @@ from typing import Any
 from ddrecon.io.files.atomic import replace_file
 
 ASSETS = resources.files("ddrecon.report") / "assets"
-SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "page.js")
+SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "page.js", "live.js")
 """What makes a page alive, in the order in which one needs the other."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width, initial-scale=1">\
 <title>{title}</title><style>{style}</style></head>
-<body>
+<body{state}>
 <h1>{title}</h1>
 <p id="lead">{lead}</p>
 {sections}
@@ -38,12 +38,23 @@ def write_page(
         temporary.write_text(text, encoding="utf-8")
 
 
-def page_text(title: str, lead: str, sections: Sequence[str], *, is_alive: bool = False) -> str:
-    """The page; with `is_alive`, with scripts that turn its volumes and compare its pictures."""
+def page_text(
+    title: str,
+    lead: str,
+    sections: Sequence[str],
+    *,
+    is_alive: bool = False,
+    is_live: bool = False,
+) -> str:
+    """The page; with `is_alive`, with scripts that turn its volumes and compare its pictures.
+
+    With `is_live`, these ask for it again and again, and take up what is new.
+    """
     scripts = ""
     if is_alive:
         scripts = "".join(f"<script>{_asset(name)}</script>\n" for name in SCRIPTS)
     return PAGE.format(
+        state=" data-live" if is_live else "",
         title=escape(title),
         style=_asset("page.css"),
         lead=escape(lead),

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from ddrecon.errors import DivergenceError, FormatError, SceneError, UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
+from ddrecon.progress import bar_width
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -101,6 +102,7 @@ def drive_run(
                 desc="optimize",
                 file=sys.stderr,
                 disable=is_quiet,
+                ncols=bar_width(),
             ) as bar,
         ):
             while not run.is_done:

@@ -43,7 +43,7 @@ def write_run_report(path: Path, findings: Findings) -> None:
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),
         section("Volume", volume_section(findings)),
-        section("Loss", side_by_side(*_curves(findings.rows))),
+        section("Loss", side_by_side(*curves(findings.rows))),
         section("Views", *view_section(findings)),
         section("Turntable", turntable(findings)),
         section("Timings", _timings(findings.rows)),
@@ -67,7 +67,7 @@ def _lead(findings: Findings) -> str:
     )
 
 
-def _curves(rows: Sequence[Row]) -> list[str]:
+def curves(rows: Sequence[Row]) -> list[str]:
     """Loss and PSNR by iteration."""
     losses = {
         "images": [(float(row.iteration), row.data_loss) for row in rows],

@@ -9,22 +9,18 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.io.files.atomic import refusals, remove_temporaries
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
-from ddrecon.losses import psnr
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
-from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.diagnoses import LateMeans, diagnose
-from ddrecon.run.findings import Findings, given_fields
+from ddrecon.run.findings import Findings, given_fields, render_views, solve, view_quality
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
@@ -65,6 +61,7 @@ class RunFolder:
         self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
         self.saved, self.next_save = -1, 0.0
         self.late = LateMeans()
+        self.save_every = CHECKPOINT_SECONDS
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run; those of an earlier run are removed."""
@@ -101,12 +98,12 @@ class RunFolder:
 
     def _note_saved(self, run: Reconstruction, seconds: float) -> None:
         self.saved = run.iteration
-        self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
+        self.next_save = monotonic() + max(self.save_every, seconds / CHECKPOINT_SHARE)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
         scene = run.current_scene()
-        self._pictures(scene, _render(scene, _solve(scene)), f"_{run.iteration:06d}")
+        self._pictures(scene, render_views(scene, solve(scene)), f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
@@ -116,8 +113,8 @@ class RunFolder:
         values = {name: self._store(scene, name) for name in dict.fromkeys(["density", *names])}
         write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
-        light_field = _solve(scene)
-        images = _render(scene, light_field)
+        light_field = solve(scene)
+        images = render_views(scene, light_field)
         quality = self._pictures(scene, images, "")
         log, environment = self.log.rows(), self.environment
         diagnoses = diagnose(scene.views, images, quality, log, self.late.moved(run))
@@ -177,7 +174,7 @@ class RunFolder:
 
     def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> dict[str, Any]:
         """The split and PSNR of each view with a target; writes pictures of views and fields."""
-        folder, quality = self.path / "previews", {}
+        folder = self.path / "previews"
         for name in FIELDS:
             if (value := value_of(scene, name)).ndim >= 3:
                 write_preview(folder / f"{name}.slices{mark}.png", slices(value))
@@ -185,26 +182,7 @@ class RunFolder:
             if view.image is not None:
                 image = images[view.name]
                 write_preview(folder / f"{view.name}{mark}.png", comparison(view.image, image))
-                quality[view.name] = {
-                    "split": "test" if view.is_test else "train",
-                    "psnr": psnr(image, view.image, view.mask),
-                }
-        return quality
-
-
-def _solve(scene: Scene) -> LightField:
-    with torch.no_grad():
-        return solve_light(scene, SolveMemory())
-
-
-def _render(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
-    """The images of the views that have a target, by name."""
-    with torch.no_grad():
-        return {
-            view.name: view_picture(light_field, scene, view)
-            for view in scene.views
-            if view.image is not None
-        }
+        return view_quality(scene, images)
 
 
 def _plain(value: Tensor) -> Any:
