@@ -93,8 +93,10 @@ def told_cameras(cameras: dict[str, Camera]) -> dict[str, Camera]:
         shifts.append(shift - torch.linalg.cross(turn, arm))
         arms.append(arm)
     turn, shift, arm = (torch.stack(vectors) for vectors in (turns, shifts, arms))
-    turn, shift = turn - turn.mean(0), shift - shift.mean(0)
-    shift = shift - arm * (shift * arm).sum() / (arm**2).sum()
+    turn = turn - turn.mean(0)
+    common = torch.cat([torch.eye(3).double().repeat(len(names), 1), arm.view(-1, 1)], 1)
+    shift = shift.view(-1, 1)
+    shift = (shift - common @ torch.linalg.lstsq(common, shift).solution).view(-1, 3)
     told = dict(cameras)
     for index, name in enumerate(names):
         axes = cameras[name].pose[:, :3]
@@ -155,14 +157,14 @@ def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) ->
 def exposures() -> dict[str, tuple[np.ndarray, float]]:
     """The gain by color and the black level of each camera.
 
-    Gains have a mean of 1 over the training cameras in each color: the light has the rest. The
+    Gains have a geometric mean of 1 over the training cameras in each color: the light has the rest. The
     held-out camera is the ruler, and has neither.
     """
     generator = np.random.default_rng(SEED + 1)
     gains = generator.uniform(0.7, 1.3, (len(ANGLES), 1)) * generator.uniform(
         0.9, 1.1, (len(ANGLES), 3)
     )
-    gains /= gains[:4].mean(0)
+    gains /= np.exp(np.log(gains[:4]).mean(0))
     blacks = generator.uniform(0.0005, 0.0025, len(ANGLES))
     gains[-1], blacks[-1] = 1, 0
     return {name: (gains[i], blacks[i]) for i, name in enumerate(ANGLES)}

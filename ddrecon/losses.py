@@ -84,6 +84,8 @@ LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
     "display": display,
     "photon": photon,
 }
+QUADRATIC = ("l2", "display", "photon")
+"""Those that are mean squares of errors times the target's slope."""
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
     lights = decompose_lights(scene.lights)
-    has_pairs = scene.diffusion.transport_rounds > 0 and has_backward_peak(medium)
+    has_pairs = scene.diffusion.rounds > 0 and has_backward_peak(medium)
     reduced = reduced_light(medium, lights, medium.degree, has_pairs)
     sky = sum_unscattered_sky(medium, lights, medium.degree)
     source = reduced.source
@@ -175,7 +175,7 @@ def solve_diffuse(
     closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    return run_rounds(problem, light, solve, settings.transport_rounds, settings.degree)
+    return run_rounds(problem, light, solve, settings.rounds, settings.degree)
 
 
 def view_picture(

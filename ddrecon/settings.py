@@ -84,8 +84,8 @@ class DiffusionSettings:
     The scheme `printed` is the paper's own, always with the smooth closure and solved by Jacobi
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
     The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
-    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 5). Left out, there
-    is one where there can be any.
+    P1 towards transport, and keep angles to `degree` (docs/theory.md, section 5). A
+    scene file that leaves rounds out gets as many as its phase function deserves.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -102,17 +102,20 @@ class DiffusionSettings:
     solver: str = one_of("multigrid", SOLVERS)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
-    transport_rounds: int = optional(minimum=0, maximum=16)
+    transport_rounds: int | None = optional(minimum=0, maximum=16)
     degree: int = one_of(3, DIRECTIONS)
-
-    def __post_init__(self) -> None:
-        if self.transport_rounds is None:
-            object.__setattr__(self, "transport_rounds", int(self._can_have_rounds))
 
     @property
     def angles(self) -> int:
         """The degree to which light's angles are kept: 1 by diffusion alone."""
-        return self.degree if self.transport_rounds else 1
+        return self.degree if self.rounds else 1
+
+    @property
+    def rounds(self) -> int:
+        """How many transport rounds there are: left out, one where there can be any."""
+        return (
+            int(self._can_have_rounds) if self.transport_rounds is None else self.transport_rounds
+        )
 
     @property
     def _can_have_rounds(self) -> bool:
@@ -122,7 +125,7 @@ class DiffusionSettings:
         """Settings that exclude each other."""
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
-        if self.transport_rounds > 0 and not self._can_have_rounds:
+        if self.rounds > 0 and not self._can_have_rounds:
             yield (
                 "transport_rounds",
                 "rounds begin at model p1 with scheme 'conservative'; ask for 0 or for these",

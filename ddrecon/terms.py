@@ -8,7 +8,8 @@ from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
 from ddrecon.medium.coefficients import Medium, scale_medium
-from ddrecon.medium.remaining import backward_fraction, has_backward_peak
+from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.renderer import multiply_scatters
 from ddrecon.scene import Scene
@@ -22,13 +23,14 @@ def needed_terms(scene: Scene) -> list[str]:
     colors = medium.extinction.scale.shape[0]
     is_diffuse = multiply_scatters(medium, settings)
     terms = [f"{colors} color channel{'s' if colors > 1 else ' (all is gray)'}"]
+    terms.append(_phase_term(scene.volume.phase))
     terms += _light_terms(scene.lights, is_diffuse)
     if not is_diffuse:
         return [*terms, "no multiple scattering: no diffusion solve"]
     if bool((medium.forward_fraction > 0).any()):
         terms.append(_peak_term(medium))
     terms.append(f"multiple scattering by {settings.model} diffusion, {_method(settings)}")
-    if settings.transport_rounds:
+    if settings.rounds:
         terms += _round_terms(medium, scene)
     else:
         terms.append("no transport rounds: diffusion alone")
@@ -38,9 +40,12 @@ def needed_terms(scene: Scene) -> list[str]:
 def _round_terms(medium: Medium, scene: Scene) -> list[str]:
     """Transport rounds, and the pairs of beams that they go with."""
     settings = scene.diffusion
-    rounds = _count(settings.transport_rounds, "transport round")
+    rounds = _count(settings.rounds, "transport round")
     directions = DIRECTIONS[settings.degree]
     terms = [f"{rounds} of sweeps along {directions} directions, each with a diffusion solve"]
+    if medium.degree > 1:
+        left = remaining_moments(medium)[2].abs().max().item()
+        terms[0] += f"; each leaves up to {left:.2g} of what diffusion lacks"
     if has_backward_peak(medium) and _has_beams(scene.lights):
         part = backward_fraction(medium).max().item()
         terms.append(f"beams in pairs: a backward peak turns {part:.3g} of scattering back")
@@ -64,6 +69,12 @@ def _angle_term(medium: Medium) -> str:
         return "fluxes Q1 and L1 (g is not 0)"
     moments = count_harmonics(medium.degree)
     return f"angles to degree {medium.degree}: {moments} moments of light (g is not 0)"
+
+
+def _phase_term(phase: PhaseFunction) -> str:
+    """Which phase function, and its mean cosine."""
+    cosines = ", ".join(f"{cosine:.3g}" for cosine in phase.moments(2)[:, 1].tolist())
+    return f"phase function {phase.NAME}, mean cosine {cosines}"
 
 
 def _peak_term(medium: Medium) -> str:

@@ -20,6 +20,7 @@ from ddrecon.variables.kinds import KINDS, Kind
 PAGE = Path(__file__).parent / "scene_file.md"
 KIND_NAMES = {
     light_schema.Color: "number or [r, g, b]",
+    schema.Backdrop: "file, number or [r, g, b]",
     schema.Quantity: "number, [r, g, b] or {file: ...}",
     schema.Density: "number or {file: ...}",
     phase_schema.PhaseSection: "{type: ...}",
@@ -213,6 +214,16 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "mask": "A picture of the same size, black where pixels are ignored.",
             "split": "`test` views are never optimized on, and always reported.",
             "weight": "How much a training view counts.",
+            "exposure": (
+                "The picture is this times radiance. As a parameter, the mean over all training "
+                "views is held."
+            ),
+            "offset": "And this is added: a black level, or haze of the lens.",
+            "background": (
+                "What the picture shows where the volume is empty: a picture without it, or a "
+                "color. Unless given, the lights behind it, or black."
+            ),
+            "noise": "How this picture errs, for `loss: photon`; see below.",
         },
     ),
     (
@@ -322,7 +333,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "warm_start": "Whether a solve begins at the last one's solution.",
             "transport_rounds": (
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
-                "it is 1, or 0 where there are none: without model `p1` or scheme `conservative`."
+                "it is 1, or where g is beyond 0.55 in size 2 and beyond 0.77 3, or 0 "
+                "where there are none: without model `p1` or scheme `conservative`."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 26, 50 or 86 directions."
@@ -336,7 +348,11 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "parameters": "What to find: names, as in the last table, with their settings.",
             "iterations": "In all.",
-            "loss": "What is made small, as a mean over pixels.",
+            "loss": (
+                "What is made small, as a mean over pixels. Unless given, `display` where pictures "
+                "are sRGB files, `l2` where they are linear. [Settings](settings.md) says more."
+            ),
+            "noise": "How pictures err, for `loss: photon`; estimated from them unless given.",
             "views_per_iteration": "Training views drawn at random for each iteration; 0 for all.",
             "derivatives": (
                 "Which light passes derivatives on: all, only light scattered once, or only the "
@@ -346,6 +362,15 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Fractions of the run at which cells and pixels become half as large: coarse to "
                 "fine."
             ),
+        },
+    ),
+    (
+        "optimize.noise, or noise of a view",
+        settings.NoiseSettings,
+        "In units of linear values, of which 1 is white in an sRGB file.",
+        {
+            "read": "Standard deviation of black.",
+            "shot": "Variance by radiance, of the photons that are counted.",
         },
     ),
     (
@@ -468,7 +493,8 @@ def _parameters() -> str:
             "## Names of parameters",
             "",
             "What can be found.",
-            "N is a light's place in the list, counted from 0; NAME is a view's name.",
+            "N is a light's place in the list, counted from 0.",
+            "NAME is a view's name, or `*` for all training views.",
             "[Commands](cli.md#names-of-parameters) has the same names, by light.",
             "",
             "| name | kept within | by color | from cell to cell |",

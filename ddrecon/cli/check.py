@@ -11,6 +11,7 @@ from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.reconstruct.setup import select_views, start_support
 from ddrecon.reconstruct.support import describe_support, support_text
+from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.terms import needed_terms
@@ -30,7 +31,7 @@ def memory_estimate(scene: Scene) -> int:
         torch.finfo(volume.density.dtype).bits // 8,
         sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
         has_flux=scale_medium(volume).has_flux,
-        has_rounds=scene.diffusion.transport_rounds > 0,
+        has_rounds=scene.diffusion.rounds > 0,
         is_limited=scene.diffusion.model == "flux_limited",
         varied=None
         if scene.optimize is None
@@ -57,6 +58,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "views": [_describe_view(view) for view in scene.views],
         "physics": needed_terms(scene),
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
+        "loss": _describe_loss(scene),
         "support": _describe_support(scene),
         "engine": engine_of_parts(_parts_in_torch(scene)),
         "memory_bytes": memory_estimate(scene),
@@ -76,11 +78,18 @@ def lines(report: dict[str, Any]) -> list[str]:
         "physics:",
         *(f"  {term}" for term in report["physics"]),
         f"optimizes: {', '.join(parameters) or 'nothing'}",
+        *([loss_text(report["loss"])] if report["loss"] else []),
         *([support_text(report["support"])] if report["support"] else []),
         f"engine: {_name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
         *(f"doubtful: {doubt}" for doubt in report["doubts"]),
     ]
+
+
+def _describe_loss(scene: Scene) -> dict[str, Any] | None:
+    """What is minimized, and what is compared; None where nothing is."""
+    train = select_views(scene, is_test=False)
+    return describe_loss(scene.optimize, train) if scene.optimize and train.views else None
 
 
 def _describe_support(scene: Scene) -> dict[str, float] | None:

@@ -73,7 +73,7 @@ class DiffusionProblem:
         return Operator((z, y, x), loss), right
 
     def flux(self, mean: Tensor, more: Vector | None = None) -> Vector | None:
-        """L1 of L0 = `mean`, with `more` flux in the source; None where direction does not matter."""
+        """L1 of L0 = `mean`, with `more` flux in the source; None without directions."""
         if not self.has_flux:
             return None
         source = Moments(mean, self.source.flux).plus(Moments(mean, more)).flux

@@ -23,7 +23,7 @@ ENDS = 1e-3
 
 
 def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Angles [n] in radians, increasing from 0 to pi, and values [C, n] >= 0 of the table at `path`.
+    """Angles [n] [rad], increasing from 0 to pi, and values [C, n] >= 0 of the table at `path`.
 
     C is 1, or 3 where there is a column a color. Raises FormatError.
     """

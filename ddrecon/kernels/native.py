@@ -71,6 +71,8 @@ _LOOPS = """
 #endif
 """
 
+ROW_SUM = "\n{\n#if defined(__clang__)\n#pragma clang fp reassociate(on)\n#endif\n"
+"""Begins a block whose sums have a free order, or else they would not become vector code."""
 TOTAL = """
 auto total = [](const F* values, int count) -> double {
     double lanes[8] = {0, 0, 0, 0, 0, 0, 0, 0}, sum = 0;

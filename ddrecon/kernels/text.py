@@ -149,11 +149,11 @@ class Bound:
     like: Tensor
 
     def launch(
-        self, count: int, threads: int | None = None, work: int | None = None, **numbers: float
+        self, count: int, threads: int | None = None, work: int | None = None, **changed: Any
     ) -> None:
-        """Does `count` items, with these `numbers` changed."""
-        for name, number in numbers.items():
-            self.kernel.write(self.record, name, number)
+        """Does `count` items, with numbers and contiguous arrays `changed`."""
+        for name, value in changed.items():
+            self.kernel.write(self.record, name, value)
         launch(self.kernel.kernel, count, [self.record], self.like, threads, work)
 
 

@@ -19,7 +19,12 @@ from ddrecon.numerics.autodiff import is_fused, recompute
 
 def scatter_once_more(medium: Medium, light: Moments) -> Moments:
     """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E3, E21)."""
-    return light.weighted((1 - medium.forward_fraction) * remaining_moments(medium))
+    return light.weighted(_factors(medium))
+
+
+def _factors(medium: Medium) -> Tensor:
+    """(1 - f) p_l, by the degree l."""
+    return (1 - medium.forward_fraction) * remaining_moments(medium)
 
 
 def scatter_towards(
@@ -29,21 +34,25 @@ def scatter_towards(
 
     With what the `turned` beams scatter (E21). As `Moments.positive_along` has it.
     """
-    is_plain = light.higher is None and not turned
-    if is_fused() and is_plain and medium.mean_cosine.ndim == 0:
+    if is_fused():
         from ddrecon.light.fused.outgoing import scatter_fused
 
-        return scatter_fused(medium, light, rays)
+        more = recompute(_sum_turned, medium, rays, turned) if turned else None
+        return scatter_fused(medium.grid, light, _factors(medium), rays, more)
     return recompute(_scatter_towards, medium, light, rays, turned)
 
 
 def _scatter_towards(
     medium: Medium, light: Moments, rays: Rays, turned: Sequence[TurnedBeam]
 ) -> Tensor:
+    more = _sum_turned(medium, rays, turned) if turned else None
+    return scatter_once_more(medium, light).positive_along(rays.towards_eye(medium.grid), more)
+
+
+def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Tensor:
+    """What light of all `turned` beams scatters towards the camera of `rays`."""
     towards = rays.towards_eye(medium.grid)
-    seen = [_scatter_turned(medium, beam, towards) for beam in turned]
-    more = functools.reduce(torch.add, seen) if seen else None
-    return scatter_once_more(medium, light).positive_along(towards, more)
+    return functools.reduce(torch.add, (_scatter_turned(medium, beam, towards) for beam in turned))
 
 
 def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor:

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.engine import current_engine
-from ddrecon.light.point_light import PointBeam
 from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.march.emission import Emission, Sampled, pack_channels
@@ -51,7 +50,7 @@ def march(
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
         return nothing, 1 - nothing
-    march_rays, march_lattice = _pick_engine(emission)
+    march_rays, march_lattice = _pick_engine()
     channels = pack_channels(emission)
     sampler = make_sampler(channels, emission.grid, sight.way, settings.steps_per_voxel)
     if sight.lattice is None or sight.places is None:
@@ -66,10 +65,9 @@ def march(
     return scattered, 1 - opacity
 
 
-def _pick_engine(emission: Emission) -> tuple[Callable[..., Part], Callable[..., Tensor]]:
+def _pick_engine() -> tuple[Callable[..., Part], Callable[..., Tensor]]:
     """How rays and lattices of rays are marched by the engine in use."""
-    has_points = any(isinstance(beam, PointBeam) for beam in emission.beams)
-    if current_engine() == "warp" and not has_points and emission.seen.colors == 1:
+    if current_engine() == "warp":
         from ddrecon.march.fused import march as fused
 
         return fused.march_rays, fused.march_lattice

@@ -110,5 +110,5 @@ class Tabulated(_Given):
 @torch.inference_mode(False)
 def _quadrature(count: int) -> tuple[Tensor, Tensor]:
     """Angles of Gauss's rule, and half its weights times P_l there [NODES, count]."""
-    cosine, weights = map(torch.from_numpy, gauss_legendre(NODES))
+    cosine, weights = gauss_legendre(NODES)
     return cosine.acos(), legendre(cosine, count) * (weights / 2)[:, None]

@@ -49,14 +49,14 @@ def each_harmonic(z: Tensor, y: Tensor, x: Tensor, degree: int) -> Iterator[tupl
                 if before is not None:
                     after = after - (ell + m - 1) * square * before
                 legendre, before = after / (ell - m), legendre
-            value = _norm(ell, m) * legendre
+            value = norm(ell, m) * legendre
             yield ell * ell + ell + m, value * cosine if m else value
             if m:
                 yield ell * ell + ell - m, value * sine
         cosine, sine = x * cosine - y * sine, x * sine + y * cosine
 
 
-def _norm(ell: int, m: int) -> float:
+def norm(ell: int, m: int) -> float:
     """What makes the mean square of a harmonic 1."""
     orders = 2 if m else 1
     return math.sqrt(orders * (2 * ell + 1) * math.factorial(ell - m) / math.factorial(ell + m))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,7 +51,29 @@ def series_weights(moments: Tensor) -> Tensor:
     return (2 * degree + 1) * moments
 
 
+NEWTON_STEPS = 5
+"""From the first guess to all digits."""
+
+
 @functools.cache
-def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cosines and weights [`count`] of Gauss's rule on [-1, 1], exact to degree 2 `count` - 1."""
-    return np.polynomial.legendre.leggauss(count)
+@torch.inference_mode(False)
+def gauss_legendre(count: int) -> tuple[Tensor, Tensor]:
+    """Cosines and weights [`count`] of Gauss's rule on [-1, 1], exact to degree 2 `count` - 1.
+
+    By Newton's method on P_count, all at once: NumPy's takes seconds for thousands of nodes.
+    """
+    place = torch.arange(count, dtype=torch.float64) + 0.75
+    cosine = torch.cos(place * (math.pi / (count + 0.5)))
+    for _ in range(NEWTON_STEPS):
+        value, slope = _last_legendre(cosine, count)
+        cosine = cosine - value / slope
+    _, slope = _last_legendre(cosine, count)
+    return cosine, 2 / ((1 - cosine**2) * slope**2)
+
+
+def _last_legendre(cosine: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+    """P_degree(`cosine`) and its derivative."""
+    before, here = torch.zeros_like(cosine), torch.ones_like(cosine)
+    for k in range(degree):
+        before, here = here, ((2 * k + 1) * cosine * here - k * before) / (k + 1)
+    return here, degree * (cosine * here - before) / (cosine**2 - 1)

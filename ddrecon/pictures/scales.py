@@ -16,11 +16,13 @@ NODES = 1025
 """Places between which the stabilized scale is interpolated, close together near black."""
 
 
-class Scale(Protocol):
-    """A scale: its `name` in words, and its `peak` where that is the same for all pictures."""
+LINEAR = "linear radiance"
+COMPARED = {"display": "displayed values (sRGB)", "photon": "radiance in units of its noise"}
+"""What losses compare, in words, where that is not linear radiance."""
 
-    @property
-    def name(self) -> str: ...
+
+class Scale(Protocol):
+    """A scale, and its `peak` where that is the same for all pictures."""
 
     @property
     def peak(self) -> float | None: ...
@@ -36,7 +38,6 @@ class Scale(Protocol):
 class Linear:
     """Linear radiance itself."""
 
-    name: str = "linear radiance"
     peak: float | None = None
 
     def values(self, radiance: Tensor) -> Tensor:
@@ -50,7 +51,6 @@ class Linear:
 class Displayed:
     """Values as displayed, sRGB in [0, 1]."""
 
-    name: str = "displayed values (sRGB)"
     peak: float | None = 1.0
 
     def values(self, radiance: Tensor) -> Tensor:
@@ -68,7 +68,6 @@ class Stabilized:
     """
 
     noise: Noise
-    name: str = "radiance in units of its noise"
     peak: float | None = None
 
     def values(self, radiance: Tensor) -> Tensor:

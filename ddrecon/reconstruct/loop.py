@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
+from ddrecon.losses import QUADRATIC
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
@@ -29,9 +30,8 @@ from ddrecon.reconstruct.objective import (
     read_numbers,
     render_quality,
 )
-from ddrecon.reconstruct.rates import rate_at
-from ddrecon.reconstruct.responses import step_responses
 from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
+from ddrecon.reconstruct.steps import share_out, solve_poses, solve_responses, step_parameters
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
@@ -95,6 +95,8 @@ class Reconstruction:
         self.noises = setup.noises_of(views, self.settings) if self.loss == "photon" else {}
         self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
         self.parameters = setup.start_parameters(scene, self.settings)
+        if self.loss not in QUADRATIC:
+            setup.descend_poses(self.parameters)
         self.gauges = find_gauges(self.train, self.parameters)
         self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
@@ -204,6 +206,9 @@ class Reconstruction:
         if state["smoothing"] is not None:
             self._smooth(Smoothing(**state["smoothing"]))
         self._enter_stage(state["stage"])
+        for parameter in self.parameters:
+            curvature = state["parameters"][parameter.name]["curvature"]
+            parameter.curvature = None if curvature is None else curvature.to(parameter.value)
         self.memory.last = {
             kind: field.to(self.scene.volume.density) for kind, field in state["solutions"].items()
         }
@@ -234,6 +239,7 @@ class Reconstruction:
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
+            parameter.curvature = None
             if parameter.name == "density" and self.support is not None:
                 parameter.restrict(self.support.on(grid))
         self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
@@ -262,18 +268,15 @@ class Reconstruction:
     def _step(self, gradients: dict[str, Tensor], pictures: dict[str, Tensor]) -> None:
         """Every parameter against its derivative, but those of views not seen or not yet due.
 
-        Responses go part of the way to those that fit the `pictures` of this iteration best.
+        What cameras do goes part of the way to what fits the `pictures` of this iteration best.
         """
-        iterations = self.settings.iterations
-        due = [p for p in self.parameters if p.view is None or p.view in pictures]
-        for parameter in due:
-            begin = round(parameter.release * iterations)
-            rate = rate_at(self.iteration, iterations, begin)
-            if rate and not parameter.is_fitted:
-                parameter.step(gradients[parameter.name], rate)
-        for name, picture in pictures.items():
-            fitted = [p for p in due if p.view == name and p.is_fitted]
-            step_responses(fitted, self.train_level.view(name), picture, self.targets[name])
+        values = {name: value.detach() for name, value in self._values().items()}
+        seen = [p for p in self.parameters if p.view is None or p.view in pictures]
+        solved = step_parameters(seen, gradients, self.iteration, self.settings.iterations)
+        solve_responses(solved, self.train_level, pictures, self.targets)
+        if poses := [p for p in solved if p.key == "camera"]:
+            own = share_out(gradients, [self.train_level.view(name) for name in pictures])
+            solve_poses(poses, self.train_level, own, values, self.targets, self.memory.last)
         for gauge in self.gauges:
             gauge.hold()
 
@@ -290,4 +293,4 @@ class Reconstruction:
         """
         if not self._is_test_due or not self.test_level.views:
             return None, None
-        return render_quality(self.test_level, self._values(), self.test_targets, self.memory)
+        return render_quality(self.test_level, self.parameters, self.test_targets, self.memory)

@@ -14,6 +14,7 @@ from ddrecon.losses import Target
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.responses import fit_held_out
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import variable_names, with_values
@@ -118,17 +119,24 @@ def add_penalties(
 
 
 def render_quality(
-    scene: Scene, values: Mapping[str, Tensor], targets: Mapping[str, Target], memory: SolveMemory
+    scene: Scene,
+    parameters: Sequence[Parameter],
+    targets: Mapping[str, Target],
+    memory: SolveMemory,
 ) -> tuple[float, float]:
-    """The mean PSNR [dB] and SSIM of the views of `scene` against their `targets` by name.
+    """The mean PSNR [dB] and SSIM of the test views of `scene` against their `targets` by name.
 
-    They are rendered with those `values` that the scene has.
+    They are rendered with those `parameters` that the scene has, and with the exposure that fits
+    each best where exposures are among them.
     """
-    known = variable_names(scene)
+    known, pairs = variable_names(scene), []
     with torch.no_grad():
-        rendered = with_values(scene, {name: values[name] for name in values if name in known})
+        values = {p.name: p.value for p in parameters if p.name in known}
+        rendered = with_values(scene, values)
         images = render_each(rendered, rendered.views, memory)
-        pairs = [(targets[v.name], i) for v, i in zip(rendered.views, images, strict=True)]
+        for view, image in zip(rendered.views, images, strict=True):
+            target = targets[view.name]
+            pairs.append((target, fit_held_out(image, view, target, parameters)[0]))
         quality = torch.stack([torch.stack([t.psnr_of(i), t.ssim_of(i)]) for t, i in pairs])
     psnr, ssim = quality.mean(0).tolist()
     return psnr, ssim

@@ -32,7 +32,8 @@ class Parameter:
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
     is Adam (Kingma and Ba 2015, arXiv:1412.6980). `rate` is one number or one for each entry.
-    `view` is the name of the view that it belongs to, None for what all views see.
+    `view` is the name of the view that it belongs to, None for what all views see. One that
+    `is_fitted` is solved for instead; `curvature` is the second derivative of the loss by it.
     """
 
     def __init__(
@@ -49,7 +50,9 @@ class Parameter:
         self.high = kind.high if settings.max is None else settings.max
         self.release = kind.release
         self.is_fitted = kind.is_fitted and settings.lr is None
-        self.view = name.split(".", 1)[1].rpartition(".")[0] if name.startswith("views.") else None
+        self.curvature: Tensor | None = None
+        owner, _, self.key = name.rpartition(".")
+        self.view = owner.removeprefix("views.") if owner.startswith("views.") else None
         self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
@@ -146,6 +149,7 @@ class Parameter:
             "shape": list(self.grid.shape),
             "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
             "moments": list(self.moments),
+            "curvature": self.curvature,
         }
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -20,6 +20,8 @@ from ddrecon.variables.values import RESPONSE
 
 LARGEST_STEP = 2.0
 """An exposure changes at most by this factor in a step: a volume may still be nearly empty."""
+LARGEST_GAIN = 100.0
+"""The same where a picture is only reported."""
 PART = 0.5
 """How far a step goes."""
 SWEEPS = 32
@@ -39,11 +41,12 @@ class Response:
     has_offset: bool
 
 
-def fit_response(picture: Tensor, target: Target, response: Response) -> Response:
+def fit_response(picture: Tensor, target: Target, response: Response, largest: float) -> Response:
     """The response that takes `picture` [3, h, w], rendered with `response`, nearest to `target`.
 
-    Nearest by least squares, weighed as the target's loss weighs small errors. A background behind
-    the volume counts as if it were exposed with it; what is found is right where nothing changes.
+    Nearest by least squares, weighed as the target's loss weighs small errors; the exposure changes
+    by a factor of at most `largest`. A background behind the volume counts as if it were exposed
+    with it; what is found is right where nothing changes.
     """
     # The sums of the normal equations by color, over pixels that count.
     light = picture.detach() - response.offset.detach().view(-1, 1, 1)
@@ -57,7 +60,7 @@ def fit_response(picture: Tensor, target: Target, response: Response) -> Respons
     for _ in range(SWEEPS if response.has_gain and response.has_offset else 1):
         if response.has_gain:
             gain = _quotient(wxt - offset * wx, wxx, response.exposure, gain)
-            gain = gain.clamp(1 / LARGEST_STEP, LARGEST_STEP)
+            gain = gain.clamp(1 / largest, largest)
         if response.has_offset:
             offset = _quotient(wt - gain * wx, w, response.offset, offset)
     like, colors, shifts = response.exposure, len(response.exposure), len(response.offset)
@@ -69,20 +72,45 @@ def fit_response(picture: Tensor, target: Target, response: Response) -> Respons
     )
 
 
+def fit_held_out(
+    picture: Tensor, view: View, target: Target, parameters: Sequence[Parameter]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The `picture` [3, h, w] of a test `view` with the response that fits its own `target` best.
+
+    And what that is, by key: of exposure and offset those that are `parameters` of training views,
+    for these say nothing of the camera of a test view. Nothing changes where there are none.
+    """
+    sizes = {
+        parameter.key: len(parameter.value)
+        for parameter in parameters
+        if parameter.view is not None and parameter.key in RESPONSE
+    }
+    if not sizes:
+        return picture, {}
+    exposure, offset = (
+        _value(getattr(view, key), default, picture).expand(sizes.get(key, -1))
+        for key, default in RESPONSE.items()
+    )
+    response = Response(exposure, offset, "exposure" in sizes, "offset" in sizes)
+    found = fit_response(picture, target, response, LARGEST_GAIN)
+    gain, light = (found.exposure / exposure).view(-1, 1, 1), picture - offset.view(-1, 1, 1)
+    return gain * light + found.offset.view(-1, 1, 1), {key: getattr(found, key) for key in sizes}
+
+
 def step_responses(
     fitted: Sequence[Parameter], view: View, picture: Tensor, target: Target
 ) -> None:
     """Takes the parameters `fitted` of a `view` part of the way to what fits its `picture` best."""
     if not fitted:
         return
-    keys = {parameter.name.rpartition(".")[2]: parameter for parameter in fitted}
+    keys = {parameter.key: parameter for parameter in fitted}
     like = view.camera.pose
     exposure, offset = (
         keys[key].value if key in keys else _value(getattr(view, key), default, like)
         for key, default in RESPONSE.items()
     )
     response = Response(exposure, offset, "exposure" in keys, "offset" in keys)
-    found = fit_response(picture, target, response)
+    found = fit_response(picture, target, response, LARGEST_STEP)
     for key, parameter in keys.items():
         before, after = parameter.value.detach(), getattr(found, key)
         value = before.lerp(after, PART).clamp(parameter.low, parameter.high)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -128,3 +128,10 @@ def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     if support is not None:
         support.on(train.volume.grid)
     return support
+
+
+def descend_poses(parameters: Sequence[Parameter]) -> None:
+    """Has the poses among `parameters` descend: with a loss that is no sum of squares."""
+    for parameter in parameters:
+        if parameter.key == "camera":
+            parameter.is_fitted = False

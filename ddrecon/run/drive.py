@@ -23,6 +23,7 @@ from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
+from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import dump_scene
@@ -105,6 +106,8 @@ def drive_run(
                 ncols=bar_width(),
             ) as bar,
         ):
+            if not is_quiet:
+                tqdm.write(loss_text(describe_loss(run.settings, run.train)), file=sys.stderr)
             while not run.is_done:
                 folder.save_in_time(run)
                 row = run.step()
@@ -165,7 +168,8 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         f"loss {summary['loss']:.4g}, PSNR {summary['psnr']:.2f} dB"
     )
     if summary["test_psnr"] is not None:
-        line += f", test PSNR {summary['test_psnr']:.2f} dB"
+        line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
+    line += f", of {summary['compared']}"
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
     lines = [line, *diagnoses, f"density and all else written to {folder}"]
     if "support" in summary:

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.losses import psnr
 from ddrecon.reconstruct.log import Row
-from ddrecon.renderer import LightField, solve_light, view_picture
+from ddrecon.renderer import LightField, solve_light
 from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of
 
@@ -56,25 +55,3 @@ def solve(scene: Scene) -> LightField:
     """The light in `scene`, without derivatives."""
     with torch.no_grad():
         return solve_light(scene, SolveMemory())
-
-
-def render_views(scene: Scene, light_field: LightField) -> dict[str, Tensor]:
-    """The images of the views that have a target, by name."""
-    with torch.no_grad():
-        return {
-            view.name: view_picture(light_field, scene, view)
-            for view in scene.views
-            if view.image is not None
-        }
-
-
-def view_quality(scene: Scene, images: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:
-    """The split and PSNR [dB] of each view that has a target."""
-    return {
-        view.name: {
-            "split": "test" if view.is_test else "train",
-            "psnr": psnr(images[view.name], view.image, view.mask),
-        }
-        for view in scene.views
-        if view.image is not None
-    }

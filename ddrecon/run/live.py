@@ -14,8 +14,9 @@ from ddrecon.errors import UsageError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import page_text, section, side_by_side
 from ddrecon.run.checkpoint import LAST, read_state
-from ddrecon.run.findings import Findings, given_fields, render_views, solve, view_quality
+from ddrecon.run.findings import Findings, given_fields, solve
 from ddrecon.run.loss_log import LossLog
+from ddrecon.run.quality import render_views
 from ddrecon.run.report import curves
 from ddrecon.run.report_views import view_section
 from ddrecon.run.report_volume import volume_section
@@ -69,14 +70,14 @@ class LiveRun:
         with torch.no_grad():
             scene = run.current_scene()
             light_field = solve(scene)
-            images = render_views(scene, light_field)
+            images, quality = render_views(run, scene, light_field)
         summary: dict[str, Any] = {}
         findings = Findings(
             scene,
             given_fields(run.scene),
             light_field,
             images,
-            view_quality(scene, images),
+            quality,
             [],
             summary,
             {},

@@ -60,10 +60,11 @@ def _lead(findings: Findings) -> str:
     cells = " x ".join(str(count) for count in reversed(findings.scene.volume.grid.shape))
     summary, test = findings.summary, ""
     if summary["test_psnr"] is not None:
-        test = f", {summary['test_psnr']:.2f} dB of those held out"
+        test = f", {summary['test_psnr']:.2f} dB of those held out, SSIM {summary['test_ssim']:.4f}"
     return (
         f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
-        f"PSNR {summary['psnr']:.2f} dB of the views seen last{test}."
+        f"PSNR {summary['psnr']:.2f} dB of the views seen last{test}. "
+        f"What is compared is {summary['compared']}, by the loss {summary['loss_function']}."
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from statistics import median
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -55,7 +57,7 @@ def _figure(findings: Findings, view: View, white: float, most: int) -> str:
     target, render = (
         _displayed(image, white, most) for image in (_target(view), findings.images[view.name])
     )
-    caption = f"{view.name}: {findings.quality[view.name]['psnr']:.2f} dB"
+    caption = f"{view.name}: {_quality_text(findings.quality[view.name])}"
     return pair(webp_of(target), webp_of(render), caption)
 
 
@@ -69,6 +71,16 @@ def _view_table(findings: Findings) -> str:
         height, width = view.camera.size
         split = "test" if view.is_test else "train"
         quality = findings.quality.get(view.name)
-        decibels = f"{quality['psnr']:.2f}" if quality else ""
-        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", decibels))
-    return table(["view", "split", "pixels", "weight", "PSNR [dB]"], rows)
+        told = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
+        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *told))
+    return table(["view", "split", "pixels", "weight", "PSNR [dB]", "SSIM"], rows)
+
+
+def _quality_text(quality: Mapping[str, Any]) -> str:
+    """PSNR and SSIM, and the exposure and offset that a held-out picture was compared with."""
+    text = f"{quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f}"
+    for key in ("exposure", "offset"):
+        if f"fitted_{key}" in quality:
+            values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
+            text += f", {key} {values} fitted to it"
+    return text

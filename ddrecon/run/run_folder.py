@@ -20,8 +20,9 @@ from ddrecon.reconstruct.support import describe_support
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.diagnoses import LateMeans, diagnose
-from ddrecon.run.findings import Findings, given_fields, render_views, solve, view_quality
+from ddrecon.run.findings import Findings, given_fields, solve
 from ddrecon.run.loss_log import LossLog
+from ddrecon.run.quality import compared_by, render_views
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
@@ -103,7 +104,8 @@ class RunFolder:
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
         scene = run.current_scene()
-        self._pictures(scene, render_views(scene, solve(scene)), f"_{run.iteration:06d}")
+        images, _ = render_views(run, scene, solve(scene))
+        self._pictures(scene, images, f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
@@ -114,8 +116,8 @@ class RunFolder:
         write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         light_field = solve(scene)
-        images = render_views(scene, light_field)
-        quality = self._pictures(scene, images, "")
+        images, quality = render_views(run, scene, light_field)
+        self._pictures(scene, images, "")
         log, environment = self.log.rows(), self.environment
         diagnoses = diagnose(scene.views, images, quality, log, self.late.moved(run))
         told = [vars(diagnosis) for diagnosis in diagnoses]
@@ -172,17 +174,16 @@ class RunFolder:
         write_linear(self.path / name, colors)
         return f"{name}.npy"
 
-    def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> dict[str, Any]:
-        """The split and PSNR of each view with a target; writes pictures of views and fields."""
+    def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> None:
+        """Writes pictures of views and fields."""
         folder = self.path / "previews"
         for name in FIELDS:
             if (value := value_of(scene, name)).ndim >= 3:
                 write_preview(folder / f"{name}.slices{mark}.png", slices(value))
         for view in scene.views:
             if view.image is not None:
-                image = images[view.name]
-                write_preview(folder / f"{view.name}{mark}.png", comparison(view.image, image))
-        return view_quality(scene, images)
+                shown = comparison(view.image, images[view.name])
+                write_preview(folder / f"{view.name}{mark}.png", shown)
 
 
 def _plain(value: Tensor) -> Any:
@@ -192,7 +193,7 @@ def _plain(value: Tensor) -> Any:
 
 def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
-    summary = {"iterations": total.pop("iteration"), **total}
+    summary = {"iterations": total.pop("iteration"), **total} | compared_by(run)
     support = describe_support(run.support, run.scene.volume.grid)
     if support is not None:
         summary["support"] = support

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 
 from ddrecon.light.lights import Light
+from ddrecon.medium.phase import PhaseFunction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
 from ddrecon.scene_file.build_starts import (
@@ -20,7 +21,13 @@ from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_volume
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import Problems
+from ddrecon.settings import DiffusionSettings
 from ddrecon.variables.wildcards import name_each
+
+MORE_ROUNDS = 0.3, 0.6
+"""A second moment of the phase function above one of these deserves a round more: by about so much
+a round multiplies what is left. For Henyey-Greenstein that is a |g| of 0.55 and 0.77.
+"""
 
 
 def load_scene(
@@ -59,8 +66,16 @@ def build_scene(
     optimize = tree.optimize
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    scene = Scene(
-        volume, lights, views, tree.render, tree.diffusion, optimize, path=scene_file.path
-    )
+    diffusion = _choose_rounds(tree.diffusion, volume.phase)
+    scene = Scene(volume, lights, views, tree.render, diffusion, optimize, path=scene_file.path)
     support = build_support(scene_file, volume.density)
     return replace(scene, starts=build_starts(scene_file, scene), support=support)
+
+
+def _choose_rounds(settings: DiffusionSettings, phase: PhaseFunction) -> DiffusionSettings:
+    """`settings`, with as many transport rounds as `phase` deserves where they were left out."""
+    if settings.transport_rounds is not None or not settings.rounds:
+        return settings
+    left = float(phase.moments(3)[:, 2].abs().max())
+    rounds = 1 + sum(left > bound for bound in MORE_ROUNDS)
+    return replace(settings, transport_rounds=rounds)

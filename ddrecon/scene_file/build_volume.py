@@ -85,7 +85,7 @@ def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype
         torch.finfo(dtype).bits // 8,
         sum(width * height for width, height in sizes),
         has_flux=section.g != 0 or section.phase is not None or "g" in optimized,
-        has_rounds=tree.diffusion.transport_rounds > 0,
+        has_rounds=tree.diffusion.rounds > 0,
         is_limited=tree.diffusion.model == "flux_limited",
         varied=sum(_varied(name, settings, fields, colors) for name, settings in optimized.items())
         if tree.optimize

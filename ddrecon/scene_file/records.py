@@ -35,7 +35,6 @@ from ddrecon.settings import (
     ParameterSettings,
     Start,
     Support,
-    Weight,
 )
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
@@ -62,10 +61,9 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
         problems.note(node.refused(what))
     for name, child in entries.items():
         with problems.collecting():
-            if name in getattr(kind, "RETIRED", {}):
-                raise child.key_refused(kind.RETIRED[name])  # type: ignore[attr-defined]
             if name not in known:
-                raise child.key_refused(f"unknown key{suggestion(name, known)}")
+                retired = getattr(kind, "RETIRED", {}).get(name)
+                raise child.key_refused(retired or f"unknown key{suggestion(name, known)}")
             if name in declared:
                 values[name] = read_value(child, Rule(hints[name], declared[name].metadata, folder))
         if problems.are_many:
@@ -240,13 +238,6 @@ def _read_start(node: Node, rule: Rule) -> Any:
     )
 
 
-def _read_weight(node: Node, rule: Rule) -> float | str:
-    """A number, or `auto`."""
-    if isinstance(node.value, str):
-        return read_text(node, Rule(str, {"choices": (AUTO,)}, rule.folder))
-    return read_number(node, rule)
-
-
 def _read_support(node: Node, rule: Rule) -> float | str | FieldFile:
     """`masks`, a displayed value, or `{file: path}`."""
     if isinstance(node.value, dict):
@@ -294,7 +285,6 @@ READERS: dict[Any, Callable[[Node, Rule], Any]] = {
     Density: _read_density,
     Quantity: _read_quantity,
     Start: _read_start,
-    Weight: _read_weight,
     Support: _read_support,
     Mapping[str, ParameterSettings]: _read_parameters,
     tuple[ViewSection, ...]: _read_views,

@@ -95,7 +95,8 @@ KINDS: Mapping[str, Kind] = {
         pose_rate,
         components=("rotation_x", "rotation_y", "rotation_z", *XYZ),
         difference_steps=SHORT_STEPS,
-        release=0.4,
+        release=0.15,
+        is_fitted=True,
     ),
     # what a camera does to radiance: a factor, and what is added to it
     "views.NAME.exposure": Kind(exposure_rate, low=1e-3, is_color=True, is_fitted=True),

@@ -154,7 +154,7 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
     numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
     if numbers:
         parts = {name.removeprefix(PHASE): number for name, number in numbers.items()}
-        phase = replace(phase, **parts)  # type: ignore[arg-type]
+        phase = replace(phase, **parts)
     changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
 
@@ -187,15 +187,15 @@ def _view_value(view: View, part: str) -> Tensor:
 
 def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> View:
     names = {part: f"views.{view.name}.{part}" for part in _view_parts(view)}
-    given = {part: values[name] for part, name in names.items() if name in values}
+    given: dict[str, Any] = {p: values[name] for p, name in names.items() if name in values}
     if not given:
         return view
-    response: dict[str, Any] = {part: given.pop(part) for part in RESPONSE if part in given}
+    response = {part: given.pop(part) for part in RESPONSE if part in given}
     camera = view.camera
     if "camera" in given:
         camera = twist(camera, given.pop("camera"), scene.volume.grid.center_xyz)
     if "focal" in given:
         given["half_width"] = 1 / (2 * given.pop("focal"))
     if given:
-        camera = replace(camera, **given)
+        camera = replace(camera, **given)  # type: ignore[arg-type]
     return replace(view, camera=camera, **response)

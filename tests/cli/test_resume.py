@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import signal
 import subprocess
 import sys
@@ -31,9 +32,8 @@ def iterations(folder: str) -> list[int]:
 
 
 def cells(folder: str) -> list[int]:
-    return [
-        int(line.split(",")[-1]) for line in Path(folder, "loss.csv").read_text().splitlines()[1:]
-    ]
+    with Path(folder, "loss.csv").open(newline="") as stream:
+        return [int(row["cells"]) for row in csv.DictReader(stream)]
 
 
 def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call: int) -> None:

@@ -45,6 +45,6 @@ def test_every_key_of_every_record_is_explained(manual: ModuleType) -> None:
 
 
 def test_no_key_takes_just_a_mapping_unless_it_is_one(manual: ModuleType) -> None:
-    plain = {"bounds", "camera", "distortion", "ring", "parameters"}
+    plain = {"bounds", "camera", "distortion", "ring", "parameters", "noise"}
     rows = [line.split("|") for line in manual.page().splitlines() if line.startswith("| `")]
     assert {row[1].strip(" `") for row in rows if row[2].strip().startswith("mapping")} == plain

@@ -17,6 +17,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import PointLight
+from ddrecon.medium.phase import TwoLobe
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import run_case
@@ -51,6 +52,13 @@ def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: in
         return make_scene(density, g=-0.4, ambient=(0.2, 0.1, 0.3), camera=camera)
     if kind == "peaked":
         return make_scene(density, g=0.5, camera=camera)
+    if kind == "lobes by color":
+        scene = make_scene(density, camera=camera)
+        lobes, weight = density.new_tensor([0.6, -0.4]), density.new_tensor([0.9, 0.5, 0.2])
+        scene.volume.phase = TwoLobe(lobes, weight)
+        outside = density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5])
+        scene.lights.append(PointLight(*outside))
+        return scene
     fields = {
         name: factor * (0.5 + random_values(3, *SHAPE, seed=seed, dtype=dtype))
         for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
@@ -104,6 +112,8 @@ EMISSIONS = [
     ("peaked", OUTSIDE, [*LIGHT, "sigma_s"]),
     ("points", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
     ("fields", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
+    ("lobes by color", OUTSIDE, ["density", "phase.g", "phase.weight", *POINT, *POSE]),
+    ("lobes by color", OUTSIDE, ["density", "phase.g", "phase.weight"]),
 ]
 each_case = pytest.mark.parametrize(
     ("kind", "view", "names"),
@@ -216,14 +226,23 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
         assert_near(one, other, 1e-12)
 
 
+def kernels_for(architecture: int) -> list:
+    """Some of all kernels: no text depends on the architecture, and each takes seconds."""
+    one, several = (
+        Layout(1, 1, 1, (False, True), 0, 0, 32),
+        Layout(3, 3, 3, (False, True), 3, 3, 64),
+    )
+    if architecture == 80:
+        walks = [tangent_kernel(one, True), adjoint_kernel(one, True, True)]
+        return [*walks, packet_integral_kernel(several), packet_adjoint_kernel(one)]
+    walks = [integral_kernel(one), adjoint_kernel(one, False, True)]
+    return [*walks, packet_integral_kernel(one), packet_adjoint_kernel(several)]
+
+
 @pytest.mark.parametrize("architecture", [80, 90])
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
-    layout = Layout(3, 1, 3, (False, True), 0, 0, 32)
-    kernels = [integral_kernel(layout), tangent_kernel(layout, True)]
-    kernels += [adjoint_kernel(layout, is_sliced, True) for is_sliced in (True, False)]
-    for several in (layout, Layout(3, 3, 3, (False, True), 3, 3, 64)):
-        kernels += [packet_integral_kernel(several), packet_adjoint_kernel(several)]
+    kernels = kernels_for(architecture)
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)

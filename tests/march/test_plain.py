@@ -153,7 +153,7 @@ def test_images_of_other_media_agree_in_the_limit(changes: dict[str, Any]):
 
 
 def test_they_agree_with_finer_cells_whatever_is_interpolated():
-    """Masses to third order or linearly, E13 as a polynomial or itself: in a smooth medium."""
+    """Masses to third order or linearly, E13 by a table or itself: in a smooth medium."""
     errors = []
     for count in (8, 16, 32):
         scene = lit_scene(LIGHTS["two beams"][:1], VIEWS["oblique"], g=0.3, model="none")

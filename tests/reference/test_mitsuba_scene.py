@@ -14,6 +14,7 @@ from torch import Tensor
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
+from ddrecon.medium.phase import Draine, TwoLobe
 from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
 from ddrecon.scene import Scene
@@ -166,6 +167,29 @@ def test_ambient_light_is_part_of_an_environment_map() -> None:
         scene, lights=[light for light in scene.lights if isinstance(light, AmbientLight)]
     )
     assert described(alone)["around"] == {"type": "constant", "radiance": (1.5, 2.5, 3.5)}
+
+
+def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time() -> None:
+    scene = make_scene(random_values(*SHAPE))
+    weight = scene.volume.density.new_tensor([0.7, 0.5, 0.2])
+    scene.volume.phase = TwoLobe(weight.new_tensor([0.6, -0.3]), weight)
+    with pytest.raises(SceneError, match="differs by color"):
+        described(scene)
+    for color in range(3):
+        phase = described(pick_color(scene, color))["medium"]["phase"]
+        lobes = [{"type": "hg", "g": pytest.approx(g)} for g in (0.6, -0.3)]
+        assert phase["type"] == "blendphase" and [phase["first"], phase["second"]] == lobes
+        assert phase["weight"] == pytest.approx(1 - float(weight[color]))
+
+
+def test_a_table_of_values_goes_from_backward_to_forward() -> None:
+    scene = make_scene(random_values(*SHAPE))
+    scene.volume.phase = Draine(*scene.volume.density.new_tensor([0.5, 1.0]))
+    phase = described(scene)["medium"]["phase"]
+    values = [float(value) for value in phase["values"].split(", ")]
+    cosine = torch.linspace(-1, 1, len(values), dtype=torch.float64)
+    expected = scene.volume.phase.value(cosine)[0]
+    np.testing.assert_allclose(values, expected, rtol=1e-6)
 
 
 def test_two_environment_maps_are_refused() -> None:

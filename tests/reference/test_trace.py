@@ -15,6 +15,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
 from ddrecon.renderer import render
@@ -152,6 +153,32 @@ def test_light_scattered_once_is_ours_to_4_percent(light: str, is_perspective: b
     assert traced.noise < 0.05
     assert traced.error(ours) < 0.04
     assert ours.mean() == pytest.approx(traced.image.mean(), rel=0.03)
+
+
+PHASES: dict[str, PhaseFunction] = {
+    "two lobes": TwoLobe(CENTER.new_tensor([0.7, -0.5]), CENTER.new_tensor(0.6)),
+    "rayleigh": Rayleigh(CENTER),
+    "draine": Draine(CENTER.new_tensor(0.5), CENTER.new_tensor(1.0)),
+    "by color": HenyeyGreenstein(CENTER.new_tensor([0.5, 0.0, -0.5])),
+}
+
+
+@pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES.keys())
+def test_every_phase_function_is_theirs(phase: PhaseFunction) -> None:
+    """As `blendphase`, `rayleigh` and `tabphase`, and color by color."""
+    grid, density = soft_ball(12)
+    camera = seen_from((0.5, 0.3, 0.8), 0.2, 8, True)
+    scene = make_scene(
+        density, grid=grid, sigma_a=(0.5,), sigma_s=(3.0,), camera=camera, model="none"
+    )
+    settings = RenderSettings(samples_per_pixel=16, steps_per_voxel=2, background=False)
+    lights = [*LIGHTS["directional"](), *LIGHTS["point"]()]
+    scene = replace(scene, lights=lights, render=settings)
+    scene.volume.phase = phase
+    traced = Traced.of(passes(scene, 8, 128, depth=2))
+    ours = render(scene)[0].permute(1, 2, 0).numpy()
+    assert traced.noise < 0.06 and traced.error(ours) < 0.03
+    np.testing.assert_allclose(ours.mean((0, 1)), traced.image.mean((0, 1)), rtol=0.02)
 
 
 def test_the_background_is_seen_where_we_see_it() -> None:

@@ -32,7 +32,7 @@ volume:
   resolution: [6, 5, 4]
   density: 0.4
   {cross_sections}
-  g: 0.3
+  {phase}
 lights:
   - {{type: directional, direction: [-1, -2, -1], irradiance: 3}}
   - {{type: environment, file: sky.npy, scale: 0.5, rotation: 20, directions: 6}}
@@ -74,10 +74,11 @@ def moved(value: Tensor) -> Tensor:
     )
 
 
-def finished(folder: Path, cross_sections: str, parameters: str) -> Any:
+def finished(folder: Path, cross_sections: str, parameters: str, phase: str = "g: 0.3") -> Any:
     """The scene found by a run in `folder`/out that ended, all its parameters moved."""
     path = folder / "scene.yaml"
-    path.write_text(SCENE.format(cross_sections=cross_sections, parameters=parameters))
+    values = {"cross_sections": cross_sections, "parameters": parameters, "phase": phase}
+    path.write_text(SCENE.format(**values))
     random = np.random.default_rng(0)
     np.save(folder / "front.npy", random.random((6, 7, 3), dtype=np.float32))
     np.save(folder / "sky.npy", random.random((4, 8, 3), dtype=np.float32))
@@ -85,7 +86,7 @@ def finished(folder: Path, cross_sections: str, parameters: str) -> Any:
     run = Reconstruction(build_scene(scene_file))
     row = run.step()
     for parameter in run.parameters:
-        limit = 0.9 if parameter.name == "albedo" else torch.inf
+        limit = 0.9 if parameter.name in ("albedo", "phase.weight") else torch.inf
         state = parameter.state()
         parameter.restore(state | {"value": moved(state["value"]).clamp(max=limit)})
     (folder / "out").mkdir()
@@ -113,6 +114,29 @@ def test_a_result_renders_as_what_was_found(
             render(again, view), wanted, rtol=1e-4, atol=1e-5 * float(wanted.max())
         )
     assert {"density", *fields} <= {path.stem for path in (tmp_path / "out" / "volumes").iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("phase", "parameters"),
+    [
+        ("{type: henyey_greenstein, g: 0.3}", "phase.g: {}"),
+        (
+            "{type: two_lobe, g: [0.6, -0.2], weight: [0.7, 0.5, 0.3]}",
+            "phase.g: {}, phase.weight: {}",
+        ),
+        ("{type: draine, g: 0.3, alpha: 0.5}", "phase.g: {}, phase.alpha: {}"),
+        ("{type: legendre, coefficients: [1, 0.4, 0.2]}", "phase.coefficients: {}"),
+    ],
+)
+def test_a_result_has_the_phase_function_that_was_found(
+    tmp_path: Path, phase: str, parameters: str
+) -> None:
+    text = CROSS_SECTIONS["sigma_a, sigma_s"]
+    found = finished(tmp_path, text, parameters, f"phase: {phase}").volume.phase
+    again = load_scene(tmp_path / "out" / RESULT).volume.phase
+    assert type(again) is type(found)
+    for one, other in zip(again.numbers, found.numbers, strict=True):
+        torch.testing.assert_close(one, other.detach(), rtol=1e-6, atol=0)
 
 
 def test_a_result_does_not_depend_on_where_its_folder_lies(tmp_path: Path) -> None:

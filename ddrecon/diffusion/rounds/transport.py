@@ -98,7 +98,7 @@ def _blend(
     if is_fused():
         from ddrecon.diffusion.rounds.fused.blend import blend_fused
 
-        length = _mean_step(medium.grid, degree)
+        length = _share_length(medium, degree)
         return blend_fused(medium, light, diffuse, gain, swept, factor, length)
     share = recompute(_transport_share, medium, degree)
     new = replace(diffuse.plus(gain), higher=share * swept)
@@ -112,16 +112,15 @@ def _times(light: Moments, factor: Tensor | float) -> Moments:
 def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
     """The factors o = 1 / (1 - nu) of E19, one for each round, largest first.
 
-    nu are Chebyshev's nodes of the interval from p_3, where that is negative, to p_2: by about so
-    much a round multiplies what is left in the moments that diffusion lacks. None where light's
-    direction does not matter.
+    nu are Chebyshev's nodes of the interval between - and + p_2: by at most about so much a round
+    multiplies what is left in the moments that diffusion lacks. As that interval is even, what
+    shrinks without blending shrinks with it. None where light's direction does not matter.
     """
     if medium.degree < 2:
         return [None] * rounds
-    moments = remaining_moments(medium)
-    high, low = SPECTRUM * moments[2], SPECTRUM * moments[3].clamp(max=0)
+    bound = SPECTRUM * remaining_moments(medium)[2]
     nodes = [math.cos(math.pi * (2 * k + 1) / (2 * rounds)) for k in range(rounds)]
-    return [1 / (1 - ((low + high) / 2 + (high - low) / 2 * node)) for node in nodes]
+    return [1 / (1 - bound * node) for node in nodes]
 
 
 def _gain(
@@ -141,7 +140,7 @@ def _gain(
     if is_fused():
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
-        length = _mean_step(medium.grid, degree)
+        length = _share_length(medium, degree)
         return gain_fused(medium, swept, light, diffuse, imbalance, cosine, length)
     share = recompute(_transport_share, medium, degree)
     swept = replace(swept, higher=None)
@@ -176,9 +175,18 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
     """
     # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
     # 1e-6, theta is 1 already
-    half_depth = (0.5 * _mean_step(medium.grid, degree) * medium.extinction.value).clamp(min=1e-3)
+    half_depth = (0.5 * _share_length(medium, degree) * medium.extinction.value).clamp(min=1e-3)
     rho = half_depth / torch.tanh(half_depth) - 1
     return 1 / (1 + rho**2)
+
+
+def _share_length(medium: Medium, degree: int) -> Tensor:
+    """The length of a step, by whose optical depth theta is [u] (E14), [C or 1, 1, 1, 1].
+
+    It is that of the mean step where scattering is not backward.
+    """
+    cosine = remaining_moments(medium)[1].clamp(max=0)
+    return _mean_step(medium.grid, degree) * (1 + 2 * cosine**2)
 
 
 @functools.cache

@@ -21,7 +21,7 @@ from ddrecon.march.fused.stops import stops
 def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
     """The kernel that adds to `bars` what bars of outputs and masses are for all that is given.
 
-    Each ray has its own `numbers` [2 C + 2, R] there. Bars of rays, angles and coefficients are
+    Each ray has its own `numbers` [2 C + 1, R] there. Bars of rays, angles and coefficients are
     found where it `varies_rays`; else their arrays may be empty.
     """
     t, records, passed = vectors(layout), ray_types(layout), masses(layout)
@@ -61,13 +61,13 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
                 a = stop(given, ray, n)
                 if step > 0:
                     m = passed.add_mass(behind, a.v, b.v, a.held - b.held)
-                a = emit(ray, a, passed.mass_of(m), given.coefficients)
+                a = emit(ray, a, passed.mass_of(m), given)
             if step > 0:
                 if n >= 0:
                     ray_bar, a_bar, b_bar = arrive_adjoint(ray, a, b, bar, ray_bar, a_bar, b_bar)
                 mass = passed.mass_of(behind)
                 ray_bar, b_bar, m_bar = emit_adjoint(
-                    ray, b, mass, given.coefficients, ray_bar, b_bar, m_bar, bars.coefficients
+                    ray, b, mass, given, ray_bar, b_bar, m_bar, bars
                 )
                 if n >= 0:
                     a_bar, b_bar = mass_adjoint(a, b, m_bar, a_bar, b_bar)
@@ -175,8 +175,7 @@ def _storing(layout: Layout, varies_rays: bool) -> Any:
         for c in range(wp.static(layout.colors)):
             numbers_bar[c, r] = ray_bar.scale[c]
             numbers_bar[wp.static(layout.colors) + c, r] = ray_bar.peak[c]
-        numbers_bar[wp.static(2 * layout.colors), r] = ray_bar.g
-        numbers_bar[wp.static(2 * layout.colors + 1), r] = ray_bar.bound
+        numbers_bar[wp.static(2 * layout.colors), r] = ray_bar.bound
         if wp.static(varies_rays):
             for axis in range(3):
                 bars.rays[r, axis] = ray_bar.origin[axis]

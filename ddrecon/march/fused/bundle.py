@@ -118,7 +118,7 @@ def see_beams(emission: Emission, packed: Packed) -> Along:
             seen.append(see(beam.direction))
         else:
             angles = torch.stack(beam.passing(packed.origin, packed.direction))
-            unused = angles.new_zeros(COEFFICIENTS, angles.shape[1])
+            unused = angles.new_zeros(COEFFICIENTS * phase.colors, angles.shape[1])
             seen.append(Along(angles, unused, (None,)))
     feet, squares = zip(*(each.angles.split(1) for each in seen), strict=True)
     return Along(
@@ -147,7 +147,7 @@ def _see_directional(
     ones = direction.new_ones(len(towards), rays)
     none = direction.new_zeros(0, rays)
     if not has_peak:
-        unused = direction.new_zeros(len(towards) * COEFFICIENTS, rays)
+        unused = direction.new_zeros(len(towards) * COEFFICIENTS * seen.colors, rays)
         factors = tuple(seen.value(cosine) for cosine in cosines)
         return Along(torch.cat([none, *(c[None] for c in cosines), ones]), unused, factors)
     # By beam, then by color, then by power.
@@ -156,8 +156,18 @@ def _see_directional(
     return Along(angles, torch.cat([none, *fitted]), (None,) * len(towards))
 
 
+def table_of(emission: Emission) -> Tensor:
+    """Coefficients of p over the angle, [phases * (steps + 1) * 2, terms], for point lights.
+
+    Without rows where there are none.
+    """
+    table = emission.seen.table(emission.peak is not None).to(emission.diffuse)
+    has_points = any(not isinstance(beam, Beam) for beam in emission.beams)
+    return table.flatten(0, 2) if has_points else table.new_empty(0, table.shape[-1])
+
+
 def numbers_of(emission: Emission, bound: Tensor | float) -> Tensor:
-    """The scale and the peak of each color, g, and the `bound` of third-order corrections."""
+    """The scale and the peak of each color, and the `bound` of third-order corrections."""
     peak = emission.peak
     if peak is not None and is_field(peak):
         peak = None
@@ -168,4 +178,4 @@ def numbers_of(emission: Emission, bound: Tensor | float) -> Tensor:
 def _numbers(colors: int, scale: Tensor, peak: Tensor | None, bound: Tensor | float) -> Tensor:
     scale = scale.view(-1).expand(colors)
     peak = 0 * scale if peak is None else peak.view(-1).expand(colors)
-    return torch.cat([scale, peak, 0 * scale[:1], torch.as_tensor(bound).to(scale).view(1)])
+    return torch.cat([scale, peak, torch.as_tensor(bound).to(scale).view(1)])

@@ -13,13 +13,7 @@ from typing import Any
 import warp as wp
 
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.node_phases import (
-    is_point,
-    node_phase,
-    node_phase_adjoint,
-    node_phase_tangent,
-    slopes_at_point,
-)
+from ddrecon.march.fused.node_phases import node_phase, node_phase_adjoint, node_phase_tangent
 from ddrecon.march.fused.rays import ray_types, vectors
 
 
@@ -51,7 +45,7 @@ def emission(layout: Layout) -> Any:
 
     @wp.func
     def emit(
-        ray: records.Ray, here: records.Stop, m: t.Mass, coefficients: wp.array2d(dtype=t.F)
+        ray: records.Ray, here: records.Stop, m: t.Mass, given: records.Bundle
     ) -> records.Stop:
         for c in range(wp.static(C)):
             here.w[c] = here.v[at.scattering(c)] * here.v[at.diffuse(c)]
@@ -62,7 +56,7 @@ def emission(layout: Layout) -> Any:
                 k = c * wp.static(layout.mass_step)
                 mass = m[k] + here.v[at.to_light(b, k)]
                 depth = light.depth_of(here.v, ray.peak, c, mass)
-                p = light.phase(ray, depth, b, here.held, coefficients)
+                p = light.phase(ray, depth, b, c, here.held, given)
                 here.p[i] = p
                 here.w[i] = here.v[at.scattering(c)] * p
                 here.u[i] = ray.scale[c] * mass
@@ -78,19 +72,18 @@ def emission_adjoint(layout: Layout) -> Any:
     """The function that adds to bars of ray, stop and mass `m` what those of emission are."""
     t, records, at = vectors(layout), ray_types(layout), _channels(layout)
     Ray, Stop, beam_adjoint = records.Ray, records.Stop, _beam_adjoint(layout)
-    light, slope, IS_POINT = node_phase(layout), slopes_at_point(layout), is_point(layout)
-    phase_at_point, point_cosine = slope.phase, slope.cosine
+    light, Bundle = node_phase(layout), records.Bundle
 
     @wp.func
     def emit_adjoint(
         ray: Ray,
         here: Stop,
         m: t.Mass,
-        coefficients: wp.array2d(dtype=t.F),
+        given: Bundle,
         ray_bar: Ray,
         here_bar: Stop,
         m_bar: t.Mass,
-        coefficients_bar: wp.array2d(dtype=t.F),
+        bars: Bundle,
     ):
         # Summed up by themselves first.
         found, found_m = Stop(), t.Mass()
@@ -107,18 +100,9 @@ def emission_adjoint(layout: Layout) -> Any:
                 k = c * wp.static(layout.mass_step)
                 mass = m[k] + here.v[at.to_light(b, k)]
                 depth = light.depth_of(here.v, ray.peak, c, mass)
-                slopes = slope.Slopes()
-                if wp.static(IS_POINT)[b] == 1:
-                    cosine = light.cosine(ray.foot[b], ray.across[b], here.held)
-                    by_depth, by_cosine, by_g = wp.grad(phase_at_point)(depth, cosine, ray.g)
-                    by_foot, by_across, by_held = wp.grad(point_cosine)(
-                        ray.foot[b], ray.across[b], here.held
-                    )
-                    slopes = slope.Slopes(by_depth, by_cosine, by_g, by_foot, by_across, by_held)
                 ray_bar, found, found_m = beam_adjoint(
-                    ray, here, mass, depth, slopes, coefficients, b, c, ray_bar, found, found_m,
-                    coefficients_bar,
-                )  # fmt: skip
+                    ray, here, mass, depth, given, b, c, ray_bar, found, found_m, bars
+                )
         here_bar.v += found.v
         here_bar.held += found.held
         return ray_bar, here_bar, m_bar + found_m
@@ -130,7 +114,7 @@ def emission_adjoint(layout: Layout) -> Any:
 def _beam_adjoint(layout: Layout) -> Any:
     """The function that adds what the bars of beam b's emission and depth in color c are."""
     t, records, at = vectors(layout), ray_types(layout), _channels(layout)
-    Ray, Stop, Slopes = records.Ray, records.Stop, slopes_at_point(layout).Slopes
+    Ray, Stop, Bundle = records.Ray, records.Stop, records.Bundle
     light, phase_adjoint = node_phase(layout), node_phase_adjoint(layout)
 
     @wp.func
@@ -139,14 +123,13 @@ def _beam_adjoint(layout: Layout) -> Any:
         here: Stop,
         mass: t.F,
         depth: t.F,
-        slopes: Slopes,
-        coefficients: wp.array2d(dtype=t.F),
+        given: Bundle,
         b: int,
         c: int,
         ray_bar: Ray,
         here_bar: Stop,
         m_bar: t.Mass,
-        coefficients_bar: wp.array2d(dtype=t.F),
+        bars: Bundle,
     ):
         i = (b + 1) * wp.static(layout.colors) + c
         k = c * wp.static(layout.mass_step)
@@ -159,9 +142,8 @@ def _beam_adjoint(layout: Layout) -> Any:
         p_bar = here_bar.w[i] * here.v[s]
         # p of E13 by depth = kappa_peak mass
         depth_bar, held_bar, ray_bar = phase_adjoint(
-            depth, slopes, b, coefficients, here.p[i], p_bar, ray_bar, here_bar.held,
-            coefficients_bar,
-        )  # fmt: skip
+            ray, here.held, depth, b, c, given, here.p[i], p_bar, ray_bar, here_bar.held, bars
+        )
         here_bar.held = held_bar
         if wp.static(layout.peak is not None):
             mass_bar += depth_bar * light.peak_of(here.v, ray.peak, c)
@@ -182,19 +164,18 @@ def emission_tangent(layout: Layout) -> Any:
     """The function that adds to the change of a stop those of its emission and depth."""
     t, records, at = vectors(layout), ray_types(layout), _channels(layout)
     Ray, Stop, beam_tangent = records.Ray, records.Stop, _beam_tangent(layout)
-    light, slope, IS_POINT = node_phase(layout), slopes_at_point(layout), is_point(layout)
-    phase_at_point, point_cosine = slope.phase, slope.cosine
+    light, Bundle = node_phase(layout), records.Bundle
 
     @wp.func
     def emit_tangent(
         ray: Ray,
         here: Stop,
         m: t.Mass,
-        coefficients: wp.array2d(dtype=t.F),
+        given: Bundle,
         d_ray: Ray,
         d_here: Stop,
         d_m: t.Mass,
-        d_coefficients: wp.array2d(dtype=t.F),
+        d_given: Bundle,
     ) -> Stop:
         for c in range(wp.static(layout.colors)):
             k = c * wp.static(layout.mass_step)
@@ -208,18 +189,9 @@ def emission_tangent(layout: Layout) -> Any:
                 mass = m[k] + here.v[at.to_light(b, k)]
                 d_mass = d_m[k] + d_here.v[at.to_light(b, k)]
                 depth = light.depth_of(here.v, ray.peak, c, mass)
-                slopes = slope.Slopes()
-                if wp.static(IS_POINT)[b] == 1:
-                    cosine = light.cosine(ray.foot[b], ray.across[b], here.held)
-                    by_depth, by_cosine, by_g = wp.grad(phase_at_point)(depth, cosine, ray.g)
-                    by_foot, by_across, by_held = wp.grad(point_cosine)(
-                        ray.foot[b], ray.across[b], here.held
-                    )
-                    slopes = slope.Slopes(by_depth, by_cosine, by_g, by_foot, by_across, by_held)
                 d_here = beam_tangent(
-                    ray, here, mass, depth, slopes, coefficients, b, c, d_ray, d_here, d_mass,
-                    d_coefficients,
-                )  # fmt: skip
+                    ray, here, mass, depth, given, b, c, d_ray, d_here, d_mass, d_given
+                )
         return d_here
 
     return emit_tangent
@@ -229,7 +201,7 @@ def emission_tangent(layout: Layout) -> Any:
 def _beam_tangent(layout: Layout) -> Any:
     """The function of the changes of beam b's emission and depth in color c."""
     t, records, at = vectors(layout), ray_types(layout), _channels(layout)
-    Ray, Stop, Slopes = records.Ray, records.Stop, slopes_at_point(layout).Slopes
+    Ray, Stop, Bundle = records.Ray, records.Stop, records.Bundle
     light, phase_tangent = node_phase(layout), node_phase_tangent(layout)
 
     @wp.func
@@ -238,14 +210,13 @@ def _beam_tangent(layout: Layout) -> Any:
         here: Stop,
         mass: t.F,
         depth: t.F,
-        slopes: Slopes,
-        coefficients: wp.array2d(dtype=t.F),
+        given: Bundle,
         b: int,
         c: int,
         d_ray: Ray,
         d_here: Stop,
         d_mass: t.F,
-        d_coefficients: wp.array2d(dtype=t.F),
+        d_given: Bundle,
     ) -> Stop:
         i = (b + 1) * wp.static(layout.colors) + c
         s = at.scattering(c)
@@ -254,7 +225,7 @@ def _beam_tangent(layout: Layout) -> Any:
             peak = light.peak_of(here.v, ray.peak, c)
             d_depth = light.peak_of(d_here.v, d_ray.peak, c) * mass + peak * d_mass
         d_p = phase_tangent(
-            depth, slopes, b, coefficients, here.p[i], d_ray, d_depth, d_here.held, d_coefficients
+            ray, here.held, depth, b, c, given, here.p[i], d_ray, d_depth, d_here.held, d_given
         )
         d_here.w[i] = d_here.v[s] * here.p[i] + here.v[s] * d_p
         d_here.u[i] = d_ray.scale[c] * mass + ray.scale[c] * d_mass

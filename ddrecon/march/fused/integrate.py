@@ -39,11 +39,12 @@ class Integrate(torch.autograd.Function):
         angles: Tensor,
         coefficients: Tensor,
         numbers: Tensor,
+        table: Tensor,
         *fields: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         out = rays.new_empty(layout.outputs, len(rays))
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
-        varied = rays, angles, coefficients, numbers
+        varied = rays, angles, coefficients, numbers, table
         if cells.is_sliced:
             given, made = _packets(cells, varied, fields), {"out": out, "masses": masses}
             packet_integral_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
@@ -65,7 +66,7 @@ class Integrate(torch.autograd.Function):
         needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
         varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))
         if ctx.cells.is_sliced and not varies_rays:
-            needs = needs_polynomials, ctx.needs_input_grad[6:]
+            needs = needs_polynomials, ctx.needs_input_grad[6], ctx.needs_input_grad[7:]
             found = _transpose_packets(ctx, needs, out_bar, masses_bar)
         else:
             varies_rays = varies_rays or needs_angles or needs_polynomials
@@ -93,7 +94,7 @@ class _Tangent(torch.autograd.Function):
     def forward(layout: Layout, cells: Cells, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         rays, count = tensors[0], len(tensors) // 2
         bundles = [
-            _bundle(layout, cells.planes, cells.pack(part[4:]), *part[:4])
+            _bundle(layout, cells.planes, cells.pack(part[5:]), *part[:5])
             for part in (tensors[:count], tensors[count:])
         ]
         d_out = rays.new_empty(layout.outputs, len(rays))
@@ -112,28 +113,33 @@ def _transpose(
 ) -> list[Tensor | None]:
     """Cotangents of all tensors, a ray a thread; those of rays only where it `varies_rays`."""
     layout, cells = ctx.layout, ctx.cells
-    masses, rays, angles, coefficients, numbers, *fields = ctx.saved_tensors
+    masses, rays, angles, coefficients, numbers, table, *fields = ctx.saved_tensors
     packed = cells.pack(fields)
-    given = _bundle(layout, cells.planes, packed, rays, angles, coefficients, numbers)
+    given = _bundle(layout, cells.planes, packed, rays, angles, coefficients, numbers, table)
     bars = [torch.zeros_like(x if varies_rays else x[:0]) for x in (rays, angles, coefficients)]
     numbers_bar = rays.new_empty(len(numbers), len(rays))
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
     shares = [torch.zeros_like(packed) for _ in range(thread_count(rays))]
     fixed = [given, *map(array, (masses, out_bar, masses_bar))]
-    bundles = [_bundle(layout, cells.planes, share, *bars, numbers) for share in shares]
+    tables = [torch.zeros_like(table if ctx.needs_input_grad[6] else table[:0]) for _ in shares]
+    bundles = [
+        _bundle(layout, cells.planes, share, *bars, numbers, own)
+        for share, own in zip(shares, tables, strict=True)
+    ]
     kernel = adjoint_kernel(layout, cells.is_sliced, varies_rays)
     launch(kernel, len(rays), lambda i: [*fixed, bundles[i], array(numbers_bar)], rays)
     found = bars if varies_rays else [None, None, None]
     fields_bar = cells.unpack(functools.reduce(Tensor.add_, shares), fields)
-    return [*found, numbers_bar.sum(1), *fields_bar]
+    table_bar = functools.reduce(Tensor.add_, tables) if ctx.needs_input_grad[6] else None
+    return [*found, numbers_bar.sum(1), table_bar, *fields_bar]
 
 
 def _transpose_packets(
-    ctx: Any, needs: tuple[bool, Sequence[bool]], out_bar: Tensor, masses_bar: Tensor
+    ctx: Any, needs: tuple[bool, bool, Sequence[bool]], out_bar: Tensor, masses_bar: Tensor
 ) -> list[Tensor | None]:
-    """The same in packets of rays, but of rays; of polynomials and fields those it `needs`."""
-    layout, cells, (needs_polynomials, needs_fields) = ctx.layout, ctx.cells, needs
-    masses, rays, angles, coefficients, numbers, *fields = ctx.saved_tensors
+    """The same in packets, but of rays; of polynomials, table and fields those it `needs`."""
+    layout, cells, (needs_polynomials, needs_table, needs_fields) = ctx.layout, ctx.cells, needs
+    masses, rays, angles, coefficients, numbers, table, *fields = ctx.saved_tensors
     packets, _ = cut(len(rays), LANES, rays)
     polynomials_bar = rays.new_empty(coefficients.shape) if needs_polynomials else None
     numbers_bar = masses.new_empty(len(numbers), packets)
@@ -143,21 +149,27 @@ def _transpose_packets(
         [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
         for _ in range(thread_count(rays))
     ]
-    given = _packets(cells, (rays, angles, coefficients, numbers), fields)
+    given = _packets(cells, (rays, angles, coefficients, numbers, table), fields)
     given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
     made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar}
-    own = [{"bars": _channels(share, fields)} for share in shares]
+    tables = [torch.zeros_like(table) if needs_table else None for _ in shares]
+    own = [
+        {"bars": _channels(share, fields), "table_bar": table_bar}
+        for share, table_bar in zip(shares, tables, strict=True)
+    ]
     packet_adjoint_kernel(layout).launch(packets, given, made, shares=own)
     for share in shares[1:]:
         for total, part in zip(shares[0], share, strict=True):
             if total is not None:
                 total += part
-    return [None, None, polynomials_bar, numbers_bar.sum(1).to(numbers.dtype), *shares[0]]
+    numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
+    table_bar = functools.reduce(torch.add, tables) if needs_table else None
+    return [None, None, polynomials_bar, numbers_bar, table_bar, *shares[0]]
 
 
 def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -> dict[str, Any]:
     """What kernels of packets are given, by name."""
-    names = "planes", "slices", "rays", "angles", "coefficients", "numbers"
+    names = "planes", "slices", "rays", "angles", "coefficients", "numbers", "table"
     given: dict[str, Any] = dict(zip(names, (cells.planes, cells.order, *varied), strict=True))
     given |= cells.strides(fields[0].shape)
     given |= {"ray_count": len(varied[0]), "node_count": len(cells.planes)}
@@ -176,7 +188,7 @@ def _channels(tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[
 def _bundle(layout: Layout, *tensors: Tensor) -> Any:
     """`tensors`, in the order of its fields, as the record that kernels are given."""
     bundle = ray_types(layout).Bundle()
-    names = "planes", "cells", "rays", "angles", "coefficients", "numbers"
+    names = "planes", "cells", "rays", "angles", "coefficients", "numbers", "table"
     for name, tensor in zip(names, tensors, strict=True):
         setattr(bundle, name, array(tensor))
     return bundle

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ddrecon.numerics.chebyshev import COEFFICIENTS
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -12,8 +14,8 @@ class Layout:
     `colors` C leave the volume. A node holds the `extinction`'s field (K = 1 or C channels),
     `diffuse` light (1 or C), K masses for each of `beams` (whether it is a point light),
     `scattering` (0: it is the extinction's field again; else 1 or C), and `peak`: None without a
-    forward peak, 0 where it is one number a color, else 1 or C channels. `bits` of a number: 32 or
-    64.
+    forward peak, 0 where it is one number a color, else 1 or C channels. `phases`: 1, or C where
+    colors have phase functions of their own. `bits` of a number: 32 or 64.
     """
 
     colors: int
@@ -22,6 +24,7 @@ class Layout:
     beams: tuple[bool, ...]
     scattering: int
     peak: int | None
+    phases: int
     bits: int
 
     @property
@@ -68,6 +71,16 @@ class Layout:
     def peak_step(self) -> int:
         """The same of the peak."""
         return int((self.peak or 0) > 1)
+
+    @property
+    def phase_step(self) -> int:
+        """The same of phase functions."""
+        return int(self.phases > 1)
+
+    @property
+    def terms(self) -> int:
+        """Coefficients of p over the depth of the peak: 1 where there is none."""
+        return 1 if self.peak is None else COEFFICIENTS
 
     @property
     def channels(self) -> int:

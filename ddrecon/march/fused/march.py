@@ -11,7 +11,14 @@ from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission, is_field
 from ddrecon.march.equidistant import Equidistant
-from ddrecon.march.fused.bundle import Packed, numbers_of, pack_lattice, pack_rays, see_beams
+from ddrecon.march.fused.bundle import (
+    Packed,
+    numbers_of,
+    pack_lattice,
+    pack_rays,
+    see_beams,
+    table_of,
+)
 from ddrecon.march.fused.cells import cells_of
 from ddrecon.march.fused.compose import compose
 from ddrecon.march.fused.integrate import Integrate
@@ -47,7 +54,14 @@ def _integrate(emission: Emission, sampler: Bands | Equidistant, packed: Packed)
     along, third_order = see_beams(emission, packed), sampler.channels.third_order
     numbers = numbers_of(emission, 0.0 if third_order is None else third_order.bound)
     out, masses, _ = Integrate.apply(
-        layout, cells, packed.bundle, along.angles, along.polynomials, numbers, *fields
+        layout,
+        cells,
+        packed.bundle,
+        along.angles,
+        along.polynomials,
+        numbers,
+        table_of(emission),
+        *fields,
     )
     irradiances = [beam.irradiance for beam in emission.beams]
     scales = emission.extinction.scale, emission.scattering.scale
@@ -64,5 +78,6 @@ def layout_of(emission: Emission) -> Layout:
         tuple(isinstance(beam, PointBeam) for beam in emission.beams),
         0 if scattering.field is extinction.field else scattering.field.shape[0],
         None if peak is None else peak.shape[0] if is_field(peak) else 0,
+        emission.seen.colors,
         torch.finfo(emission.diffuse.dtype).bits,
     )

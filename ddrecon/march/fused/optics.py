@@ -12,8 +12,6 @@ from typing import Any
 
 import warp as wp
 
-from ddrecon.numerics.chebyshev import COEFFICIENTS, SCALE
-
 SERIES_BELOW = 0.5
 """Differences of depth below this take psi from its series."""
 TERMS = {wp.float32: 7, wp.float64: 13}
@@ -84,90 +82,9 @@ def decays(scalar: Any, role: str) -> SimpleNamespace:
 
 
 @functools.cache
-def phases(scalar: Any, role: str) -> SimpleNamespace:
-    """p of E2 and of E13 by their formulas."""
-    F, named = scalar, _named(role)
-    psi_series = _series(scalar, role)
-
-    @named
-    def henyey_greenstein(depth: F, cosine: F, g: F) -> F:
-        """p of E2, which has no peak: `depth` does not matter."""
-        square = F(1.0) + g * g - F(2.0) * g * cosine
-        return (F(1.0) - g * g) / (square * wp.sqrt(square))
-
-    @named
-    def phi(depth: F) -> F:
-        """(1 - exp(-depth)) / depth."""
-        if depth >= F(wp.static(SERIES_BELOW)):
-            return (F(1.0) - wp.exp(-depth)) / depth
-        return F(1.0) - depth * psi_series(depth)
-
-    @named
-    def peaked_phase(depth: F, cosine: F, g: F) -> F:
-        """p of E13 on a way of peak `depth` (E15, E16); at least 0."""
-        unscattered = phi(depth)
-        h = g * wp.exp((g - F(1.0)) * depth) * phi(g * depth) / unscattered
-        away = h - F(2.0) * cosine
-        root = wp.sqrt(F(1.0) + h * away)
-        above = F(1.0) + root * (F(2.0) + root * (F(3.0) + F(1.5) * root))
-        curved = above / (root * root * root * (root + F(1.0)) * (root + F(1.0)))
-        linear = F(3.0) * cosine - F(1.5) + F(1.5) * h * away
-        peak = linear + (F(1.0) - h * h) * away * away * curved
-        rest = (F(1.0) - g * g) * (F(1.0) + F(3.0) * g / (F(1.0) + g) * cosine)
-        return wp.max(rest + g * g * unscattered * peak, F(0.0))
-
-    return SimpleNamespace(henyey_greenstein=henyey_greenstein, peaked_phase=peaked_phase)
-
-
-@functools.cache
-def polynomials(scalar: Any, role: str) -> SimpleNamespace:
-    """E13 along a ray, by its polynomial."""
-    F, named = scalar, _named(role)
-
-    @named
-    def place_of(depth: F) -> F:
-        """The variable of the polynomials that stand for E13 along a ray."""
-        return F(1.0) - F(wp.static(2.0 * SCALE)) / (depth + F(wp.static(SCALE)))
-
-    @named
-    def polynomial(coefficients: wp.array2d(dtype=F), first: int, ray: int, place: F) -> F:
-        """The polynomial of a ray at `place`: its coefficients are rows from `first` on."""
-        value = coefficients[first + wp.static(COEFFICIENTS - 1), ray]
-        for k in range(wp.static(COEFFICIENTS - 1)):
-            value = coefficients[first + wp.static(COEFFICIENTS - 2) - k, ray] + value * place
-        return value
-
-    @named
-    def polynomial_slope(coefficients: wp.array2d(dtype=F), first: int, ray: int, place: F) -> F:
-        """Its derivative by depth: d place / d depth = (1 - place)^2 / (2 s)."""
-        slope = (
-            F(wp.static(float(COEFFICIENTS - 1)))
-            * coefficients[first + wp.static(COEFFICIENTS - 1), ray]
-        )
-        for k in range(wp.static(COEFFICIENTS - 2)):
-            power = wp.static(COEFFICIENTS - 2) - k
-            slope = F(power) * coefficients[first + power, ray] + slope * place
-        away = F(1.0) - place
-        return slope * away * away * F(wp.static(0.5 / SCALE))
-
-    return SimpleNamespace(
-        place_of=place_of, polynomial=polynomial, polynomial_slope=polynomial_slope
-    )
-
-
-@functools.cache
 def points(scalar: Any, role: str) -> SimpleNamespace:
     """Light from a point as a ray sees it."""
     F, named = scalar, _named(role)
-
-    @named
-    def point_cosine(foot: F, across: F, t: F) -> F:
-        """Cosine between light from a point and a ray at distance `t`.
-
-        The point's foot is at distance -`foot` on the ray, and `across` the square of its distance.
-        """
-        along = foot + t
-        return -along / wp.sqrt(across + along * along)
 
     @named
     def subtended(foot: F, across: F, t0: F, t1: F) -> F:
@@ -175,4 +92,4 @@ def points(scalar: Any, role: str) -> SimpleNamespace:
         apart = wp.sqrt(across)
         return wp.atan2(apart * (t1 - t0), across + (foot + t0) * (foot + t1)) / apart
 
-    return SimpleNamespace(point_cosine=point_cosine, subtended=subtended)
+    return SimpleNamespace(subtended=subtended)

@@ -1,5 +1,8 @@
 """C++ of packets of rays: the formulas of the view-ray integral, as `optics` has them for one."""
 
+import math
+
+from ddrecon.numerics.angle_table import STEPS
 from ddrecon.numerics.chebyshev import COEFFICIENTS, SCALE
 
 DECAYS = """
@@ -24,17 +27,6 @@ struct Decay {
         by1 = P::pick(u0 <= u1, -mean - by_lower, by_lower);
         return mean;
     }
-    // phi = (1 - exp(-depth)) / depth, and its derivative psi - phi.
-    INLINE V phi(V depth) {
-        const V half = P::all(F(0.5));
-        const V near = F(1) - depth * P::psi_series(P::least(depth, half));
-        return P::pick(depth < half, near, (F(1) - P::decay(depth)) / P::most(depth, half));
-    }
-    INLINE V phi_slope(V depth, V value) {
-        const V half = P::all(F(0.5));
-        const V psi = P::psi_series(P::least(depth, half));
-        return P::pick(depth < half, psi, (F(1) - value) / P::most(depth, half)) - value;
-    }
 };
 """
 POLYNOMIALS = f"""
@@ -43,84 +35,77 @@ constexpr int COEFFICIENTS = {COEFFICIENTS};
 struct Polynomial {{
     INLINE V place(V depth) {{ return F(1) - F({2.0 * SCALE}) / (depth + F({SCALE})); }}
     INLINE V at(const V* c, V place) {{
-        V value = c[COEFFICIENTS - 1];
-        for (int k = COEFFICIENTS - 2; k >= 0; --k) value = c[k] + value * place;
+        V value = c[TERMS - 1];
+        for (int k = TERMS - 2; k >= 0; --k) value = c[k] + value * place;
         return value;
     }}
     // Its derivative by depth: d place / d depth = (1 - place)^2 / (2 s).
     INLINE V slope(const V* c, V place) {{
-        V value = F(COEFFICIENTS - 1) * c[COEFFICIENTS - 1];
-        for (int k = COEFFICIENTS - 2; k >= 1; --k) value = F(k) * c[k] + value * place;
+        V value = F(TERMS - 1) * c[TERMS - 1];
+        for (int k = TERMS - 2; k >= 1; --k) value = F(k) * c[k] + value * place;
         const V away = F(1) - place;
         return value * away * away * F({0.5 / SCALE});
     }}
 }};
 """
-PHASES = """
-struct Phase {
-    // p of E2 without a peak, and its derivative by g.
-    INLINE V plain(V cosine, F g) {
-        const V square = F(1 + g * g) - F(2 * g) * cosine;
-        return F(1 - g * g) / (square * P::root(square));
-    }
-    INLINE V plain_by_g(V cosine, F g) {
-        const V square = F(1 + g * g) - F(2 * g) * cosine;
-        const V p = F(1 - g * g) / (square * P::root(square));
-        return F(-2 * g) / (square * P::root(square)) - F(3) * p * (g - cosine) / square;
-    }
-    // p of E13 on a way of peak `depth` (E15, E16), at least 0; and its derivatives.
-    INLINE V peaked(V depth, V cosine, F g) {
-        V by_depth, by_g;
-        return peaked_slopes(depth, cosine, g, by_depth, by_g);
-    }
-    INLINE V peaked_slopes(V depth, V cosine, F g, V& by_depth, V& by_g) {
-        const V turned = Decay::phi(depth), within = Decay::phi(g * depth);
-        const V turned_rate = Decay::phi_slope(depth, turned) / turned;
-        const V within_rate = Decay::phi_slope(g * depth, within) / within;
-        // h and its derivatives.
-        const V part = P::decay((F(1) - g) * depth) * within / turned;
-        const V h = g * part;
-        const V h_by_depth = h * ((g - F(1)) + g * within_rate - turned_rate);
-        const V h_by_g = part + h * depth * (F(1) + within_rate);
-        // q_h of E16.
-        const V away = h - F(2) * cosine;
-        const V r = P::root(F(1) + h * away);
-        const V inverse = F(1) / (r * r * r * (r + F(1)) * (r + F(1)));
-        const V curved = (F(1) + r * (F(2) + r * (F(3) + F(1.5) * r))) * inverse;
-        const V curved_by_r = (F(2) + r * (F(6) + F(4.5) * r)) * inverse
-                            - curved * (F(3) / r + F(2) / (r + F(1)));
-        const V least = F(1) - h * h;
-        const V peak = F(3) * cosine - F(1.5) + F(1.5) * h * away + least * away * away * curved;
-        const V bends = away + h;
-        const V peak_by_h = F(1.5) * bends + F(2) * away * (least - h * away) * curved
-                          + least * away * away * curved_by_r * bends / (F(2) * r);
-        // What scatters without its peak, and the peak.
-        const V rest = F(1 - g * g) + F(3 * g * (1 - g)) * cosine;
-        const V value = rest + g * g * turned * peak;
-        const V none = P::all(F(0));
-        const V by_h = F(g * g) * turned * peak_by_h;
-        by_depth = P::pick(
-            value > none, F(g * g) * turned * turned_rate * peak + by_h * h_by_depth, none);
-        by_g = P::pick(
-            value > none,
-            F(-2 * g) + F(3 - 6 * g) * cosine + F(2 * g) * turned * peak + by_h * h_by_g, none);
-        return P::most(value, none);
-    }
-};
-struct Point {
+POINTS = f"""
+constexpr int STEPS = {STEPS};
+struct Point {{
     // Light from a point whose foot is at -`foot` on a ray, `across` the square of its distance.
-    INLINE V cosine(V foot, V across, V t) {
-        const V along = foot + t;
-        return -along / P::root(across + along * along);
-    }
+    // Its angle lies between two of the table of p: the first of four rows, and what they count.
+    int row[LANES];
+    V weights[4];
+    INLINE Point at(V foot, V across, V t) {{
+        Point point;
+        const V apart = P::root(across), away = -(foot + t);
+        V u;
+        for (int l = 0; l < LANES; ++l) {{
+            const F place = wp::atan2(P::lane(apart, l), P::lane(away, l)) * F({STEPS / math.pi!r});
+            int first = (int)place;
+            first = first < 0 ? 0 : (first > STEPS - 1 ? STEPS - 1 : first);
+            point.row[l] = 2 * first;
+            P::put(u, l, place - F(first));
+        }}
+        const V rest = F(1) - u, h = P::all(F({math.pi / STEPS!r}));
+        point.weights[0] = (F(1) + u + u) * rest * rest;
+        point.weights[1] = h * u * rest * rest;
+        point.weights[2] = (F(1) + rest + rest) * u * u;
+        point.weights[3] = -h * rest * u * u;
+        return point;
+    }}
+    // The coefficients of p over the depth of the peak; `table` is that of the color.
+    INLINE void curve(const Point& point, const F* table, V* out) {{
+        for (int l = 0; l < LANES; ++l) {{
+            const F* const rows = table + (long long)point.row[l] * TERMS;
+            F lane[4];
+            for (int j = 0; j < 4; ++j) lane[j] = P::lane(point.weights[j], l);
+            for (int k = 0; k < TERMS; ++k)
+                P::put(out[k], l, lane[0] * rows[k] + lane[1] * rows[TERMS + k]
+                    + lane[2] * rows[2 * TERMS + k] + lane[3] * rows[3 * TERMS + k]);
+        }}
+    }}
+    // What bars of these are for the table.
+    INLINE void spread(const Point& point, F* table_bar, const V* bar) {{
+        for (int l = 0; l < LANES; ++l)
+            for (int j = 0; j < 4; ++j)
+                for (int k = 0; k < TERMS; ++k) {{
+                    F* const at = table_bar + (long long)(point.row[l] + j) * TERMS + k;
+                    const F more = P::lane(point.weights[j], l) * P::lane(bar[k], l);
+#if defined(__CUDA_ARCH__)
+                    atomicAdd(at, more);
+#else
+                    *at += more;
+#endif
+                }}
+    }}
     // The integral of 1 / r^2: the angle that the way subtends over the distance.
-    INLINE V subtended(V foot, V across, V t0, V t1) {
+    INLINE V subtended(V foot, V across, V t0, V t1) {{
         const V apart = P::root(across);
         const V opposite = apart * (t1 - t0), adjacent = across + (foot + t0) * (foot + t1);
         V angle = P::all(F(0));
         for (int l = 0; l < LANES; ++l)
             P::put(angle, l, wp::atan2(P::lane(opposite, l), P::lane(adjacent, l)));
         return angle / apart;
-    }
-};
+    }}
+}};
 """

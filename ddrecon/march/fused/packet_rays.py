@@ -10,10 +10,11 @@ from ddrecon.kernels.packets import packet_program
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
-from ddrecon.march.fused.packet_optics import DECAYS, PHASES, POLYNOMIALS
+from ddrecon.march.fused.packet_optics import DECAYS, POINTS, POLYNOMIALS
+from ddrecon.numerics.angle_table import STEPS
 
 GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers; int *slices;
+F *planes, *rays, *angles, *coefficients, *numbers, *table; int *slices;
 int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride;
 """
 """As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells."""
@@ -21,7 +22,7 @@ int ray_count, node_count, rows, columns, plane_stride, row_stride, column_strid
 _RECORDS = """
 struct Ray {
     V o0, o1, o2, d0, d1, d2, near, far;
-    V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * COEFFICIENTS + 1];
+    V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * PHASES * COEFFICIENTS + 1];
 };
 // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at
 // and `t` held in the box; values; emission, depth, exp(-depth), and p.
@@ -40,7 +41,7 @@ _BEGIN = """
 const int last = ray_count - 1, begin = item * LANES;
 const F* scale = numbers;
 const F* peaks = numbers + C;
-const F g = numbers[2 * C], bound = numbers[2 * C + 1];
+const F bound = numbers[2 * C];
 Ray ray;
 ray.o0 = P::load(rays, begin, 8, last);
 ray.o1 = P::load(rays + 1, begin, 8, last);
@@ -55,7 +56,7 @@ for (int b = 0; b < BEAMS; ++b) {
     ray.across[b] = P::load(angles + (BEAMS + b) * (last + 1), begin, 1, last);
 }
 if (HAS_PEAK)
-    for (int k = 0; k < BEAMS * COEFFICIENTS; ++k)
+    for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k)
         ray.coefficients[k] = P::load(coefficients + k * (last + 1), begin, 1, last);
 auto distance = [&](int n) -> V { return (planes[n] - ray.o0) / ray.d0; };
 // Nodes before the box and behind it are held at its faces: between them nothing is added.
@@ -165,6 +166,13 @@ auto locate = [&](int n, Node& node) {
 auto peak_of = [&](const Node& node, int c) -> V {
     return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
 };
+auto first_of = [&](int b, int c) -> int { return (b * PHASES + c * PHASE_STEP) * COEFFICIENTS; };
+// Of p of beam b in color c: coefficients over the depth of the peak, in `own` where at a point.
+auto curve_of = [&](int b, int c, const Point& point, V* own) -> const V* {
+    if (!IS_POINT[b]) return ray.coefficients + first_of(b, c);
+    if (c == 0 || PHASE_STEP) Point::curve(point, table + c * PHASE_STEP * TABLE_STEP, own);
+    return own;
+};
 // All else at node n: all outputs' emission, depth and p behind the mass `m`.
 auto emit = [&](int n, Node& node, const W* m) {
     sample(node, n, EXTINCTION, FIRST_OWN_SCATTERING);
@@ -174,22 +182,26 @@ auto emit = [&](int n, Node& node, const W* m) {
         node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
     }
     for (int c = 0; c < C; ++c) {
-        const V mass = P::narrow(m[c * MASS_STEP]);
         const V scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
         node.w[c] = scattering * node.v[FIRST_DIFFUSE + c * DIFFUSE_STEP];
-        node.u[c] = scale[c] * mass;
-        for (int b = 0; b < BEAMS; ++b) {
+        node.u[c] = scale[c] * P::narrow(m[c * MASS_STEP]);
+    }
+    for (int b = 0; b < BEAMS; ++b) {
+        V own[TERMS];
+        Point point;
+        if (IS_POINT[b]) point = Point::at(ray.foot[b], ray.across[b], node.t);
+        for (int c = 0; c < C; ++c) {
             const int i = C + b * C + c;
+            const V mass = P::narrow(m[c * MASS_STEP]);
+            const V scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
             const V way = mass + node.v[FIRST_MASS + b * EXTINCTION + c * MASS_STEP];
             V p = P::all(F(1));
-            if (IS_POINT[b]) {
-                const V cosine = Point::cosine(ray.foot[b], ray.across[b], node.t);
-                p = HAS_PEAK ? Phase::peaked(peak_of(node, c) * way, cosine, g)
-                             : Phase::plain(cosine, g);
-            } else if (HAS_PEAK) {
-                const V* polynomial = ray.coefficients + b * COEFFICIENTS;
+            if (HAS_PEAK) {
                 const V place = Polynomial::place(peak_of(node, c) * way);
-                p = P::most(Polynomial::at(polynomial, place), P::all(F(0)));
+                p = Polynomial::at(curve_of(b, c, point, own), place);
+                p = P::most(p, P::all(F(0)));
+            } else if (IS_POINT[b]) {
+                p = curve_of(b, c, point, own)[0];
             }
             node.p[i] = p;
             node.w[i] = scattering * p;
@@ -213,7 +225,7 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 
 def packet_kernel(name: str, layout: Layout, walk: str, given: str) -> TextKernel:
     """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`."""
-    structs = PLACES + RUNS + ROWS + VALUES + DECAYS + POLYNOMIALS + PHASES + _RECORDS
+    structs = PLACES + RUNS + ROWS + VALUES + DECAYS + POLYNOMIALS + POINTS + _RECORDS
     text = _constants(layout) + structs + _BEGIN + walk
     declared = f"{GIVEN} F *fields[{layout.channels}]; {given}"
     return TextKernel(name, layout.bits, text, declared, packet_program)
@@ -239,6 +251,10 @@ def _constants(layout: Layout) -> str:
         "FIRST_OWN_SCATTERING": layout.first_scattering,
         "FIRST_PEAK": layout.first_peak,
         "PEAK_STEP": layout.peak_step,
+        "PHASES": layout.phases,
+        "PHASE_STEP": layout.phase_step,
+        "TERMS": layout.terms,
+        "TABLE_STEP": 2 * (STEPS + 1) * layout.terms,
         "HAS_PEAK": int(layout.peak is not None),
         "IS_PEAK_FIELD": int(bool(layout.peak)),
     }

@@ -53,8 +53,8 @@ _TRANSPOSE = """
 const V none = P::all(F(0));
 V inside = none;
 for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
-V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], g_bar = none, bound_bar = none;
-V polynomial_bar[BEAMS * COEFFICIENTS + 1];
+V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], bound_bar = none;
+V polynomial_bar[BEAMS * PHASES * COEFFICIENTS + 1];
 const bool varies_polynomials = polynomials_bar;
 for (int i = 0; i < OUT; ++i)
     bar[i] = inside * P::load(out_bar + (long long)i * (last + 1), begin, 1, last);
@@ -65,7 +65,7 @@ for (int k = 0; k < EXTINCTION; ++k) {
     m[k] = P::load_wide(masses + row, begin, last);
 }
 for (int c = 0; c < C; ++c) scale_bar[c] = peak_bar[c] = none;
-for (int k = 0; k < BEAMS * COEFFICIENTS; ++k) polynomial_bar[k] = none;
+for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k) polynomial_bar[k] = none;
 // What node b emits, and its values go back to the cells. Its mass is that behind it, `m_b`.
 auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_bar, const V* u_bar,
                   V* m_bar) {
@@ -77,7 +77,15 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
         v_bar[d] += w_bar[c] * scattering;
         m_bar[k] += u_bar[c] * scale[c];
         scale_bar[c] += u_bar[c] * mass;
-        for (int b = 0; b < BEAMS; ++b) {
+    }
+    for (int b = 0; b < BEAMS; ++b) {
+        V own[TERMS];
+        Point point;
+        if (IS_POINT[b] && !node.is_empty)
+            point = Point::at(ray.foot[b], ray.across[b], node.t);
+        for (int c = 0; c < C; ++c) {
+            const int k = c * MASS_STEP, s = FIRST_SCATTERING + c * SCATTERING_STEP;
+            const V mass = P::narrow(m_b[k]), scattering = node.v[s];
             const int i = C + b * C + c, j = FIRST_MASS + b * EXTINCTION + k;
             const V way = mass + node.v[j];
             V way_bar = u_bar[i] * scale[c];
@@ -85,27 +93,22 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
             v_bar[s] += w_bar[i] * node.p[i];
             const V p_bar = w_bar[i] * scattering;
             V depth_bar = none;
-            if (node.is_empty) {
-                // What scatters nothing has no phase function to vary.
-            } else if (IS_POINT[b]) {
-                const V cosine = Point::cosine(ray.foot[b], ray.across[b], node.t);
-                if (HAS_PEAK) {
-                    V by_depth, by_g;
-                    Phase::peaked_slopes(peak_of(node, c) * way, cosine, g, by_depth, by_g);
-                    depth_bar = p_bar * by_depth;
-                    g_bar += p_bar * by_g;
-                } else {
-                    g_bar += p_bar * Phase::plain_by_g(cosine, g);
+            // What scatters nothing has no phase function to vary.
+            if ((HAS_PEAK || IS_POINT[b]) && !node.is_empty) {
+                const V place = Polynomial::place(HAS_PEAK ? peak_of(node, c) * way : none);
+                V power = HAS_PEAK ? P::pick(node.p[i] > none, p_bar, none) : p_bar;
+                if (HAS_PEAK)
+                    depth_bar = power * Polynomial::slope(curve_of(b, c, point, own), place);
+                V powers[TERMS];
+                for (int k = 0; k < TERMS; ++k) {
+                    powers[k] = power;
+                    power *= place;
                 }
-            } else if (HAS_PEAK) {
-                const V place = Polynomial::place(peak_of(node, c) * way);
-                V power = P::pick(node.p[i] > none, p_bar, none);
-                depth_bar = power * Polynomial::slope(ray.coefficients + b * COEFFICIENTS, place);
-                if (varies_polynomials)
-                    for (int k = 0; k < COEFFICIENTS; ++k) {
-                        polynomial_bar[b * COEFFICIENTS + k] += power;
-                        power *= place;
-                    }
+                if (IS_POINT[b] && table_bar)
+                    Point::spread(point, table_bar + c * PHASE_STEP * TABLE_STEP, powers);
+                if (!IS_POINT[b] && varies_polynomials)
+                    for (int k = 0; k < TERMS; ++k)
+                        polynomial_bar[first_of(b, c) + k] += powers[k];
             }
             if (HAS_PEAK) {
                 way_bar += depth_bar * peak_of(node, c);
@@ -183,10 +186,9 @@ for (int c = 0; c < C; ++c) {
     numbers_bar[c * packets + item] = P::sum(scale_bar[c]);
     numbers_bar[(C + c) * packets + item] = P::sum(peak_bar[c]);
 }
-numbers_bar[2 * C * packets + item] = P::sum(g_bar);
-numbers_bar[(2 * C + 1) * packets + item] = P::sum(bound_bar);
+numbers_bar[2 * C * packets + item] = P::sum(bound_bar);
 if (varies_polynomials)
-    for (int k = 0; k < BEAMS * COEFFICIENTS; ++k)
+    for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
             polynomials_bar[(long long)k * (last + 1) + begin + l] =
                 P::lane(polynomial_bar[k], l);
@@ -204,10 +206,10 @@ def packet_adjoint_kernel(layout: Layout) -> TextKernel:
     """The kernel that adds to `bars`, of `fields`, what bars of outputs and masses are for them.
 
     These are left out where none are asked for. Each packet has its own `numbers_bar`
-    [2 C + 2, packets]; `polynomials_bar` [10 beams, R] may be left out.
+    [2 C + 1, packets]; `polynomials_bar` and `table_bar`, as what they are of, may be left out.
     """
     given = f"""
     double *masses, *numbers_bar; int packets;
-    F *out_bar, *masses_bar, *polynomials_bar, *bars[{layout.channels}]
+    F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *bars[{layout.channels}]
     """
     return packet_kernel("transpose", layout, SPREAD + _TRANSPOSE, given)

@@ -29,6 +29,8 @@ def vectors(layout: Layout) -> SimpleNamespace:
         PerBeam=vector(len(layout.beams)),
         Bent=vector(layout.masses),
         Triple=vector(3),
+        Curve=vector(layout.terms),
+        Weights=vector(4),
         Total=wp.types.vector(length=layout.extinction, dtype=wp.float64),
     )
 
@@ -44,8 +46,9 @@ def ray_types(layout: Layout) -> SimpleNamespace:
 
         `planes` [N]: nodes, across the slices [u] or as parts of the way from near to far; `cells`
         [n, h, w, channels]; `angles` [2 beams, R]: the cosine to directional light, or the foot of
-        a point light, then its square distance; `coefficients` [10 beams, R]: the polynomial of
-        E13; `numbers`: scale and peak by color, g, bound of third-order corrections.
+        a point light, then its square distance; `coefficients` [beams * phases * COEFFICIENTS, R]:
+        the polynomials of E13; `numbers`: scale and peak by color, bound of third-order
+        corrections; `table` [phases * (steps + 1) * 2, terms]: those of point lights by angle.
         """
 
         planes: wp.array(dtype=t.F)
@@ -54,6 +57,7 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         angles: wp.array2d(dtype=t.F)
         coefficients: wp.array2d(dtype=t.F)
         numbers: wp.array(dtype=t.F)
+        table: wp.array2d(dtype=t.F)
 
     @wp.struct
     class Ray:
@@ -68,7 +72,6 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         across: t.PerBeam
         scale: t.Color
         peak: t.Color
-        g: t.F
         bound: t.F
 
     @wp.struct
@@ -113,8 +116,7 @@ def loading(layout: Layout) -> Any:
         for c in range(wp.static(layout.colors)):
             ray.scale[c] = given.numbers[c]
             ray.peak[c] = given.numbers[wp.static(layout.colors) + c]
-        ray.g = given.numbers[wp.static(2 * layout.colors)]
-        ray.bound = given.numbers[wp.static(2 * layout.colors + 1)]
+        ray.bound = given.numbers[wp.static(2 * layout.colors)]
         return ray
 
     return load_ray

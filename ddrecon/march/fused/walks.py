@@ -40,7 +40,7 @@ def integral_kernel(layout: Layout) -> Any:
             # The mass passed on the way to it, and what it emits behind that.
             if n > 0:
                 m = passed.add_mass(m, before.v, here.v, here.held - before.held)
-            here = emit(ray, here, passed.mass_of(m), given.coefficients)
+            here = emit(ray, here, passed.mass_of(m), given)
             # E2, E3: what arrives from the segment between both.
             if n > 0:
                 total += arrive(ray, before, here)
@@ -84,17 +84,8 @@ def tangent_kernel(layout: Layout, is_sliced: bool) -> Any:
                     denser = (d_before.v[k] + d_here.v[k]) * (here.held - before.held)
                     d_m[k] = d_m[k] + t.F(0.5) * (denser + longer)
                 m = passed.add_mass(m, before.v, here.v, here.held - before.held)
-            here = emit(ray, here, passed.mass_of(m), given.coefficients)
-            d_here = emit_tangent(
-                ray,
-                here,
-                passed.mass_of(m),
-                given.coefficients,
-                d_ray,
-                d_here,
-                d_m,
-                d_given.coefficients,
-            )
+            here = emit(ray, here, passed.mass_of(m), given)
+            d_here = emit_tangent(ray, here, passed.mass_of(m), given, d_ray, d_here, d_m, d_given)
             if n > 0:
                 total += arrive_tangent(ray, before, here, d_ray, d_before, d_here)
             before = here

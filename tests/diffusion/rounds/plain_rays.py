@@ -90,9 +90,10 @@ def share_by_loops(medium: Medium, degree: int) -> Tensor:
         axis, step = fastest_axis(medium.grid, w)
         if medium.grid.shape[axis] > 1:
             length, weights = length + weight * step, weights + weight
+    backward = 1 + 2 * min(float(medium.mean_cosine), 0.0) ** 2
     share = torch.ones_like(medium.extinction.value)
     for cell, extinction in enumerate(medium.extinction.value.flatten().tolist()):
-        half = 0.5 * extinction * length / max(weights, 1e-9)
+        half = 0.5 * backward * extinction * length / max(weights, 1e-9)
         rho = half / math.tanh(half) - 1 if half > 1e-3 else 0.0
         share.view(-1)[cell] = 1 / (1 + rho**2)
     return share
@@ -106,10 +107,8 @@ def remaining_by_formula(g: float, degree: int) -> list[float]:
 
 def factors_by_formula(g: float, rounds: int) -> list[float]:
     """1 / (1 - nu) at Chebyshev's nodes nu (E19)."""
-    _, _, second, third = remaining_by_formula(g, 3)
-    high, low = 0.9 * second, 0.9 * min(third, 0.0)
-    nodes = [math.cos((k + 0.5) * math.pi / rounds) for k in range(rounds)]
-    return [1 / (1 - ((low + high) / 2 + (high - low) / 2 * node)) for node in nodes]
+    bound = 0.9 * remaining_by_formula(g, 3)[2]
+    return [1 / (1 - bound * math.cos((k + 0.5) * math.pi / rounds)) for k in range(rounds)]
 
 
 def round_by_loops(problem: DiffusionProblem, light: Moments, g: float, degree: int) -> Moments:

@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.share import ROW_SUM, SHARE, SHARE_SLOPE, numbers_by_color
+from ddrecon.diffusion.rounds.fused.share import SHARE, SHARE_SLOPE, numbers_by_color
 from ddrecon.grid import Grid
+from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
@@ -118,7 +119,7 @@ def blend_fused(
     gain: Moments,
     swept: Tensor,
     factor: Tensor,
-    length: float,
+    length: Tensor,
 ) -> Moments:
     """From `light` to `diffuse` plus `gain`, and of what is higher to theta `swept`, by `factor`.
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.fused.cells import COLLECT_CELL, FOLLOW_CELL, GIVEN, RETURN_CELL
 from ddrecon.diffusion.rounds.fused.schedule import POINTS, Step, steps_of
 from ddrecon.diffusion.rounds.fused.share import constants
-from ddrecon.diffusion.rounds.fused.swept import Swept
+from ddrecon.diffusion.rounds.fused.swept import Parts, Swept, moment_of, units_of_parts
 from ddrecon.kernels.text import TextKernel
 from ddrecon.numerics.harmonics import harmonics
 
@@ -27,7 +27,8 @@ class Cells:
 
     def __init__(self, swept: Swept):
         self.swept, self.like = swept, swept.total()
-        _, self.colors, *self.shape = self.like.shape
+        count, self.colors, *self.shape = self.like.shape
+        self.units = units_of_parts(round(count**0.5) - 1)[:count, None]
         self.kernels = functools.partial(
             cell_kernels, torch.finfo(self.like.dtype).bits, swept.scattering is None
         )
@@ -37,21 +38,28 @@ class Cells:
         found = torch.zeros_like(self.like)
         for steps, values, weights in self._parts(arrays=2):
             light = self._follow(steps, values)["light"]
-            found += torch.tensordot((values * weights).to(light), light, 1)
+            weighted = self.units * values * weights
+            found += torch.tensordot(weighted.to(light), light, 1)
             found[0] += float(weights.sum()) * self.swept.scales[2].view(-1, 1, 1, 1)
         return found
 
-    def transpose(self, bars: Tensor, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of moments."""
+    def transpose(self, bars: Parts, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light."""
         swept, (_, back, collect) = self.swept, self.kernels(varies_numbers)
         fields = [
             torch.zeros_like(f) for f in (swept.extinction, swept.scattering) if f is not None
         ]
+        given_bars = torch.zeros_like(self.like)
+        for k, total in enumerate(given_bars):
+            if (bar := moment_of(bars, k)) is not None:
+                total += bar
         found, scales = torch.zeros_like(self.like), torch.zeros_like(swept.scales)
         for steps, values, weights in self._parts(arrays=10):
             given = self._follow(steps, values)
             light = given["light"]
-            given["bar"] = torch.tensordot((values * weights).T.to(bars), bars, 1)
+            given["bar"] = torch.tensordot(
+                (self.units * values * weights).T.to(light), given_bars, 1
+            )
             names = BARS[: 2 + len(fields)] + NUMBER_BARS * varies_numbers
             given |= {name: torch.empty_like(light) for name in names}
             for number in reversed(range(max(self.shape))):

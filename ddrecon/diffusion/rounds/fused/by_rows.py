@@ -6,8 +6,9 @@ other has found. So both ways share one sum, and no moment is read but to be add
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -15,15 +16,16 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.kernels import follow_kernel, return_kernel
 from ddrecon.diffusion.rounds.fused.rows import MARGIN, POINTERS
-from ddrecon.diffusion.rounds.fused.schedule import Tables, make_tables
+from ddrecon.diffusion.rounds.fused.schedule import make_tables
 from ddrecon.diffusion.rounds.fused.surroundings import surround
-from ddrecon.diffusion.rounds.fused.swept import Swept
-from ddrecon.kernels.launch import thread_count
+from ddrecon.diffusion.rounds.fused.swept import Parts, Swept, moment_of
 from ddrecon.kernels.spare import borrow, give_back
 from ddrecon.kernels.text import TextKernel
 
-FOLLOWED, KEPT = 16, 8
-"""Directions at most that go through the cells together, if lines of few or of all are kept."""
+MOST = 16
+"""Directions at most that go through the cells together."""
+SLAB = 8
+"""Slices at most of which all lines are kept for the adjoint."""
 
 
 @dataclass(frozen=True)
@@ -46,42 +48,50 @@ class Job:
 class Rows:
     """The arrays of a sweep on a processor, and the launches of kernels on them."""
 
-    def __init__(self, swept: Swept, is_kept: bool):
+    def __init__(self, swept: Swept, threads: int):
         self.swept, self.like = swept, swept.like
         self.count, self.colors = swept.factors.shape[1:]
         self.depth, self.height, self.width = self.like.shape[1:]
-        # Moments lie in memory of their own; 0 is the address of none.
-        self.moments = [
-            one if one is None else one.contiguous() for pair in swept.moments for one in pair
-        ]
-        addresses = [0 if one is None else one.data_ptr() for one in self.moments]
-        self.addresses = torch.tensor(addresses, dtype=torch.int64)
+        self.held: list[Tensor] = []
         self.bits = torch.finfo(self.like.dtype).bits
         self.pitch = -(-(self.width + 2) // MARGIN) * MARGIN
-        threads = thread_count(self.like)
         # Two threads do a color; more than all colors need share its directions.
         self.together = max(1, min(threads // 2, self.colors))
         self.pieces = max(1, threads // (2 * self.colors))
         self.threads = threads
         self.lanes = 1 if threads == 1 else 2 * self.together * self.pieces
-        self.tables = self._tables(is_kept)
+        self.tables = make_tables(
+            swept.grid, swept.directions, self.count, MOST, self.pieces, self.like.dtype
+        )
+        self.slabs = max(len(self._slabs(way, (0, self.depth))) for way in (0, 1))
         fields = [f for f in (swept.extinction, swept.scattering) if f is not None]
         self.fields, self.ranges = surround(fields, self.pitch)
         self.channels = [len(field) for field in fields]
 
-    def follow(self) -> Tensor:
-        """The moments of radiance [K, C, z, y, x]."""
+    def follow(self, is_saved: bool) -> tuple[Tensor, Tensor | None]:
+        """The moments of radiance [K, C, z, y, x]; and what `transpose` needs, if it `is_saved`.
+
+        That is I before slabs of slices, [C, directions, slabs, y, x].
+        """
         sums = self._sums()
+        shape = self.colors, self.swept.directions, self.slabs, self.height, self.width
+        saved = self.like.new_empty(shape) if is_saved else None
         lines = self.like.new_zeros(self._line_count(self.height + 2))
         kernel = follow_kernel(self.bits, self._shares_field, False)
+        values = self._given(lines) | {"found": sums, "saved": saved}
         for jobs in self._launches(is_backward=False):
-            self._launch(kernel, jobs, self._given(lines) | {"found": sums})
-        return sums.sum(0) if len(sums) > 1 else sums[0]
+            self._launch(kernel, jobs, values)
+        return (sums.sum(0) if len(sums) > 1 else sums[0]), saved
 
-    def transpose(self, bars: Tensor, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of moments."""
+    def transpose(
+        self, saved: Tensor, bars: Parts, varies_numbers: bool
+    ) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light.
+
+        `saved`: by `follow`, for as many threads.
+        """
         sums = self._sums()
-        lines = borrow(self._line_count(self.depth * self.height), self.like)
+        lines = borrow(self._line_count((SLAB + 1) * self.height), self.like)
         kinds = 2 + len(self.fields)
         size = kinds * self.tables.most * self.pitch * (self.height + 2) + MARGIN
         shape = self.depth, self.height, self.width
@@ -89,18 +99,19 @@ class Rows:
         fields = [self.like.new_zeros(each, *shape) for each in channels]
         scales = self.like.new_zeros(2 * self.pieces, self.colors, 3, dtype=torch.float64)
         values = self._given(lines) | {
-            "bars": bars.contiguous(), "found": sums, "sums": scales,
+            "bars": self._addresses(moment_of(bars, k) for k in range(self.count)),
+            "saved": saved, "found": sums, "sums": scales,
             "returning": self.like.new_zeros(self.lanes * size),
             "e_bar": fields[0], "sc_bar": fields[-1],
         }  # fmt: skip
         keep = follow_kernel(self.bits, self._shares_field, True)
         back = return_kernel(self.bits, self._shares_field, varies_numbers)
         for jobs in self._launches(is_backward=True):
-            # Lines are kept for both halves of the slices.
-            if jobs[0].slices[1] == self.depth:
-                whole = [replace(job, slices=(0, self.depth)) for job in jobs]
-                self._launch(keep, whole, values)
-            self._launch(back, jobs, values)
+            for slabs in zip_longest(*(self._slabs(job.way, job.slices) for job in jobs)):
+                pairs = zip(jobs, slabs, strict=True)
+                part = [replace(job, slices=slab) for job, slab in pairs if slab is not None]
+                self._launch(keep, part, values)
+                self._launch(back, part, values)
         give_back(lines)
         found = sums.sum(0) if len(sums) > 1 else sums[0]
         of_fields = [
@@ -112,13 +123,6 @@ class Rows:
     @property
     def _shares_field(self) -> bool:
         return self.swept.scattering is None
-
-    def _tables(self, is_kept: bool) -> Tables:
-        swept = self.swept
-        most = max(KEPT, self.count // 2) if is_kept else FOLLOWED
-        return make_tables(
-            swept.grid, swept.directions, self.count, most, self.pieces, self.like.dtype
-        )
 
     def _line_count(self, places: int) -> int:
         return self.lanes * (2 * self.tables.most * self.pitch * places + MARGIN)
@@ -132,12 +136,20 @@ class Rows:
         shape = self.pieces, self.count, *self.like.shape
         return self.like.new_empty(shape) if self.pieces == 1 else self.like.new_zeros(shape)
 
+    def _addresses(self, moments: Iterable[Tensor | None]) -> Tensor:
+        """Where each of `moments` lies, in memory of its own; 0 for none."""
+        held = [one if one is None else one.contiguous() for one in moments]
+        self.held += [one for one in held if one is not None]
+        return torch.tensor([0 if one is None else one.data_ptr() for one in held])
+
     def _given(self, lines: Tensor) -> dict[str, Any]:
         """What all kernels are given, by its names; `found`, `jobs` and cotangents are missing."""
         tables, like = self.tables, self.like
         scratch_rows = 3 * POINTERS + 5 + tables.most
         return {
-            "addresses": self.addresses, "factors": self.swept.factors.contiguous(),
+            "moments": self._addresses(one for pair in self.swept.moments for one in pair),
+            "factors": self.swept.factors, "slab": SLAB, "slabs": self.slabs,
+            "directions": self.swept.directions,
             "extinction": self.fields[0],
             "scattering": self.fields[-1], "scales": self.swept.scales, "parts": tables.parts,
             "matrices": tables.matrices, "lines": lines, "ranges": self.ranges,
@@ -179,9 +191,20 @@ class Rows:
         """From and to which slice, as `way` counts them, a job goes in one of two phases."""
         if self.lanes == 1:
             return 0, self.depth
-        # Slices below the middle come first on the way up.
-        middle = self.depth - self.depth // 2 if way else self.depth // 2
-        return (0, middle) if (phase == 0) != is_backward else (middle, self.depth)
+        is_first = (phase == 0) != is_backward
+        return (0, self._middle(way)) if is_first else (self._middle(way), self.depth)
+
+    def _middle(self, way: int) -> int:
+        """How many slices there are before those that light on the other way comes to first."""
+        return self.depth - self.depth // 2 if way else self.depth // 2
+
+    def _slabs(self, way: int, slices: tuple[int, int]) -> list[tuple[int, int]]:
+        """The slabs within `slices`, the last one first. They begin anew in the middle."""
+        middle, found = self._middle(way), []
+        for first, last in ((0, middle), (middle, self.depth)):
+            if slices[0] <= first and last <= slices[1]:
+                found += [(s, min(s + SLAB, last)) for s in range(first, last, SLAB)]
+        return found[::-1]
 
     def _launch(self, kernel: TextKernel, jobs: list[Job], values: dict[str, Any]) -> None:
         rows = [self._row(job) for job in jobs]
@@ -199,4 +222,4 @@ class Rows:
             bars.append(job.piece * self._bar_channels(channels) + own)
         way = -1 if job.way else 1
         numbers = [job.color, way, *job.groups, *job.slices, int(job.is_adding), job.lane]
-        return [*numbers, sums, *bars, job.piece]
+        return [*numbers, sums, *bars, job.piece, self._middle(job.way)]

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.share import (
-    ROW_SUM,
     SHARE,
     SHARE_SLOPE,
     constants,
     numbers_by_color,
 )
 from ddrecon.grid import Grid
+from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
@@ -118,7 +118,7 @@ def gain_fused(
     diffuse: Moments,
     imbalance: Tensor | None,
     cosine: Tensor,
-    length: float,
+    length: Tensor,
 ) -> tuple[Moments, Tensor, Vector | None]:
     """theta (`swept` - `diffuse`), what diffusion receives of it, and by how much flux is turned.
 
@@ -128,6 +128,7 @@ def gain_fused(
     """
     strength = (1 - medium.forward_fraction) * medium.scattering.scale
     numbers = numbers_by_color(medium, length, [strength, cosine])
+    numbers = numbers.expand(-1, len(swept.mean))
     shares_field = medium.scattering.field is medium.extinction.field
     source, mean, *flux = _Gain.apply(
         medium.grid,

@@ -1,6 +1,6 @@
 """Rows of cells along which radiance is followed backward: the adjoint of `rows.py`, in C++.
 
-`rows.FOLLOW` kept what scatters and I of all slices. Of a row and a direction there are these lines
+`rows.FOLLOW` kept what scatters and I of all slices of a slab. Of a row and a direction there are these lines
 of the last slice, which is the next one that light crosses:
 
     RETURNING            exp(-depth) source_bar, which goes to the cells where the step began
@@ -42,7 +42,7 @@ RETURN = (
     + """
 enum { NEAR, LIGHT };
 enum { RETURNING, FAR, MASS, SCATTERED };
-const long long stride = 2LL * most * pitch, places = (long long)depth * height;
+const long long stride = 2LL * most * pitch, places = (slab + 1LL) * height;
 const int kinds = SHARES_FIELD ? 3 : 4;
 const long long back_stride = (long long)kinds * most * pitch;
 const F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
@@ -61,7 +61,7 @@ for (int t = height - 1; t >= 0; --t) {
     const int r = y_way > 0 ? t : height - 1 - t;
     const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
     auto line = [&](int slice, int turn, int which, int j) -> const F* {
-        const long long place = (long long)slice * height + turn;
+        const long long place = (slice - slice_from + 1LL) * height + turn;
         return own_lines + place * stride + (2 * (before + j) + which) * (long long)pitch;
     };
     auto back = [&](int slice, int turn, int which, int j) -> F* {
@@ -72,8 +72,11 @@ for (int t = height - 1; t >= 0; --t) {
     auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
     auto read = [&](int k, F* row, int from, int to) {
-        const F* moment = bars + k * all + color * cells + at;
-        INDEPENDENT
+        if (!bars[k]) {
+            for (int c = from; c < to; ++c) row[c] = F(0);
+            return;
+        }
+        const F* moment = (const F*)bars[k] + color * cells + at;
         for (int c = from; c < to; ++c) row[c] = moment[c];
         ask_for(moment, from, to);
     };

@@ -5,7 +5,8 @@ through the rows, t counting them in the way of a group of directions. A step be
 to four cells, which lie in this slice or the one before, in this row or the one before: wherever a
 direction goes, they were done already. Of a row and a direction there are two lines of numbers:
 `NEAR`, what scatters along it, and `LIGHT`, I less the light from outside. Lines of the last slice
-are kept, each in the place of one that no step needs any more; or, for the adjoint, of all slices.
+are kept, each in the place of one that no step needs any more. I before each slab of slices is
+saved: for the adjoint, light goes through a slab once more, and lines of all its slices are kept.
 
 Behind each row there are at least two cells that hold what is beyond its ends. Where a step meets
 no medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row.
@@ -15,13 +16,14 @@ MARGIN = 16
 """Cells before an array of lines, whose rows begin where vectors do."""
 POINTERS = 64
 """Moments and pairs of a group at most: so many rows are multiplied at once."""
-JOB = 12
+JOB = 13
 """Whole numbers of a job: see `by_rows.py`."""
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
-    F *found, *bars, *returning, *e_bar, *sc_bar; double *sums; long *addresses;
+    F *found, *saved, *returning, *e_bar, *sc_bar; double *sums; long *moments, *bars;
     int *ranges, *jobs, *groups, *points, *pairs, *order;
-    int depth, height, width, pitch, colors, count, even, most, scratch_rows;
+    int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
+    int directions;
     int extinction_channels, scattering_channels
 """
 """What kernels of rows are given; what is not used, is none."""
@@ -42,6 +44,14 @@ const F* sc_cells = scattering + inner + (scattering_channels > 1 ? color * padd
 const F scale = scales[color], strength = scales[colors + color];
 const F inflow = scales[2 * colors + color];
 const F* empty_row = nothing + MARGIN;
+// Slabs of slices begin anew in the middle, where the ways meet; of those but the first I is saved.
+const int middle = job[12];
+auto begins = [&](int s) { return (s < middle ? s : s - middle) % slab == 0; };
+auto save_of = [&](int s, int t, int direction) -> long long {
+    const int before = s < middle ? 0 : (middle + slab - 1) / slab;
+    const long long number = before + (s < middle ? s : s - middle) / slab - 1;
+    return (((color * (long long)directions + direction) * slabs + number) * height + t) * width;
+};
 F* own_scratch = scratch + ((long long)lane * scratch_rows) * pitch;
 auto scratch_row = [&](int i) -> F* { return own_scratch + (long long)i * pitch; };
 struct Empty { enum { value = 1 }; };
@@ -118,7 +128,7 @@ auto ask_for = [&](const F* row, int from, int to) {
 };
 // One of the moments that scatter, from a cell on; those of `bars` and of light follow each other.
 auto read_scattering = [&](long long at, int k, F* row, int from, int to) {
-    const F *light = (const F*)addresses[2 * k], *source = (const F*)addresses[2 * k + 1];
+    const F *light = (const F*)moments[2 * k], *source = (const F*)moments[2 * k + 1];
     const F by_light = light ? factors[k * colors + color] : F(0);
     const F by_source = source ? factors[(count + k) * colors + color] : F(0);
     const F *one = (light ? light : source) + at, *other = (source ? source : light) + at;
@@ -251,9 +261,10 @@ FOLLOW = (
     + """
 enum { NEAR, LIGHT };
 const long long stride = 2LL * most * pitch;
-const long long places = KEEPS ? (long long)depth * height : height + 2;
+const long long places = KEEPS ? (slab + 1LL) * height : height + 2;
 F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
-for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_to; ++g) {"""
+const int slice_before = KEEPS && slice_from > 0 ? slice_from - 1 : slice_from;
+for (int s = slice_before; s < slice_to; ++s) for (int g = group_from; g < group_to; ++g) {"""
     + GROUP
     + "const int ahead = y_way * width;"
     + MULTIPLY
@@ -264,7 +275,7 @@ for (int t = 0; t < height; ++t) {
     const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
     auto line = [&](int slice, int turn, int which, int j) -> F* {
         const long long place = KEEPS
-            ? (long long)slice * height + turn
+            ? (slice - slice_from + 1LL) * height + turn
             : (turn + 2LL * (depth - slice)) % (height + 2);
         return own_lines + place * stride + (2 * (before + j) + which) * (long long)pitch;
     };
@@ -286,7 +297,12 @@ for (int t = 0; t < height; ++t) {
         F *near_row = near_of(j), *__restrict light_row = light_of(j);
         light_row[-1] = light_row[width] = F(0);
         if (x_way > 0) near_row[-1] = near_row[0];
-        else near_row[width] = near_row[width - 1];"""
+        else near_row[width] = near_row[width - 1];
+        if (KEEPS && s < slice_from) {
+            const F* row = saved + save_of(s + 1, t, begin + j);
+            for (int c = 0; c < width; ++c) light_row[c] = row[c];
+            continue;
+        }"""
     + UPSTREAM
     + """
         auto pass = [&](auto points, auto along, auto empty, int from, int to) {
@@ -326,6 +342,10 @@ for (int t = 0; t < height; ++t) {
         }
         else if (point_count == 1) pass_all(One(), Across());
         else pass_all(Four(), Across());
+        if (!KEEPS && saved && s + 1 < depth && begins(s + 1)) {
+            F* row = saved + save_of(s + 1, t, begin + j);
+            for (int c = 0; c < width; ++c) row[c] = light_row[c];
+        }
     }
     if (KEEPS) continue;
     F* found_row = found + job[11] * count * all + color * cells + at;

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Course, Direction
+from ddrecon.diffusion.rounds.fused.swept import units_of_parts
 from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
@@ -213,6 +214,7 @@ class _Maker:
         ways = torch.tensor([unit[0][0].direction for unit in units], dtype=torch.float64)
         values = harmonics(ways, self.degree)[self.order].T
         weighted = values * values.new_tensor([unit[0][1] for unit in units])[:, None]
+        weighted = weighted * units_of_parts(self.degree)[self.order]
         even = len(self.order) - self.odd
         for matrix in (values, weighted):
             parts = matrix[:, :even], matrix[: sum(has_odd), even:]

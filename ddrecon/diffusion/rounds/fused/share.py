@@ -7,8 +7,6 @@ from torch import Tensor
 
 from ddrecon.medium.coefficients import Medium
 
-ROW_SUM = "\n{\n#if defined(__clang__)\n#pragma clang fp reassociate(on)\n#endif\n"
-"""Begins a block whose sums have a free order, or else they would not become vector code."""
 # d is the depth of a mean step, at least LEAST: theta is 1 there, but its formula 0 / 0 in empty
 # cells. rho = d (psi / phi - 1/2).
 SHARE = """
@@ -35,7 +33,7 @@ def constants(**is_so: bool) -> str:
     return "".join(f"const bool {name} = {str(so).lower()};\n" for name, so in is_so.items())
 
 
-def numbers_by_color(medium: Medium, length: float, others: Sequence[Tensor]) -> Tensor:
+def numbers_by_color(medium: Medium, length: Tensor, others: Sequence[Tensor]) -> Tensor:
     """The depth of a step of `length` per unit of extinction's field, then `others`, [N, C]."""
     colors = max(each.numel() for each in (medium.extinction.scale, *others))
     each = medium.extinction.scale * length, *others

@@ -9,11 +9,12 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, parts_of
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, parts_of, split, units_of_parts
+from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once
-from ddrecon.numerics.harmonics import count_harmonics, degrees_of_harmonics
+from ddrecon.numerics.harmonics import degrees_of_harmonics
 
 
 def sweep_fused(
@@ -37,7 +38,7 @@ def sweep_fused(
         [each.reshape(-1).expand(colors) for each in (medium.extinction.scale, strength, entering)]
     )
     shares_field = medium.scattering.field is medium.extinction.field
-    moments: Tensor = _Sweep.apply(
+    mean, *rest = _Sweep.apply(
         source.mean.is_cuda if by_cells is None else by_cells,
         medium.grid,
         directions,
@@ -48,39 +49,45 @@ def sweep_fused(
         *((None,) * PARTS if light is None else parts_of(light, colors)),
         *parts_of(source, colors),
     )
-    return Moments.of_harmonics(moments)
+    z, y, x, higher = (*rest, None)[:4] if rest else (None, None, None, None)
+    return Moments(mean, (z, y, x) if rest else None, higher)
 
 
 def _spread_factors(factors: Tensor, colors: int) -> Tensor:
-    """`factors` [L + 1, 1 or C, 1, 1, 1] of light and those of sources, by harmonic: [2, K, C].
-
-    A flux is sqrt(3) times as large as the moments of degree 1.
-    """
+    """`factors` [L + 1, 1 or C, 1, 1, 1] of light and those of sources, by harmonic: [2, K, C]."""
     degree = len(factors) - 1
     each = factors.reshape(degree + 1, -1).expand(-1, colors)[list(degrees_of_harmonics(degree))]
-    units = each.new_ones(count_harmonics(degree), 1)
-    units[1:4] = 3**-0.5
+    units = (1 / units_of_parts(degree)).to(each)[:, None]
     return torch.stack([each * units, units.expand(-1, colors)])
 
 
 class _Sweep(torch.autograd.Function):
-    """The moments [K, C, z, y, x] of light, and their derivatives by all tensors of `Swept`."""
+    """The parts of light, and their derivatives by all tensors of `Swept`."""
 
     @staticmethod
-    def forward(ctx: Any, by_cells: bool, *given: Any) -> Tensor:
+    def forward(ctx: Any, by_cells: bool, *given: Any) -> tuple[Tensor, ...]:
         grid, directions, *tensors = given
         ctx.by_cells, ctx.of = by_cells, (grid, directions)
         ctx.save_for_backward(*tensors)
-        swept = Swept.of(*given)
-        return Cells(swept).follow() if by_cells else Rows(swept, is_kept=False).follow()
+        swept, is_saved = Swept.of(*given), any(ctx.needs_input_grad)
+        ctx.set_materialize_grads(False)
+        ctx.threads, ctx.saved = thread_count(swept.like), None
+        if by_cells:
+            return split(Cells(swept).follow())
+        moments, ctx.saved = Rows(swept, ctx.threads).follow(is_saved)
+        return split(moments)
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, bars: Tensor) -> tuple[Any, ...]:
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
         _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
-        sweep = Cells(swept) if ctx.by_cells else Rows(swept, is_kept=True)
-        scales_bar, moments_bar, fields = sweep.transpose(bars, needs_scales)
+        parts = *bars, *[None] * (PARTS - len(bars))
+        if ctx.by_cells:
+            found = Cells(swept).transpose(parts, needs_scales)
+        else:
+            found = Rows(swept, ctx.threads).transpose(ctx.saved, parts, needs_scales)
+        scales_bar, moments_bar, fields = found
         extinction_bar, *scattering_bar = fields
         return (
             None,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
+from ddrecon.numerics.harmonics import count_harmonics
 
 Parts = tuple[Tensor | None, ...]
 """The mean of light, its flux along z, y, x, and what is higher; None for what is missing."""
@@ -26,6 +27,29 @@ def parts_of(light: Moments, colors: int) -> Parts:
         part if part is None else part.expand(*part.shape[:-4], colors, *part.shape[-3:])
         for part in parts
     )
+
+
+def units_of_parts(degree: int) -> Tensor:
+    """How many times the moments up to `degree` the parts of light are, [K]: sqrt(3) for a flux."""
+    units = torch.ones(count_harmonics(degree), dtype=torch.float64)
+    units[1:4] = 3**0.5
+    return units
+
+
+def split(moments: Tensor) -> tuple[Tensor, ...]:
+    """The parts of light in `moments` [K, C, z, y, x], which are in units of parts."""
+    if len(moments) == 1:
+        return (moments[0],)
+    first = (moments[_OF_HARMONIC.index(part)] for part in range(PARTS - 1))
+    return (*first, moments[PARTS - 1 :])[: 5 if len(moments) > 4 else 4]
+
+
+def moment_of(parts: Parts, k: int) -> Tensor | None:
+    """The part of light, or of its part of higher moments, that is moment `k`; None for none."""
+    if k < PARTS - 1:
+        return parts[_OF_HARMONIC[k]]
+    higher = parts[PARTS - 1]
+    return None if higher is None else higher[k - 4]
 
 
 @dataclass(frozen=True)
@@ -70,7 +94,7 @@ class Swept:
     def moments(self) -> list[tuple[Tensor | None, Tensor | None]]:
         """The moments [C, z, y, x] of `light` and of `source`, harmonic by harmonic."""
         count = self.factors.shape[1]
-        return [(_moment(self.light, k), _moment(self.source, k)) for k in range(count)]
+        return [(moment_of(self.light, k), moment_of(self.source, k)) for k in range(count)]
 
     def total(self) -> Tensor:
         """The moments of what scatters, [K, C, z, y, x]."""
@@ -87,7 +111,9 @@ class Swept:
         found: list[Tensor | None] = []
         for part, need in zip(range(PARTS), needs, strict=True):
             ks = slice(4, None) if part == PARTS - 1 else _OF_HARMONIC.index(part)
-            found.append(factors[ks] * bar[ks] if need else None)
+            # A source counts as it is, but for the units of its flux.
+            is_itself = which == 1 and part in (0, PARTS - 1)
+            found.append((bar[ks] if is_itself else factors[ks] * bar[ks]) if need else None)
         return found
 
     def factor_bar(self, bar: Tensor) -> Tensor:
@@ -99,10 +125,3 @@ class Swept:
                     terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
                     found[which, k] = torch.stack([torch.dot(*each) for each in terms])
         return found.to(bar.dtype)
-
-
-def _moment(parts: Parts, k: int) -> Tensor | None:
-    if k < PARTS - 1:
-        return parts[_OF_HARMONIC[k]]
-    higher = parts[PARTS - 1]
-    return None if higher is None else higher[k - 4]

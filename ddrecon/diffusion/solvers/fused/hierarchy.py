@@ -100,8 +100,6 @@ class Hierarchy:
 
 def shares_of(cells: int, colors: int, like: Tensor) -> tuple[int, int]:
     """Into how many shares a color's slices are cut, and how many threads work on those of all."""
-    if like.is_cuda:
-        return 32, 1
     threads = thread_count(like) if cells * colors > SMALL else 1
     return threads // math.gcd(threads, colors), threads
 

@@ -1,11 +1,7 @@
 """C++ of a level: where its numbers are, its stencil, and inner products."""
 
 APART = """
-#if defined(__CUDA_ARCH__)
-#define APART
-#else
 #define APART __attribute__((noinline))  // compiled once, however often it is called
-#endif
 """
 VECTORS = "enum { Y, R, D, D_ODD, P, Q, VECTORS };"
 """Solution, residual, directions of even and odd iterations, what the cycle makes, A d."""

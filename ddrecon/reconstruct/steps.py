@@ -1,0 +1,91 @@
+"""How parameters move in an iteration: along their derivatives, or to what is solved for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.losses import Target
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.poses import calibration_prior, pose_curvature, step_pose
+from ddrecon.reconstruct.rates import rate_at
+from ddrecon.reconstruct.responses import step_responses
+from ddrecon.renderer import solve_light
+from ddrecon.scene import Scene, View
+from ddrecon.variables.values import RESPONSE, with_values
+
+
+def step_parameters(
+    parameters: Sequence[Parameter],
+    gradients: Mapping[str, Tensor],
+    iteration: int,
+    iterations: int,
+) -> list[Parameter]:
+    """Moves those of `parameters` that are due along their `gradients`; returns those to be solved.
+
+    `iteration` is one of `iterations`.
+    """
+    solved = []
+    for parameter in parameters:
+        rate = rate_at(iteration, iterations, round(parameter.release * iterations))
+        if rate and parameter.is_fitted:
+            solved.append(parameter)
+        elif rate:
+            parameter.step(gradients[parameter.name], rate)
+    return solved
+
+
+def solve_responses(
+    parameters: Sequence[Parameter],
+    scene: Scene,
+    pictures: Mapping[str, Tensor],
+    targets: Mapping[str, Target],
+) -> None:
+    """Takes the exposures and offsets among `parameters` towards what fits the `pictures` best."""
+    for name, picture in pictures.items():
+        fitted = [p for p in parameters if p.view == name and p.key in RESPONSE]
+        step_responses(fitted, scene.view(name), picture, targets[name])
+
+
+def solve_poses(
+    poses: Sequence[Parameter],
+    scene: Scene,
+    gradients: Mapping[str, Tensor],
+    values: Mapping[str, Tensor],
+    targets: Mapping[str, Target],
+    solutions: Mapping[tuple[str, int], Tensor],
+) -> None:
+    """Takes the `poses` of the views of `scene` towards the least of the loss.
+
+    `gradients` are those of each view's own loss, by the `values` of all parameters. A curvature is
+    found once for each resolution, in the light that `solutions` are near to.
+    """
+    lacking = [pose for pose in poses if pose.curvature is None]
+    if lacking:
+        memory = SolveMemory()
+        memory.last = dict(solutions)
+        with torch.no_grad():
+            world = with_values(scene, values)
+            light_field = solve_light(world, memory)
+        for pose in lacking:
+            assert pose.view is not None
+            pose.curvature = pose_curvature(light_field, world, pose.name, targets[pose.view])
+    grid = scene.volume.grid
+    for pose in poses:
+        assert pose.view is not None and pose.curvature is not None
+        prior = calibration_prior(scene.view(pose.view).camera, grid)
+        step_pose(pose, gradients[pose.name], pose.curvature, prior)
+
+
+def share_out(gradients: Mapping[str, Tensor], views: Sequence[View]) -> dict[str, Tensor]:
+    """The `gradients` of the mean loss of `views` by what each has, as those of its own loss."""
+    total = sum(view.weight for view in views)
+    return {
+        name: gradient * (total / view.weight)
+        for view in views
+        if (name := f"views.{view.name}.camera") in gradients
+        for gradient in (gradients[name],)
+    }

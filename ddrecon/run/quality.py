@@ -1,0 +1,66 @@
+"""How good the pictures of a run are: each view rendered, compared, and told in numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.pictures.scales import COMPARED, LINEAR
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.responses import fit_held_out
+from ddrecon.reconstruct.setup import choose_loss, targets_of
+from ddrecon.renderer import LightField, view_picture
+from ddrecon.scene import Scene
+from ddrecon.settings import OptimizeSettings
+
+
+def render_views(
+    run: Reconstruction, scene: Scene, light_field: LightField
+) -> tuple[dict[str, Tensor], dict[str, dict[str, Any]]]:
+    """The picture of each view of `scene` that has a target, by name, and its quality.
+
+    That is its split, PSNR and SSIM, and of a test view the exposure it was given to compare it.
+    """
+    shown = [view for view in scene.views if view.image is not None]
+    targets = targets_of(replace(scene, views=shown), run.loss, run.noises)
+    pictures, quality = {}, {}
+    for view in shown:
+        target, fitted = targets[view.name], dict[str, Tensor]()
+        with torch.no_grad():
+            picture = view_picture(light_field, scene, view)
+            if view.is_test:
+                picture, fitted = fit_held_out(picture, view, target, run.parameters)
+        pictures[view.name] = picture
+        quality[view.name] = {
+            "split": "test" if view.is_test else "train",
+            "psnr": float(target.psnr_of(picture)),
+            "ssim": float(target.ssim_of(picture)),
+            **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
+        }
+    return pictures, quality
+
+
+def compared_by(run: Reconstruction) -> dict[str, Any]:
+    """What `run` minimizes and what its pictures are compared in, for its summary."""
+    described = describe_loss(run.settings, run.train)
+    if run.loss == "photon":
+        described["noise"] = {name: vars(noise) for name, noise in run.noises.items()}
+    return described
+
+
+def describe_loss(settings: OptimizeSettings, train: Scene) -> dict[str, Any]:
+    """The loss that fits the views of `train` by `settings`, and what it compares.
+
+    Raises SceneError where pictures of different kinds leave it open.
+    """
+    loss = choose_loss(settings, train)
+    return {"loss_function": loss, "compared": COMPARED.get(loss, LINEAR)}
+
+
+def loss_text(described: Mapping[str, Any]) -> str:
+    """What `describe_loss` says, as a line."""
+    return f"loss: {described['loss_function']}, of {described['compared']}"

@@ -1,0 +1,148 @@
+"""The section volume.phase: what it becomes, what is written back, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from example_scene import SCENE, changed
+
+from ddrecon.errors import DataWarning, SceneError
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, Rayleigh, TwoLobe
+from ddrecon.medium.phase_series import Legendre, Tabulated
+from ddrecon.scene_file.build import build_scene, load_scene
+from ddrecon.scene_file.dump import dump_scene
+from ddrecon.scene_file.load import read_scene
+
+VOLUME = {name: value for name, value in yaml.safe_load(SCENE)["volume"].items() if name != "g"}
+SECTIONS: dict[str, tuple[type, dict[str, Any]]] = {
+    "henyey_greenstein": (HenyeyGreenstein, {"g": [0.8, 0.7, 0.6]}),
+    "two_lobe": (TwoLobe, {"g": [0.8, -0.3], "weight": 0.7}),
+    "rayleigh": (Rayleigh, {}),
+    "draine": (Draine, {"g": 0.5, "alpha": [1, 0.5, 0]}),
+    "legendre": (Legendre, {"coefficients": [1, 0.4, 0.2]}),
+    "table": (Tabulated, {"file": "table.csv"}),
+}
+
+
+def scene_with(**phase: Any) -> str:
+    return changed(volume=VOLUME | {"phase": phase}, optimize=None)
+
+
+@pytest.fixture(autouse=True)
+def table(tmp_path: Path) -> None:
+    degrees = np.arange(0, 181, 5)
+    values = 0.75 * (1 + np.cos(np.radians(degrees)) ** 2)
+    rows = [f"{angle}, {value}" for angle, value in zip(degrees, values, strict=True)]
+    (tmp_path / "table.csv").write_text("\n".join(["angle, p", *rows]))
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_each_kind_is_built_and_written_back(
+    name: str, write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    kind, numbers = SECTIONS[name]
+    scene_file = read_scene(write(scene_with(type=name, **numbers)))
+    scene = build_scene(scene_file)
+    phase = scene.volume.phase
+    assert isinstance(phase, kind) and name == phase.NAME
+    has_colors = any(isinstance(value, list) and len(value) == 3 for value in numbers.values())
+    if kind is not Legendre:
+        assert phase.colors == (3 if has_colors else 1)
+    assert scene.volume.sigma_s.shape[0] == 3
+    dump_scene(scene_file, tmp_path / "again.yaml")
+    again = load_scene(tmp_path / "again.yaml").volume.phase
+    assert all(map(torch.equal, again.numbers, phase.numbers))
+
+
+def test_g_is_short_for_henyey_greenstein(write: Callable[[str], Path]) -> None:
+    texts = (
+        changed(volume=VOLUME | {"g": 0.4}, optimize=None),
+        scene_with(type="henyey_greenstein", g=0.4),
+    )
+    scenes = [write_and_load(write, text) for text in texts]
+    assert scenes[0].volume.g == scenes[1].volume.g == torch.tensor(0.4)
+
+
+def write_and_load(write: Callable[[str], Path], text: str) -> Any:
+    return load_scene(write(text))
+
+
+def test_phase_g_is_optimized_as_g(write: Callable[[str], Path]) -> None:
+    parameters = {"parameters": {"phase.g": {"init": 0.1}}}
+    phase = {"phase": {"type": "henyey_greenstein", "g": 0.4}}
+    scene = load_scene(write(changed(volume=VOLUME | phase, optimize=parameters)))
+    assert list(scene.starts) == ["g"] and scene.starts["g"] == torch.tensor(0.1)
+
+
+def test_lobes_start_from_a_list(write: Callable[[str], Path]) -> None:
+    parameters = {"parameters": {"phase.g": {"init": [0.5, -0.1]}, "phase.weight": {"init": 0.5}}}
+    phase = {"phase": {"type": "two_lobe", "g": [0.8, -0.3], "weight": 0.7}}
+    starts = load_scene(write(changed(volume=VOLUME | phase, optimize=parameters))).starts
+    torch.testing.assert_close(starts["phase.g"], torch.tensor([0.5, -0.1]))
+    assert starts["phase.weight"] == 0.5
+
+
+def test_a_table_of_another_scale_is_divided_with_a_warning(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    known = write_and_load(write, scene_with(type="table", file="table.csv")).volume.phase
+    lines = (tmp_path / "table.csv").read_text().splitlines()
+    rows = [line.split(", ") for line in lines[1:]]
+    scaled = [f"{angle}, {4 * float(value)}" for angle, value in rows]
+    (tmp_path / "table.csv").write_text("\n".join([lines[0], *scaled]))
+    with pytest.warns(DataWarning, match=r"table.csv: its mean over the sphere is 4"):
+        found = write_and_load(write, scene_with(type="table", file="table.csv")).volume.phase
+    cosine = torch.linspace(-1, 1, 9)
+    torch.testing.assert_close(found.value(cosine), known.value(cosine))
+    exact = 0.75 * (1 + cosine**2)
+    torch.testing.assert_close(found.value(cosine)[0], exact, rtol=0, atol=2e-3)
+
+
+REFUSED = {
+    "both": ({"g": 0.2, "phase": {"type": "rayleigh"}}, "give only one of g or phase"),
+    "unknown": ({"phase": {"type": "two_lobes"}}, "did you mean 'two_lobe'"),
+    "beyond": ({"phase": {"type": "two_lobe", "g": [1, 0], "weight": 0.5}}, "must be below 1"),
+    "weight": ({"phase": {"type": "two_lobe", "g": [0, 0], "weight": 2}}, "must be at most 1"),
+    "chi_0": ({"phase": {"type": "legendre", "coefficients": [2, 1]}}, "chi_0 must be 1"),
+    "chi_l": ({"phase": {"type": "legendre", "coefficients": [1, 1.5]}}, "divide each by 2 l + 1"),
+    "neither": ({"phase": {"type": "legendre"}}, "missing coefficients or file"),
+}
+
+
+@pytest.mark.parametrize(("section", "line"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_is_wrong_is_said_at_its_key(
+    section: dict[str, Any], line: str, refusal: Callable[..., list[str]]
+) -> None:
+    (found,) = refusal(changed(volume=VOLUME | section, optimize=None))
+    assert "volume.phase" in found and line in found
+
+
+def test_one_number_is_named_once(refusal: Callable[..., list[str]]) -> None:
+    optimize = {"parameters": {"g": {}, "phase.g": {}}}
+    assert "the same number" in refusal(changed(volume=VOLUME | {"g": 0.2}, optimize=optimize))[0]
+
+
+def test_droplets_scatter_as_one_sphere_does_and_forward(write: Callable[[str], Path]) -> None:
+    miepython = pytest.importorskip("miepython", reason="needs the extra `mie`")
+    phase = {"refractive_index": 1.33, "effective_radius": 1.0, "effective_variance": 1e-4}
+    text = scene_with(type="mie", wavelength=[0.6, 0.5, 0.4], **phase)
+    found = load_scene(write(text), dtype=torch.float64).volume.phase
+    cosine = np.cos(np.radians(np.array([2.0, 30.0, 60.0, 110.0, 170.0])))
+    for color, wavelength in enumerate((0.6, 0.5, 0.4)):
+        size = 2 * np.pi / wavelength
+        one = miepython.i_unpolarized(1.33, size, cosine, norm="4pi")
+        ours = found.value(torch.from_numpy(cosine))[color].numpy()
+        np.testing.assert_allclose(ours, one, rtol=0.15, atol=0.01)
+        *_, mean_cosine = miepython.efficiencies_mx(1.33, size)
+        assert float(found.moments(2)[color, 1]) == pytest.approx(mean_cosine, abs=0.01)
+
+
+def test_a_missing_file_is_the_scene_s_mistake(write: Callable[[str], Path]) -> None:
+    with pytest.raises(SceneError, match=r"volume\.phase\.file"):
+        load_scene(write(scene_with(type="table", file="nowhere.csv")))
