@@ -28,9 +28,9 @@ class Volume:
     """What a user describes: density, and cross sections per unit density, on a `grid`.
 
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
-    [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function, or g in (-1, 1), the
-    mean cosine of Henyey and Greenstein's. Tensors may be replaced or require gradients. Raises
-    ValueError where shapes disagree.
+    [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function; or in its place `g`
+    in (-1, 1), the mean cosine of Henyey and Greenstein's. Tensors may be replaced or require
+    gradients. Raises ValueError where shapes disagree.
     """
 
     grid: Grid
@@ -45,8 +45,12 @@ class Volume:
         density: Tensor,
         sigma_a: Tensor,
         sigma_s: Tensor,
-        phase: PhaseFunction | Tensor,
+        phase: PhaseFunction | Tensor | None = None,
+        g: Tensor | None = None,
     ):
+        phase = phase if g is None else g
+        if phase is None:
+            raise TypeError("a volume needs a phase function, or g")
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
         if tuple(self.density.shape) != self.grid.shape:

@@ -17,6 +17,7 @@ from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, face_fluxe
 from ddrecon.light.reduced import ambient_radiance, reduced_light
 from ddrecon.light.sky import decompose_lights
 from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.remaining import has_backward_peak
 from ddrecon.scene import Scene
 
 
@@ -36,14 +37,15 @@ class Balance:
 
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
     """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
-    medium, grid, settings = scale_medium(scene.volume), scene.volume.grid, scene.diffusion
-    lights, is_directed = decompose_lights(scene.lights), medium.has_flux
+    grid, settings = scene.volume.grid, scene.diffusion
+    medium, lights = scale_medium(scene.volume, settings.angles), decompose_lights(scene.lights)
+    has_pairs = settings.rounds > 0 and has_backward_peak(medium)
     problem = DiffusionProblem(
         medium,
         Closure(settings.closure, grid, settings.floor),
-        reduced_light(medium, lights, is_directed).source,
+        reduced_light(medium, lights, medium.degree, has_pairs).source,
         ambient_radiance(lights, solution),
-        is_directed,
+        medium.degree > 0,
     )
     operator, right = problem.system
     if not right.any():
