@@ -109,8 +109,7 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
         return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
     # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
     lights = decompose_lights(scene.lights)
-    has_pairs = scene.diffusion.rounds > 0 and has_backward_peak(medium)
-    reduced = reduced_light(medium, lights, medium.degree, has_pairs)
+    reduced = reduced_light(medium, lights, medium.degree, has_backward_peak(medium))
     sky = sum_unscattered_sky(medium, lights, medium.degree)
     source = reduced.source
     if sky is not None:

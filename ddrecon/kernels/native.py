@@ -4,11 +4,8 @@ Warp's own language makes scalar code of a thread. A loop over many numbers besi
 memory is therefore written in C++, which Warp compiles for processors (where it becomes vector
 instructions) and for GPUs (where a thread does one turn of it):
 
-    def _kernel(bits):
-        F = number_type(bits)
-
-        @wp.func_native(program(bits, "for (int i = first; i < last; ++i) y.data[i] = ..."))
-        def scale_row(y: wp.array(dtype=F), first: int, last: int): ...
+    TextKernel("scale", bits, BLOCK + "for (int i = begin; i < end; ++i) y[i] = 2 * x[i];",
+               "int length, total; F *x, *y")
 
 In the text `F` is the type of numbers, and there are the functions below.
 """
@@ -136,7 +133,7 @@ def number_type(bits: int) -> Any:
 
 
 def program(bits: int, body: str) -> str:
-    """C++ for `wp.func_native`: `body` behind the definitions of `F`, of functions and of a word.
+    """C++ of `body` behind the definitions of `F`, of functions and of a word.
 
     `decay(depth)` is exp(-depth), of depths from about -87 to any size, exact to the last digit but
     one; where it is below about 1e-38 (1e-304 in 64 `bits`) it is that. `psi_series(depth)` is

@@ -5,7 +5,7 @@ over numbers beside each other does not do. Then every value is a vector `V` of 
 of each item, and the text reads as that for a single item does: `a * b`, `pick(a < b, a, b)`. On a
 GPU a packet is one item, `V` a plain number, and a thread does it.
 
-    @wp.func_native(packet_program(bits, "V x = P::load(given.x.data, first, 1, last); ..."))
+    TextKernel(name, bits, "V y = P::load(x, item * LANES, 1, last); ...", "F *x", packet_program)
 
 `V` are numbers of type `F`, `I` whole numbers, `W` numbers in double precision; `P` has the
 functions below.
@@ -129,5 +129,5 @@ def _definitions(bits: int) -> str:
 
 
 def packet_program(bits: int, body: str) -> str:
-    """C++ for `wp.func_native`: `body` behind the types and functions of packets."""
+    """C++ of `body` behind the types and functions of packets."""
     return _definitions(bits) + body

@@ -13,7 +13,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.harmonics import count_harmonics, degrees_of_harmonics, each_harmonic
+from ddrecon.numerics.harmonics import (
+    count_harmonics,
+    degrees_of_harmonics,
+    each_harmonic,
+    harmonics,
+)
+from ddrecon.numerics.remember import remember
 
 Vector = tuple[Tensor, Tensor, Tensor]
 """Components along z, y, x."""
@@ -122,6 +128,11 @@ def _vector(components: Iterable[Tensor]) -> Vector:
     return z, y, x
 
 
+@remember
+def _harmonics_of(direction: Tensor, degree: int) -> Tensor:
+    return harmonics(direction, degree)
+
+
 def beam_moments(radiance: Tensor, direction: Tensor, degree: int) -> Moments:
     """The moments up to `degree` of light that all travels along `direction` w.
 
@@ -132,7 +143,9 @@ def beam_moments(radiance: Tensor, direction: Tensor, degree: int) -> Moments:
         return Moments(radiance)
     z, y, x = direction
     higher = None
-    if degree > 1:
+    if degree > 1 and direction.ndim == 1:
+        higher = _harmonics_of(direction, degree)[4:].view(-1, 1, 1, 1, 1) * radiance
+    elif degree > 1:
         values = dict(each_harmonic(z, y, x, degree))
         higher = torch.stack([values[k] * radiance for k in range(4, count_harmonics(degree))])
     return Moments(radiance, (3 * z * radiance, 3 * y * radiance, 3 * x * radiance), higher)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.light.beam import Beam, follow_beam
 from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
-from ddrecon.light.moments import Moments
+from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light
 from ddrecon.light.sky import Source
@@ -93,6 +93,11 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
 def _follow(
     medium: Medium, light: DirectionalLight | PointLight, degree: int
 ) -> tuple[Beam | PointBeam, Moments]:
+    if isinstance(light, DirectionalLight) and is_fused():
+        from ddrecon.light.fused.beams import follow_beams
+
+        (beam,), received = follow_beams(medium, [light], has_flux=False)
+        return beam, beam_moments(received.mean, beam.direction, degree)
     if isinstance(light, DirectionalLight):
         return follow_beam(medium, light, degree)
     return follow_point_light(medium, light, degree)

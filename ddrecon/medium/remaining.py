@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.coefficients import P1_DEGREE, Medium
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.numerics.angle_table import STEPS
 from ddrecon.numerics.legendre import legendre_at_even_angles, series_weights
@@ -39,8 +39,8 @@ def backward_fraction(medium: Medium) -> Tensor:
 
 
 def has_backward_peak(medium: Medium) -> bool:
-    """Whether a part of scattering counts as turned back."""
-    return is_any_nonzero(backward_fraction(medium))
+    """Whether a part of scattering counts as turned back: not by diffusion alone."""
+    return medium.seen.degree > P1_DEGREE and is_any_nonzero(backward_fraction(medium))
 
 
 def turned_phase(medium: Medium, turns: int) -> Tensor:

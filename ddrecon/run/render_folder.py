@@ -15,9 +15,9 @@ from ddrecon.errors import UsageError
 from ddrecon.extras import advice
 from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
-from ddrecon.losses import psnr
+from ddrecon.losses import Target
 from ddrecon.progress import Progress
-from ddrecon.renderer import LightField, solve_light, view_components, view_image
+from ddrecon.renderer import LightField, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.problems import suggestion
@@ -49,7 +49,9 @@ def render_to_folder(
                 for path in write_picture(folder / name, pixels(image))
             ]
             if view.image is not None:
-                quality[view.name] = psnr(images[view.name], view.image, view.mask)
+                loss = "display" if view.step else "l2"
+                target = Target.of(view.image, view.mask, loss)
+                quality[view.name] = float(target.psnr_of(images[view.name]))
     return _report(scene, memory, {"light": light_seconds, "views": seconds}, files) | {
         "psnr": quality
     }
@@ -170,10 +172,14 @@ def _report(
 def _images(
     light_field: LightField, scene: Scene, view: View, has_components: bool
 ) -> dict[str, Tensor]:
+    picture = view_picture(light_field, scene, view)
     if not has_components:
-        return {view.name: view_image(light_field, scene, view.camera)}
+        return {view.name: picture}
+    # As the camera exposes them; its offset, and what is behind, count as reduced.
     parts = view_components(light_field, scene, view.camera)
-    named = {
-        f"{view.name}.{name}": getattr(parts, name) for name in ("reduced", "single", "multiple")
-    }
-    return {view.name: parts.reduced + parts.single + parts.multiple, **named}
+    gain = 1.0 if view.exposure is None else view.exposure.view(-1, 1, 1)
+    single, multiple = gain * parts.single, gain * parts.multiple
+    reduced = picture - single - multiple
+    named = {"reduced": reduced, "single": single, "multiple": multiple}
+    parts_of = {f"{view.name}.{name}": part for name, part in named.items()}
+    return {view.name: reduced + single + multiple, **parts_of}

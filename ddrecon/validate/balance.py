@@ -38,12 +38,12 @@ class Balance:
 def balance_of(scene: Scene, solution: Tensor) -> Balance:
     """The balance of `solution`, L0 [C, z, y, x], in `scene` with beams and ambient light."""
     grid, settings = scene.volume.grid, scene.diffusion
-    medium, lights = scale_medium(scene.volume, settings.angles), decompose_lights(scene.lights)
-    has_pairs = settings.rounds > 0 and has_backward_peak(medium)
+    medium = scale_medium(scene.volume, settings.angles)
+    lights = decompose_lights(scene.lights)
     problem = DiffusionProblem(
         medium,
         Closure(settings.closure, grid, settings.floor),
-        reduced_light(medium, lights, medium.degree, has_pairs).source,
+        reduced_light(medium, lights, medium.degree, has_backward_peak(medium)).source,
         ambient_radiance(lights, solution),
         medium.degree > 0,
     )

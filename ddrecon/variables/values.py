@@ -197,5 +197,5 @@ def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> Vie
     if "focal" in given:
         given["half_width"] = 1 / (2 * given.pop("focal"))
     if given:
-        camera = replace(camera, **given)  # type: ignore[arg-type]
+        camera = replace(camera, **given)
     return replace(view, camera=camera, **response)

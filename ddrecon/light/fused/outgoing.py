@@ -70,7 +70,7 @@ class _Scatter(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, radiance_bar: Tensor) -> tuple[Tensor | None, ...]:
-        _, factors, more, mean, higher, *flux = ctx.saved_tensors
+        _, factors, _, mean, higher, *flux = ctx.saved_tensors
         given, (degree, has_more) = _given(ctx.is_eye, *ctx.saved_tensors)
         _, _, needs_point, needs_factors, needs_more, *_ = ctx.needs_input_grad
         with_along = degree > 0 and (needs_point or needs_more)

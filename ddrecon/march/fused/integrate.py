@@ -163,7 +163,8 @@ def _transpose_packets(
             if total is not None:
                 total += part
     numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
-    table_bar = functools.reduce(torch.add, tables) if needs_table else None
+    found = [table_bar for table_bar in tables if table_bar is not None]
+    table_bar = functools.reduce(torch.add, found) if found else None
     return [None, None, polynomials_bar, numbers_bar, table_bar, *shares[0]]
 
 

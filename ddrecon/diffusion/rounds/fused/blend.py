@@ -55,7 +55,8 @@ _ADJOINT = (
     + _ROWS
     + """
 const F *const bars[4] = {new_mean_bar + at, new_z_bar + at, new_y_bar + at, new_x_bar + at};
-F *const light_bars[4] = {light_mean_bar + at, light_z_bar + at, light_y_bar + at, light_x_bar + at};
+F *const light_bars[4]
+    = {light_mean_bar + at, light_z_bar + at, light_y_bar + at, light_x_bar + at};
 F *const diffuse_bars[4]
     = {diffuse_mean_bar + at, diffuse_z_bar + at, diffuse_y_bar + at, diffuse_x_bar + at};
 F *e_bars = extinction_bar + at, *share_bars = share_bar + at;
@@ -123,7 +124,7 @@ def blend_fused(
 ) -> Moments:
     """From `light` to `diffuse` plus `gain`, and of what is higher to theta `swept`, by `factor`.
 
-    As `blend` in `transport.py` has it; `length`: of the mean step [u], by which theta is (E14).
+    As `_blend` in `transport.py` has it; `length`: of the mean step [u], by which theta is (E14).
     """
     numbers = numbers_by_color(medium, length, [factor])
     numbers = numbers.expand(-1, len(light.mean))

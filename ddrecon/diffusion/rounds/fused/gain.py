@@ -1,4 +1,4 @@
-"""What a sweep changed, and what of it is a source to diffusion, by fused kernels (E12, E14, E17)."""
+"""What a sweep changed, and what of it is a source to diffusion, by fused kernels (E12, E17)."""
 
 from __future__ import annotations
 

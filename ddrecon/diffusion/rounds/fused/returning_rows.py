@@ -1,7 +1,7 @@
 """Rows of cells along which radiance is followed backward: the adjoint of `rows.py`, in C++.
 
-`rows.FOLLOW` kept what scatters and I of all slices of a slab. Of a row and a direction there are these lines
-of the last slice, which is the next one that light crosses:
+`rows.FOLLOW` kept what scatters and I of all slices of a slab. Of a row and a direction there are
+these lines of the last slice, which is the next one that light crosses:
 
     RETURNING            exp(-depth) source_bar, which goes to the cells where the step began
     FAR, MASS            cotangents of q and of extinction's field at these cells
@@ -10,12 +10,12 @@ of the last slice, which is the next one that light crosses:
 Where a step meets no medium, nothing returns to what scatters.
 """
 
+from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.rows import (
     DECAYED,
     DIRECTION,
     ENDS,
     GROUP,
-    MULTIPLY,
     PLACES,
     SLOPES,
     UPSTREAM,

@@ -56,7 +56,8 @@ def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor
         result = field.new_empty(MARGIN + len(field) * rows * pitch)
         result[:MARGIN] = 0
         given = {
-            "cells": field.detach(), "channels": len(field), "depth": depth, "height": height, "width": width,
+            "cells": field.detach(), "channels": len(field), "depth": depth, "height": height,
+            "width": width,
             "pitch": pitch, "margin": MARGIN,
         }  # fmt: skip
         kernel = copy_kernel(torch.finfo(field.dtype).bits)
