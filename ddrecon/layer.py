@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.numerics.autodiff import leave_uncompiled
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
-from ddrecon.variables.values import with_values
+from ddrecon.variables.values import value_of, with_values
+
+DTYPES = (torch.float32, torch.float64)
+"""What light is computed in."""
 
 
 class VolumeRenderer(torch.nn.Module):
     """Renders the views of `scene`, with fields of its caller in place of the scene's own.
 
-    Solutions are remembered from one call to the next as starting points, unless
-    `scene.diffusion.warm_start` is off.
+    The scene's tensors move with the layer (`to`, `cuda`, `double`), and what it is given is
+    taken to their precision, also under autocast. Solutions are remembered from one call to the
+    next as starting points, unless `scene.diffusion.warm_start` is off.
     """
 
     def __init__(self, scene: Scene):
         super().__init__()
         self.scene = scene
-        self.memory = SolveMemory(scene.diffusion.warm_start)
+        self.memories: list[SolveMemory] = []
 
+    @leave_uncompiled
     def forward(
         self,
         density: Tensor | None = None,
@@ -38,10 +46,67 @@ class VolumeRenderer(torch.nn.Module):
 
         `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar
         in (-1, 1); `values`: anything else by name, such as `lights.0.irradiance`
-        (`ddrecon.variables`). What is not given is the scene's. Raises KeyError for a name the
-        scene does not have, ValueError for a density of another shape than the grid's.
+        (`ddrecon.variables`). What is not given is the scene's. Each may have one more axis in
+        front, of n entries; the images then are `[n, views, 3, h, w]`. Raises KeyError for a name
+        the scene does not have, ValueError for shapes that do not go together or another device,
+        NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
         """
-        fields = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
-        given = {name: value for name, value in fields.items() if value is not None}
-        self.memory.records.clear()
-        return render(with_values(self.scene, {**given, **(values or {})}), view, self.memory)
+        named = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
+        given = {name: value for name, value in named.items() if value is not None}
+        given |= values or {}
+        own = self.scene.volume.density
+        for name, value in given.items():
+            if value.device != own.device:
+                raise ValueError(
+                    f"{name} is on {value.device}, the layer on {own.device}: layer.to(device)"
+                )
+        with torch.autocast(own.device.type, enabled=False):
+            given = {name: value.to(own.dtype) for name, value in given.items()}
+            counts = {name: len(v) for name, v in given.items() if self._is_batch(name, v)}
+            if not counts:
+                return self._render(given, view, 0)
+            if len(set(counts.values())) > 1:
+                raise ValueError(f"batches differ in size: {counts}")
+            entries = range(next(iter(counts.values())))
+            each = [{n: v[i] if n in counts else v for n, v in given.items()} for i in entries]
+            return torch.stack([self._render(one, view, i) for i, one in enumerate(each)])
+
+    def _render(self, given: Mapping[str, Tensor], view: str | None, number: int) -> Tensor:
+        """The images of entry `number` of a batch, which starts from its own last solutions."""
+        while len(self.memories) <= number:
+            self.memories.append(SolveMemory(self.scene.diffusion.warm_start))
+        self.memories[number].records.clear()
+        return render(with_values(self.scene, given), view, self.memories[number])
+
+    def _is_batch(self, name: str, value: Tensor) -> bool:
+        """Whether `value` has an axis of entries in front of what the variable `name` has."""
+        if name in ("sigma_a", "sigma_s", "sigma_t", "albedo"):
+            return value.ndim in (2, 5)
+        with torch.no_grad():
+            return value.ndim == value_of(self.scene, name).ndim + 1
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """What torch calls to move a module: the scene's tensors are moved as well."""
+        module: Self = super()._apply(fn, recurse)
+        scene = _map_tensors(fn, self.scene)
+        if scene.volume.density.dtype not in DTYPES:
+            raise TypeError(
+                f"light is not computed in {scene.volume.density.dtype}; leave the layer in "
+                "float32 or float64, what it is given may be of any precision"
+            )
+        self.scene, self.memories = scene, []
+        return module
+
+
+def _map_tensors(fn: Callable[[Tensor], Tensor], record: Any) -> Any:
+    """`record` with `fn` of each tensor in it; leaves stay leaves."""
+    if isinstance(record, Tensor):
+        return fn(record.detach()).requires_grad_(record.requires_grad)
+    if isinstance(record, list):
+        return [_map_tensors(fn, entry) for entry in record]
+    if isinstance(record, dict):
+        return {key: _map_tensors(fn, entry) for key, entry in record.items()}
+    if is_dataclass(record) and not isinstance(record, type):
+        parts = {part.name: getattr(record, part.name) for part in fields(record) if part.init}
+        return replace(record, **{name: _map_tensors(fn, part) for name, part in parts.items()})
+    return record

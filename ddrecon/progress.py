@@ -2,8 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 """`progress(items, what)` gives the `items` one by one, and shows that `what` is being done."""
+
+
+def bar_width() -> int | None:
+    """The columns of a progress bar; None leaves them to tqdm, which finds out the terminal's.
+
+    A terminal that says it has none, as some containers' do, would see nothing at all.
+    """
+    try:
+        columns = os.get_terminal_size(sys.stderr.fileno()).columns
+    except (OSError, ValueError, AttributeError):
+        return None
+    return None if columns else 80

@@ -38,7 +38,7 @@ from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
-from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.autodiff import is_varied, require_plain_autograd
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
@@ -84,6 +84,7 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
     and of its lights. `memory` carries the last solutions from one call to the next, as starting
     points. Raises ValueError when views differ in size: render those one by one.
     """
+    require_plain_autograd()
     views = scene.views if view is None else [scene.view(view)]
     if len({item.camera.size for item in views}) > 1:
         raise ValueError(

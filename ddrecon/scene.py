@@ -7,6 +7,7 @@ in a file.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,6 +67,11 @@ class Scene:
     starts: dict[str, Tensor] = field(default_factory=dict)
     support: Tensor | None = None
     path: Path | None = None
+
+    def _repr_html_(self) -> str:
+        """The scene in a notebook. What draws it is of a room above, and so is loaded by name."""
+        html: str = import_module("ddrecon.report.notebook").scene_html(self)
+        return html
 
     def view(self, name: str) -> View:
         """The view called `name`; raises KeyError with the known names."""

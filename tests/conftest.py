@@ -35,7 +35,6 @@ def same_seed() -> None:
 
 
 PACKAGES = {
-    ".vdb": ("openvdb", "pyopenvdb"),
     ".tif": ("tifffile",),
     ".tiff": ("tifffile",),
     ".nc": ("netCDF4",),

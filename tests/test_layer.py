@@ -86,3 +86,110 @@ def test_function_transforms_agree_with_backward(name: str, dtype: torch.dtype) 
     assert abs(one - other) <= (1e-10 if dtype == torch.float64 else 1e-3) * max(
         abs(one), abs((tangent * weight).abs().sum()) * 1e-2
     )
+
+
+def small_layer(dtype: torch.dtype = torch.float64, **kind: object) -> VolumeRenderer:
+    scene = make_scene(
+        random_values(*SHAPE, dtype=dtype), ambient=(0.2,), tolerance=1e-6, g=0.3, **kind
+    )
+    scene.starts["density"] = random_values(*SHAPE, dtype=dtype)
+    return VolumeRenderer(scene)
+
+
+def test_the_scene_moves_with_the_layer() -> None:
+    layer = small_layer()
+    before = layer()
+    layer.scene.volume.density.requires_grad_()
+    single = torch.nn.Sequential(layer).to(torch.float32)[0]
+    image = single()
+    assert image.dtype == torch.float32 and single.scene.volume.density.requires_grad
+    torch.testing.assert_close(image.double(), before, rtol=1e-4, atol=1e-5)
+    for name in (*NAMES[:4], "lights.0.direction", "lights.1.radiance"):
+        assert value_of(single.scene, name).dtype == torch.float32
+    assert single.scene.views[0].camera.pose.dtype == torch.float32
+    assert single.scene.starts["density"].dtype == torch.float32
+    assert value_of(small_layer().to("meta").scene, "lights.0.irradiance").device.type == "meta"
+    with pytest.raises(
+        TypeError, match=r"not computed in torch\.float16; leave the layer in float3"
+    ):
+        single.half()
+    assert single().dtype == torch.float32
+    with pytest.raises(ValueError, match=r"density is on meta, the layer on cpu: layer.to\(device"):
+        single(density=torch.ones(SHAPE, device="meta"))
+
+
+@pytest.mark.parametrize("given", [torch.bfloat16, torch.float32, torch.float64])
+def test_precision_is_the_layers_whatever_it_is_given(given: torch.dtype) -> None:
+    """Also under autocast, and after a call in another precision."""
+    layer = small_layer(torch.float32)
+    layer(density=random_values(*SHAPE))
+    density = random_values(*SHAPE).to(given).requires_grad_()
+    expected = layer(density=density.detach().float())
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        image = layer(density=density)
+    assert image.dtype == torch.float32
+    torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-6)
+    image.sum().backward()
+    assert density.grad is not None and density.grad.dtype == given
+
+
+def test_a_batch_is_its_entries_one_by_one() -> None:
+    """Of densities, cross sections and light directions; the derivative as well."""
+    layer = small_layer()
+    densities = random_values(3, *SHAPE, seed=1).requires_grad_()
+    batch = {
+        "density": densities,
+        "sigma_s": random_values(3, 3, seed=2),
+        "g": torch.tensor([0.1, 0.3, 0.5], dtype=torch.float64),
+        "values": {
+            "lights.0.direction": random_values(3, 3, seed=3) - 2.0,
+            "lights.1.radiance": random_values(3, seed=4),
+        },
+    }
+    images = layer(**batch)
+    weight = random_values(*images.shape, seed=5)
+    (gradient,) = torch.autograd.grad((images * weight).sum(), densities)
+    assert images.shape == (3, 1, 3, 4, 5)
+    for i in range(3):
+        density = densities[i].detach().requires_grad_()
+        values = {name: value[i] for name, value in batch["values"].items()}
+        values["lights.1.radiance"] = batch["values"]["lights.1.radiance"]
+        one = small_layer()(density, sigma_s=batch["sigma_s"][i], g=batch["g"][i], values=values)
+        torch.testing.assert_close(images[i], one, rtol=1e-5, atol=1e-7)
+        (alone,) = torch.autograd.grad((one * weight[i]).sum(), density)
+        torch.testing.assert_close(gradient[i], alone, rtol=1e-3, atol=1e-6)
+    with pytest.raises(ValueError, match="batches differ in size"):
+        layer(density=densities, g=torch.tensor([0.1, 0.2]))
+
+
+def test_what_torch_cannot_do_is_said() -> None:
+    layer, density = small_layer(), random_values(*SHAPE).requires_grad_()
+
+    def total(values: Tensor) -> Tensor:
+        return layer(density=values).sum()
+
+    with pytest.raises(NotImplementedError, match=r"vmap: .*VolumeRenderer takes batches, \[n, z"):
+        torch.func.vmap(total)(density.detach().expand(2, *SHAPE))
+    with pytest.raises(NotImplementedError, match=r"use torch\.autograd\.grad or backward"):
+        torch.func.grad(total)(density.detach())
+    for again in (
+        lambda: torch.autograd.grad(total(density), density, create_graph=True),
+        lambda: torch.autograd.functional.hessian(total, density.detach()),
+    ):
+        with pytest.raises(NotImplementedError, match="only first derivatives of light"):
+            again()
+
+
+@pytest.mark.slow
+def test_the_compiler_leaves_it_alone() -> None:
+    layer, density = small_layer(), random_values(*SHAPE)
+
+    def network(strength: Tensor) -> Tensor:
+        return layer(density=density * strength).sin() * 2
+
+    strength = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+    torch._dynamo.utils.counters.clear()
+    images, expected = torch.compile(network, backend="eager")(strength), network(strength)
+    torch.testing.assert_close(images, expected, rtol=1e-5, atol=1e-7)
+    counts = torch._dynamo.utils.counters["frames"]
+    assert counts["total"] <= 3, "the frames inside were compiled"

@@ -134,8 +134,4 @@ def _is_same(changed: Scene, scene: Scene) -> bool:
 
 def _effective(diffusion: DiffusionSettings) -> DiffusionSettings:
     """Without the degree where there are no rounds that it could matter to."""
-    return (
-        diffusion
-        if diffusion.rounds
-        else replace(diffusion, degree=DiffusionSettings.degree)
-    )
+    return diffusion if diffusion.rounds else replace(diffusion, degree=DiffusionSettings.degree)

@@ -13,6 +13,7 @@ from ddrecon.reconstruct.setup import select_views, start_support
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
+from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.terms import needed_terms
 from ddrecon.variables.values import with_values
 
@@ -42,6 +43,8 @@ def memory_estimate(scene: Scene) -> int:
 def describe(scene: Scene) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
+    And what can hardly be meant.
+
     Its parameters are where they start.
     """
     scene = with_values(scene, scene.starts)
@@ -59,6 +62,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "support": _describe_support(scene),
         "engine": engine_of_parts(_parts_in_torch(scene)),
         "memory_bytes": memory_estimate(scene),
+        "doubts": find_doubts(scene),
     }
 
 
@@ -78,6 +82,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         *([support_text(report["support"])] if report["support"] else []),
         f"engine: {_name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
+        *(f"doubtful: {doubt}" for doubt in report["doubts"]),
     ]
 
 

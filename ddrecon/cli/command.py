@@ -13,7 +13,6 @@ from typing import Any
 
 import click
 
-from ddrecon import __version__
 from ddrecon.engine import CHOICES
 from ddrecon.errors import DataWarning, DdreconError
 
@@ -134,26 +133,3 @@ def show_warnings() -> Iterator[None]:
         warnings.simplefilter("always", DataWarning)
         warnings.showwarning = lambda message, *_: click.echo(f"warning: {message}", err=True)
         yield
-
-
-def show_version(context: click.Context, parameter: click.Parameter, is_asked: bool) -> None:
-    """Prints what a run's result may depend on, and ends the program."""
-    if is_asked and not context.resilient_parsing:
-        import platform
-
-        import torch
-
-        from ddrecon.engine import engine_versions
-
-        try:
-            engine, *packages = engine_versions().items()
-        except DdreconError as error:
-            click.echo(str(error), err=True)
-            context.exit(error.exit_code)
-        brought = "".join(f" ({name} {version})" for name, version in packages)
-        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
-        click.echo(
-            f"ddrecon {__version__}, Python {platform.python_version()}, "
-            f"torch {torch.__version__}, engine {engine[1]}{brought}, device {device}"
-        )
-        context.exit()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import click
 
-from ddrecon.cli.command import show_version
 from ddrecon.cli.file_commands import export, info
 from ddrecon.cli.scene_commands import check, optimize, render
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
+from ddrecon.cli.version import show_version
+from ddrecon.cli.watch import watch
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -23,5 +24,5 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-for command in (check, render, optimize, gradcheck, reference, bench, export, info):
+for command in (check, render, optimize, watch, gradcheck, reference, bench, export, info):
     main.add_command(command)

@@ -6,7 +6,7 @@ torch is imported inside the commands, so that `--help` answers at once.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -29,14 +29,28 @@ if TYPE_CHECKING:
     help="Where it goes.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace files that are there.")
+@click.option(
+    "--up",
+    type=click.Choice(["y", "z"]),
+    default="y",
+    help="Which axis points up in FILE, a volume: y leaves the axes as they are; z is for programs "
+    "such as Blender and Unreal.",
+)
 @in_session
-def export(session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool) -> None:
+def export(
+    session: Session, sources: tuple[Path, ...], output: Path, overwrite: bool, up: str
+) -> None:
     """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as
-    NeRF's transforms.json), or all fields of VOLUMEs in the format of FILE's suffix.
+    NeRF's transforms.json), or all fields of SCENE, or of VOLUMEs, in the format of FILE's suffix.
+
+    SCENE is a scene file or the folder of a finished run.
     """
     kind = output.suffix.lower()
-    if kind in (".xml", ".json") and len(sources) > 1:
+    has_scene = any(source.is_dir() or source.suffix in (".yaml", ".yml") for source in sources)
+    if (has_scene or kind in (".xml", ".json")) and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
+    if kind in (".xml", ".json") and up == "z":
+        raise click.UsageError("--up z turns volumes only")
     if kind == ".xml":
         from ddrecon.reference.export import export_scene
 
@@ -49,10 +63,42 @@ def export(session: Session, sources: tuple[Path, ...], output: Path, overwrite:
             session.build(scene_file), scene_file, output, may_exist=overwrite
         )
     else:
-        from ddrecon.io.volumes.convert import convert
-
-        written = convert(sources, output, may_exist=overwrite)
+        _export_fields(session, sources, output, overwrite, has_scene, up)
+        written = [output]
     click.echo(f"written: {', '.join(map(str, written))}")
+
+
+def _export_fields(
+    session: Session,
+    sources: tuple[Path, ...],
+    output: Path,
+    overwrite: bool,
+    is_scene: bool,
+    up: str,
+) -> None:
+    """Writes the fields of a scene, or of all volumes `sources`, to `output`."""
+    from ddrecon.io.volumes.convert import raise_z, read_together, require_target
+    from ddrecon.io.volumes.table import keeps_constants, write_fields
+    from ddrecon.scene_file.export_fields import fields_of
+
+    require_target(output, may_exist=overwrite)
+    if is_scene:
+        fields, constants, bounds = fields_of(session.load(sources[0]))
+    else:
+        (fields, bounds), constants = read_together(sources), {}
+    if up == "z":
+        fields, bounds = raise_z(fields, bounds)
+    write_fields(output, fields, bounds, constants)
+    if constants:
+        numbers = ", ".join(f"{name} {_words(value)}" for name, value in constants.items())
+        place = (
+            "in its metadata" if keeps_constants(output) else "which the format has no place for"
+        )
+        click.echo(f"fields: {', '.join(fields)}; the same everywhere, {place}: {numbers}")
+
+
+def _words(value: Any) -> str:
+    return " ".join(f"{number:.6g}" for number in value.flatten().tolist())
 
 
 @click.command()

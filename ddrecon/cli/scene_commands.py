@@ -5,12 +5,16 @@ torch is imported inside the commands, so that `--help` answers at once.
 
 from __future__ import annotations
 
+import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from ddrecon.cli.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, SCENE, in_session
+from ddrecon.cli.watch import SAVE_EVERY, watched
+from ddrecon.errors import DataWarning
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -132,6 +136,9 @@ def render(
 @click.option(
     "--tensorboard", "has_events", is_flag=True, help="Also write the loss log for TensorBoard."
 )
+@click.option(
+    "--watch", "is_watched", is_flag=True, help="Also serve the run's page, as ddrecon watch does."
+)
 @DTYPE
 @AS_JSON
 @in_session
@@ -144,10 +151,12 @@ def optimize(
     resume: bool,
     preview_every: int | None,
     has_events: bool,
+    is_watched: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
     from ddrecon.run.drive import drive_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
+    from ddrecon.scene_file.doubts import find_doubts
 
     if has_events:
         require_tensorboard()
@@ -155,9 +164,16 @@ def optimize(
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
-    with open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
-        run,
-        folder,
+    for doubt in find_doubts(built):
+        warnings.warn(doubt, DataWarning, 2)
+    with (
+        open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
+            run,
+            folder,
+        ),
+        watched(output) if is_watched else nullcontext(),
     ):
+        if is_watched:
+            folder.save_every = SAVE_EVERY
         summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
     session.show(summary, summary_lines(summary, output))

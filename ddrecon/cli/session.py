@@ -22,6 +22,7 @@ from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
 from ddrecon.memory import keep_freed_memory
+from ddrecon.progress import bar_width
 from ddrecon.run.result import RESULT
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import build_scene
@@ -79,7 +80,14 @@ class Session:
 
     def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
         """`items` with a progress bar on stderr, unless quiet."""
-        return tqdm(items, desc=what, file=sys.stderr, disable=self.is_quiet, leave=self.is_verbose)
+        return tqdm(
+            items,
+            desc=what,
+            file=sys.stderr,
+            disable=self.is_quiet,
+            leave=self.is_verbose,
+            ncols=bar_width(),
+        )
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
         """Prints `report` as JSON where that was asked for, else `lines`."""

@@ -7,6 +7,7 @@ cross sections are constant, rays need march through one field only, the density
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 
 import torch
 from torch import Tensor
@@ -71,6 +72,11 @@ class Volume:
     @g.setter
     def g(self, g: Tensor) -> None:
         self.phase = HenyeyGreenstein(g)
+
+    def _repr_html_(self) -> str:
+        """The volume in a notebook. What draws it is of a room above, and so is loaded by name."""
+        html: str = import_module("ddrecon.report.notebook").volume_html(self)
+        return html
 
 
 @dataclass(frozen=True)

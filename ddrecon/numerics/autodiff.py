@@ -35,6 +35,37 @@ def is_forward() -> bool:
     return forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
 
 
+def require_plain_autograd() -> None:
+    """Raises NotImplementedError within those transforms of `torch.func` that light has not."""
+    stack = torch._C._functorch.get_interpreter_stack() or []
+    kinds = {str(interpreter.key()).rpartition(".")[2] for interpreter in stack}
+    if "Vmap" in kinds:
+        raise NotImplementedError(
+            "torch.func.vmap: light is not computed for many at once; "
+            "ddrecon.VolumeRenderer takes batches, [n, z, y, x], one after another"
+        )
+    if "Grad" in kinds:
+        raise NotImplementedError(
+            "torch.func.grad, vjp, jacrev and hessian: light has no such transforms; "
+            "use torch.autograd.grad or backward, or torch.func.jvp"
+        )
+
+
+def leave_uncompiled(function: Any) -> Any:
+    """`function`, which torch.compile leaves as it is: what is around it is compiled.
+
+    It is what `torch.compiler.disable` does, without importing torch's compiler, which takes two
+    seconds of every run.
+    """
+    frames = torch._C._dynamo.eval_frame
+    skip = frames._FrameAction.SKIP
+    # What it calls is left as it is as well.
+    frames.set_code_exec_strategy(function.__code__, frames._FrameExecStrategy(skip, skip))
+    function._torchdynamo_disable = True
+    function._torchdynamo_disable_msg = "light is computed by kernels and solvers of its own"
+    return function
+
+
 def version_of(tensor: Tensor) -> int:
     """How often the numbers of `tensor` were changed in place; -1 where nobody counts.
 

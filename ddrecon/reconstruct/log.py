@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 class Row:
     """One iteration. PSNRs [dB] and SSIMs are means over views, of values as they are compared.
 
+    `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
     `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
     views are None where none was rendered, and SSIMs where they were not looked at.
     """
@@ -22,11 +23,13 @@ class Row:
     forward_iterations: int
     adjoint_iterations: int
     cells: int
+    data_loss: float
+    penalty: float
     ssim: float | None = None
     test_ssim: float | None = None
 
 
-NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0)
+NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
 """The sum of no rows."""
 
 

@@ -49,6 +49,14 @@ class Result:
     scene: Scene
     rows: list[Row]
 
+    def _repr_html_(self) -> str:
+        """The reconstructed scene, in a notebook, and how well it fits."""
+        last = self.rows[-1]
+        test = [row.test_psnr for row in self.rows if row.test_psnr is not None][-1:]
+        held = f", {test[0]:.2f} dB of those held out" if test else ""
+        fit = f"{last.iteration} iterations, PSNR {last.psnr:.2f} dB of the views seen last{held}"
+        return f"<p>{fit}</p>{self.scene._repr_html_()}"
+
 
 def optimize(
     scene: Scene, iterations: int | None = None, watch: Callable[[Row], None] | None = None
@@ -157,6 +165,8 @@ class Reconstruction:
             iteration=self.iteration + 1,
             seconds=self.total.seconds + perf_counter() - start,
             loss=numbers.loss,
+            data_loss=numbers.of_images,
+            penalty=numbers.loss - numbers.of_images,
             psnr=numbers.psnr,
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),

@@ -8,51 +8,70 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from html import escape
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from ddrecon.io.files.atomic import replace_file
 
-STYLE = """
-:root { color-scheme: light dark; --line: #8885; --soft: #8882; }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 1080px; margin: 0 auto; padding: 1rem; }
-h1 { font-size: 1.6rem; margin-bottom: 0; }
-h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; border-bottom: 1px solid var(--line); }
-figure { margin: 0.75rem 0; } figcaption { font-size: 0.9rem; opacity: 0.8; }
-img { max-width: 100%; height: auto; image-rendering: pixelated; }
-.row { display: grid; gap: 1rem; }
-@media (min-width: 800px) { .row { grid-template-columns: 1fr 1fr; } }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-td, th { padding: 0.2rem 0.7rem 0.2rem 0; text-align: left; white-space: nowrap;
-  border-bottom: 1px solid var(--soft); }
-pre { overflow-x: auto; background: var(--soft); padding: 0.75rem; font-size: 0.8rem; }
-svg { width: 100%; height: auto; }
-"""
+ASSETS = resources.files("ddrecon.report") / "assets"
+SCRIPTS = ("volumes.js", "viewer.js", "slices.js", "compare.js", "page.js", "live.js")
+"""What makes a page alive, in the order in which one needs the other."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">\
 <meta name="viewport" content="width=device-width, initial-scale=1">\
 <title>{title}</title><style>{style}</style></head>
-<body>
+<body{state}>
 <h1>{title}</h1>
-<p>{lead}</p>
+<p id="lead">{lead}</p>
 {sections}
-</body></html>
+{scripts}</body></html>
 """
 
 
-def write_page(path: Path, title: str, lead: str, sections: Sequence[str]) -> None:
+def write_page(
+    path: Path, title: str, lead: str, sections: Sequence[str], *, is_alive: bool = False
+) -> None:
     """Writes the page of `sections` under `title`, and `lead`, a sentence, to `path`."""
-    text = PAGE.format(
-        title=escape(title), style=STYLE, lead=escape(lead), sections="\n".join(sections)
-    )
+    text = page_text(title, lead, sections, is_alive=is_alive)
     with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
+def page_text(
+    title: str,
+    lead: str,
+    sections: Sequence[str],
+    *,
+    is_alive: bool = False,
+    is_live: bool = False,
+) -> str:
+    """The page; with `is_alive`, with scripts that turn its volumes and compare its pictures.
+
+    With `is_live`, these ask for it again and again, and take up what is new.
+    """
+    scripts = ""
+    if is_alive:
+        scripts = "".join(f"<script>{_asset(name)}</script>\n" for name in SCRIPTS)
+    return PAGE.format(
+        state=" data-live" if is_live else "",
+        title=escape(title),
+        style=_asset("page.css"),
+        lead=escape(lead),
+        sections="\n".join(sections),
+        scripts=scripts,
+    )
+
+
+def _asset(name: str) -> str:
+    return (ASSETS / name).read_text(encoding="utf-8")
+
+
 def section(heading: str, *parts: str) -> str:
     """The `parts` under `heading`."""
-    return f"<section><h2>{escape(heading)}</h2>\n" + "\n".join(parts) + "</section>"
+    name = heading.lower().replace(" ", "-")
+    start = f'<section id="{escape(name)}"><h2>{escape(heading)}</h2>\n'
+    return start + "\n".join(parts) + "</section>"
 
 
 def paragraph(text: str) -> str:
@@ -63,6 +82,11 @@ def paragraph(text: str) -> str:
 def items(lines: Sequence[str]) -> str:
     """A list of `lines`."""
     return "<ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def warnings(lines: Sequence[str]) -> str:
+    """A list of `lines` that is not overlooked."""
+    return f'<div class="doubts">{items(lines)}</div>'
 
 
 def side_by_side(*parts: str) -> str:
@@ -79,11 +103,45 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def picture(png: bytes, caption: str, width: int = 600) -> str:
-    """The picture `png`, `width` pixels wide where there is room, above `caption`."""
-    data = base64.b64encode(png).decode("ascii")
-    shown = f'alt="{escape(caption)}" style="width: {width}px"'
-    image = f'<img src="data:image/png;base64,{data}" {shown}>'
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+    """The picture `png`, `width` pixels wide where there is room, above `caption`.
+
+    Its pixels are shown as squares.
+    """
+    shown = f'class="pixels" style="width: {width}px"'
+    return _captioned(embed(png, caption, shown), caption)
+
+
+def movie(webp: bytes, caption: str) -> str:
+    """The moving picture `webp`, large and smooth, above `caption`."""
+    return _captioned(embed(webp, caption, 'class="turntable"'), caption)
+
+
+def pair(target: bytes, render: bytes, caption: str) -> str:
+    """Two pictures of one view side by side, or one over the other where scripts run."""
+    images = embed(target, f"{caption}, target") + embed(render, f"{caption}, render")
+    return _captioned(f'<div class="pair">{images}</div>', caption)
+
+
+def embed(image: bytes, text: str, attributes: str = "") -> str:
+    """An element with the PNG or WebP `image` in it; `text` says what it shows."""
+    kind = "png" if image.startswith(b"\x89PNG") else "webp"
+    data = base64.b64encode(image).decode("ascii")
+    return f'<img src="data:image/{kind};base64,{data}" alt="{escape(text)}" {attributes}>'
+
+
+def grid(parts: Sequence[str]) -> str:
+    """The `parts` in as many columns as there is room for."""
+    return f'<div class="views">{"".join(parts)}</div>'
+
+
+def unfolded(summary: str, part: str, *, is_open: bool) -> str:
+    """The `part` below `summary`, which folds it away."""
+    start = "<details open>" if is_open else "<details>"
+    return f"{start}<summary>{escape(summary)}</summary>{part}</details>"
+
+
+def _captioned(element: str, caption: str) -> str:
+    return f"<figure>{element}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 def fold(summary: str, text: str) -> str:

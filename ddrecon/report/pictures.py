@@ -30,7 +30,12 @@ def find_white(image: np.ndarray) -> float:
 
     It is that of the brightest pixels, but for one in a thousand.
     """
-    return max(float(np.quantile(image.max(-1), 0.999)), 1e-6)
+    return find_high(image.max(-1))
+
+
+def find_high(values: np.ndarray) -> float:
+    """What all but one of a thousand `values` are below; always above 0."""
+    return max(float(np.quantile(values, 0.999)), 1e-6)
 
 
 def comparison(target: Tensor, image: Tensor) -> np.ndarray:

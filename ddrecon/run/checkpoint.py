@@ -58,6 +58,14 @@ def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, A
         return state, previous
 
 
+def read_state(path: Path) -> dict[str, Any]:
+    """The state in the checkpoint at `path`, of whatever scene; raises FormatError."""
+    content = _load(path)
+    if content.get("format") != FORMAT:
+        raise FormatError(path, UNUSABLE)
+    return dict(content["state"])
+
+
 def forget_checkpoints(folder: Path) -> None:
     """Removes the checkpoints in `folder`."""
     for name in (LAST, PREVIOUS):

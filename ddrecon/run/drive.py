@@ -15,6 +15,7 @@ from tqdm import tqdm
 from ddrecon.errors import DivergenceError, FormatError, SceneError, UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
+from ddrecon.progress import bar_width
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -102,6 +103,7 @@ def drive_run(
                 desc="optimize",
                 file=sys.stderr,
                 disable=is_quiet,
+                ncols=bar_width(),
             ) as bar,
         ):
             if not is_quiet:
@@ -110,6 +112,7 @@ def drive_run(
                 folder.save_in_time(run)
                 row = run.step()
                 folder.log.add(row)
+                folder.late.note(run)
                 if events is not None:
                     events.log(row)
                 bar.set_postfix_str(progress_text(run.total, row), refresh=False)
@@ -167,7 +170,8 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     if summary["test_psnr"] is not None:
         line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
     line += f", of {summary['compared']}"
-    lines = [line, f"density and all else written to {folder}"]
+    diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
+    lines = [line, *diagnoses, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))
     if "smoothing" in summary:

@@ -18,6 +18,8 @@ READERS: dict[str, Callable[[str], Any]] = {
     "iteration": int,
     "seconds": float,
     "loss": float,
+    "data_loss": float,
+    "penalty": float,
     "psnr": float,
     "test_psnr": lambda text: float(text) if text else None,
     "forward_iterations": int,

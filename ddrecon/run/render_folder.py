@@ -20,9 +20,11 @@ from ddrecon.progress import Progress
 from ddrecon.renderer import LightField, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.scene import Scene, View
+from ddrecon.scene_file.problems import suggestion
 from ddrecon.terms import needed_terms
 from ddrecon.turntable import place_turntable
 from ddrecon.variables.tangents import render_tangent, variation
+from ddrecon.variables.values import component_names, value_of, variable_names
 
 GRADIENT = "gradient"
 """Files of derivative images are named VIEW.gradient, and VIEW.gradient.single for a component."""
@@ -126,7 +128,14 @@ def require_variation(scene: Scene, parameter: str) -> None:
     try:
         variation(scene, parameter)
     except KeyError as error:
-        raise UsageError(f"--gradient {parameter}: {error.args[0]}") from None
+        names = variable_names(scene)
+        parts = [
+            f"{name}.{part}"
+            for name in names
+            for part in component_names(name, value_of(scene, name))
+        ]
+        guess = "" if parameter in names else suggestion(parameter, [*names, *parts])
+        raise UsageError(f"--gradient {parameter}: {error.args[0]}{guess}") from None
 
 
 def render_lines(report: dict[str, Any], folder: Path) -> list[str]:

@@ -9,22 +9,21 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.io.files.atomic import refusals, remove_temporaries
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear, write_preview
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
-from ddrecon.renderer import LightField, solve_light
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
+from ddrecon.run.diagnoses import LateMeans, diagnose
+from ddrecon.run.findings import Findings, given_fields, solve
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import compared_by, render_views
-from ddrecon.run.report import Findings, write_run_report
+from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
@@ -62,6 +61,8 @@ class RunFolder:
             remove_temporaries(path)
         self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
         self.saved, self.next_save = -1, 0.0
+        self.late = LateMeans()
+        self.save_every = CHECKPOINT_SECONDS
 
     def start(self, run: Reconstruction) -> None:
         """Begins the log and the checkpoints of a new run; those of an earlier run are removed."""
@@ -98,12 +99,12 @@ class RunFolder:
 
     def _note_saved(self, run: Reconstruction, seconds: float) -> None:
         self.saved = run.iteration
-        self.next_save = monotonic() + max(CHECKPOINT_SECONDS, seconds / CHECKPOINT_SHARE)
+        self.next_save = monotonic() + max(self.save_every, seconds / CHECKPOINT_SHARE)
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
         scene = run.current_scene()
-        images, _ = render_views(run, scene, _solve(scene))
+        images, _ = render_views(run, scene, solve(scene))
         self._pictures(scene, images, f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
@@ -114,15 +115,18 @@ class RunFolder:
         values = {name: self._store(scene, name) for name in dict.fromkeys(["density", *names])}
         write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
-        light_field = _solve(scene)
+        light_field = solve(scene)
         images, quality = render_views(run, scene, light_field)
         self._pictures(scene, images, "")
-        summary = _summary(run) | {"views": quality}
+        log, environment = self.log.rows(), self.environment
+        diagnoses = diagnose(scene.views, images, quality, log, self.late.moved(run))
+        told = [vars(diagnosis) for diagnosis in diagnoses]
+        summary = _summary(run) | {"views": quality, "diagnoses": told}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
-        log, environment = self.log.rows(), self.environment
+        given = given_fields(run.scene)
         findings = Findings(
-            scene, light_field, images, quality, log, summary, environment, settings
+            scene, given, light_field, images, quality, log, summary, environment, settings
         )
         write_run_report(self.path / "report.html", findings)
         return summary
@@ -180,11 +184,6 @@ class RunFolder:
             if view.image is not None:
                 shown = comparison(view.image, images[view.name])
                 write_preview(folder / f"{view.name}{mark}.png", shown)
-
-
-def _solve(scene: Scene) -> LightField:
-    with torch.no_grad():
-        return solve_light(scene, SolveMemory())
 
 
 def _plain(value: Tensor) -> Any:

@@ -23,6 +23,8 @@ from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.sight import explain_blindness, sees_box
 
+NAMED = 4
+"""Views that a line about several names."""
 LATTICE = 33
 """Pixels along each side of an image at which its distortion is checked."""
 
@@ -47,21 +49,23 @@ def build_views(
 def _note_blind(
     scene_file: SceneFile, views: Sequence[View], grid: Grid, problems: Problems
 ) -> None:
-    """Notes the `views` that do not see the box of `grid`: one by one, or all in one line."""
-    blind = [view for view in views if not sees_box(view.camera, grid)]
-    if len(blind) > 1 and len(blind) == len(scene_file.tree.views):
-        why = explain_blindness([view.camera for view in blind], grid)
-        problems.note(scene_file.refused("views", f"none looks through the volume; {why}"))
+    """Notes the `views` that do not see the box of `grid`, in one line: they share a cause."""
+    seeing = [sees_box(view.camera, grid) for view in views]
+    blind = [view for view, sees in zip(views, seeing, strict=True) if not sees]
+    if not blind:
         return
-    for view in blind:
-        index = [section.name for section in scene_file.tree.views].index(view.name)
-        problems.note(
-            scene_file.refused(
-                f"views.{index}.camera",
-                f"no pixel of view {view.name!r} looks through the volume;"
-                f" {explain_blindness([view.camera], grid)}",
-            )
-        )
+    others = [view.camera for view, sees in zip(views, seeing, strict=True) if sees]
+    sections = scene_file.tree.views
+    index = [section.name for section in sections].index(blind[0].name)
+    key, which = f"views.{index}.camera", f"no pixel of view {blind[0].name!r}"
+    if len(blind) > 1:
+        named = ", ".join(repr(view.name) for view in blind[:NAMED])
+        rest = ", ..." if len(blind) > NAMED else ""
+        which = f"no pixel of {len(blind)} of {len(sections)} views ({named}{rest})"
+    if len(blind) == len(sections) > 1:
+        key, which = "views", "none"
+    why = explain_blindness([view.camera for view in blind], grid, others)
+    problems.note(scene_file.refused(key, f"{which} looks through the volume; {why}"))
 
 
 def _build_view(

@@ -1,7 +1,7 @@
 """YAML text as a tree of nodes that know their key path and where they were written.
 
-The strict part of YAML: one document of mappings, lists and scalars; no anchors, aliases, tags or
-repeated keys.
+The strict part of YAML: one document of mappings, lists and scalars; no tags or repeated keys.
+Aliases, and the merge key `<<`, are written out, up to `MAX_COPIES` values.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.scalars import Scalar, resolve
 
 MAX_DEPTH = 32
+MAX_COPIES = 10_000
+"""So many values may come of aliases: a few of these could stand for billions."""
+MERGE = "<<"
 FAST = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """The parser in C, where it is there: some twenty times faster."""
 SHORT = 2**17
@@ -88,8 +91,7 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
 
     Repeated keys go to `problems`.
 
-    Raises SceneError where the text has no such tree: broken syntax, several documents, aliases,
-    tags.
+    Raises SceneError where the text has no such tree: broken syntax, several documents, tags.
     """
     try:
         return _parse(text, locate, problems, key)
@@ -123,11 +125,16 @@ def _parse(text: str, locate: Locate, problems: Problems, key: str) -> Node:
 
 
 class _Composer:
-    """Builds nodes from the parser's events: aliases are seen before anything follows them."""
+    """Builds nodes from the parser's events: aliases are seen before anything follows them.
+
+    `anchors` are the nodes that aliases may stand for, by name; `copies` counts what they became.
+    """
 
     def __init__(self, text: str, locate: Locate, problems: Problems, loader: Any):
         self.events = yaml.parse(text, Loader=loader)
         self.locate, self.problems = locate, problems
+        self.anchors: dict[str, Node] = {}
+        self.copies = 0
 
     def document(self, key: str) -> Node:
         next(self.events)
@@ -145,8 +152,10 @@ class _Composer:
     def node(self, event: yaml.Event, key: str, key_where: str | None, depth: int) -> Node:
         where = self.where(event)
         node = Node(key, where, key_where or where, None)
-        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-            raise node.refused("anchors and aliases are not supported; write the value out")
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in self.anchors:
+                raise node.refused(f"*{event.anchor} stands for nothing: no &{event.anchor} before")
+            return self.copy(self.anchors[event.anchor], node, node, depth)
         if tag := getattr(event, "tag", None):
             raise node.refused(f"tags such as {tag!r} are not supported")
         if depth > MAX_DEPTH:
@@ -157,7 +166,30 @@ class _Composer:
             node.value = list(self.items(node, depth))
         else:
             node.value = self.mapping(node, depth)
+        if anchor := getattr(event, "anchor", None):
+            self.anchors[anchor] = node
         return node
+
+    def copy(self, source: Node, place: Node, alias: Node, depth: int) -> Node:
+        """`source` with all that is below it, for the `place` that an `alias` leads to."""
+        self.copies += 1
+        if self.copies > MAX_COPIES:
+            raise alias.refused(
+                f"aliases stand for more than {MAX_COPIES:,} values; write the value out"
+            )
+        if depth > MAX_DEPTH:
+            raise alias.refused(f"nested more than {MAX_DEPTH} deep")
+
+        def below(name: object, child: Node) -> Node:
+            inner = Node(place.child_key(name), child.where, child.key_where, None)
+            return self.copy(child, inner, alias, depth + 1)
+
+        value = source.value
+        if isinstance(value, dict):
+            value = {name: below(name, child) for name, child in value.items()}
+        elif isinstance(value, list):
+            value = [below(index, child) for index, child in enumerate(value)]
+        return Node(place.key, place.where, place.key_where, value)
 
     def items(self, parent: Node, depth: int) -> Iterator[Node]:
         index = 0
@@ -166,12 +198,15 @@ class _Composer:
             index += 1
 
     def mapping(self, parent: Node, depth: int) -> dict[str, Node]:
-        entries: dict[str, Node] = {}
+        entries, merged = dict[str, Node](), dict[str, Node]()
         while not isinstance(event := next(self.events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
                 raise SceneError(
                     f"{self.where(event)}: {parent.child_key('?')}: a key must be plain text"
                 )
+            if event.value == MERGE and not event.style:
+                merged = self.merged(parent, self.where(event), depth) | merged
+                continue
             name = event.value if event.value.isprintable() else repr(event.value)
             child = self.node(
                 next(self.events), parent.child_key(name), self.where(event), depth + 1
@@ -182,7 +217,16 @@ class _Composer:
                 )
             else:
                 entries[name] = child
-        return entries
+        return merged | entries
+
+    def merged(self, parent: Node, where: str, depth: int) -> dict[str, Node]:
+        """The entries of the mapping that follows a merge key in `parent`."""
+        child = self.node(next(self.events), parent.key, where, depth)
+        if not isinstance(child.value, dict):
+            raise child.key_refused(
+                f"{MERGE} takes the entries of one mapping, found {describe_found(child)}"
+            )
+        return child.value
 
     def where(self, event: yaml.Event) -> str:
         mark = event.start_mark

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator
+import re
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 
 from ddrecon.errors import FormatError, SceneError
 
+PLACED = re.compile(r".*?: (?P<key>\S+[.][0-9]+\S*): (?P<what>.*)")
+"""A problem of an entry of a list, after the file and the place where it is."""
+ALIKE = 4
+"""So many lines that differ but in their places are told as one."""
 MOST = 100
 """Problems that are told in one go."""
 LONGEST = 60
@@ -48,13 +53,30 @@ class Problems:
         """
         files = list(dict.fromkeys(line for error in self.unusable for line in error.lines))
         if self.lines:
-            lines = [*dict.fromkeys(self.lines), *files]
+            lines = [*_group(dict.fromkeys(self.lines)), *files]
             raise SceneError(
                 [*lines[:MOST], "and more: mend these first"] if len(lines) > MOST else lines
             )
         if self.unusable:
             first = self.unusable[0]
             raise FormatError(first.path, first.reason, files[1:])
+
+
+def _group(lines: Iterable[str]) -> list[str]:
+    """`lines` with those that say the same of several entries of a list made one.
+
+    It is the first of them, which tells how many follow it.
+    """
+    groups: dict[str, list[str]] = {}
+    for line in lines:
+        match = PLACED.match(line)
+        kind = re.sub("[.][0-9]+", ".N", match["key"]) + match["what"] if match else line
+        groups.setdefault(kind, []).append(line)
+    return [
+        line
+        for same in groups.values()
+        for line in (same if len(same) < ALIKE else [f"{same[0]} ({len(same) - 1} more like this)"])
+    ]
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

@@ -46,12 +46,16 @@ CONVENTIONS: dict[str, Callable[[Tensor], Tensor]] = {
 """What poses may be instead of camera to world with OpenGL axes, and what makes these of them."""
 
 
-def explain_blindness(cameras: Sequence[Camera], grid: Grid) -> str:
-    """Why, most likely, none of `cameras` sees the box of `grid`."""
+def explain_blindness(cameras: Sequence[Camera], grid: Grid, seeing: Sequence[Camera] = ()) -> str:
+    """Why, most likely, none of `cameras` sees the box of `grid`.
+
+    `seeing` are those of the scene that do, which they may by chance.
+    """
     middle = grid.center_xyz
-    for what, convert in CONVENTIONS.items() if len(cameras) > 1 else ():
-        if all(_looks_at(replace(one, pose=convert(one.pose)), grid) for one in cameras):
-            return f"it would with matrices read otherwise; they seem to be {what}"
+    for group in ([*cameras, *seeing], cameras):
+        for what, convert in CONVENTIONS.items() if len(group) > 1 else ():
+            if all(_looks_at(replace(one, pose=convert(one.pose)), grid) for one in group):
+                return f"it would with matrices read otherwise; they seem to be {what}"
     if len(cameras) > 1 and (place := _meeting_place(cameras)) is not None:
         return (
             f"the cameras look at about ({', '.join(f'{x:.3g}' for x in place.tolist())}), but the"

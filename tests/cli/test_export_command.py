@@ -135,3 +135,53 @@ def test_no_folder(refuse: Refuse, folder: Path) -> None:
     assert refuse(2, "export", "scene.yaml", "-o", "none/smoke.xml") == [
         "none/smoke.xml: there is no folder none"
     ]
+
+
+def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
+    """What differs by cell as fields, the rest as metadata where the format has a place for it."""
+    succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
+    constants = "sigma_t 6.5 5.5 4.5, albedo 0.923077 0.909091 0.888889, g 0.3"
+    for name, place in (
+        ("run.vdb", "in its metadata"),
+        ("run.npz", "which the format has no place for"),
+    ):
+        assert succeed("export", "run", "-o", name).stdout.splitlines() == [
+            f"fields: density; the same everywhere, {place}: {constants}",
+            f"written: {name}",
+        ]
+        ours, theirs = (
+            read_field(Path(name), "density"),
+            read_field(Path("run/volumes/density.npz"), "density"),
+        )
+        assert np.array_equal(ours.values, theirs.values) and np.array_equal(
+            ours.bounds, theirs.bounds
+        )
+    succeed(
+        "export",
+        "scene.yaml",
+        "-o",
+        "by_cell.npz",
+        "-D",
+        "volume.sigma_s={file: density.npz, name: density}",
+    )
+    assert field_names(Path("by_cell.npz")) == ["density", "sigma_t", "albedo"]
+    assert refuse(2, "export", "run", "density.npz", "-o", "both.vdb")[-1].startswith(
+        "Error: one scene"
+    )
+
+
+@pytest.mark.parametrize("colors", [(), (3,)])
+def test_z_points_up_where_y_did(succeed: Run, refuse: Refuse, colors: tuple[int, ...]) -> None:
+    """Each cell keeps its place in space: (x, y, z) becomes (x, -z, y)."""
+    values = np.random.default_rng(2).random((2, 3, 4, *colors)).astype(np.float32)
+    box = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 5.0]])
+    write_field(Path("start.npz"), "albedo", values, box)
+    succeed("export", "start.npz", "-o", "turned.npz", "--up", "z")
+    turned = read_field(Path("turned.npz"), "albedo")
+    assert turned.bounds is not None and turned.bounds.tolist() == [[-1, -5, -2], [1, 3, 2.5]]
+    for (z, y, x), value in np.ndenumerate(values[..., 0] if colors else values):
+        center = box[0] + (np.array([x, y, z]) + 0.5) * (box[1] - box[0]) / [4, 3, 2]
+        place = np.array([center[0], -center[2], center[1]]) - turned.bounds[0]
+        i, j, k = (place / (turned.bounds[1] - turned.bounds[0]) * [4, 2, 3]).astype(int)
+        assert (turned.values[k, j, i, 0] if colors else turned.values[k, j, i]) == value
+    assert "turns volumes only" in refuse(2, "export", "scene.yaml", "-o", "a.xml", "--up", "z")[-1]

@@ -76,6 +76,9 @@ def test_the_log_has_a_row_an_iteration(succeed: Run) -> None:
     seconds = [float(row["seconds"]) for row in log]
     assert seconds == sorted(seconds) and seconds[0] > 0
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
+    for row in log:
+        parts = float(row["data_loss"]) + float(row["penalty"])
+        assert parts == pytest.approx(float(row["loss"]), rel=1e-6) and float(row["penalty"]) >= 0
     assert int(log[-1]["forward_iterations"]) > 0 and int(log[-1]["adjoint_iterations"]) > 0
     assert float(log[-1]["test_psnr"]) > 0
 
@@ -204,9 +207,9 @@ def test_divergence_keeps_the_last_good_state(run: Run) -> None:
 def test_the_report_shows_every_view_field_and_setting(succeed: Run) -> None:
     succeed(*OPTIMIZE, "out")
     text, summary = Path("out/report.html").read_text(), read_json("out/summary.json")
-    assert text.count("<img ") == 2 + 2 + 1 and text.count("<svg ") == 2
+    assert text.count("<img ") == 2 * 2 + 2 + 1 and text.count("<svg ") == 2
     for name, view in summary["views"].items():
-        assert f"{name} ({view['split']}): {view['psnr']:.2f} dB" in text
+        assert f"{name}: {view['psnr']:.2f} dB" in text
     for told in (
         "density, middle slices",
         "means along the axes",

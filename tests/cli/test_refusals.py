@@ -213,8 +213,8 @@ def test_unknown_parameter(refuse: Refuse) -> None:
 
 
 def test_unknown_gradient(refuse: Refuse) -> None:
-    (line,) = refuse(2, *COMMANDS["render"], "--gradient", "sigma_q")
-    assert line == "--gradient sigma_q: the scene has no number sigma_q"
+    (line,) = refuse(2, *COMMANDS["render"], "--gradient", "densty")
+    assert line == "--gradient densty: the scene has no number densty; did you mean 'density'?"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="CUDA is here")

@@ -440,7 +440,7 @@ def test_overrides_prefer_the_longest_key_there_is(read: Read):
         ),
         (
             "volume.g=*x",
-            "-D volume.g=*x: volume.g: anchors and aliases are not supported; write the value out",
+            "-D volume.g=*x: volume.g: *x stands for nothing: no &x before",
         ),
         ("render={background: true, background: true}", "render.background: repeated key"),
     ],

@@ -8,12 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ddrecon.errors import SceneError
 from ddrecon.scene_file.load import MAX_BYTES, read_scene
-from ddrecon.scene_file.nodes import parse
+from ddrecon.scene_file.nodes import Node, parse
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.scalars import resolve
 
@@ -81,20 +82,50 @@ def test_quoted_scalars_are_text():
     )
 
 
+def plain(node: Node) -> object:
+    """What `node` and all below it hold, as Python has it; keys are checked."""
+    if isinstance(node.value, dict):
+        for name, child in node.value.items():
+            assert child.key == node.child_key(name)
+        return {name: plain(child) for name, child in node.value.items()}
+    if isinstance(node.value, list):
+        assert [child.key for child in node.value] == [
+            node.child_key(i) for i in range(len(node.value))
+        ]
+        return [plain(child) for child in node.value]
+    return node.value
+
+
+ALIASED = """
+lens: &lens {fov: 30, size: &size [8, 6]}
+views:
+  - {name: a, camera: *lens}
+  - {name: b, camera: {<<: *lens, fov: 40}}
+  - {name: c, camera: {fov: 50, <<: *lens, size: [1, 2]}, thumb: *size}
+"""
+
+
+def test_aliases_and_merges_mean_what_yaml_says():
+    """As PyYAML has them; keys lead to where they are used, places to where they are written."""
+    root = parse(ALIASED, lambda line, column: f"{line}:{column}", Problems())
+    assert plain(root) == yaml.safe_load(ALIASED)
+    marks = {node.key: node.where for node in root.walk()}
+    assert marks["views.0.camera"] == "4:23" and marks["views.0.camera.fov"] == "2:19"
+    assert marks["views.1.camera.fov"] == "5:40" and marks["views.1.camera.size.1"] == "2:39"
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
+        ("a: 1\nb: [*x]\n", "scene.yaml:2:5: b.0: *x stands for nothing: no &x before"),
+        ("a: &x [*x]\n", "scene.yaml:1:8: a.0: *x stands for nothing: no &x before"),
         (
-            "a: &x 1\nb: *x\n",
-            "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out",
+            "a: &x [" + "0, " * 5000 + "0]\nb: [*x, *x]\n",
+            "scene.yaml:2:9: b.1: aliases stand for more than 10,000 values; write the value out",
         ),
         (
-            "a: 1\nb: [*x]\n",
-            "scene.yaml:2:5: b.0: anchors and aliases are not supported; write the value out",
-        ),
-        (
-            "a: &x [*x]\n",
-            "scene.yaml:1:4: a: anchors and aliases are not supported; write the value out",
+            "a: [1]\nb: {<<: [2]}\n",
+            "scene.yaml:2:5: b: << takes the entries of one mapping, found a list of 1",
         ),
         (
             "a: !!python/name:os.system x\n",

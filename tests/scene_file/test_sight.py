@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -139,3 +140,17 @@ def test_the_other_axis_that_is_up_is_named(is_y_up: bool) -> None:
         cameras.append(Camera((turn.T if is_y_up else turn) @ pose, (9, 9), 0.05))
     words = "y up in a scene with z up" if is_y_up else "z up, as in Blender, in a scene with y up"
     assert words in explain_blindness(cameras, grid)
+
+
+def test_cameras_that_see_the_box_by_chance_are_asked_as_well() -> None:
+    """World to camera read as camera to world: some of many look at the box all the same."""
+    up, middle = torch.tensor([0.0, 1.0, 0.0]), torch.tensor(GRID.center_xyz)
+    poses = [
+        look_at(middle + 9 * torch.tensor([math.cos(a), 0.4, math.sin(a)]), middle, up)
+        for a in (0.4 + 0.8 * i for i in range(7))
+    ]
+    cameras = [Camera(inverse(as_opencv(pose)), (9, 12), 0.3) for pose in poses]
+    seeing = [camera for camera in cameras if sees_box(camera, GRID)]
+    blind = [camera for camera in cameras if not sees_box(camera, GRID)]
+    assert seeing and blind
+    assert "world to camera with OpenCV axes" in explain_blindness(blind, GRID, seeing)

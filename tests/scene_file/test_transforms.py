@@ -362,6 +362,18 @@ def test_what_cannot_be_exported(read: Read, tmp_path: Path) -> None:
     assert (tmp_path / "t.json").read_text() == "mine"
 
 
+def test_what_is_wrong_with_every_frame_is_told_once(refusal: Refusal, tmp_path: Path) -> None:
+    """Ten poses that are scaled are one line; two, or other faults between them, are not."""
+    wrong = (2 * np.array(POSE)).tolist()
+    frames = [frame(None, transform_matrix=wrong) for _ in range(10)]
+    transforms(tmp_path / "t.json", *frames, frame(None, transform_matrix=3), **NERFSTUDIO)
+    lines = refusal(changed(views={"transforms": "t.json"}))
+    assert len(lines) == 2 and "frames.0.transform_matrix: its last row" in lines[0]
+    assert lines[0].endswith("(9 more like this)") and "frames.10.transform_matrix: exp" in lines[1]
+    transforms(tmp_path / "t.json", *frames[:2], **NERFSTUDIO)
+    assert len(refusal(changed(views={"transforms": "t.json"}))) == 2
+
+
 LENSES = {
     "OPENCV": {"k1": -0.1, "k2": 0.02, "k3": 0.0, "k4": 0.0, "p1": 1e-3, "p2": -2e-3},
     "OPENCV_FISHEYE": {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.0},

@@ -1,4 +1,4 @@
-"""Volumes from one format into another."""
+"""Volumes from several files put together, and turned for programs whose up is z."""
 
 from __future__ import annotations
 
@@ -9,18 +9,24 @@ import numpy as np
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.folders import require_free_files
-from ddrecon.io.volumes.field import BOX, Field
-from ddrecon.io.volumes.table import field_names, read_field, require_format, write_fields
+from ddrecon.io.volumes.field import BOX, Field, Fields
+from ddrecon.io.volumes.table import field_names, read_field, require_format
 
 
-def convert(sources: Sequence[Path], output: Path, *, may_exist: bool) -> list[Path]:
-    """Writes all fields of the volumes `sources` to `output`, in the format of its suffix.
+def require_target(output: Path, *, may_exist: bool) -> None:
+    """Raises UsageError where `output` is there and may not be or its folder is missing.
 
-    Returns what was written. Raises UsageError where `output` is there and may not be or its folder
-    is missing, FormatError for volumes of different cells or boxes, and for none at all.
+    Raises FormatError where its suffix is no volume format's.
     """
     require_format(output)
     require_free_files([output], may_exist=may_exist)
+
+
+def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:
+    """All fields of the volumes `sources`, and their box.
+
+    Raises FormatError for volumes of different cells or boxes, and for none at all.
+    """
     fields: dict[str, Field] = {}
     for path in sources:
         for name in field_names(path):
@@ -30,12 +36,15 @@ def convert(sources: Sequence[Path], output: Path, *, may_exist: bool) -> list[P
             _require_same_cells(path, fields[name], next(iter(fields.values())))
     if not fields:
         raise FormatError(sources[0], "has no fields")
-    write_fields(
-        output,
-        {name: field.values for name, field in fields.items()},
-        _bounds(sources[0], next(iter(fields.values()))),
-    )
-    return [output]
+    values = {name: field.values for name, field in fields.items()}
+    return values, _bounds(sources[0], next(iter(fields.values())))
+
+
+def raise_z(fields: Fields, bounds: np.ndarray) -> tuple[Fields, np.ndarray]:
+    """`fields` and their box turned so that z points up where y did: (x, y, z) is (x, -z, y)."""
+    (x, y, z), (far_x, far_y, far_z) = bounds.tolist()
+    box = np.array([[x, -far_z, y], [far_x, -z, far_y]])
+    return {name: values.swapaxes(0, 1)[:, ::-1] for name, values in fields.items()}, box
 
 
 def _require_same_cells(path: Path, field: Field, first: Field) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -36,6 +37,8 @@ BOX = "[[xmin, ymin, zmin], [xmax, ymax, zmax]]"
 """What `bounds` are, in messages."""
 Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
+NO_FIELDS: Fields = MappingProxyType({})
+"""None of them."""
 
 
 def name_from_file(path: Path) -> list[str]:

@@ -16,7 +16,7 @@ from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.volumes.field import Field, Fields, check_field
+from ddrecon.io.volumes.field import NO_FIELDS, Field, Fields, check_field
 
 COLOR = "color"
 NAMES = {
@@ -39,15 +39,18 @@ EVEN = 0.05
 """How far off even spacing a coordinate may be [cells]: files often round to a few digits."""
 
 
-def write_netcdf(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+def write_netcdf(
+    path: Path, fields: Fields, bounds: np.ndarray, constants: Fields = NO_FIELDS
+) -> None:
     """Writes `fields`, [z, y, x] or [z, y, x, 3], as float32 variables, and their box.
 
-    `bounds` [2, 3], its corners (x, y, z), are written as coordinates and their bounds.
+    `bounds` [2, 3], its corners (x, y, z), are written as coordinates and their bounds; `constants`
+    as attributes of the file.
     """
     netcdf = load_for_file("netCDF4", path)
     z, y, x = next(iter(fields.values())).shape[:3]
     with replace_file(path) as temporary, netcdf.Dataset(temporary, "w") as file:
-        file.Conventions = "CF-1.11"
+        file.setncatts({"Conventions": "CF-1.11", **constants})
         for axis, count, low, high in zip(
             "xyz", (x, y, z), *np.asarray(bounds, np.float64), strict=True
         ):

@@ -24,20 +24,22 @@ from ddrecon.io.volumes.vti import read_vti, vti_names, write_vti
 class VolumeFormat:
     """How one kind of volume file is read and written.
 
-    By `names(path)`, `read(path, name)` and `write(path, fields, bounds)`.
+    By `names(path)`, `read(path, name)` and `write(path, fields, bounds)`. With `has_metadata`,
+    `write` takes constants as well.
     """
 
     names: Callable[[Path], list[str]]
     read: Callable[[Path, str], Field]
-    write: Callable[[Path, Fields, np.ndarray], None]
+    write: Callable[..., None]
+    has_metadata: bool = False
 
 
 FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(npz_names, read_npz, write_npz),
     ".vol": VolumeFormat(name_from_file, read_vol, write_vol),
-    ".vdb": VolumeFormat(vdb_names, read_vdb, write_vdb),
+    ".vdb": VolumeFormat(vdb_names, read_vdb, write_vdb, has_metadata=True),
     ".vti": VolumeFormat(vti_names, read_vti, write_vti),
-    ".nc": VolumeFormat(netcdf_names, read_netcdf, write_netcdf),
+    ".nc": VolumeFormat(netcdf_names, read_netcdf, write_netcdf, has_metadata=True),
     **dict.fromkeys((".tif", ".tiff"), VolumeFormat(name_from_file, read_stack, write_stack)),
 }
 
@@ -70,12 +72,24 @@ def write_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray) -
     write_fields(path, {name: values}, bounds)
 
 
-def write_fields(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+def write_fields(
+    path: Path, fields: Fields, bounds: np.ndarray, constants: Fields | None = None
+) -> None:
     """Writes several fields of the same cells, by name, each as `write_field` does.
 
-    Raises FormatError where the format holds but one.
+    `constants`, each one number or three, become metadata where `keeps_constants`, else nothing.
+    Raises FormatError where the format holds but one field.
     """
-    _format_of(path).write(path, fields, bounds)
+    write = _format_of(path).write
+    if constants and keeps_constants(path):
+        write(path, fields, bounds, constants)
+    else:
+        write(path, fields, bounds)
+
+
+def keeps_constants(path: Path) -> bool:
+    """Whether the format of the suffix of `path` has metadata for them."""
+    return _format_of(path).has_metadata
 
 
 def require_format(path: Path) -> None:

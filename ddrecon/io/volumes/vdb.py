@@ -18,7 +18,7 @@ import numpy as np
 
 from ddrecon.io.files.arrays import as_float32
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.volumes.field import Fields
+from ddrecon.io.volumes.field import NO_FIELDS, Fields
 
 RESOLUTION = "ddrecon_resolution"
 MAGIC, FILE_VERSION, LIBRARY_VERSION = 0x56444220, 224, (10, 0)
@@ -27,17 +27,23 @@ ONLY_ACTIVE_VALUES = b"\0"
 LEAF, LOWER, UPPER = 3, 4, 5
 """Log2 of the children along an axis, of a leaf and the nodes above: OpenVDB's standard tree."""
 POSITIONS = struct.Struct("<3q")
+HEADER, UUID_LENGTH = "<qIIIB", 36
+TREE = "Tree_{}_5_4_3"
 
 
-def write_vdb(path: Path, fields: Fields, bounds: np.ndarray) -> None:
+def write_vdb(
+    path: Path, fields: Fields, bounds: np.ndarray, constants: Fields = NO_FIELDS
+) -> None:
     """Writes `fields`, each [z, y, x] or [z, y, x, 3], as float32 fog volumes.
 
-    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform.
+    `bounds` [2, 3], the corners (x, y, z) of the box [u], become their transform; `constants`, each
+    one number or three, metadata of the file.
     """
     header = (
-        struct.pack("<qIIIB", MAGIC, FILE_VERSION, *LIBRARY_VERSION, 1) + str(uuid.uuid4()).encode()
+        struct.pack(HEADER, MAGIC, FILE_VERSION, *LIBRARY_VERSION, 1) + str(uuid.uuid4()).encode()
     )
-    data = header + _metadata({}) + struct.pack("<I", len(fields))
+    labels = {name: _label(value) for name, value in constants.items()}
+    data = header + _metadata(labels) + struct.pack("<I", len(fields))
     for name, values in fields.items():
         data += _grid(name, as_float32(values), np.asarray(bounds, np.float64), len(data))
     with replace_file(path) as temporary:
@@ -50,7 +56,7 @@ def _grid(name: str, values: np.ndarray, bounds: np.ndarray, start: int) -> byte
     It is a descriptor that says where its parts lie, then those parts.
     """
     kind = "float" if values.ndim == 3 else "vec3s"
-    descriptor = _text(name) + _text(f"Tree_{kind}_5_4_3") + _text("")
+    descriptor = _text(name) + _text(TREE.format(kind)) + _text("")
     cells = values.shape[2::-1]
     labels = {
         "class": ("string", b"fog volume"),
@@ -186,6 +192,11 @@ def _metadata(entries: dict[str, tuple[str, bytes]]) -> bytes:
         for name, (kind, value) in entries.items()
     ]
     return struct.pack("<I", len(parts)) + b"".join(parts)
+
+
+def _label(value: np.ndarray) -> tuple[str, bytes]:
+    """One number or three, as the type and the value of an entry."""
+    return "float" if value.size == 1 else "vec3s", value.astype("<f4").tobytes()
 
 
 def _text(text: str) -> bytes:

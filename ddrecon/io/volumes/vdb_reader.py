@@ -1,10 +1,11 @@
 """Reading OpenVDB files, through the module `openvdb` (`pyopenvdb` before OpenVDB 11).
 
-Debian and Blender have it, pip has not.
+Debian and Blender have it, pip has not. Without it, the files that we write can still be read.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -16,12 +17,13 @@ from ddrecon.errors import FormatError
 from ddrecon.io.files.arrays import check_size
 from ddrecon.io.volumes.field import Field, check_field
 from ddrecon.io.volumes.vdb import RESOLUTION
+from ddrecon.io.volumes.vdb_plain import ForeignError, read_plain
 
 MODULES = ("openvdb", "pyopenvdb")
 ADVICE = (
-    "reading .vdb needs the Python module openvdb, which pip does not have. Convert the file to "
-    ".npz where it is at hand, in Blender's Python or in Debian's (apt-get install "
-    "python3-openvdb): docs/formats.md has the line to type"
+    "reading the .vdb of another program needs the Python module openvdb, which pip does not have. "
+    "Convert the file to .npz where it is at hand, in Blender's Python or in Debian's (apt-get "
+    "install python3-openvdb): docs/formats.md has the line to type"
 )
 COMPONENTS = {"float": 1, "double": 1, "half": 1, "vec3s": 3, "vec3d": 3}
 
@@ -31,7 +33,8 @@ def vdb_names(path: Path) -> list[str]:
 
     Raises FormatError when it cannot be read.
     """
-    return list(_grids(path))
+    module = _module()
+    return list(_plain(path) if module is None else _grids(path, module))
 
 
 def read_vdb(path: Path, name: str) -> Field:
@@ -41,11 +44,13 @@ def read_vdb(path: Path, name: str) -> Field:
     lie as it does. Raises FormatError when it cannot be read, is absent, turned against the axes,
     or not a legal field.
     """
-    grids = _grids(path)
-    if name not in grids:
-        raise FormatError(
-            path, f"has no grid {name!r}; it has {', '.join(map(repr, grids)) or 'none'}"
-        )
+    module = _module()
+    if module is None:
+        fields = _plain(path)
+        _require_grid(path, name, fields)
+        return fields[name]
+    grids = _grids(path, module)
+    _require_grid(path, name, grids)
     grid = grids[name]
     low, high = _cells(path, grid, list(grids.values()))
     components = COMPONENTS[grid.valueTypeName]
@@ -56,9 +61,15 @@ def read_vdb(path: Path, name: str) -> Field:
     return check_field(path, name, values.swapaxes(0, 2), _bounds(grid, low, high))
 
 
-def _grids(path: Path) -> dict[str, Any]:
+def _require_grid(path: Path, name: str, grids: Collection[str]) -> None:
+    if name not in grids:
+        raise FormatError(
+            path, f"has no grid {name!r}; it has {', '.join(map(repr, grids)) or 'none'}"
+        )
+
+
+def _grids(path: Path, module: ModuleType) -> dict[str, Any]:
     """The grids by name, but for those of other kinds of values."""
-    module = _module(path)
     try:
         grids, _ = module.readAll(str(path))
     except Exception as error:  # OpenVDB's own exceptions are of many kinds
@@ -66,13 +77,21 @@ def _grids(path: Path) -> dict[str, Any]:
     return {grid.name: grid for grid in grids if grid.valueTypeName in COMPONENTS}
 
 
-def _module(path: Path) -> ModuleType:
+def _module() -> ModuleType | None:
     for name in MODULES:
         try:
             return import_module(name)
         except ImportError:
             continue
-    raise FormatError(path, ADVICE)
+    return None
+
+
+def _plain(path: Path) -> dict[str, Field]:
+    """The fields by name of a file that we have written; raises FormatError for any other."""
+    try:
+        return read_plain(path)
+    except ForeignError:
+        raise FormatError(path, ADVICE) from None
 
 
 def _cells(path: Path, grid: Any, others: list[Any]) -> tuple[np.ndarray, np.ndarray]:

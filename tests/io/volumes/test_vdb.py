@@ -15,7 +15,7 @@ import openvdb_python
 import pytest
 
 from ddrecon.errors import FormatError
-from ddrecon.io.volumes.table import read_field, write_fields
+from ddrecon.io.volumes.table import field_names, read_field, write_fields
 
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.5, 3.0]])
 
@@ -135,14 +135,48 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
     assert "not an OpenVDB file that can be read" in openvdb_python.run(CATCH, path, "density")
 
 
-def test_without_openvdb_the_ways_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def without_openvdb(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenVDB's module is not installed."""
     for name in ("openvdb", "pyopenvdb"):
         monkeypatch.setitem(sys.modules, name, None)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (9, 40, 17), (9, 12, 4200), (3, 130, 5, 3)])
+@pytest.mark.usefixtures("without_openvdb")
+def test_what_we_write_is_read_without_openvdb(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    """Also in a box so long that the root of the tree has two children."""
+    fields = {"density": sparse(*shape), "full": np.random.default_rng(1).random(shape, np.float32)}
+    path = tmp_path / "smoke.vdb"
+    write_fields(path, fields, BOUNDS, {"g": np.array(0.3), "albedo": np.ones(3)})
+    assert field_names(path) == list(fields)
+    for name, values in fields.items():
+        found = read_field(path, name)
+        assert np.array_equal(found.values, values)
+        assert np.allclose(found.bounds, BOUNDS, rtol=1e-14, atol=0)
+    with pytest.raises(FormatError, match="no grid 'lwc'; it has 'density', 'full'"):
+        read_field(path, "lwc")
+
+
+@pytest.mark.parametrize("place", [8, 12], ids=["file version", "library version"])
+@pytest.mark.usefixtures("without_openvdb")
+def test_without_openvdb_the_ways_are_named(tmp_path: Path, place: int) -> None:
+    path = written(tmp_path / "smoke.vdb", density=np.ones((1, 2, 3)))
+    data = bytearray(path.read_bytes())
+    data[place] += 1
+    path.write_bytes(data)
     module, package = "needs the Python module openvdb", "apt-get install python3-openvdb"
     with pytest.raises(FormatError, match=rf"{module}.*Blender.*{package}.*docs/formats\.md"):
-        read_field(written(tmp_path / "smoke.vdb", density=np.ones((1, 2, 3))), "density")
+        read_field(path, "density")
+
+
+def test_openvdb_finds_the_constants(tmp_path: Path) -> None:
+    path, colors = tmp_path / "smoke.vdb", np.array([0.5, 0.25, 1])
+    write_fields(
+        path, {"density": np.ones((1, 2, 3))}, BOUNDS, {"g": np.array(0.5), "albedo": colors}
+    )
+    found = openvdb_python.described("vdb.readAll(sys.argv[1])[1]", path)
+    assert found == {"g": 0.5, "albedo": colors.tolist()}
 
 
 def test_the_program_in_the_documentation_converts(tmp_path: Path) -> None:

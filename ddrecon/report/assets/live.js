@@ -1,0 +1,40 @@
+// A page that a run serves while it goes on asks for itself again, and takes up what is new: the
+// volume turns on as it stands, and views that have not changed keep their wipers.
+"use strict";
+
+const PAUSE = 2000; // milliseconds
+const taken = new Map(); // what each part was when it was last taken
+
+function takePart(next, id) {
+  const [part, here] = [next.getElementById(id), document.getElementById(id)];
+  if (!part || taken.get(id) === part.outerHTML) return;
+  taken.set(id, part.outerHTML);
+  const fresh = document.importNode(part, true);
+  if (here) here.replaceWith(fresh);
+  else document.body.append(fresh);
+  for (const pair of fresh.querySelectorAll(".pair")) makeWiper(pair);
+}
+
+async function takeVolume(next) {
+  const text = [...next.querySelectorAll("script.field")].map((field) => field.textContent).join();
+  if (!viewers.length || taken.get("fields") === text) return;
+  taken.set("fields", text);
+  await readFields(next);
+  fillControls();
+  showField();
+}
+
+async function refresh() {
+  try {
+    const answer = await fetch(location.href, { cache: "no-store" });
+    const next = new DOMParser().parseFromString(await answer.text(), "text/html");
+    if (!("live" in next.body.dataset)) return location.reload(); // the run is done
+    for (const id of ["lead", "loss", "views"]) takePart(next, id);
+    await takeVolume(next);
+  } catch (error) {
+    console.warn(error); // the server is gone, or busy
+  }
+  setTimeout(refresh, PAUSE);
+}
+
+if ("live" in document.body.dataset) setTimeout(refresh, PAUSE);

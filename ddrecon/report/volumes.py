@@ -1,0 +1,123 @@
+"""Volumes within a page: turned, seen through and cut by its scripts, as pictures without them."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool3d
+
+from ddrecon.io.images import srgb
+from ddrecon.report.pictures import find_high
+
+MOST_CELLS = 1_000_000
+"""A field of more is made coarser, by whole factors."""
+CONTROLS = (
+    ("opacity", "opacity", -2, 10, 0.1),
+    ("low", "from", 0, 0.9, 0.01),
+    ("high", "to", 0.05, 1, 0.01),
+)
+"""Sliders of the transfer function: names, labels, ends and steps."""
+PALETTES = ("lit smoke", "values")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A field `name` [z, y, x] or [C, z, y, x] in a box with `sides` (x, y, z).
+
+    `of` is `result` or `truth`; `white` is the value shown as white.
+    """
+
+    name: str
+    of: str
+    values: Tensor
+    sides: tuple[float, float, float]
+    white: float
+
+
+def find_white_value(values: Tensor) -> float:
+    """The value of a field that is shown as white: all but one cell in a thousand are below."""
+    return find_high(values.detach().float().cpu().numpy())
+
+
+def volume_viewer(
+    fields: Sequence[Shown], still: str, up: int, towards_eye: tuple[float, float, float]
+) -> str:
+    """The `fields` to turn and to cut; `still` is what is shown where no scripts run.
+
+    `up` is the axis (0, 1, 2) that points up; `towards_eye` (x, y, z) is where the first camera
+    stands.
+    """
+    eye = " ".join(f"{part:.4g}" for part in towards_eye)
+    room = f'<div id="viewers" data-up="{up}" data-eye="{eye}"></div>'
+    slices = "".join(_slice(axis, label) for axis, label in enumerate("xyz"))
+    return "\n".join(
+        [
+            f'<div class="still">{still}</div>',
+            f'<div class="lively">{room}</div>',
+            f'<div class="controls lively">{_controls()}</div>',
+            f'<div class="slices lively">{slices}</div>',
+            *map(_data, fields),
+        ]
+    )
+
+
+def _controls() -> str:
+    sliders = [
+        f'<label>{label} <input type="range" id="{name}" min="{low}" max="{high}" step="{step}">'
+        "</label>"
+        for name, label, low, high, step in CONTROLS
+    ]
+    colors = "".join(f'<option value="{i}">{text}</option>' for i, text in enumerate(PALETTES))
+    return (
+        '<label>field <select id="field"></select></label>'
+        f'<label>shown as <select id="palette">{colors}</select></label>' + "".join(sliders)
+    )
+
+
+def _slice(axis: int, label: str) -> str:
+    canvases = "".join(f'<canvas data-of="{of}"></canvas>' for of in ("result", "truth"))
+    slider = (
+        '<input type="range" min="0" max="0.9999" step="0.0001" value="0.5"'
+        f' aria-label="place along {label}">'
+    )
+    return (
+        f'<figure class="slice" data-axis="{axis}"><div class="both">{canvases}</div>{slider}'
+        "<figcaption><output></output></figcaption></figure>"
+    )
+
+
+def _data(field: Shown) -> str:
+    """`field` for the scripts: as it is displayed, in 8 bits, x fastest."""
+    values = field.values.detach()
+    values = _coarsen(values if values.ndim == 4 else values[None])
+    cells = (values.permute(1, 2, 3, 0) / field.white).float().cpu().numpy()
+    packed = gzip.compress(srgb.encode_bytes(cells).tobytes(), mtime=0)
+    longest = max(field.sides)
+    content = {
+        "name": field.name,
+        "of": field.of,
+        "size": list(values.shape[:0:-1]),
+        "box": [side / longest for side in field.sides],
+        "white": field.white,
+        "channels": values.shape[0],
+        "data": base64.b64encode(packed).decode("ascii"),
+    }
+    return f'<script type="application/json" class="field">{json.dumps(content)}</script>'
+
+
+def _coarsen(values: Tensor) -> Tensor:
+    """`values` [C, z, y, x] with at most about `MOST_CELLS` cells, means of blocks of them."""
+    cells = values[0].numel()
+    factor = 1
+    while cells / factor**3 > MOST_CELLS:
+        factor += 1
+    if factor == 1:
+        return values
+    with torch.no_grad():
+        return avg_pool3d(values.float(), factor, ceil_mode=True, count_include_pad=False)

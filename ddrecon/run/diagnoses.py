@@ -1,0 +1,217 @@
+"""What seems to be wrong with a run, told by its pictures, its log and how its parameters move.
+
+Each function returns a sentence, with what to do, or None where there is nothing to say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import mean, median
+
+import torch
+from torch import Tensor
+
+from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.scene import View
+
+OVERFIT = 6.0
+"""Held-out views this much worse than those trained on [dB] are not explained by noise."""
+GAIN = 1.15
+"""A view whose brightness is off by this factor, against the others, was exposed differently."""
+SHIFT = 0.5
+"""A render that fits better when moved by more pixels was seen by another camera."""
+EXPLAINED = 0.3
+"""The part of a residual that such a move has to explain."""
+FALLING = 1.15
+"""The loss falls yet where it is smaller by this factor in the last part of a run than before."""
+LATE = 0.25
+"""That part of a run, and as much before it."""
+DRIFT = 0.005
+"""Relative changes over the last part of a run that are not rest."""
+BRIGHTNESS = ("irradiance", "radiance", "intensity", "scale")
+REFLECTION = ("albedo", "sigma_s")
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is wrong, in a word that names its `kind` and in a sentence."""
+
+    kind: str
+    text: str
+
+
+class LateMeans:
+    """The mean value of each parameter where the last part of a run begins."""
+
+    def __init__(self) -> None:
+        self.means: dict[str, float] = {}
+
+    def note(self, run: Reconstruction) -> None:
+        """Notes the means, if `run` is there now; after every iteration."""
+        if run.iteration == int((1 - LATE) * run.settings.iterations):
+            self.means = _means(run)
+
+    def moved(self, run: Reconstruction) -> dict[str, float]:
+        """By what factor each mean has changed since, for those above 0."""
+        now = _means(run)
+        return {
+            name: now[name] / was for name, was in self.means.items() if min(was, now[name]) > 0
+        }
+
+
+def _means(run: Reconstruction) -> dict[str, float]:
+    return {parameter.name: float(parameter.value.detach().mean()) for parameter in run.parameters}
+
+
+def diagnose(
+    views: Sequence[View],
+    images: Mapping[str, Tensor],
+    quality: Mapping[str, Mapping[str, float]],
+    rows: Sequence[Row],
+    moved: Mapping[str, float],
+) -> list[Diagnosis]:
+    """What seems to be wrong with a run that has rendered `images` of its `views`.
+
+    `quality` has the PSNR of each, `rows` are its log, and `moved` is by what factor each parameter
+    has changed, in the mean, over the last quarter of the run.
+    """
+    seen = [view for view in views if view.image is not None]
+    trained = [view for view in seen if not view.is_test]
+    overfit = find_overfit(seen, quality)
+    told = {
+        "overfit": overfit,
+        "exposure": find_exposure(trained, images),
+        "cameras": find_shift(trained, images),
+        # What is overfit would only become more so.
+        "unfinished": None if overfit else find_falling(rows),
+        "drift": find_drift(moved),
+    }
+    return [Diagnosis(kind, text) for kind, text in told.items() if text is not None]
+
+
+def find_overfit(views: Sequence[View], quality: Mapping[str, Mapping[str, float]]) -> str | None:
+    """Whether views that were held out are far worse than those trained on."""
+    test, train = (
+        [quality[v.name]["psnr"] for v in views if v.is_test is k] for k in (True, False)
+    )
+    if not test or not train or mean(train) - mean(test) < OVERFIT:
+        return None
+    return (
+        f"overfit: views held out are {mean(train) - mean(test):.1f} dB worse than those trained "
+        "on; raise optimize.parameters.density.tv, add views, or look for cameras that are off"
+    )
+
+
+def find_exposure(views: Sequence[View], images: Mapping[str, Tensor]) -> str | None:
+    """Whether some picture is brighter or darker, as a whole, than the others say."""
+    gains = {view.name: _gain(view, images[view.name]) for view in views}
+    usual = median(gains.values()) if len(gains) > 2 else 1.0
+    odd = {n: g / usual for n, g in gains.items() if abs(math.log(g / usual)) > math.log(GAIN)}
+    if not odd:
+        return None
+    named = ", ".join(f"{name} ({gain:.2f} times)" for name, gain in _worst(odd))
+    return (
+        f"exposure? pictures brighter than their renders by a factor of their own: {named}; give "
+        "all pictures one exposure and white balance"
+    )
+
+
+def find_shift(views: Sequence[View], images: Mapping[str, Tensor]) -> str | None:
+    """Whether renders fit their pictures better when moved: residuals go with the parallax."""
+    moves = {}
+    for view in views:
+        (right, down), explained = best_shift(view, images[view.name])
+        if math.hypot(right, down) > SHIFT and explained > EXPLAINED:
+            moves[view.name] = math.hypot(right, down)
+    if not moves:
+        return None
+    named = ", ".join(f"{name} ({move:.1f} pixels)" for name, move in _worst(moves))
+    return (
+        f"cameras? renders fit better when moved: {named}; check poses and intrinsics, or optimize "
+        "the poses (views.NAME.camera)"
+    )
+
+
+def find_falling(rows: Sequence[Row]) -> str | None:
+    """Whether the loss still falls at the end, at the last resolution."""
+    last = [row for row in rows if row.cells == rows[-1].cells]
+    count = min(int(LATE * len(rows)), len(last) // 2)
+    if count < 3:
+        return None
+    before, after = (
+        median(row.loss for row in part) for part in (last[-2 * count : -count], last[-count:])
+    )
+    if not after > 0 or before / after < FALLING:
+        return None
+    total = rows[-1].iteration
+    return (
+        f"unfinished: the loss fell by {100 * (1 - after / before):.0f} % over the last {count} "
+        f"iterations; go on with --resume --iterations {2 * total}"
+    )
+
+
+def find_drift(moved: Mapping[str, float]) -> str | None:
+    """Whether light and albedo still move against each other, so that pictures stay the same."""
+    lights = {n: f for n, f in moved.items() if n.rpartition(".")[2] in BRIGHTNESS}
+    media = {n: f for n, f in moved.items() if n in REFLECTION}
+    for light, brighter in lights.items():
+        for medium, whiter in media.items():
+            one, other = math.log(brighter), math.log(whiter)
+            if min(abs(one), abs(other)) > DRIFT and one * other < 0:
+                return (
+                    f"drift: {light} and {medium} still move against each other (by factors of "
+                    f"{brighter:.3f} and {whiter:.3f} over the last quarter of the run): pictures "
+                    "hardly tell them apart; fix one of them"
+                )
+    return None
+
+
+def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:
+    """By how many pixels (right, down) the render `image` [3, h, w] is to be moved to fit best.
+
+    And the part of its residual, to the picture of `view`, that this explains. It is one step of
+    Gauss-Newton: the residual is fitted by the derivatives of the render along both axes (central
+    differences; Lucas and Kanade 1981).
+    """
+    target, weight = _picture(view), _weight(view)
+    if min(image.shape[1:]) < 3:
+        return (0.0, 0.0), 0.0
+    inner = (slice(None), slice(1, -1), slice(1, -1))
+    residual = ((target - image) * weight)[inner].double().flatten()
+    # A render moved to the right by d is r(x - d): it changes by -d times its derivative.
+    right = (image[:, 1:-1, :-2] - image[:, 1:-1, 2:]) / 2 * weight[..., 1:-1, 1:-1]
+    down = (image[:, :-2, 1:-1] - image[:, 2:, 1:-1]) / 2 * weight[..., 1:-1, 1:-1]
+    slopes = torch.stack([right.double().flatten(), down.double().flatten()])
+    normal, total = slopes @ slopes.T, float(residual @ residual)
+    if total == 0 or float(torch.linalg.det(normal)) <= 1e-9 * float(normal.trace()) ** 2:
+        return (0.0, 0.0), 0.0
+    move = torch.linalg.solve(normal, slopes @ residual)
+    left = residual - move @ slopes
+    return (float(move[0]), float(move[1])), 1 - float(left @ left) / total
+
+
+def _gain(view: View, image: Tensor) -> float:
+    """How much brighter the picture of `view` is than its render, as a whole."""
+    weight = _weight(view)
+    picture, render = (float((x * weight).sum().clamp(min=1e-12)) for x in (_picture(view), image))
+    return picture / render
+
+
+def _picture(view: View) -> Tensor:
+    if view.image is None:
+        raise ValueError(f"view {view.name} has no image")
+    return view.image
+
+
+def _weight(view: View) -> Tensor:
+    """1 where a pixel counts, [1, h, w]."""
+    picture = _picture(view)
+    return torch.ones_like(picture[:1]) if view.mask is None else view.mask[None]
+
+
+def _worst(numbers: Mapping[str, float]) -> list[tuple[str, float]]:
+    """At most four of `numbers`, by name: those farthest from 1 as factors."""
+    return sorted(numbers.items(), key=lambda item: -abs(math.log(item[1])))[:4]

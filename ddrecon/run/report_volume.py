@@ -1,0 +1,102 @@
+"""The volume of a run on its page: to turn and to cut, as pictures, and once around."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import Camera
+from ddrecon.io.images.movies import SECONDS, encode_frames
+from ddrecon.io.images.table import png_of
+from ddrecon.io.images.webp import moving_webp_of
+from ddrecon.reconstruct.smoothing import smoothing_text
+from ddrecon.renderer import view_image
+from ddrecon.report.page import movie, paragraph, picture, side_by_side
+from ddrecon.report.pictures import find_white, pixels, projections, slices
+from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
+from ddrecon.run.findings import Findings
+from ddrecon.scene import View
+from ddrecon.turntable import place_turntable, upright_axis
+from ddrecon.variables.kinds import FIELDS
+from ddrecon.variables.values import value_of
+
+FRAMES, FRAME = 24, 256
+"""Pictures of the turntable, and pixels along their longer side, at most."""
+ENLARGED = 2
+"""They have at most so many times the pixels of the first view along a side."""
+
+
+def volume_section(findings: Findings) -> str:
+    """Every field that was found, and beside it what the scene file has in its place."""
+    scene = findings.scene
+    named = {name: value_of(scene, name) for name in FIELDS}
+    named = {name: value for name, value in named.items() if value.ndim >= 3}
+    whites = {name: find_white_value(value) for name, value in named.items()}
+    z, y, x = scene.volume.grid.extent
+    fields = [
+        Shown(name, of, value, (x, y, z), whites[name])
+        for of, values in (("result", named), ("truth", findings.given))
+        for name, value in values.items()
+    ]
+    cameras = [view.camera for view in scene.views]
+    towards = cameras[0].pose[:, 3] - cameras[0].pose.new_tensor(scene.volume.grid.center_xyz)
+    eye = towards.tolist()
+    still = _stills(named)
+    viewer = volume_viewer(fields, still, upright_axis(cameras), (eye[0], eye[1], eye[2]))
+    return "\n".join([viewer, *_remarks(findings.summary)])
+
+
+def _remarks(summary: Mapping[str, Any]) -> list[str]:
+    """What the run did to the volume by itself."""
+    remarks = []
+    if "support" in summary:
+        left_out = 100 * (1 - summary["support"]["cells"])
+        remarks.append(paragraph(f"Left out by the support: {left_out:.3g} % of the cells."))
+    if "smoothing" in summary:
+        remarks.append(paragraph(smoothing_text(summary["smoothing"])))
+    return remarks
+
+
+def _stills(fields: dict[str, Tensor]) -> str:
+    """Slices and projections of every field."""
+    parts = [
+        paragraph(
+            "Across z, x and y from left to right; y, or z, is up. The largest value is white."
+        )
+    ]
+    for name, value in fields.items():
+        largest = f"(the largest value of a cell is {float(value.max()):.4g})"
+        cut = picture(png_of(slices(value)), f"{name}, middle slices {largest}")
+        means = picture(png_of(projections(value)), f"{name}, means along the axes {largest}")
+        parts.append(side_by_side(cut, means))
+    return "\n".join(parts)
+
+
+def turntable(findings: Findings) -> str:
+    """A movie of FRAMES pictures once around the volume, from the first view."""
+    first = findings.scene.views[0]
+    view = View(first.name, _enlarge(first.camera))
+    with torch.no_grad():
+        images = [
+            pixels(view_image(findings.light_field, findings.scene, each.camera))
+            for each in place_turntable(findings.scene, view, FRAMES)
+        ]
+    white = max(map(find_white, images))
+    caption = (
+        f"Once around the upright axis, from {first.name}; radiance {white:.3g} is white. "
+        "Larger: ddrecon render RUN --ring 60"
+    )
+    return movie(moving_webp_of(encode_frames(images, white), SECONDS), caption)
+
+
+def _enlarge(camera: Camera) -> Camera:
+    """The same view with `FRAME` pixels along its longer side, or `ENLARGED` times as many."""
+    height, width = camera.size
+    factor = min(FRAME / max(height, width), ENLARGED)
+    size = max(1, round(height * factor)), max(1, round(width * factor))
+    aspect = camera.pixel_aspect * (height * size[1]) / (width * size[0])
+    return replace(camera, size=size, pixel_aspect=aspect)

@@ -1,0 +1,75 @@
+"""What is legal in a scene but can hardly be meant: optical depths and distances.
+
+Most come of lengths in different units: bounds in millimeters, cameras in meters.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from ddrecon.cameras import Camera
+from ddrecon.grid import Grid
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, with_values
+
+THICKEST, THINNEST = 3e3, 1e-3
+"""Optical depths beyond these look like a wall, or like nothing."""
+SMALLEST = 2.0
+"""A box of fewer pixels than this, along its diagonal, shows nothing."""
+UNITS = "are volume.bounds, cross sections and cameras in the same unit?"
+
+
+def find_doubts(scene: Scene) -> list[str]:
+    """A line about each number of `scene` that can hardly be meant; parameters are at their start.
+
+    Where the density starts as nothing, optical depths are those of a density of 1.
+    """
+    return [*_doubt_depth(scene), *_doubt_cameras(scene)]
+
+
+def _doubt_depth(scene: Scene) -> list[str]:
+    scene = with_values(scene, scene.starts)
+    grid, density = scene.volume.grid, scene.volume.density
+    where = "through the densest part"
+    if not bool(density.any()):
+        density, where = torch.ones_like(density), "at a density of 1"
+    extinction = value_of(scene, "sigma_t").amax(0) * density
+    # The thickest line of cells along each axis.
+    depths = [float(extinction.sum(axis).max()) * size for axis, size in enumerate(grid.spacing)]
+    if min(depths) > THICKEST or max(depths) < THINNEST:
+        return [f"volume: the optical depth across the box is {max(depths):.3g} {where}; {UNITS}"]
+    return []
+
+
+def _doubt_cameras(scene: Scene) -> list[str]:
+    grid, lines = scene.volume.grid, []
+    inside = [view.name for view in scene.views if _is_inside(view.camera, grid)]
+    if inside:
+        lines.append(f"views: within the box, not outside of it: {_names(inside)}; {UNITS}")
+    small = [view.name for view in scene.views if _pixels_across(view.camera, grid) < SMALLEST]
+    if small:
+        lines.append(f"views: the box is smaller than a pixel or two to {_names(small)}; {UNITS}")
+    return lines
+
+
+def _names(views: list[str]) -> str:
+    """The cameras of `views` in words."""
+    return f"camera {views[0]}" if len(views) == 1 else f"{len(views)} cameras ({views[0]}, ...)"
+
+
+def _is_inside(camera: Camera, grid: Grid) -> bool:
+    low, high = grid.bounds_xyz
+    place = camera.pose[:, 3].tolist()
+    return camera.is_perspective and all(
+        a < x < b for a, x, b in zip(low, place, high, strict=True)
+    )
+
+
+def _pixels_across(camera: Camera, grid: Grid) -> float:
+    """How many pixels of `camera` the diagonal of the box would take, seen from the side."""
+    low, high = (camera.pose.new_tensor(corner).double() for corner in grid.bounds_xyz)
+    distance = 1.0
+    if camera.is_perspective:
+        distance = float(torch.dist((low + high) / 2, camera.pose[:, 3].double()))
+    width = 2 * float(camera.half_width) * distance
+    return float(torch.dist(low, high)) / max(width, 1e-30) * camera.size[1]

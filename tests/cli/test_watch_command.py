@@ -1,0 +1,77 @@
+"""The page of a run while it goes on: what it shows, when it is done, and who may see it."""
+
+from __future__ import annotations
+
+import http.client
+import re
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+
+from ddrecon.progress import bar_width
+from ddrecon.run.live import LiveRun
+from ddrecon.run.serve import serve_page
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def stopped(succeed: Run) -> Path:
+    """A run that has stopped halfway: its report is not there."""
+    succeed("optimize", "scene.yaml", "-o", "out", "-q", "--iterations", "2")
+    Path("out/report.html").unlink()
+    return Path("out")
+
+
+def test_a_run_is_shown_before_its_end(succeed: Run, stopped: Path) -> None:
+    """With its loss, volume and views; then, when it is done, as its report."""
+    live = LiveRun(stopped)
+    page = live.page()
+    assert "<body data-live>" in page and "iteration 2, PSNR" in page
+    for section in ("volume", "loss", "views"):
+        assert f'<section id="{section}">' in page
+    assert re.findall(r'class="field">{"name": "(\w+)", "of": "result"', page) == ["density"]
+    assert page.count('<div class="pair">') == 2
+    succeed("optimize", "scene.yaml", "-o", "out", "-q", "--resume", "--iterations", "3")
+    assert live.page() == Path("out/report.html").read_text() and "data-live>" not in live.page()
+
+
+def test_only_this_machine_sees_it() -> None:
+    """Not under another's name for this address, and nothing but the page."""
+    with serve_page(lambda: "<p>hello</p>", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        port = server.server_address[1]
+        assert server.server_address[0] == "127.0.0.1"
+        answers = {}
+        for host, path in (
+            (f"127.0.0.1:{port}", "/"),
+            (f"localhost:{port}", "/"),
+            (f"elsewhere.example:{port}", "/"),
+            (f"127.0.0.1:{port}", "/etc/passwd"),
+        ):
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+            connection.request("GET", path, headers={"Host": host})
+            answer = connection.getresponse()
+            answers[host.partition(":")[0] + path] = (answer.status, answer.read())
+        server.shutdown()
+    assert answers["127.0.0.1/"] == answers["localhost/"] == (200, b"<p>hello</p>")
+    assert answers["elsewhere.example/"][0] == answers["127.0.0.1/etc/passwd"][0] == 404
+
+
+def test_what_is_no_run_is_refused(refuse: Callable[..., list[str]]) -> None:
+    (line,) = refuse(2, "watch", ".")
+    assert line == ".: holds no run, as `ddrecon optimize -o` makes it"
+
+
+def test_a_terminal_without_a_size_gets_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Size:
+        columns = 0
+
+    monkeypatch.setattr("os.get_terminal_size", lambda _: Size)
+    monkeypatch.setattr("sys.stderr.fileno", lambda: 2, raising=False)
+    assert bar_width() == 80
+    Size.columns = 120
+    assert bar_width() is None

@@ -1,0 +1,34 @@
+"""In a notebook, a scene, its volume and a result are the viewer in small."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+
+import torch
+from media import make_scene, random_values
+
+from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.loop import Result
+
+
+def framed(text: str) -> str:
+    """The page within the frame of `text`."""
+    (page,) = re.findall(r'<iframe sandbox="allow-scripts" srcdoc="([^"]*)"', text)
+    return html.unescape(page)
+
+
+def test_scene_volume_and_result_show_their_fields() -> None:
+    scene = make_scene(random_values(3, 4, 5, dtype=torch.float32).requires_grad_())
+    scene.volume.sigma_s = torch.rand(3, 3, 4, 5)
+    row = Row(7, 1.0, 0.1, 31.25, 28.5, 1, 1, 60, 0.1, 0.0)
+    for shown in (scene, scene.volume, Result(scene, [row])):
+        page = framed(shown._repr_html_())
+        data = re.findall(r'<script type="application/json" class="field">(.*?)</script>', page)
+        fields = [json.loads(content) for content in data]
+        assert [field["name"] for field in fields] == ["density", "sigma_s"]
+        assert fields[0]["size"] == [5, 4, 3] and "5 x 4 x 3 cells, density up to" in page
+    assert "31.25 dB of the views seen last, 28.50 dB of those held out" in (
+        Result(scene, [row])._repr_html_()
+    )

@@ -1,0 +1,125 @@
+"""Each diagnosis is made of a scene that has the fault, and of none of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from ddrecon.cameras import twist
+from ddrecon.losses import psnr
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.renderer import render
+from ddrecon.run.diagnoses import LateMeans, best_shift, diagnose
+from ddrecon.scene import Scene, View
+from ddrecon.scene_file.build import load_scene
+from ddrecon.variables.values import with_values
+
+BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
+SMALL = (
+    "volume.resolution=[8, 8, 8]",
+    "optimize.refine_at=[]",
+    "optimize.parameters.density.tv=0.1",
+    "diffusion={model: none}",
+    "lights=[{type: directional, direction: [-1, -2, -1], irradiance: 3}]",
+    *(f"views.{i}.camera.resolution=[14, 14]" for i in range(7)),
+    *(f"views.{i}.image=null" for i in range(7)),
+)
+
+
+def make_scene(*overrides: str) -> Scene:
+    """The ball's six training views and its test view, small, of a lopsided blob, with noise.
+
+    The density starts near the truth, so that few iterations do.
+    """
+    scene = load_scene(BALL, overrides=(*SMALL, *overrides))
+    z, y, x = scene.volume.grid.centers(scene.volume.density)
+    blob = torch.exp(-((x - 0.05) ** 2 + 2 * (y + 0.1) ** 2 + (z + 0.05) ** 2) / 0.05)
+    with torch.no_grad():
+        truth = with_values(scene, {"density": blob})
+        images = render(truth)
+        images = images + 0.1 * images.mean() * torch.randn(images.shape)
+    views = [replace(view, image=image) for view, image in zip(scene.views, images, strict=True)]
+    starts = scene.starts | ({"density": 0.8 * blob} if "density" in scene.starts else {})
+    return replace(scene, views=views, volume=truth.volume, starts=starts)
+
+
+def kinds(scene: Scene, iterations: int = 60) -> list[str]:
+    """The kinds of diagnoses of a reconstruction of `scene`."""
+    run, rows, late = Reconstruction(scene, iterations), [], LateMeans()
+    while not run.is_done:
+        rows.append(run.step())
+        late.note(run)
+    found = run.current_scene()
+    with torch.no_grad():
+        images = {view.name: render(found, view.name)[0] for view in scene.views}
+    quality = {
+        view.name: {"psnr": psnr(images[view.name], view.image, view.mask)} for view in scene.views
+    }
+    return [told.kind for told in diagnose(scene.views, images, quality, rows, late.moved(run))]
+
+
+def expose(scene: Scene) -> None:
+    scene.views[2].image = scene.views[2].image * 1.6
+
+
+def move(scene: Scene) -> None:
+    change = torch.tensor([0.0, 0, 0, 0.12, 0, 0])
+    camera = scene.views[3].camera
+    scene.views[3].camera = twist(camera, change, scene.volume.grid.center_xyz)
+
+
+def keep_one(scene: Scene) -> None:
+    scene.views[1:-1] = []
+    start_empty(scene)
+
+
+def start_empty(scene: Scene) -> None:
+    scene.starts["density"] = torch.zeros(scene.volume.grid.shape)
+
+
+@pytest.mark.parametrize(
+    ("fault", "iterations", "expected"),
+    [
+        (lambda scene: None, 24, []),
+        (expose, 24, ["exposure"]),
+        (move, 24, ["cameras"]),
+        (keep_one, 50, ["overfit"]),
+        (start_empty, 20, ["unfinished"]),
+    ],
+    ids=["clean", "exposure", "cameras", "overfit", "unfinished"],
+)
+def test_a_fault_is_told_and_no_other(
+    fault: Callable[[Scene], None], iterations: int, expected: list[str]
+) -> None:
+    scene = make_scene()
+    fault(scene)
+    assert kinds(scene, iterations) == expected
+
+
+DRIFTING = (
+    "{albedo: {init: 0.7, lr: 0.03, field: false}, lights.0.irradiance: {init: 4.4, lr: 0.2}}"
+)
+
+
+@pytest.mark.slow
+def test_light_and_albedo_that_move_against_each_other() -> None:
+    """From a light too bright and an albedo too low, whose product is about right."""
+    scene = make_scene(f"optimize.parameters={DRIFTING}", "diffusion={transport_rounds: 0}")
+    assert "drift" in kinds(scene, 60)
+
+
+@pytest.mark.parametrize("move", [(0.3, -0.2), (-0.15, 0.25)])
+def test_the_shift_of_a_smooth_picture_is_found(move: tuple[float, float]) -> None:
+    """To first order: a picture and its copy a part of a pixel to the right and down."""
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(50.0), indexing="ij")
+
+    def blob(right: float, down: float) -> torch.Tensor:
+        return torch.exp(-((x - 24 - right) ** 2 + (y - 19 - down) ** 2) / 60).expand(3, -1, -1)
+
+    view = View("front", None, image=blob(*move), mask=(x > 5).float())  # type: ignore[arg-type]
+    found, explained = best_shift(view, blob(0, 0))
+    assert found == pytest.approx(move, abs=0.01) and explained > 0.99

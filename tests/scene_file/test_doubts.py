@@ -1,0 +1,42 @@
+"""What can hardly be meant is told, and what can is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ddrecon.scene_file.build import load_scene
+from ddrecon.scene_file.doubts import find_doubts
+
+ROOT = Path(__file__).parents[2]
+BALL = ROOT / "configs" / "ball.yaml"
+SIDES = "volume.bounds={{min: [-{0}, -{0}, -{0}], max: [{0}, {0}, {0}]}}"
+
+
+def doubts(*overrides: str) -> list[str]:
+    return find_doubts(load_scene(BALL, overrides=overrides))
+
+
+@pytest.mark.parametrize("config", ["ball", "plume", "smoke_sky"])
+def test_scenes_of_ours_are_not_doubted(config: str) -> None:
+    assert find_doubts(load_scene(ROOT / "configs" / f"{config}.yaml")) == []
+
+
+def test_a_box_in_millimeters() -> None:
+    """Where cameras are in meters, they stand within it; where sigma is, nothing shines through."""
+    depth, inside = doubts(SIDES.format(500))
+    assert "the optical depth across the box is 9.5e+03 at a density of 1" in depth
+    assert "within the box, not outside of it" in inside and "cameras (" in inside
+    assert "same unit" in depth and "same unit" in inside
+
+
+CAMERA = "{type: perspective, origin: [0, 0, 2.5], target: [0, 0, 0], fov: 30, resolution: [9, 9]}"
+
+
+def test_a_box_in_kilometers() -> None:
+    """It shows nothing: too thin, and too small, though the middle pixel sees it."""
+    tiny = SIDES.format(0.00005), f"views=[{{name: front, camera: {CAMERA}}}]"
+    depth, small = doubts(*tiny, "volume.density=1", "optimize=null")
+    assert "the optical depth across the box is 0.00095 through the densest part" in depth
+    assert "smaller than a pixel or two to camera front" in small
