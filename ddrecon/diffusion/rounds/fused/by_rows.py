@@ -22,10 +22,19 @@ from ddrecon.diffusion.rounds.fused.swept import Parts, Swept, moment_of
 from ddrecon.kernels.spare import borrow, give_back
 from ddrecon.kernels.text import TextKernel
 
-MOST = 16
-"""Directions at most that go through the cells together."""
-SLAB = 8
-"""Slices at most of which all lines are kept for the adjoint."""
+MOST_OF_FEW, MOST = 8, 16
+"""Directions at most that go through the cells together: of few moments, and of many.
+
+More read many moments less often; fewer leave more of a cache to each.
+"""
+FEW = 4
+SLABS = 4, 8
+"""Slices at most of which all lines are kept for the adjoint; the second in large volumes.
+
+Fewer fit into a cache, but more is saved before them.
+"""
+LARGE = 2**20
+"""Cells of a large volume."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +69,10 @@ class Rows:
         self.pieces = max(1, threads // (2 * self.colors))
         self.threads = threads
         self.lanes = 1 if threads == 1 else 2 * self.together * self.pieces
+        self.slab = SLABS[swept.grid.cells > LARGE]
+        most = MOST_OF_FEW if self.count <= FEW else MOST
         self.tables = make_tables(
-            swept.grid, swept.directions, self.count, MOST, self.pieces, self.like.dtype
+            swept.grid, swept.directions, self.count, most, self.pieces, self.like.dtype
         )
         self.slabs = max(len(self._slabs(way, (0, self.depth))) for way in (0, 1))
         fields = [f for f in (swept.extinction, swept.scattering) if f is not None]
@@ -91,7 +102,7 @@ class Rows:
         `saved`: by `follow`, for as many threads.
         """
         sums = self._sums()
-        lines = borrow(self._line_count((SLAB + 1) * self.height), self.like)
+        lines = borrow(self._line_count((self.slab + 1) * self.height), self.like)
         kinds = 2 + len(self.fields)
         size = kinds * self.tables.most * self.pitch * (self.height + 2) + MARGIN
         shape = self.depth, self.height, self.width
@@ -148,7 +159,7 @@ class Rows:
         scratch_rows = 3 * POINTERS + 5 + tables.most
         return {
             "moments": self._addresses(one for pair in self.swept.moments for one in pair),
-            "factors": self.swept.factors, "slab": SLAB, "slabs": self.slabs,
+            "factors": self.swept.factors, "slab": self.slab, "slabs": self.slabs,
             "directions": self.swept.directions,
             "extinction": self.fields[0],
             "scattering": self.fields[-1], "scales": self.swept.scales, "parts": tables.parts,
@@ -203,7 +214,7 @@ class Rows:
         middle, found = self._middle(way), []
         for first, last in ((0, middle), (middle, self.depth)):
             if slices[0] <= first and last <= slices[1]:
-                found += [(s, min(s + SLAB, last)) for s in range(first, last, SLAB)]
+                found += [(s, min(s + self.slab, last)) for s in range(first, last, self.slab)]
         return found[::-1]
 
     def _launch(self, kernel: TextKernel, jobs: list[Job], values: dict[str, Any]) -> None:
