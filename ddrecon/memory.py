@@ -34,7 +34,8 @@ class Needs:
     """What the memory of a scene depends on.
 
     `resolution` (x, y, z), `colors` (1 or 3), `size`: bytes of a number, `pixels` of all views.
-    `varied` is how many fields are optimized, each color counted; None where nothing is.
+    `moments` is how many of light rounds keep. `varied` is how many fields are optimized, each
+    color counted; None where nothing is.
     """
 
     resolution: tuple[int, int, int]
@@ -43,6 +44,7 @@ class Needs:
     pixels: int
     has_flux: bool = False
     has_rounds: bool = False
+    moments: int = 1
     is_limited: bool = False
     varied: float | None = None
 
@@ -57,7 +59,8 @@ class Arrays:
     """How many numbers are alive at the peak, in each cell, marched node and pixel of all views.
 
     By what they are for: one array each, whatever the scene (`once`), or of every `color`, `varied`
-    field, or color of L1 (`flux`), of transport rounds (`rounds`), of a flux limiter (`limited`).
+    field, or color of L1 (`flux`), of transport rounds (`rounds`) and each moment more than one
+    that they keep (`moments`), of a flux limiter (`limited`).
     """
 
     cell: dict[str, int]
@@ -66,16 +69,24 @@ class Arrays:
 
 
 RENDER = Arrays(
-    cell={"once": 17, "color": 21, "flux": 3, "rounds": 16, "limited": 7},
+    cell={"once": 17, "color": 21, "flux": 3, "rounds": 16, "moments": 4, "limited": 7},
     node={"once": 6, "color": 2},
     pixel=12,  # what rays meet, renders
 )
 OPTIMIZE = Arrays(
-    cell={"once": 50, "varied": 15, "color": 7, "flux": 13, "rounds": 34, "limited": 32},
+    cell={
+        "once": 50,
+        "varied": 15,
+        "color": 7,
+        "flux": 13,
+        "rounds": 34,
+        "moments": 8,
+        "limited": 32,
+    },
     node={"color": 12, "varied": 4},
     pixel=18,  # targets, those of a coarser level, what rays meet, renders
 )
-"""Fitted to what `benchmarks/memory.py` measures."""
+"""Fitted to what `benchmarks/memory.py` measures, but for `moments`: the arrays that are kept."""
 
 
 def memory_of(needs: Needs) -> int:
@@ -90,6 +101,7 @@ def memory_of(needs: Needs) -> int:
         "varied": needs.varied or 0,
         "flux": needs.colors * needs.has_flux,
         "rounds": needs.colors * needs.has_rounds,
+        "moments": needs.colors * needs.has_rounds * (needs.moments - 1),
         "limited": needs.colors * needs.is_limited,
     }
     in_cells = needs.cells * sum(number * counts[name] for name, number in arrays.cell.items())

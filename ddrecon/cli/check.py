@@ -9,6 +9,7 @@ import torch
 from ddrecon.engine import engine_of_parts
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
+from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.reconstruct.setup import select_views, start_support
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
@@ -25,13 +26,16 @@ def memory_estimate(scene: Scene) -> int:
     """
     volume, grid = scene.volume, scene.volume.grid
     fields = [start for start in scene.starts.values() if tuple(start.shape[-3:]) == grid.shape]
+    medium = scale_medium(volume, scene.diffusion.angles)
+    is_directed = medium.degree > 0 or "g" in scene.starts
     needs = Needs(
         (grid.shape[2], grid.shape[1], grid.shape[0]),
         max(volume.sigma_a.shape[0], volume.sigma_s.shape[0]),
         torch.finfo(volume.density.dtype).bits // 8,
         sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
-        has_flux=scale_medium(volume).has_flux,
+        has_flux=is_directed,
         has_rounds=scene.diffusion.rounds > 0,
+        moments=count_harmonics(scene.diffusion.angles) if is_directed else 1,
         is_limited=scene.diffusion.model == "flux_limited",
         varied=None
         if scene.optimize is None

@@ -19,6 +19,7 @@ from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
 from ddrecon.memory import Needs, shortage
+from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.light_schema import Color
@@ -79,13 +80,15 @@ def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype
     colors = 3 if any(given) else 1
     optimized = tree.optimize.parameters if tree.optimize else {}
     sizes = [view.camera.resolution for view in tree.views if view.camera.resolution is not None]
+    has_flux = section.g != 0 or section.phase is not None or "g" in optimized
     return Needs(
         (grid.shape[2], grid.shape[1], grid.shape[0]),
         colors,
         torch.finfo(dtype).bits // 8,
         sum(width * height for width, height in sizes),
-        has_flux=section.g != 0 or section.phase is not None or "g" in optimized,
+        has_flux=has_flux,
         has_rounds=tree.diffusion.rounds > 0,
+        moments=count_harmonics(tree.diffusion.angles) if has_flux else 1,
         is_limited=tree.diffusion.model == "flux_limited",
         varied=sum(_varied(name, settings, fields, colors) for name, settings in optimized.items())
         if tree.optimize
