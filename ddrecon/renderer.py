@@ -174,7 +174,7 @@ def solve_diffuse(
     closure = Closure(settings.closure, medium.grid, settings.floor)
     problem = DiffusionProblem(medium, closure, source, outside, medium.degree > 0)
     light = solve_conservative(problem, solve)
-    return run_rounds(problem, light, solve, settings.rounds, settings.degree)
+    return run_rounds(problem, light, solve, settings.rounds, settings.angles)
 
 
 def view_picture(

@@ -85,7 +85,7 @@ class DiffusionSettings:
     iteration: `closure` and `solver` are for `conservative`. `floor` is that of the smooth closure.
     The model `flux_limited` has a `limiter` in place of a closure. `transport_rounds` sweeps take
     P1 towards transport, and keep angles to `degree` (docs/theory.md, section 5). A
-    scene file that leaves rounds out gets as many as its phase function deserves.
+    scene file that leaves them out gets what its phase function deserves.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
@@ -103,12 +103,14 @@ class DiffusionSettings:
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
     transport_rounds: int | None = optional(minimum=0, maximum=16)
-    degree: int = one_of(3, DIRECTIONS)
+    degree: int | None = one_of(None, DIRECTIONS)
 
     @property
     def angles(self) -> int:
-        """The degree to which light's angles are kept: 1 by diffusion alone."""
-        return self.degree if self.rounds else 1
+        """The degree to which light's angles are kept: left out 3, and 1 by diffusion alone."""
+        if not self.rounds:
+            return 1
+        return 3 if self.degree is None else self.degree
 
     @property
     def rounds(self) -> int:

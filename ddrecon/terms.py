@@ -41,7 +41,7 @@ def _round_terms(medium: Medium, scene: Scene) -> list[str]:
     """Transport rounds, and the pairs of beams that they go with."""
     settings = scene.diffusion
     rounds = _count(settings.rounds, "transport round")
-    directions = DIRECTIONS[settings.degree]
+    directions = DIRECTIONS[settings.angles]
     terms = [f"{rounds} of sweeps along {directions} directions, each with a diffusion solve"]
     if medium.degree > 1:
         left = remaining_moments(medium)[2].abs().max().item()

@@ -333,11 +333,12 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "warm_start": "Whether a solve begins at the last one's solution.",
             "transport_rounds": (
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
-                "it is 1, or where g is beyond 0.55 in size 2 and beyond 0.77 3, or 0 "
+                "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
                 "where there are none: without model `p1` or scheme `conservative`."
             ),
             "degree": (
-                "Degree to which such sweeps keep light's angles, along 26, 50 or 86 directions."
+                "Degree to which such sweeps keep light's angles, along 26 directions up to 3, "
+                "then 50 and 86. Left out, it is 3, or 1 where g is at most 0.32 in size and not sought."
             ),
         },
     ),

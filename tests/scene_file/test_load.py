@@ -252,7 +252,7 @@ ONE_FAULT = [
     ),
     (
         "diffusion.degree=4",
-        "diffusion.degree: expected one of 3, 5, 7, found 4",
+        "diffusion.degree: expected one of 1, 3, 5, 7, found 4",
     ),
     ("diffusion.transport_rounds=17", "diffusion.transport_rounds: must be at most 16"),
     (

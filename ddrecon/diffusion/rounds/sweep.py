@@ -22,7 +22,7 @@ from ddrecon.numerics.autodiff import is_forward, is_fused
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
-DIRECTIONS = {3: 26, 5: 50, 7: 86}
+DIRECTIONS = {1: 26, 3: 26, 5: 50, 7: 86}
 """By the degree to which angles are kept, directions of a rule that is exact to twice that."""
 
 
