@@ -338,7 +338,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 26 directions up to 3, "
-                "then 50 and 86. Left out, it is 3, or 1 where g is at most 0.32 in size and not sought."
+                "then 50 and 86. Left out, it is 3, or 1 where g is not sought and at most 0.32."
             ),
         },
     ),
