@@ -30,7 +30,7 @@ class Sweep:
     coarser: tuple[int, ...] = (2, 4)
 
 
-QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 26), (1, 26), (2, 26)), (1, 2), (0, 0.05), (2,))
+QUICK = Sweep((1e-2, 1e-4, 1e-6), ("p1",), ((0, 3), (1, 3), (2, 3)), (1, 2), (0, 0.05), (2,))
 EXACT: dict[str, Any] = {"solver": "multigrid", "tolerance": 1e-8, "warm_start": False}
 EXACT_LIMITED = 1e-5
 """The tolerance in place of that for `flux_limited`.

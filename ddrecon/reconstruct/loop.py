@@ -95,8 +95,7 @@ class Reconstruction:
         self.noises = setup.noises_of(views, self.settings) if self.loss == "photon" else {}
         self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
         self.parameters = setup.start_parameters(scene, self.settings)
-        if self.loss not in QUADRATIC:
-            setup.descend_poses(self.parameters)
+        setup.choose_pose_steps(self.parameters, self.train, self.loss in QUADRATIC)
         self.gauges = find_gauges(self.train, self.parameters)
         self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)

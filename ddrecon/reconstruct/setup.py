@@ -130,8 +130,14 @@ def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     return support
 
 
-def descend_poses(parameters: Sequence[Parameter]) -> None:
-    """Has the poses among `parameters` descend: with a loss that is no sum of squares."""
-    for parameter in parameters:
-        if parameter.key == "camera":
-            parameter.is_fitted = False
+def choose_pose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bool) -> None:
+    """Has the poses among `parameters` descend where they are not to be solved for (E29).
+
+    That is with a loss that is no sum of squares; and where poses of only some of several views of
+    `train` are sought, or of a single one: then no calibration of all is to be mended, but a camera
+    to be found, which may be far off.
+    """
+    poses = [parameter for parameter in parameters if parameter.key == "camera"]
+    if not is_quadratic or not len(poses) == len(train.views) > 1:
+        for pose in poses:
+            pose.is_fitted = False
