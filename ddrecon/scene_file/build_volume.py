@@ -18,6 +18,7 @@ from ddrecon.grid import Grid, Triple
 from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import PhaseFunction
 from ddrecon.memory import Needs, shortage
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene_file.build_phase import build_phase
@@ -25,6 +26,7 @@ from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems
+from ddrecon.scene_file.rounds import choose_rounds
 from ddrecon.settings import FieldFile, ParameterSettings
 from ddrecon.variables.kinds import FIELDS
 from ddrecon.variables.values import cross_sections
@@ -40,7 +42,8 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     section = scene_file.tree.volume
     fields = _read_fields(scene_file)
     grid = _agree_on_grid(scene_file, fields)
-    if too_much := shortage(_needs(scene_file, fields, grid, dtype), device):
+    phase = build_phase(scene_file, dtype, device)
+    if too_much := shortage(_needs(scene_file, fields, grid, phase, dtype), device):
         raise scene_file.refused("volume.resolution", too_much)
 
     def quantity(name: str) -> Tensor:
@@ -54,7 +57,6 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     else:
         sigma_a, sigma_s = cross_sections(quantity("sigma_t"), quantity("albedo"))
     sigma_a, sigma_s = _same_colors(sigma_a, sigma_s)
-    phase = build_phase(scene_file, dtype, device)
     if phase.colors > 1:
         sigma_a, sigma_s = (sigma.expand(3, *sigma.shape[1:]) for sigma in (sigma_a, sigma_s))
     density = quantity("density")
@@ -65,7 +67,9 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     return Volume(grid, density, sigma_a, sigma_s, phase)
 
 
-def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype) -> Needs:
+def _needs(
+    scene_file: SceneFile, fields: Fields, grid: Grid, phase: PhaseFunction, dtype: torch.dtype
+) -> Needs:
     """What the scene's memory depends on.
 
     Views that are as large as their images count as nothing, since those are not read yet.
@@ -88,7 +92,7 @@ def _needs(scene_file: SceneFile, fields: Fields, grid: Grid, dtype: torch.dtype
         sum(width * height for width, height in sizes),
         has_flux=has_flux,
         has_rounds=tree.diffusion.rounds > 0,
-        moments=count_harmonics(tree.diffusion.angles) if has_flux else 1,
+        moments=count_harmonics(choose_rounds(tree, phase).angles) if has_flux else 1,
         is_limited=tree.diffusion.model == "flux_limited",
         varied=sum(_varied(name, settings, fields, colors) for name, settings in optimized.items())
         if tree.optimize

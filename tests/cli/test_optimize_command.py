@@ -215,7 +215,7 @@ def test_the_report_shows_every_view_field_and_setting(succeed: Run) -> None:
         "means along the axes",
         "Once around",
         "irradiance: 3.0",
-        "angles to degree 3",
+        "fluxes Q1 and L1",
         "torch",
     ):
         assert told in text

@@ -140,7 +140,7 @@ def test_directions_agree_the_better_the_more_there_are():
     scene = make_scene(ball(12), **WHITE, directional=(3.0,), transport_rounds=2, tolerance=1e-8)
     few, some, many = (
         render(replace(scene, diffusion=replace(scene.diffusion, degree=degree)))
-        for degree in sorted(DIRECTIONS)
+        for degree in sorted(set(DIRECTIONS) - {1})
     )
     assert (
         float((some - many).norm()) < 0.6 * float((few - many).norm()) < 0.02 * float(many.norm())
