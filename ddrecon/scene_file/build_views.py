@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -90,16 +90,9 @@ def _build_view(
                 read_referenced(scene_file, f"{key}.mask", section.mask, read_mask)
             ).to(device, dtype)
     size = _size(section.camera, image)
-    for name, picture in (("image", image), ("mask", mask), ("background", background)):
-        if picture is not None and size is not None and tuple(picture.shape[-2:]) != size:
-            height, width = picture.shape[-2:]
-            problems.note(
-                scene_file.refused(
-                    f"{key}.{name}",
-                    f"is {width} x {height} pixels, but the camera has {size[1]} x {size[0]}",
-                )
-            )
     if size is not None:
+        pictures = {"image": image, "mask": mask, "background": background}
+        _note_sizes(scene_file, key, pictures, size, problems)
         with problems.collecting():
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
             _require_unfolded(scene_file, f"{key}.camera", camera)
@@ -132,6 +125,21 @@ def _build_view(
         step,
         None if noise is None else Noise(noise.read, noise.shot, step),
     )
+
+
+def _note_sizes(
+    scene_file: SceneFile,
+    key: str,
+    pictures: Mapping[str, Tensor | None],
+    size: tuple[int, int],
+    problems: Problems,
+) -> None:
+    """Notes those of `pictures`, by their keys in the view `key`, that are not of `size` (h, w)."""
+    for name, picture in pictures.items():
+        if picture is not None and tuple(picture.shape[-2:]) != size:
+            height, width = picture.shape[-2:]
+            wrong = f"is {width} x {height} pixels, but the camera has {size[1]} x {size[0]}"
+            problems.note(scene_file.refused(f"{key}.{name}", wrong))
 
 
 def _pixels(image: Image, dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -73,7 +73,8 @@ def test_no_thickness_of_cells_lets_rounds_grow(g: float, thickness: float, patt
         directional=(3.0,),
         tolerance=1e-8,
     )
-    first, later = (light_after(scene, rounds) for rounds in (1, 10))
+    # A backward or forward peak is no part of diffusion: there the first round is the measure.
+    first, later = (light_after(scene, rounds) for rounds in (int(g != 0), 10))
     assert bool(torch.isfinite(later).all()) and float(later.norm()) < 2 * float(first.norm())
     assert float((later - light_after(scene, 11)).norm()) < 0.05 * float(later.norm())
 
