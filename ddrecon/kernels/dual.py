@@ -52,6 +52,7 @@ struct Dual {
     HERE Dual& operator+=(Dual o) { return *this = *this + o; }
     HERE Dual& operator-=(Dual o) { return *this = *this - o; }
     HERE explicit operator Whole() const { return (Whole)v; }
+    HERE explicit operator double() const { return (double)v; }
     HERE bool operator<(Dual o) const { return v < o.v; }
     HERE bool operator>(Dual o) const { return v > o.v; }
     HERE bool operator<=(Dual o) const { return v <= o.v; }
@@ -192,7 +193,11 @@ def with_changes(
     given: Mapping[str, Any], changes: Mapping[str, Tensor | None]
 ) -> dict[str, Tensor]:
     """The `changes` of all arrays of numbers that are `given`, as `d_` and their names."""
-    arrays = {name: each for name, each in given.items() if isinstance(each, Tensor)}
+    arrays = {
+        name: each
+        for name, each in given.items()
+        if isinstance(each, Tensor) and each.is_floating_point()
+    }
     missing = [each for name, each in arrays.items() if changes.get(name) is None]
     nothing: Tensor | None = None
     if missing:

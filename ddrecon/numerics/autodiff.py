@@ -74,9 +74,14 @@ def version_of(tensor: Tensor) -> int:
     return -1 if tensor.is_inference() else tensor._version
 
 
-def is_fused() -> bool:
-    """Whether fused kernels stand for torch's operations."""
-    return current_engine() == "warp"
+def is_fused(*steady: Tensor) -> bool:
+    """Whether fused kernels stand for torch's operations.
+
+    They have no tangents by tensors `steady`: where these vary in forward mode, they do not.
+    """
+    if current_engine() != "warp":
+        return False
+    return not any(forward_ad.unpack_dual(one).tangent is not None for one in steady)
 
 
 def keep(ctx: Any, *tensors: Tensor) -> None:
