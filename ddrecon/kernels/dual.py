@@ -36,28 +36,35 @@ typedef int Whole;
 const auto decay_of = decay;
 const auto psi_of = psi_series;
 const auto psi_slope_of = psi_slope_series;
+// Copied by hand: so compilers keep two numbers, where they would make a short vector of them, and
+// loops of short vectors do not become loops of long ones.
 struct Dual {
     R v, d;
-    Dual() = default;
+    HERE Dual() {}
+    HERE Dual(const Dual& o) : v(o.v), d(o.d) {}
+    HERE Dual& operator=(const Dual& o) {
+        v = o.v, d = o.d;
+        return *this;
+    }
     HERE Dual(R v) : v(v), d(R(0)) {}
     HERE Dual(R v, R d) : v(v), d(d) {}
     HERE Dual operator-() const { return {-v, -d}; }
-    HERE Dual operator+(Dual o) const { return {v + o.v, d + o.d}; }
-    HERE Dual operator-(Dual o) const { return {v - o.v, d - o.d}; }
-    HERE Dual operator*(Dual o) const { return {v * o.v, d * o.v + v * o.d}; }
-    HERE Dual operator/(Dual o) const {
+    HERE Dual operator+(const Dual& o) const { return {v + o.v, d + o.d}; }
+    HERE Dual operator-(const Dual& o) const { return {v - o.v, d - o.d}; }
+    HERE Dual operator*(const Dual& o) const { return {v * o.v, d * o.v + v * o.d}; }
+    HERE Dual operator/(const Dual& o) const {
         const R one = R(1) / o.v, q = v * one;
         return {q, (d - q * o.d) * one};
     }
-    HERE Dual& operator+=(Dual o) { return *this = *this + o; }
-    HERE Dual& operator-=(Dual o) { return *this = *this - o; }
+    HERE Dual& operator+=(const Dual& o) { return *this = *this + o; }
+    HERE Dual& operator-=(const Dual& o) { return *this = *this - o; }
     HERE explicit operator Whole() const { return (Whole)v; }
     HERE explicit operator double() const { return (double)v; }
-    HERE bool operator<(Dual o) const { return v < o.v; }
-    HERE bool operator>(Dual o) const { return v > o.v; }
-    HERE bool operator<=(Dual o) const { return v <= o.v; }
-    HERE bool operator>=(Dual o) const { return v >= o.v; }
-    HERE bool operator==(Dual o) const { return v == o.v; }
+    HERE bool operator<(const Dual& o) const { return v < o.v; }
+    HERE bool operator>(const Dual& o) const { return v > o.v; }
+    HERE bool operator<=(const Dual& o) const { return v <= o.v; }
+    HERE bool operator>=(const Dual& o) const { return v >= o.v; }
+    HERE bool operator==(const Dual& o) const { return v == o.v; }
 };
 // Where numbers are read: values and changes.
 struct In {
@@ -69,8 +76,8 @@ struct In {
 // Where changes are written.
 struct Change {
     R& d;
-    HERE void operator=(Dual o) { d = o.d; }
-    HERE void operator+=(Dual o) { d += o.d; }
+    HERE void operator=(const Dual& o) { d = o.d; }
+    HERE void operator+=(const Dual& o) { d += o.d; }
 };
 struct Out {
     R* d;
@@ -82,9 +89,9 @@ struct Both {
     R *v, *d;
     struct Place {
         R &v, &d;
-        HERE void operator=(Dual o) { v = o.v, d = o.d; }
+        HERE void operator=(const Dual& o) { v = o.v, d = o.d; }
         HERE operator Dual() const { return {v, d}; }
-        HERE Dual operator*(Dual o) const { return Dual(v, d) * o; }
+        HERE Dual operator*(const Dual& o) const { return Dual(v, d) * o; }
     };
     HERE Place operator[](long long i) const { return {v[i], d[i]}; }
     HERE Both operator+(long long i) const { return {v + i, d + i}; }
