@@ -53,7 +53,6 @@ def change_received(
     by the names of `Receiver.given`, and of `entered`.
     """
     given = receiver.given | {"light": light, "lights": 1, "adds": light > 0, "entered": entered}
-    names = MOMENTS[: receiver.moments]
-    kernel = tangent_of(receive_kernel(receiver.bits), " ".join(names))
-    made = {f"d_{name}": one for name, one in zip(names, d_moments, strict=True)}
+    kernel = tangent_of(receive_kernel(receiver.bits), " ".join(MOMENTS))
+    made = {f"d_{name}": one for name, one in zip(MOMENTS, d_moments, strict=False)}
     kernel.launch(receiver.items, given | with_changes(given, changes), made)
