@@ -60,11 +60,16 @@ class Integrate(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.layout, ctx.cells = inputs[:2]
         ctx.mark_non_differentiable(output[2])
+        ctx.set_materialize_grads(False)
         keep(ctx, output[2], *inputs[2:])
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, out_bar: Tensor, masses_bar: Tensor, _: None) -> tuple[Any, ...]:
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
+        out_bar, masses_bar = (
+            room.zero_() if bar is None else bar
+            for bar, room in zip(bars, _empty(ctx.layout, ctx.saved_tensors[1]), strict=False)
+        )
         needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
         varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))
         if ctx.cells.is_sliced and not varies_rays:
