@@ -89,6 +89,10 @@ class DiffusionProblem:
 
     def spread(self, flux: Vector) -> Tensor:
         """- div(D kappa_s `flux`), what a source of that flux adds to the right side of E4."""
+        if is_fused():
+            from ddrecon.diffusion.fused.spread import spread_flux
+
+            return spread_flux(self.medium, self.diffusion, flux)
         z, y, x = (
             recompute(_divergence, self.medium, self.diffusion, along, axis)
             for axis, along in zip(AXES, flux, strict=True)
