@@ -174,6 +174,6 @@ def optimize(
         watched(output) if is_watched else nullcontext(),
     ):
         if is_watched:
-            folder.save_every = SAVE_EVERY
+            folder.save_often(SAVE_EVERY)
         summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
     session.show(summary, summary_lines(summary, output))
