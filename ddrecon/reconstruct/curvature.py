@@ -43,7 +43,7 @@ class Curvature:
         self.scene, self.parameters = scene, list(parameters)
         self.values = {p.name: p.value.detach() for p in parameters}
         self.solutions = dict(solutions or {})
-        memory = self._memory()
+        memory = self.new_memory()
         with torch.no_grad():
             world = with_values(scene, self.values)
             images = render_each(world, world.views, memory)
@@ -102,7 +102,7 @@ class Curvature:
                 for name, value in self.values.items()
             }
             world = with_values(self.scene, duals)
-            light_field = solve_light(world, self._memory())
+            light_field = solve_light(world, self.new_memory())
             for view in world.views:
                 picture = view_picture(light_field, world, view, derivatives)
                 tangent = forward_ad.unpack_dual(picture).tangent
@@ -117,9 +117,11 @@ class Curvature:
 
         leaves = {name: value.clone().requires_grad_() for name, value in self.values.items()}
         names = [view.name for view in self.scene.views]
-        return self.join(differentiate(self.scene, names, leaves, along, self._memory()).gradients)
+        return self.join(
+            differentiate(self.scene, names, leaves, along, self.new_memory()).gradients
+        )
 
-    def _memory(self) -> SolveMemory:
+    def new_memory(self) -> SolveMemory:
         """What solves begin from: the same each time, so that a product depends on nothing else."""
         memory = SolveMemory()
         memory.last = dict(self.solutions)

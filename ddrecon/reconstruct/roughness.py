@@ -29,7 +29,7 @@ class Roughness:
     @staticmethod
     def about(field: Tensor, grid: Grid, weight: float) -> Roughness:
         """That of `weight` times `losses.total_variation`, about `field` [..., z, y, x]."""
-        square = sum(slope.square() for slope in slopes(field, grid))
+        square = torch.stack([slope.square() for slope in slopes(field, grid)]).sum(0)
         return Roughness(grid, weight / field.numel() / (square + ROUNDING**2).sqrt())
 
     def product(self, change: Tensor) -> Tensor:
@@ -40,13 +40,19 @@ class Roughness:
         """D^T V^(1/2) times `noises`, a field for each axis; of white ones its covariance is R."""
         return join_slopes([self.stiffness.sqrt() * noise for noise in noises], self.grid)
 
+    def conductances(self) -> list[Tensor]:
+        """What holds neighbors together, along each axis: one entry shorter than cells there."""
+        return [
+            self.stiffness.narrow(axis, 0, self.stiffness.shape[axis] - 1) * factor**2
+            for axis, factor in zip(AXES, _factors(self.grid), strict=True)
+        ]
+
     def diagonal(self) -> Tensor:
         """The diagonal of R."""
         total = torch.zeros_like(self.stiffness)
-        for axis, factor in zip(AXES, _factors(self.grid), strict=True):
-            held = self.stiffness.narrow(axis, 0, total.shape[axis] - 1) * factor**2
-            total.narrow(axis, 0, total.shape[axis] - 1).add_(held)
-            total.narrow(axis, 1, total.shape[axis] - 1).add_(held)
+        for axis, held in zip(AXES, self.conductances(), strict=True):
+            total.narrow(axis, 0, held.shape[axis]).add_(held)
+            total.narrow(axis, 1, held.shape[axis]).add_(held)
         return total
 
 
