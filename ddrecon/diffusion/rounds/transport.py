@@ -170,7 +170,7 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
     """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E14).
 
     The rest is diffusion's. rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic diffuses
-    too much if its source is linear over steps of optical depth d, which is that of `_share_length`.
+    too much if its source is linear over steps of optical depth d, that of `_share_length`.
     Returns `[C, z, y, x]` in (0, 1].
     """
     # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below

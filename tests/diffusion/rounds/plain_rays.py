@@ -84,8 +84,7 @@ def sweep_by_loops(medium: Medium, source: Tensor, inflow: float, directions: in
 
 
 def share_by_loops(medium: Medium, degree: int) -> Tensor:
-    """theta = 1 / (1 + rho^2), rho = (d/2) coth(d/2) - 1; d is exp(-p_1) times a mean step's depth.
-    """
+    """theta = 1 / (1 + rho^2), rho = (d/2) coth(d/2) - 1, d exp(-p_1) times a mean step's depth."""
     length = weights = 0.0
     for w, weight in quadrature({3: 26, 5: 50}[degree]):
         axis, step = fastest_axis(medium.grid, w)
