@@ -85,7 +85,7 @@ class Rows:
         scales = self.like.new_zeros(2 * lanes.pieces, lanes.colors, 3, dtype=torch.float64)
         made = {
             "found": sums, "sums": scales, "e_bar": fields[0], "sc_bar": fields[-1],
-            "lines": lines, **self._zeros(returning=lanes.count * returning),
+            "lines": lines, **self._zeros(returning=lanes.number * returning),
         }  # fmt: skip
         kernel = return_kernel(self.bits, self._shares_field, varies_numbers)
         given = self._given() | {"bars": bars, "saved": saved}
@@ -103,7 +103,7 @@ class Rows:
         return self.swept.scattering is None
 
     def _line_count(self, places: int) -> int:
-        return self.lanes.count * (2 * self.tables.most * self.pitch * places + MARGIN)
+        return self.lanes.number * (2 * self.tables.most * self.pitch * places + MARGIN)
 
     def _sums(self) -> Tensor:
         """Moments for each piece; of a piece without directions they stay zero."""
@@ -112,7 +112,7 @@ class Rows:
 
     def _zeros(self, **sizes: int) -> dict[str, Tensor]:
         """Zeros by their names, with what kernels work in and an empty row."""
-        scratch = self.lanes.count * self._scratch_rows * self.pitch
+        scratch = self.lanes.number * self._scratch_rows * self.pitch
         sizes |= {"scratch": scratch, "nothing": self.pitch + 2 * MARGIN}
         whole = {name: -(-size // MARGIN) * MARGIN for name, size in sizes.items()}
         parts = self.like.new_zeros(sum(whole.values())).split(list(whole.values()))
@@ -141,7 +141,7 @@ class Rows:
     def _launch(
         self, kernel: TextKernel, is_backward: bool, given: dict[str, Any], made: dict[str, Any]
     ) -> None:
-        count, work = self.lanes.count, self.like.numel() * self.tables.most * self.count
+        count, work = self.lanes.number, self.like.numel() * self.tables.most * self.count
         bound = kernel.bind(given, made)
         phase: Phase
         for phase in plan(self.lanes, self.tables.chunks, self.depth, is_backward):

@@ -45,13 +45,13 @@ class Job(NamedTuple):
 class Lanes(NamedTuple):
     """How many colors go `together`, of how many; into how many `pieces` directions are shared.
 
-    `count`: of lanes, one for each way, color and piece that go together; or one for all.
+    `number`: of lanes, one for each way, color and piece that go together; or one for all.
     """
 
     colors: int
     together: int
     pieces: int
-    count: int
+    number: int
 
     @staticmethod
     def of(threads: int, colors: int) -> Lanes:
@@ -91,7 +91,7 @@ def plan(lanes: Lanes, chunks: Chunks, depth: int, is_backward: bool) -> tuple[P
         _part(lanes, chunks, depth, first, number, phase, is_backward)
         for first, number, phase in product(firsts, numbers, range(2))
     ]
-    if lanes.count == 1:
+    if lanes.number == 1:
         return (Phase.of([list(chain(*chain(*parts)))]),)
     return tuple(map(Phase.of, parts))
 
@@ -108,7 +108,7 @@ def _part(
     """By lane, the jobs of a phase of colors from the `first` on, for each way's chunk `number`."""
     middles = depth // 2, depth - depth // 2
     # One thread does a way after the other; two meet in the middle.
-    ways = (phase,) if lanes.count == 1 else (0, 1)
+    ways = (phase,) if lanes.number == 1 else (0, 1)
     found = list[list[Job]]()
     for place, way, piece in product(range(lanes.together), ways, range(lanes.pieces)):
         found.append([])
@@ -119,7 +119,7 @@ def _part(
         slices = (0, middles[way]) if is_first else (middles[way], depth)
         job = Job(
             color, -1 if way else 1, *own[piece][number],
-            *(slices if lanes.count > 1 else (0, depth)),
+            *(slices if lanes.number > 1 else (0, depth)),
             middle=middles[way],
             adds=int(number > 0 or phase > 0),
             lane=len(found) - 1,
