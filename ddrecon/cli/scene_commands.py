@@ -154,7 +154,8 @@ def optimize(
     is_watched: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.run.drive import drive_run, open_run, summary_lines
+    from ddrecon.ranks import is_first
+    from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
     from ddrecon.scene_file.doubts import find_doubts
 
@@ -166,6 +167,9 @@ def optimize(
     built, environment = session.build(scene_file), session.environment()
     for doubt in find_doubts(built):
         warnings.warn(doubt, DataWarning, 2)
+    if not is_first():
+        follow_run(built, scene_file, resume=resume)
+        return
     with (
         open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
             run,
