@@ -73,8 +73,9 @@ def join_ranks(has_gpu: bool) -> None:
     except (RuntimeError, ValueError, OSError) as error:
         place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
         raise RanksError(
-            f"rank {rank} of {count} cannot reach {place} within {wait.total_seconds():g} s"
-            f" ({_reason(error)}); check MASTER_ADDR and MASTER_PORT, or torchrun's rendezvous"
+            f"rank {rank} of {count} cannot meet the others at {place}"
+            f" within {wait.total_seconds():g} s ({_reason(error)});"
+            " check MASTER_ADDR and MASTER_PORT, or torchrun's rendezvous"
         ) from error
     _meet(store, rank, count, wait)
     backend = "cpu:gloo,cuda:nccl" if has_gpu else "gloo"
@@ -165,9 +166,15 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     return [part.view(like.shape).to(like.dtype) for part, like in zip(parts, tensors, strict=True)]
 
 
+def sum_numbers(numbers: Sequence[float]) -> list[float]:
+    """The sums over ranks of each of `numbers`."""
+    sums: list[float] = sum_over_ranks([torch.tensor(numbers, dtype=torch.float64)])[0].tolist()
+    return sums
+
+
 def is_any(flag: bool) -> bool:
     """Whether `flag` is true on any rank."""
-    return flag if _group is None else bool(sum_over_ranks([torch.tensor(float(flag))])[0])
+    return sum_numbers([flag])[0] > 0
 
 
 def from_first(value: T) -> T:
@@ -243,6 +250,6 @@ def _note(rank: int) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of what torch says, without where in its source that was."""
-    line = str(error).partition("\n")[0]
-    return one_line(line.rpartition("] ")[2] or line) if line.startswith("[") else one_line(line)
+    """The first sentence of what torch says, without where in its source that was."""
+    line = str(error).partition("\n")[0].partition(". ")[0]
+    return one_line(line.rpartition("] ")[2] or line if line.startswith("[") else line).rstrip(".")

@@ -87,6 +87,9 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     ) -> None:
         for name, value in THREADING.items():
             os.environ.setdefault(name, value)
+        if "RANK" in os.environ:
+            # Where others cannot be reached, one line says so, and not a page of torch's.
+            os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
         try:
             from ddrecon.cli.session import open_session, show_compilations
             from ddrecon.ranks import is_first, leave_ranks

@@ -85,6 +85,7 @@ def render(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
+    from ddrecon.ranks import is_first
     from ddrecon.run.render_folder import (
         remove_targets,
         render_gradient_to_folder,
@@ -105,12 +106,14 @@ def render(
         views = list(loaded.views)
     if parameter is not None:
         require_variation(loaded, parameter)
-    with claim_folder(output, may_exist=overwrite):
+    with claim_folder(output, may_exist=overwrite) if is_first() else nullcontext():
         settings = views, output, components
         if parameter is None:
             report = render_to_folder(loaded, *settings, session.progress)
         else:
             report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
+        if not is_first():
+            return
         if count is not None:
             report["ring"] = write_ring(views, output, has_mp4)
         write_json(output / "render.json", report)

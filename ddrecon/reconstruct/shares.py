@@ -18,6 +18,7 @@ from ddrecon.ranks import (
     is_first,
     own_rank,
     rank_count,
+    sum_numbers,
     sum_over_ranks,
 )
 from ddrecon.reconstruct.parameters import Parameter
@@ -76,8 +77,7 @@ def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[T
     """
     if rank_count() == 1:
         return list(found)
-    is_found = torch.tensor([float(one is not None) for one in found])
-    is_found = sum_over_ranks([is_found])[0] > 0
+    is_found = [count > 0 for count in sum_numbers([one is not None for one in found])]
     chosen = [
         torch.zeros_like(like) if one is None else one
         for one, like, is_any in zip(found, likes, is_found, strict=True)
