@@ -64,7 +64,8 @@ def _lead(findings: Findings) -> str:
     return (
         f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
         f"PSNR {summary['psnr']:.2f} dB of the views seen last{test}. "
-        f"What is compared is {summary['compared']}, by the loss {summary['loss_function']}."
+        f"What is compared is {summary['compared']}, by the loss {summary['loss_function']}. "
+        f"It {summary['ended']['text']}."
     )
 
 
