@@ -1,0 +1,90 @@
+"""The command `uncertainty`.
+
+torch is imported inside the command, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ddrecon.cli.command import AS_JSON, OUTPUT, OVERWRITE, in_session
+
+if TYPE_CHECKING:
+    from ddrecon.cli.session import Session
+
+SAMPLES = 16
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@OUTPUT
+@OVERWRITE
+@click.option(
+    "--samples",
+    type=click.IntRange(min=2),
+    default=SAMPLES,
+    show_default=True,
+    metavar="N",
+    help="Samples of the posterior in all, also after --resume.",
+)
+@click.option(
+    "--noise",
+    "read",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="X",
+    help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
+    "reconstruction leaves.",
+)
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0, max=1, min_open=True),
+    help="Relative residual of a sample.",
+)
+@click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
+@click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
+@AS_JSON
+@in_session
+def uncertainty(
+    session: Session,
+    run: Path,
+    output: Path,
+    overwrite: bool,
+    samples: int,
+    read: float | None,
+    tolerance: float | None,
+    has_samples: bool,
+    resume: bool,
+) -> None:
+    """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
+    they do not.
+    """
+    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.pictures.noise import Noise
+    from ddrecon.reconstruct.posterior import TOLERANCE
+    from ddrecon.run.uncertainty_folder import (
+        drive_uncertainty,
+        dtype_of,
+        state_of,
+        take_up,
+        uncertainty_lines,
+    )
+
+    state = state_of(run)
+    session = replace(session, dtype=dtype_of(state))
+    taken = take_up(session.build(session.read(run / "scene.yaml")), state, run)
+    with claim_folder(output, may_exist=overwrite or resume):
+        record = drive_uncertainty(
+            taken,
+            output,
+            samples,
+            noise=None if read is None else Noise(read, 0.0),
+            tolerance=tolerance or TOLERANCE,
+            has_samples=has_samples,
+            resume=resume,
+            is_quiet=session.is_quiet,
+        )
+    session.show(record, uncertainty_lines(record, output))

@@ -1,0 +1,227 @@
+"""How sure a run is, as a folder: deviations of all that was optimized, and the page about them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ddrecon.errors import FormatError, UsageError
+from ddrecon.io.files.json_file import write_json
+from ddrecon.io.volumes.table import write_field
+from ddrecon.pictures.noise import Noise
+from ddrecon.progress import bar_width
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.picture_errors import PictureErrors
+from ddrecon.reconstruct.uncertainty import Uncertainty
+from ddrecon.run.checkpoint import (
+    LAST,
+    UNUSABLE,
+    forget_checkpoints,
+    load_checkpoint,
+    read_state,
+    save_checkpoint,
+)
+from ddrecon.run.drive import defer_interrupt
+from ddrecon.run.run_folder import CHECKPOINTS
+from ddrecon.run.uncertainty_report import write_uncertainty_report
+from ddrecon.scene import Scene
+
+RECORD = "uncertainty.json"
+"""What tells a folder of this kind."""
+SAMPLES = "samples"
+"""The folder of samples that are kept."""
+
+
+def state_of(folder: Path) -> dict[str, Any]:
+    """The state that the run in `folder` was saved in last; raises UsageError without one."""
+    checkpoint = folder / CHECKPOINTS / LAST
+    if not (folder / "scene.yaml").is_file() or not checkpoint.is_file():
+        raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
+    state = read_state(checkpoint)
+    if "parameters" not in state:
+        raise UsageError(f"{folder}: holds no run; name the folder that `ddrecon optimize` wrote")
+    return state
+
+
+def dtype_of(state: Mapping[str, Any]) -> torch.dtype:
+    """The precision of the run that made `state`."""
+    value: Tensor = next(iter(state["parameters"].values()))["value"]
+    return value.dtype
+
+
+def take_up(scene: Scene, state: dict[str, Any], folder: Path) -> Reconstruction:
+    """The run in `folder` of `scene`, where `state` has it.
+
+    Raises FormatError where the state does not fit, UsageError before the last resolution.
+    """
+    run = Reconstruction(scene)
+    try:
+        run.restore(state)
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+        raise FormatError(folder / CHECKPOINTS / LAST, UNUSABLE) from error
+    if run.stage + 1 < len(run.factors):
+        raise UsageError(
+            f"{folder}: the run stopped before its last resolution; finish it with "
+            "`ddrecon optimize --resume`"
+        )
+    return run
+
+
+def drive_uncertainty(
+    run: Reconstruction,
+    path: Path,
+    samples: int,
+    *,
+    noise: Noise | None,
+    tolerance: float,
+    has_samples: bool,
+    resume: bool,
+    is_quiet: bool,
+) -> dict[str, Any]:
+    """What `uncertainty.json` says of `run`, after `samples` in all, its folder being `path`.
+
+    Each sample is saved when it is drawn: `resume` goes on after the last. `has_samples` keeps them
+    as volumes. An interrupt takes effect after a sample.
+    """
+    began, checkpoints = perf_counter(), path / CHECKPOINTS
+    for name in ("volumes", CHECKPOINTS):
+        (path / name).mkdir(exist_ok=True)
+    described = _describe(run, noise, tolerance)
+    state: dict[str, Any] | None = None
+    if resume:
+        state, loaded = load_checkpoint(checkpoints, described)
+        os.replace(loaded, checkpoints / LAST)
+    else:
+        forget_checkpoints(checkpoints)
+    errors = None if state is None else PictureErrors(**state["errors"])
+    found = Uncertainty(run, noise, tolerance, errors)
+    before = 0.0
+    if state is not None:
+        found.restore(state)
+        before = state["seconds"]
+    with (
+        defer_interrupt() as asked,
+        tqdm(
+            total=samples,
+            initial=found.count,
+            desc="uncertainty",
+            file=sys.stderr,
+            disable=is_quiet,
+            ncols=bar_width(),
+        ) as bar,
+    ):
+        while found.count < samples:
+            sample = found.step()
+            if has_samples:
+                _write_sample(found, sample.change, path / SAMPLES / f"{found.count - 1:04d}")
+            seconds = before + perf_counter() - began
+            save_checkpoint(checkpoints, found.state() | {"seconds": seconds}, described)
+            bar.set_postfix_str(f"{sample.products} products", refresh=False)
+            bar.update()
+            if asked:
+                raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
+    seconds = before + perf_counter() - began
+    return _finish(run, found, path, seconds)
+
+
+def _describe(run: Reconstruction, noise: Noise | None, tolerance: float) -> dict[str, Any]:
+    """What samples depend on, in plain values, so that only those of the same run are added up."""
+    sums = {p.name: float(p.value.detach().double().abs().sum()) for p in run.parameters}
+    return {
+        "iteration": run.iteration,
+        "values": sums,
+        "seed": run.seed,
+        "noise": None if noise is None else vars(noise),
+        "tolerance": tolerance,
+    }
+
+
+def _finish(run: Reconstruction, found: Uncertainty, path: Path, seconds: float) -> dict[str, Any]:
+    """Writes volumes, record and report of what was `found`; the record."""
+    box = np.array(run.scene.volume.grid.bounds_xyz)
+    stated = {"std": found.deviations, "mean": found.means, "told": found.told}
+    tabled = {parameter.name for parameter in found.tabled}
+    fields = dict[str, Any]()
+    for name in found.curvature.values:
+        if name in tabled:
+            continue
+        for kind, values in stated.items():
+            _write(path / "volumes" / f"{name}_{kind}.npz", f"{name}_{kind}", values[name], box)
+        value, deviation = found.curvature.values[name], stated["std"][name]
+        fields[name] = {
+            "root_mean_square": float(value.square().mean().sqrt()),
+            "deviation": float(deviation.square().mean().sqrt()),
+            "told": float(stated["told"][name].mean()),
+        }
+    names, spread = found.number_names(), found.number_deviations().tolist()
+    numbers = {
+        name: {"value": value, "deviation": deviation}
+        for name, value, deviation in zip(
+            names, found.number_values().tolist(), spread, strict=True
+        )
+    }
+    record = {
+        "samples": found.count,
+        "seconds": seconds,
+        "seed": run.seed,
+        "products": found.products,
+        "residual": found.residual,
+        "noise": found.errors.described(),
+        "fields": fields,
+        "numbers": numbers,
+        "correlations": found.correlations().tolist() if names else [],
+    }
+    write_json(path / RECORD, record)
+    write_uncertainty_report(path / "report.html", run, found, record)
+    return record
+
+
+def _write_sample(found: Uncertainty, change: Tensor, folder: Path) -> None:
+    """Writes the fields of a sample to `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    box = np.array(found.curvature.scene.volume.grid.bounds_xyz)
+    tabled = {parameter.name for parameter in found.tabled}
+    for name, part in found.curvature.split(change).items():
+        if name not in tabled:
+            _write(folder / f"{name}.npz", name, found.curvature.values[name] + part, box)
+
+
+def _write(path: Path, name: str, value: Tensor, box: np.ndarray) -> None:
+    """Writes a field [z, y, x] or [C, z, y, x]; a map [C, h, w] as a slice of one."""
+    array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
+    write_field(path, name, array.float().cpu().numpy(), box)
+
+
+def volumes_in(folder: Path) -> list[Path]:
+    """The volumes of the `folder` that `drive_uncertainty` wrote, in order; else none."""
+    if not (folder / RECORD).is_file():
+        return []
+    return sorted((folder / "volumes").glob("*.npz"))
+
+
+def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
+    """The `record` of a folder `path` as lines."""
+    noise = record["noise"]
+    lines = [
+        f"{record['samples']} samples in {record['seconds']:.1f} s, {record['products']} products;"
+        f" pictures err by {noise['deviation']:.3g} (from {noise['from']})"
+    ]
+    lines += [
+        f"{name}: deviation {field['deviation']:.3g} of {field['root_mean_square']:.3g}"
+        f" (root mean squares), {100 * field['told']:.0f} % told by pictures"
+        for name, field in record["fields"].items()
+    ]
+    lines += [
+        f"{name}: {number['value']:.5g} +- {number['deviation']:.2g}"
+        for name, number in record["numbers"].items()
+    ]
+    return [*lines, f"deviations and report written to {path}"]
