@@ -21,7 +21,7 @@ TOLERANCE = 0.03
 """How small a sample's residual is to be, of what it was for a draw from the prior."""
 MOST = 40
 """Products with J^T W J that a sample may take."""
-ROUNDS = 4
+ROUNDS = 10
 """Times that cells are let go of or held at a bound."""
 PROBES = 3
 """Random pictures that the diagonal of J^T W J is found by."""
@@ -31,8 +31,8 @@ PROBES = 3
 class Sample:
     """How far from the optimum a draw from the posterior is, `change` [n], and one from the prior.
 
-    Both are of the same disturbance of the prior. `products` with J^T W J were needed; `residual`
-    is what is left.
+    Both are of the same disturbance of the prior; that from the prior leaves out what levels of
+    smoothed fields do. `products` with J^T W J were needed; `residual` is what is left.
     """
 
     change: Tensor
@@ -57,7 +57,7 @@ class Posterior:
         tolerance: float = TOLERANCE,
     ):
         self.curvature, self.temperature = curvature, temperature
-        self.seed, self.tolerance = seed, tolerance
+        self.seed, self.tolerance, self.most = seed, tolerance, MOST
         self.prior = Prior(curvature, temperature)
         value = curvature.join(curvature.values)
         self.low, self.high = (bound - value for bound in find_bounds(curvature))
@@ -72,10 +72,11 @@ class Posterior:
         """The sample of this `number`, the same whenever it is asked for."""
         generator = self._generator(number)
         scale = self.temperature**0.5
-        noise = scale * self.prior.root_noise(generator)
-        prior = self._within(self._solve_prior(noise))
-        right = noise + scale * self.data_noise(generator) - self.gradient
-        return self._minimize(right, prior)
+        noise, level = (scale * part for part in self.prior.root_noise(generator))
+        even, shift = (self._solve_prior(part) for part in (noise, level))
+        right = noise + level + scale * self.data_noise(generator) - self.gradient
+        change, products, residual = self._minimize(right, self._within(even + shift))
+        return Sample(change, self._within(even), products, residual)
 
     def data_noise(self, generator: torch.Generator) -> Tensor:
         """A random vector whose covariance is J^T W J."""
@@ -98,8 +99,10 @@ class Posterior:
         """H times `vector`, H being J^T W J + R + T K."""
         return self.curvature.data_product(vector) + self.prior.product(vector)
 
-    def _minimize(self, right: Tensor, start: Tensor) -> Sample:
+    def _minimize(self, right: Tensor, start: Tensor) -> tuple[Tensor, int, float]:
         """The least of d^T H d / 2 - `right`^T d within bounds, from `start`.
+
+        And how many products that took, and what is left.
 
         Which cells are at a bound is guessed, the others are solved for, and the guess is mended
         (active sets: Bertsekas 1982, doi:10.1137/0320018).
@@ -113,12 +116,12 @@ class Posterior:
             size = self._size(residual, is_fixed)
             first = first or size
             left = size / first if first else 0.0
-            if left <= self.tolerance or products >= MOST or turn == ROUNDS - 1:
+            if left <= self.tolerance or products >= self.most or turn == ROUNDS - 1:
                 break
-            solved = self._correct(residual, is_fixed, MOST - products, self.tolerance / left)
+            solved = self._correct(residual, is_fixed, self.most - products, self.tolerance / left)
             products += solved.products
             change = self._within(change + solved.value)
-        return Sample(change, start, products, left)
+        return change, products, left
 
     def _correct(
         self, right: Tensor, is_fixed: Tensor, most: int, tolerance: float = TOLERANCE

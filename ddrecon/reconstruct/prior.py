@@ -42,17 +42,22 @@ class Prior:
         weak = {name: _times(held, parts[name]) for name, held in self.held.items()}
         return self.curvature.penalty_product(vector) + self.curvature.join(weak)
 
-    def root_noise(self, generator: torch.Generator) -> Tensor:
-        """A random vector whose covariance is R + T K."""
-        parts = {}
+    def root_noise(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Two random vectors, the covariance of whose sum is R + T K.
+
+        The second is what a level of smoothed fields comes of, the first all else.
+        """
+        parts, levels = dict[str, Tensor](), dict[str, Tensor]()
         for name, value in self.curvature.values.items():
             held = self.held[name]
             root = torch.linalg.cholesky(held) if held.ndim == 2 else held.sqrt()
-            parts[name] = _times(root, normal_like(value, generator))
-            if (roughness := self.curvature.roughness.get(name)) is not None:
+            weak = _times(root, normal_like(value, generator))
+            if (roughness := self.curvature.roughness.get(name)) is None:
+                parts[name] = weak
+            else:
                 noises = [normal_like(value, generator) for _ in AXES]
-                parts[name] = parts[name] + roughness.root_product(noises)
-        return self.curvature.join(parts)
+                parts[name], levels[name] = roughness.root_product(noises), weak
+        return self.curvature.join(parts), self.curvature.join(levels)
 
     def solve(
         self,
