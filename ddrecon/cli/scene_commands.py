@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,6 +18,17 @@ from ddrecon.errors import DataWarning
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+
+
+class CountOrAuto(click.IntRange):
+    """A whole number, or `auto`."""
+
+    name = "integer or auto"
+
+    def convert(
+        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
+    ) -> Any:
+        return value if value == "auto" else super().convert(value, parameter, context)
 
 
 @click.command()
@@ -126,8 +137,8 @@ def render(
 @OVERWRITE
 @click.option(
     "--iterations",
-    type=click.IntRange(min=1),
-    help="Total number of iterations, also after --resume.",
+    type=CountOrAuto(min=1),
+    help="Total number of iterations, also after --resume; auto: the run ends by itself.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
 @click.option(
@@ -156,7 +167,7 @@ def optimize(
     scene: Path,
     output: Path,
     overwrite: bool,
-    iterations: int | None,
+    iterations: int | str | None,
     resume: bool,
     preview_every: int | None,
     has_events: bool,

@@ -75,7 +75,7 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
         run.restore(state)
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise FormatError(loaded, UNUSABLE) from error
-    if run.iteration > run.settings.iterations:
+    if run.iteration > run.schedule.most:
         raise UsageError(
             f"{path}: {run.iteration} iterations are made already; "
             "ask for more than that, in all, with --iterations"
@@ -111,7 +111,7 @@ def drive_run(
     before it is passed on. So do a divergence and the end of another rank; any other failure leaves
     the checkpoints written so far.
     """
-    total = run.settings.iterations
+    total = None if run.schedule.is_auto else run.schedule.planned
     try:
         with (
             defer_interrupt() as asked,
@@ -190,7 +190,8 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
     line += f", of {summary['compared']}"
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
-    lines = [line, *diagnoses, f"density and all else written to {folder}"]
+    ended = [] if summary["ended"]["kind"] == "iterations" else [summary["ended"]["text"]]
+    lines = [line, *ended, *diagnoses, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))
     if "smoothing" in summary:
