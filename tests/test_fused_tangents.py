@@ -44,7 +44,9 @@ def scene_of(case: str, dtype: torch.dtype = torch.float64) -> Scene:
         for name, part in CASES[case].items()
     }
     density = half_empty(*SHAPE, dtype=dtype)
-    scene = make_scene(density, camera=make_camera((0.3, 0.4, 3.0), (9, 8), dtype=dtype), **settings)
+    scene = make_scene(
+        density, camera=make_camera((0.3, 0.4, 3.0), (9, 8), dtype=dtype), **settings
+    )
     if case in EVERY_LIGHT:
         tensor = density.new_tensor
         scene.lights += [
@@ -60,9 +62,7 @@ def variables_of(scene: Scene, moves: bool = False) -> dict[str, Tensor]:
     """All but those that others are made of; those that move rays and beams if it `moves`."""
     names = (name for name in variable_names(scene) if name not in ("sigma_t", "albedo"))
     return {
-        name: value_of(scene, name).detach()
-        for name in names
-        if moves or not name.endswith(MOVES)
+        name: value_of(scene, name).detach() for name in names if moves or not name.endswith(MOVES)
     }
 
 

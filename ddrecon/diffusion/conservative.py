@@ -22,7 +22,7 @@ from ddrecon.diffusion.operator import (
     conductance,
     face_fluxes,
 )
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import is_fused, recompute
 
@@ -76,7 +76,7 @@ class DiffusionProblem:
         """L1 of L0 = `mean`, with `more` flux in the source; None without directions."""
         if not self.has_flux:
             return None
-        source = Moments(mean, self.source.flux).plus(Moments(mean, more)).flux
+        source = add_vectors(self.source.flux, more)
         if is_fused():
             from ddrecon.diffusion.fused.flux import find_flux
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 wp = pytest.importorskip("warp")
 
+# ruff: noqa: E402 - what follows imports Warp
 from ddrecon.diffusion.fused.system_kernels import system_kernel
 from ddrecon.kernels.dual import interleaved_tangent_of, pair, tangent_of, with_changes
 from ddrecon.kernels.text import BLOCK, TextKernel
@@ -19,7 +20,7 @@ from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 COUNT = 37
 GIVEN = "int length, total; F shift, *x, *y, *half, *out, *other"
 TEXT = """
-const F *first = x, *second = y;
+const F *first = x, two = F(2), *second = y;
 F* const outs[2] = {out, other};
 F* __restrict kept = half + 0;
 auto bent = [](F a, const F* from, int i) -> F { return a < F(0) ? -a * a : from[i] / (F(1) + a); };
@@ -29,7 +30,7 @@ for (int i = begin; i < end; ++i) {
     kept[i] = F(0.5) * depth;
     const F thin = depth < F(0.5) ? psi_series(depth) : (F(1) - decay(depth)) / depth;
     outs[0][i] = decay(depth) * wp::sqrt(depth + shift) + thin * second[i];
-    outs[1][i] = bent(first[i], y, i) - F(2) * kept[i];
+    outs[1][i] = bent(first[i], y, i) - two * kept[i];
 }
 """
 

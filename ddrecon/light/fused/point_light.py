@@ -22,7 +22,6 @@ BLOCK = 128
 """Ways that one item does on a processor; on a GPU it is one."""
 
 
-
 def integrate_ways(
     field: Tensor, grid: Grid, begin: Tensor, end: Tensor, length: Tensor, fraction: Tensor
 ) -> Tensor:

@@ -118,7 +118,9 @@ class Unscattered(torch.autograd.Function):
             d_moments, d_masses = receiver.new_moments(), []
             for light, shear in enumerate(ctx.shears):
                 entered, d_entered = beams.follow(shear, light)
-                change_received(receiver, light, entered, d_given | {"entered": d_entered}, d_moments)
+                change_received(
+                    receiver, light, entered, d_given | {"entered": d_entered}, d_moments
+                )
                 if ctx.has_mass and d_field is None:
                     d_masses.append(d_entered)
                 elif ctx.has_mass:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, parts_of, split, units_of_parts
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, choose, parts_of, split
 from ddrecon.diffusion.rounds.fused.tangents import CellTangents, RowTangents, changes_of
 from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
@@ -17,6 +17,7 @@ from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.harmonics import degrees_of_harmonics
+from ddrecon.numerics.remember import remember
 
 
 def sweep_fused(
@@ -34,18 +35,19 @@ def sweep_fused(
     thread does a cell of a slice, not rows of directions; None: on a GPU.
     """
     colors = len(medium.extinction.value) if light is None else len(light.mean)
-    strength = (1 - medium.forward_fraction) * medium.scattering.scale
-    entering = source.mean.new_zeros(1) if inflow is None else inflow
-    scales = torch.stack(
-        [each.reshape(-1).expand(colors) for each in (medium.extinction.scale, strength, entering)]
-    )
     shares_field = medium.scattering.field is medium.extinction.field
     mean, *rest, _ = _Sweep.apply(
         source.mean.is_cuda if by_cells is None else by_cells,
         torch.is_grad_enabled(),
         medium.grid,
         directions,
-        scales,
+        _scales(
+            medium.extinction.scale,
+            medium.scattering.scale,
+            medium.forward_fraction,
+            inflow,
+            colors,
+        ),
         medium.extinction.field,
         None if shares_field else medium.scattering.field,
         _spread_factors(factors, colors),
@@ -56,12 +58,21 @@ def sweep_fused(
     return Moments(mean, (z, y, x) if rest else None, higher)
 
 
+@remember
+def _scales(
+    extinction: Tensor, scattering: Tensor, fraction: Tensor, inflow: Tensor | None, colors: int
+) -> Tensor:
+    """Of extinction, of scattering that remains, and the inflow of each of `colors`, [3, C]."""
+    entering = torch.zeros_like(extinction) if inflow is None else inflow
+    each = extinction, (1 - fraction) * scattering, entering
+    return torch.stack([one.reshape(-1).expand(colors) for one in each])
+
+
+@remember
 def _spread_factors(factors: Tensor, colors: int) -> Tensor:
-    """`factors` [L + 1, 1 or C, 1, 1, 1] of light and those of sources, by harmonic: [2, K, C]."""
-    degree = len(factors) - 1
-    each = factors.reshape(degree + 1, -1).expand(-1, colors)[list(degrees_of_harmonics(degree))]
-    units = (1 / units_of_parts(degree)).to(each)[:, None]
-    return torch.stack([each * units, units.expand(-1, colors)])
+    """`factors` [L + 1, 1 or C, 1, 1, 1] by harmonic, [K, C]."""
+    degrees = torch.tensor(degrees_of_harmonics(len(factors) - 1), device=factors.device)
+    return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
 
 
 class _Sweep(torch.autograd.Function):
@@ -96,7 +107,7 @@ class _Sweep(torch.autograd.Function):
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
         _, _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
-        parts = *bars[:-1], *[None] * (PARTS + 1 - len(bars))
+        parts = (*bars[:-1], *[None] * PARTS)[:PARTS]
         if ctx.by_cells:
             found = Cells(swept).transpose(parts, needs_scales)
         else:
@@ -112,8 +123,8 @@ class _Sweep(torch.autograd.Function):
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
             swept.factor_bar(moments_bar) if needs_factors else None,
-            *swept.part_bars(0, moments_bar, needs_parts[:PARTS]),
-            *swept.part_bars(1, moments_bar, needs_parts[PARTS:]),
+            *swept.light_bars(moments_bar, needs_parts[:PARTS]),
+            *choose(moments_bar, needs_parts[PARTS:]),
         )
 
     @staticmethod

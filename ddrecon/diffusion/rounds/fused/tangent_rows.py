@@ -21,18 +21,17 @@ from ddrecon.diffusion.rounds.fused.rows import (
 from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.kernels.text import TextKernel
 
-_GIVEN = "F *d_factors, *d_extinction, *d_scattering, *d_scales; long *d_moments;"
+_GIVEN = "F *d_light_parts[5], *d_source_parts[5], *d_factors, *d_scales"
 # The change of one of the moments that scatter, from a cell on.
 _READ_CHANGE = """
 auto read_change = [&](long long at, int k, F* __restrict row, int from, int to) {
-    const F by[4] = {factors[k * colors + color], factors[(count + k) * colors + color],
-                     d_factors[k * colors + color], d_factors[(count + k) * colors + color]};
-    const long long terms[4]
-        = {d_moments[2 * k], d_moments[2 * k + 1], moments[2 * k], moments[2 * k + 1]};
+    const F* terms[3] = {part_of(d_source_parts, k), part_of(d_light_parts, k),
+                         part_of(light_parts, k)};
+    const F by[3] = {F(1), factors[k * colors + color], d_factors[k * colors + color]};
     for (int c = from; c < to; ++c) row[c] = F(0);
-    for (int i = 0; i < 4; ++i) {
+    for (int i = 0; i < 3; ++i) {
         if (!terms[i] || by[i] == F(0)) continue;
-        const F* __restrict term = (const F*)terms[i] + at;
+        const F* __restrict term = terms[i] + at;
         for (int c = from; c < to; ++c) row[c] += by[i] * term[c];
     }
 };
@@ -70,8 +69,10 @@ _FOLLOW = (
     PLACES
     + """
 enum { NEAR, LIGHT, D_NEAR, D_LIGHT, LINES };
-const F* d_e_cells = d_extinction + (e_cells - extinction);
-const F* d_sc_cells = d_scattering + (sc_cells - scattering);
+// changes of fields lie behind them
+const F* d_e_cells = e_cells + extinction_channels * padded;
+const F* d_sc_cells = sc_cells + scattering_channels * padded;
+const int slice_from = job_from, slice_to = job_to;
 const F d_scale = d_scales[color], d_strength = d_scales[colors + color];
 const F d_inflow = d_scales[2 * colors + color];
 const long long stride = (long long)LINES * most * pitch;
@@ -160,11 +161,12 @@ for (int t = 0; t < height; ++t) {
         else if (point_count == 1) pass_all(One(), Across());
         else pass_all(Four(), Across());
     }
-    F* found_row = found + job[11] * count * all + color * cells + at;
+    F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
     to_moments(to_weighted_sums, found_row, d_light_of, is_adding, 0, width);
-    if (!is_adding && job[11] == 0)
+    if (!is_adding && piece == 0)
         for (int c = 0; c < width; ++c) found_row[c] += d_inflow;
+}
 }
 }
 """
@@ -178,4 +180,4 @@ def tangent_kernel(bits: int, shares_field: bool) -> TextKernel:
     `shares_field`: whether extinction and scattering have the same field.
     """
     text = constants(SHARES_FIELD=shares_field, KEEPS=False) + _FOLLOW
-    return TextKernel("change_rows", bits, text, GIVEN + ";" + _GIVEN)
+    return TextKernel("change_rows", bits, text, f"{GIVEN}; {_GIVEN}")

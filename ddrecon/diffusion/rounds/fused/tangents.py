@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,9 +10,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.rows import MARGIN
-from ddrecon.diffusion.rounds.fused.surroundings import surround
-from ddrecon.diffusion.rounds.fused.swept import Swept
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept
 from ddrecon.diffusion.rounds.fused.tangent_rows import tangent_kernel
 from ddrecon.kernels.dual import tangent_of, with_changes
 
@@ -26,39 +25,33 @@ def changes_of(swept: Swept, *changes: Tensor | None) -> Swept:
     scales, extinction, scattering, factors = whole
     assert scales is not None and extinction is not None and factors is not None
     parts = changes[len(whole) :]
-    return Swept.of(
-        swept.grid, swept.directions, scales, extinction, scattering, factors, *parts
-    )
+    return Swept.of(swept.grid, swept.directions, scales, extinction, scattering, factors, *parts)
 
 
 class RowTangents(Rows):
     """The change of a sweep on a processor: light and its change go through the rows together."""
 
     def __init__(self, swept: Swept, changes: Swept, threads: int):
-        super().__init__(swept, threads)
         self.changes = changes
+        super().__init__(swept, threads)
 
     def change(self) -> Tensor:
         """The change of the moments of radiance [K, C, z, y, x]."""
-        swept, changes, sums = self.swept, self.changes, self._sums()
-        pairs = (swept.extinction, swept.scattering), (changes.extinction, changes.scattering)
-        given = [field for pair in pairs for field in pair if field is not None]
-        # Together: steps meet a medium where it changes, too.
-        fields, ranges = surround(given, self.pitch)
-        count = len(fields) // 2
-        lines = self.like.new_zeros(
-            self.lanes * (4 * self.tables.most * self.pitch * (self.height + 2) + MARGIN)
-        )
-        values = self._given(lines) | {
-            "extinction": fields[0], "scattering": fields[count - 1], "ranges": ranges,
-            "d_extinction": fields[count], "d_scattering": fields[-1],
-            "d_scales": changes.scales, "d_factors": changes.factors, "found": sums,
-            "d_moments": self._addresses(one for pair in changes.moments for one in pair),
+        changes, sums = self.changes, self._sums()
+        given = self._given() | {
+            "d_light_parts": changes.light, "d_source_parts": changes.source,
+            "d_factors": changes.factors, "d_scales": changes.scales,
         }  # fmt: skip
-        kernel = tangent_kernel(self.bits, self._shares_field)
-        for jobs in self._launches(is_backward=False):
-            self._launch(kernel, jobs, values)
+        lines = 2 * self._line_count(self.height + 2)
+        made = {"found": sums, **self._zeros(lines=lines)}
+        self._launch(tangent_kernel(self.bits, self._shares_field), False, given, made)
         return sums.sum(0) if len(sums) > 1 else sums[0]
+
+    def _matter(self) -> list[Tensor]:
+        # Each with its change behind it: steps meet a medium where that changes, too.
+        return [
+            torch.cat(pair) for pair in zip(self.swept.fields, self.changes.fields, strict=True)
+        ]
 
 
 class CellTangents(Cells):
@@ -68,17 +61,13 @@ class CellTangents(Cells):
         super().__init__(swept)
         self.changes = changes
         # Both the factors and what they multiply change.
-        crossed = Swept(
-            swept.grid, swept.directions, swept.scales, swept.extinction, swept.scattering,
-            swept.factors, changes.light, changes.source,
-        )  # fmt: skip
-        by_factors = Swept(
-            swept.grid, swept.directions, swept.scales, swept.extinction, swept.scattering,
-            changes.factors, swept.light, swept.source,
-        )  # fmt: skip
-        self.d_moments = by_factors.total()
-        if any(part is not None for part in (*changes.light, *changes.source)):
-            self.d_moments += crossed.total()
+        nothing = (None,) * PARTS
+        crossed = replace(swept, light=changes.light, source=changes.source)
+        by_factors = replace(swept, factors=changes.factors, source=nothing)
+        self.d_moments = torch.zeros_like(self.like)
+        for part in (crossed, by_factors):
+            if any(each is not None for each in (*part.light, *part.source)):
+                self.d_moments += part.total()
 
     def change(self) -> Tensor:
         """The change of the moments of radiance [K, C, z, y, x]."""
