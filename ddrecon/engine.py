@@ -2,9 +2,10 @@
 
 An engine is an implementation of the inner loops. `torch` is the readable definition and has them
 all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. Torch's are, with either engine: most tangents in
-forward mode, point lights but for the mass on the way to them, the scattering of skies towards a
-camera, the model `flux_limited`, the scheme `printed`, and solvers other than `multigrid`.
+same formulas, so their numbers agree to rounding. Torch's are, with either engine: point lights but
+for the mass on the way to them, the scattering of skies towards a camera, tangents in forward mode
+by where lights are, the model `flux_limited`, the scheme `printed`, and solvers other than
+`multigrid`.
 """
 
 from __future__ import annotations

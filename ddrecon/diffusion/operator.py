@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.numerics.autodiff import keep
+from ddrecon.numerics.autodiff import keep, run_plainly
 
 Prepared = TypeVar("Prepared")
 AXES = (1, 2, 3)
@@ -90,6 +90,15 @@ class Operator:
     def change_terms(self, d_tensors: Iterable[Tensor | None], u: Tensor) -> Iterator[Tensor]:
         """dA u = dloss u + G^T (dc G u), term by term (E8)."""
         d_loss, *d_conductances = d_tensors
+        if (
+            current_engine() == "warp"
+            and d_loss is not None
+            and all(each is not None for each in d_conductances)
+        ):
+            from ddrecon.diffusion.fused.product import multiply  # imports Warp
+
+            yield run_plainly(multiply, u, d_loss, *d_conductances)
+            return
         if d_loss is not None:
             yield d_loss * u
         for axis, d_conductance in zip(AXES, d_conductances, strict=True):

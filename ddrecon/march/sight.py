@@ -18,7 +18,7 @@ from ddrecon.grid import Grid
 from ddrecon.march.box import Crossing, cross_box
 from ddrecon.march.lattice import Lattice, choose_lattice
 from ddrecon.march.samplers import Way, choose_way
-from ddrecon.numerics.autodiff import is_forward, version_of
+from ddrecon.numerics.autodiff import is_steady, version_of
 from ddrecon.settings import RenderSettings
 
 LIMIT = 1 << 28
@@ -75,8 +75,7 @@ def look_through(camera: Camera, grid: Grid, settings: RenderSettings) -> Sight:
     another or has changed.
     """
     tensors = camera.tensors
-    is_varied = any(tensor.requires_grad or tensor.is_inference() for tensor in tensors)
-    if is_varied or is_forward():
+    if not is_steady(*tensors):
         return _look(camera, grid, settings)
     key = _key(camera, grid, settings)
     kept = _KEPT.get(camera)

@@ -35,6 +35,15 @@ def is_forward() -> bool:
     return forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
 
 
+def is_steady(*tensors: Tensor) -> bool:
+    """Whether what is made of `tensors` has no derivatives, and may be kept for later."""
+    return not (
+        any(one.requires_grad or one.is_inference() for one in tensors)
+        or torch._C._are_functorch_transforms_active()
+        or (is_forward() and any(map(is_varied, tensors)))
+    )
+
+
 def require_plain_autograd() -> None:
     """Raises NotImplementedError within those transforms of `torch.func` that light has not."""
     stack = torch._C._functorch.get_interpreter_stack() or []

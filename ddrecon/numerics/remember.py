@@ -14,7 +14,7 @@ from weakref import ref
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.autodiff import is_forward, version_of
+from ddrecon.numerics.autodiff import is_steady, version_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -49,7 +49,7 @@ def remember(function: Callable[P, T]) -> Callable[P, T]:
 
     def recall(*arguments: Any) -> Any:
         tensors = [one for one in arguments if isinstance(one, Tensor)]
-        if is_forward() or any(one.requires_grad or one.is_inference() for one in tensors):
+        if not is_steady(*tensors):
             return function(*arguments)  # type: ignore[call-arg]
         key = tuple((id(one),) if isinstance(one, Tensor) else one for one in arguments)
         found = kept.get(key)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.autograd.forward_ad as forward
-from media import box_grid, half_empty, random_values
+from media import box_grid, half_empty, make_operator, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.closures import Closure
@@ -23,6 +23,7 @@ from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.fused import closure_kernels, flux_kernels, spread, system_kernels  # noqa: E402
+from ddrecon.diffusion.fused.product import multiply  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -204,3 +205,17 @@ def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob(f"*.sm{architecture}.ptx"))) == len(kernels)
+
+
+@each_shape
+@each_colors
+def test_the_product_with_the_operator_is_torchs(shape: Shape, colors: tuple[int, int]):
+    """What changes of a solve start from: A may have one color where light has three."""
+    of_medium, of_light = colors
+    diffusion, absorption = (random_values(of_medium, *shape, seed=seed) for seed in (1, 2))
+    operator, u = (
+        make_operator(box_grid(shape), diffusion + 0.1, absorption),
+        random_values(of_light, *shape, seed=3),
+    )
+    found = multiply(u, operator.loss, *operator.conductances)
+    torch.testing.assert_close(found, operator.apply(u), rtol=1e-13, atol=1e-13)
