@@ -45,9 +45,7 @@ class Cells:
     def transpose(self, bars: Parts, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light."""
         swept, (_, back, collect) = self.swept, self.kernels(varies_numbers)
-        fields = [
-            torch.zeros_like(f) for f in (swept.extinction, swept.scattering) if f is not None
-        ]
+        fields = [torch.zeros_like(field) for field in swept.fields]
         given_bars = torch.zeros_like(self.like)
         for k, total in enumerate(given_bars):
             if (bar := moment_of(bars, k)) is not None:

@@ -52,9 +52,8 @@ class Rows:
         # slabs begin anew in the middle, where the ways meet
         low, high = self.depth // 2, self.depth - self.depth // 2
         self.slabs = -(-low // self.slab) + -(-high // self.slab)
-        fields = [f for f in (swept.extinction, swept.scattering) if f is not None]
-        self.fields, self.ranges = surround(fields, self.pitch)
-        self.channels = [len(field) for field in fields]
+        self.fields, self.ranges = surround(self._matter(), self.pitch)
+        self.channels = [len(field) for field in swept.fields]
 
     def follow(self, is_saved: bool) -> tuple[Tensor, Tensor | None]:
         """The moments of radiance [K, C, z, y, x]; and what `transpose` needs, if it `is_saved`.
@@ -97,6 +96,10 @@ class Rows:
             for bar, each in zip(fields, self.channels, strict=True)
         ]
         return scales.sum(0).T.to(found.dtype), found, of_fields
+
+    def _matter(self) -> list[Tensor]:
+        """The fields that steps meet."""
+        return self.swept.fields
 
     @property
     def _shares_field(self) -> bool:

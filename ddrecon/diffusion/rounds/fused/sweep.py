@@ -10,10 +10,12 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
 from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, choose, parts_of, split
+from ddrecon.diffusion.rounds.fused.tangents import CellTangents, RowTangents, changes_of
+from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.harmonics import degrees_of_harmonics
 from ddrecon.numerics.remember import remember
 
@@ -34,8 +36,9 @@ def sweep_fused(
     """
     colors = len(medium.extinction.value) if light is None else len(light.mean)
     shares_field = medium.scattering.field is medium.extinction.field
-    mean, *rest = _Sweep.apply(
+    mean, *rest, _ = _Sweep.apply(
         source.mean.is_cuda if by_cells is None else by_cells,
+        torch.is_grad_enabled(),
         medium.grid,
         directions,
         _scales(
@@ -73,27 +76,38 @@ def _spread_factors(factors: Tensor, colors: int) -> Tensor:
 
 
 class _Sweep(torch.autograd.Function):
-    """The parts of light, and their derivatives by all tensors of `Swept`."""
+    """The parts of light, and their derivatives by all tensors of `Swept`.
+
+    At last what the backward pass needs, where gradients may be asked for: the numbers of threads,
+    and what `Rows` saves.
+    """
 
     @staticmethod
-    def forward(ctx: Any, by_cells: bool, *given: Any) -> tuple[Tensor, ...]:
-        grid, directions, *tensors = given
-        ctx.by_cells, ctx.of = by_cells, (grid, directions)
-        ctx.save_for_backward(*tensors)
-        swept, is_saved = Swept.of(*given), any(ctx.needs_input_grad)
-        ctx.set_materialize_grads(False)
-        ctx.threads, ctx.saved = thread_count(swept.like), None
+    def forward(by_cells: bool, may_save: bool, *given: Any) -> tuple[Any, ...]:
+        swept, threads = Swept.of(*given), thread_count(Swept.of(*given).like)
         if by_cells:
-            return split(Cells(swept).follow())
-        moments, ctx.saved = Rows(swept, ctx.threads).follow(is_saved)
-        return split(moments)
+            return *split(Cells(swept).follow()), None
+        is_saved = may_save and any(
+            isinstance(each, Tensor) and each.requires_grad for each in given
+        )
+        moments, saved = Rows(swept, threads).follow(is_saved)
+        return *split(moments), saved
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
+        ctx.by_cells, _, grid, directions, *tensors = inputs
+        ctx.of, ctx.threads, ctx.saved = (grid, directions), thread_count(output[0]), output[-1]
+        ctx.set_materialize_grads(False)
+        if ctx.saved is not None:
+            ctx.mark_non_differentiable(ctx.saved)
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
-        _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
-        parts = (*bars, *[None] * PARTS)[:PARTS]
+        _, _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
+        parts = (*bars[:-1], *[None] * PARTS)[:PARTS]
         if ctx.by_cells:
             found = Cells(swept).transpose(parts, needs_scales)
         else:
@@ -104,6 +118,7 @@ class _Sweep(torch.autograd.Function):
             None,
             None,
             None,
+            None,
             scales_bar if needs_scales else None,
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
@@ -111,3 +126,15 @@ class _Sweep(torch.autograd.Function):
             *swept.light_bars(moments_bar, needs_parts[:PARTS]),
             *choose(moments_bar, needs_parts[PARTS:]),
         )
+
+    @staticmethod
+    def jvp(ctx: Any, *changes: Any) -> tuple[Tensor | None, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            values, d_values = halve(tensors)
+            swept = Swept.of(*ctx.of, *values)
+            d_swept = changes_of(swept, *d_values)
+            if ctx.by_cells:
+                return split(CellTangents(swept, d_swept).change())
+            return split(RowTangents(swept, d_swept, ctx.threads).change())
+
+        return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None

@@ -90,6 +90,11 @@ class Swept:
         (like, *_) = (part for part in (*self.source, *self.light) if part is not None)
         return like
 
+    @property
+    def fields(self) -> list[Tensor]:
+        """Those of extinction and of scattering; one where they share it."""
+        return [field for field in (self.extinction, self.scattering) if field is not None]
+
     def total(self) -> Tensor:
         """The moments of what scatters, [K, C, z, y, x], in units of parts."""
         found = self.like.new_zeros(len(self.factors), *self.like.shape)
