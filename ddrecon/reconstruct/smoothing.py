@@ -15,6 +15,7 @@ import torch
 
 from ddrecon.errors import SceneError
 from ddrecon.losses import Target
+from ddrecon.ranks import from_first
 from ddrecon.reconstruct.levels import factors, scene_at_level
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
@@ -135,4 +136,5 @@ def _quality(scene: Scene, left_out: str, weight: float, start: Callable[[Scene]
             (seen * image * other).sum((1, 2), keepdim=True) for other in (target.image, image)
         )
         gain = both / square.clamp(min=torch.finfo(image.dtype).tiny)
-        return float(target.psnr_of(gain * image))
+        # What is decided by it is decided alike on all ranks.
+        return from_first(float(target.psnr_of(gain * image)))
