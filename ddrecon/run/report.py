@@ -67,6 +67,7 @@ def _lead(findings: Findings) -> str:
         f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
         f"PSNR {summary['psnr']:.2f} dB of views trained on{test}. "
         f"All of these compare {summary['compared']}; the loss is {summary['loss_function']}."
+        f" It {summary['ended']['text']}."
     )
 
 

@@ -198,6 +198,7 @@ def _plain(value: Tensor) -> Any:
 def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
     summary = {"iterations": total.pop("iteration"), **total} | compared_by(run)
+    summary["ended"] = run.schedule.ending(run.iteration)
     support = describe_support(run.support, run.scene.volume.grid)
     if support is not None:
         summary["support"] = support

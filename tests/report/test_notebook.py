@@ -9,8 +9,7 @@ import re
 import torch
 from media import make_scene, random_values
 
-from ddrecon.reconstruct.log import Row
-from ddrecon.reconstruct.loop import Result
+from ddrecon.reconstruct.log import Result, Row
 
 
 def framed(text: str) -> str:
