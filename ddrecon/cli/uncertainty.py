@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ddrecon.reconstruct.loop import Reconstruction
 
 SAMPLES = 16
+CANDIDATES = 12
 
 
 @click.command()
@@ -46,6 +47,13 @@ SAMPLES = 16
     help="Relative residual of a sample.",
 )
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
+@click.option(
+    "--next-view",
+    "ring",
+    type=click.Choice(["ring"]),
+    help=f"Rank {CANDIDATES} cameras, turned around the volume from the first: which picture would "
+    "tell most?",
+)
 @click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
 @AS_JSON
 @in_session
@@ -58,6 +66,7 @@ def uncertainty(
     read: float | None,
     tolerance: float | None,
     has_samples: bool,
+    ring: str | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -65,6 +74,7 @@ def uncertainty(
     """
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.pictures.noise import Noise
+    from ddrecon.reconstruct.next_view import FEWEST
     from ddrecon.reconstruct.posterior import TOLERANCE
     from ddrecon.run.uncertainty_folder import (
         drive_uncertainty,
@@ -74,6 +84,8 @@ def uncertainty(
         uncertainty_lines,
     )
 
+    if ring and samples < FEWEST:
+        raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     state = state_of(run)
     session = replace(session, dtype=dtype_of(state))
     taken = take_up(session.build(session.read(run / "scene.yaml")), state, run)
@@ -86,6 +98,7 @@ def uncertainty(
             noise=None if read is None else Noise(read, 0.0),
             tolerance=tolerance or TOLERANCE,
             has_samples=has_samples,
+            candidates=CANDIDATES if ring else 0,
             resume=resume,
             is_quiet=session.is_quiet,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -21,6 +21,7 @@ from ddrecon.io.volumes.table import write_field
 from ddrecon.pictures.noise import Noise
 from ddrecon.progress import bar_width
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.next_view import Candidate, NextView
 from ddrecon.reconstruct.picture_errors import PictureErrors
 from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.run.checkpoint import (
@@ -35,6 +36,7 @@ from ddrecon.run.drive import defer_interrupt
 from ddrecon.run.run_folder import CHECKPOINTS
 from ddrecon.run.uncertainty_report import write_uncertainty_report
 from ddrecon.scene import Scene
+from ddrecon.turntable import place_turntable
 
 RECORD = "uncertainty.json"
 """What tells a folder of this kind."""
@@ -86,18 +88,20 @@ def drive_uncertainty(
     noise: Noise | None,
     tolerance: float,
     has_samples: bool,
+    candidates: int = 0,
     resume: bool,
     is_quiet: bool,
 ) -> dict[str, Any]:
     """What `uncertainty.json` says of `run`, after `samples` in all, its folder being `path`.
 
     Each sample is saved when it is drawn: `resume` goes on after the last. `has_samples` keeps them
-    as volumes. An interrupt takes effect after a sample.
+    as volumes. An interrupt takes effect after a sample. So many `candidates` for the next picture,
+    around the volume, are ranked.
     """
     began, checkpoints = perf_counter(), path / CHECKPOINTS
     for name in ("volumes", CHECKPOINTS):
         (path / name).mkdir(exist_ok=True)
-    described = _describe(run, seed, noise, tolerance)
+    described = _describe(run, seed, noise, tolerance) | {"candidates": candidates}
     state: dict[str, Any] | None = None
     if resume:
         state, loaded = load_checkpoint(checkpoints, described)
@@ -106,9 +110,12 @@ def drive_uncertainty(
         forget_checkpoints(checkpoints)
     errors = None if state is None else PictureErrors(**state["errors"])
     found = Uncertainty(run, seed, noise, tolerance, errors)
-    before = 0.0
+    before, ring = 0.0, place_turntable(run.train_level, run.train_level.views[0], candidates)
+    ranking = NextView(found.curvature, ring, found.errors.deviation) if ring else None
     if state is not None:
         found.restore(state)
+        if ranking is not None:
+            ranking.restore(state["ranking"])
         before = state["seconds"]
     with (
         defer_interrupt() as asked,
@@ -125,14 +132,18 @@ def drive_uncertainty(
             sample = found.step()
             if has_samples:
                 _write_sample(found, sample.change, path / SAMPLES / f"{found.count - 1:04d}")
-            seconds = before + perf_counter() - began
-            save_checkpoint(checkpoints, found.state() | {"seconds": seconds}, described)
+            kept = found.state()
+            if ranking is not None:
+                ranking.add(sample.change)
+                kept["ranking"] = ranking.state()
+            kept["seconds"] = before + perf_counter() - began
+            save_checkpoint(checkpoints, kept, described)
             bar.set_postfix_str(f"{sample.products} products", refresh=False)
             bar.update()
             if asked:
                 raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
     seconds = before + perf_counter() - began
-    return _finish(run, found, path, seconds)
+    return _finish(run, found, path, seconds, [] if ranking is None else ranking.rank())
 
 
 def _describe(
@@ -149,7 +160,13 @@ def _describe(
     }
 
 
-def _finish(run: Reconstruction, found: Uncertainty, path: Path, seconds: float) -> dict[str, Any]:
+def _finish(
+    run: Reconstruction,
+    found: Uncertainty,
+    path: Path,
+    seconds: float,
+    ranked: Sequence[Candidate],
+) -> dict[str, Any]:
     """Writes volumes, record and report of what was `found`; the record."""
     stated = {"std": found.deviations, "mean": found.means, "told": found.told}
     fields = dict[str, Any]()
@@ -178,6 +195,7 @@ def _finish(run: Reconstruction, found: Uncertainty, path: Path, seconds: float)
         "fields": fields,
         "numbers": numbers,
         "correlations": found.correlations().tolist() if names else [],
+        "next_views": [candidate.described() for candidate in ranked],
     }
     write_json(path / RECORD, record)
     write_uncertainty_report(path / "report.html", run, found, record)
@@ -231,5 +249,10 @@ def uncertainty_lines(record: Mapping[str, Any], path: Path) -> list[str]:
     lines += [
         f"{name}: {number['value']:.5g} +- {number['deviation']:.2g}"
         for name, number in record["numbers"].items()
+    ]
+    lines += [
+        f"{'next view: ' if place == 0 else '  then '}{view['name']}, whose picture takes at least "
+        f"{100 * view['gain']:.1f} % of the variance (+- {100 * view['error']:.1f})"
+        for place, view in enumerate(record["next_views"])
     ]
     return [*lines, f"deviations and report written to {path}"]

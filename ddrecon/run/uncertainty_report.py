@@ -33,6 +33,8 @@ def write_uncertainty_report(
     ]
     if record["numbers"]:
         sections.append(section("Numbers", *_numbers(record)))
+    if record["next_views"]:
+        sections.append(section("Next picture", *_next_views(record)))
     sections.append(section("How", *_how(record)))
     title = f"ddrecon: how sure {path.absolute().parent.name} is"
     write_page(path, title, _lead(record), sections, is_alive=False)
@@ -91,6 +93,25 @@ def _numbers(record: Mapping[str, Any]) -> list[str]:
             table(["", "", "correlation"], pairs),
         ]
     return parts
+
+
+def _next_views(record: Mapping[str, Any]) -> list[str]:
+    """The table of cameras whose pictures would tell most."""
+    rows = [
+        (
+            view["name"],
+            f"{100 * view['gain']:.1f} ± {100 * view['error']:.1f} %",
+            ", ".join(f"{row[3]:.3g}" for row in view["matrix"][:3]),
+        )
+        for view in record["next_views"]
+    ]
+    return [
+        paragraph(
+            "How much of the variance of all cells a picture by each of these cameras would take"
+            " away at least, if it errs as the others do. Their matrices are in uncertainty.json."
+        ),
+        table(["camera", "of the variance, at least", "stands at x, y, z"], rows),
+    ]
 
 
 def _how(record: Mapping[str, Any]) -> list[str]:
