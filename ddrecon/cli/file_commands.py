@@ -43,8 +43,12 @@ def export(
     """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as
     NeRF's transforms.json), or all fields of SCENE, or of VOLUMEs, in the format of FILE's suffix.
 
-    SCENE is a scene file or the folder of a finished run.
+    SCENE is a scene file or the folder of a finished run; a folder of `ddrecon uncertainty` counts
+    as its volumes.
     """
+    from ddrecon.run.uncertainty_folder import volumes_in
+
+    sources = tuple(path for source in sources for path in volumes_in(source) or [source])
     kind = output.suffix.lower()
     has_scene = any(source.is_dir() or source.suffix in (".yaml", ".yml") for source in sources)
     if (has_scene or kind in (".xml", ".json")) and len(sources) > 1:

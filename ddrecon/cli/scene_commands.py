@@ -150,6 +150,12 @@ def render(
 @click.option(
     "--watch", "is_watched", is_flag=True, help="Also serve the run's page, as ddrecon watch does."
 )
+@click.option(
+    "--uncertainty",
+    "has_uncertainty",
+    is_flag=True,
+    help="Then also say how sure the result is, as ddrecon uncertainty does.",
+)
 @DTYPE
 @AS_JSON
 @in_session
@@ -163,8 +169,10 @@ def optimize(
     preview_every: int | None,
     has_events: bool,
     is_watched: bool,
+    has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
+    from ddrecon.cli.uncertainty import add_uncertainty
     from ddrecon.run.drive import drive_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
     from ddrecon.scene_file.doubts import find_doubts
@@ -187,4 +195,8 @@ def optimize(
         if is_watched:
             folder.save_every = SAVE_EVERY
         summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
-    session.show(summary, summary_lines(summary, output))
+        lines = summary_lines(summary, output)
+        if has_uncertainty:
+            record, more = add_uncertainty(run, output, session.is_quiet)
+            summary, lines = summary | {"uncertainty": record}, [*lines, *more]
+    session.show(summary, lines)

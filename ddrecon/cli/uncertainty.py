@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +15,7 @@ from ddrecon.cli.command import AS_JSON, OUTPUT, OVERWRITE, in_session
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+    from ddrecon.reconstruct.loop import Reconstruction
 
 SAMPLES = 16
 CANDIDATES = 12
@@ -93,6 +94,7 @@ def uncertainty(
             taken,
             output,
             samples,
+            seed=session.seed,
             noise=None if read is None else Noise(read, 0.0),
             tolerance=tolerance or TOLERANCE,
             has_samples=has_samples,
@@ -101,3 +103,26 @@ def uncertainty(
             is_quiet=session.is_quiet,
         )
     session.show(record, uncertainty_lines(record, output))
+
+
+def add_uncertainty(
+    run: Reconstruction, folder: Path, is_quiet: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """How sure `run` is, told in `uncertainty` within its `folder`: the record, and its lines."""
+    from ddrecon.reconstruct.posterior import TOLERANCE
+    from ddrecon.run.uncertainty_folder import drive_uncertainty, uncertainty_lines
+
+    path = folder / "uncertainty"
+    path.mkdir(exist_ok=True)
+    record = drive_uncertainty(
+        run,
+        path,
+        SAMPLES,
+        seed=run.seed,
+        noise=None,
+        tolerance=TOLERANCE,
+        has_samples=False,
+        resume=False,
+        is_quiet=is_quiet,
+    )
+    return record, uncertainty_lines(record, path)

@@ -21,6 +21,8 @@ TOLERANCE = 0.03
 """How small a sample's residual is to be, of what it was for a draw from the prior."""
 MOST = 40
 """Products with J^T W J that a sample may take."""
+ROUGH = 0.1
+"""The same where only the size of all of it matters."""
 ROUNDS = 10
 """Times that cells are let go of or held at a bound."""
 PROBES = 3
@@ -92,7 +94,7 @@ class Posterior:
         By one random vector, without bounds.
         """
         noise = self.data_noise(self._generator(-2))
-        change = self._correct(noise, self.is_kept, MOST // 2).value
+        change = self._correct(noise, self.is_kept, self.most, ROUGH).value
         return float(noise @ change)
 
     def product(self, vector: Tensor) -> Tensor:

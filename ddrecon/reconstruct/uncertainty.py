@@ -18,20 +18,18 @@ from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors
 from ddrecon.reconstruct.posterior import TOLERANCE, Posterior, Sample
 from ddrecon.variables.values import component_names
 
-FEW = 32
-"""A parameter of at most so many entries is a table of numbers; others are fields or maps."""
-
 
 class Uncertainty:
     """Samples of the posterior about where `run` is, and the sums they leave.
 
-    A sample is drawn with `step`; which one depends on the seed and on how many there were. `noise`
+    A sample is drawn with `step`; which one depends on `seed` and on how many there were. `noise`
     is that of all pictures, where their scene is not to say. `errors` is what was found before.
     """
 
     def __init__(
         self,
         run: Reconstruction,
+        seed: int,
         noise: Noise | None = None,
         tolerance: float = TOLERANCE,
         errors: PictureErrors | None = None,
@@ -42,10 +40,10 @@ class Uncertainty:
         noises = _noises(run, noise)
         # What residuals said takes a solve to find: a run that goes on has it.
         if errors is None or errors.is_known:
-            errors = find_errors(self.curvature, run.targets, noises, gradient, run.seed)
+            errors = find_errors(self.curvature, run.targets, noises, gradient, seed)
         self.errors = errors
         temperature = self.errors.temperature
-        self.posterior = Posterior(self.curvature, gradient, temperature, run.seed, tolerance)
+        self.posterior = Posterior(self.curvature, gradient, temperature, seed, tolerance)
         nothing = torch.zeros(self.curvature.size, dtype=torch.float64)
         self.count, self.products, self.residual = 0, 0, 0.0
         self.sums = {key: nothing.clone() for key in ("post", "post2", "prior", "prior2")}
@@ -133,8 +131,8 @@ class Uncertainty:
 
     @property
     def tabled(self) -> list[Parameter]:
-        """The parameters whose entries are a table of numbers."""
-        return [p for p in self.parameters if not p.is_field and p.value.numel() <= FEW]
+        """The parameters whose entries are a table of numbers: no fields and no maps."""
+        return [p for p in self.parameters if not p.is_field and p.value.ndim < 3]
 
     def _numbers_in(self, vector: Tensor) -> Tensor:
         parts = self.curvature.split(vector)

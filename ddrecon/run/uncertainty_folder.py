@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from ddrecon.errors import FormatError, UsageError
 from ddrecon.io.files.json_file import write_json
+from ddrecon.io.images.table import write_linear
 from ddrecon.io.volumes.table import write_field
 from ddrecon.pictures.noise import Noise
 from ddrecon.progress import bar_width
@@ -83,6 +84,7 @@ def drive_uncertainty(
     path: Path,
     samples: int,
     *,
+    seed: int,
     noise: Noise | None,
     tolerance: float,
     has_samples: bool,
@@ -99,7 +101,7 @@ def drive_uncertainty(
     began, checkpoints = perf_counter(), path / CHECKPOINTS
     for name in ("volumes", CHECKPOINTS):
         (path / name).mkdir(exist_ok=True)
-    described = _describe(run, noise, tolerance) | {"candidates": candidates}
+    described = _describe(run, seed, noise, tolerance) | {"candidates": candidates}
     state: dict[str, Any] | None = None
     if resume:
         state, loaded = load_checkpoint(checkpoints, described)
@@ -107,7 +109,7 @@ def drive_uncertainty(
     else:
         forget_checkpoints(checkpoints)
     errors = None if state is None else PictureErrors(**state["errors"])
-    found = Uncertainty(run, noise, tolerance, errors)
+    found = Uncertainty(run, seed, noise, tolerance, errors)
     before, ring = 0.0, place_turntable(run.train_level, run.train_level.views[0], candidates)
     ranking = NextView(found.curvature, ring, found.errors.deviation) if ring else None
     if state is not None:
@@ -144,13 +146,15 @@ def drive_uncertainty(
     return _finish(run, found, path, seconds, [] if ranking is None else ranking.rank())
 
 
-def _describe(run: Reconstruction, noise: Noise | None, tolerance: float) -> dict[str, Any]:
+def _describe(
+    run: Reconstruction, seed: int, noise: Noise | None, tolerance: float
+) -> dict[str, Any]:
     """What samples depend on, in plain values, so that only those of the same run are added up."""
     sums = {p.name: float(p.value.detach().double().abs().sum()) for p in run.parameters}
     return {
         "iteration": run.iteration,
         "values": sums,
-        "seed": run.seed,
+        "seed": seed,
         "noise": None if noise is None else vars(noise),
         "tolerance": tolerance,
     }
@@ -164,15 +168,11 @@ def _finish(
     ranked: Sequence[Candidate],
 ) -> dict[str, Any]:
     """Writes volumes, record and report of what was `found`; the record."""
-    box = np.array(run.scene.volume.grid.bounds_xyz)
     stated = {"std": found.deviations, "mean": found.means, "told": found.told}
-    tabled = {parameter.name for parameter in found.tabled}
     fields = dict[str, Any]()
-    for name in found.curvature.values:
-        if name in tabled:
-            continue
+    for name in _written(found):
         for kind, values in stated.items():
-            _write(path / "volumes" / f"{name}_{kind}.npz", f"{name}_{kind}", values[name], box)
+            _write(found, path / "volumes", f"{name}_{kind}", values[name])
         value, deviation = found.curvature.values[name], stated["std"][name]
         fields[name] = {
             "root_mean_square": float(value.square().mean().sqrt()),
@@ -189,7 +189,6 @@ def _finish(
     record = {
         "samples": found.count,
         "seconds": seconds,
-        "seed": run.seed,
         "products": found.products,
         "residual": found.residual,
         "noise": found.errors.described(),
@@ -206,17 +205,26 @@ def _finish(
 def _write_sample(found: Uncertainty, change: Tensor, folder: Path) -> None:
     """Writes the fields of a sample to `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    box = np.array(found.curvature.scene.volume.grid.bounds_xyz)
+    parts = found.curvature.split(change)
+    for name in _written(found):
+        _write(found, folder, name, found.curvature.values[name] + parts[name])
+
+
+def _written(found: Uncertainty) -> list[str]:
+    """The names of fields and maps: of all that is no table of numbers."""
     tabled = {parameter.name for parameter in found.tabled}
-    for name, part in found.curvature.split(change).items():
-        if name not in tabled:
-            _write(folder / f"{name}.npz", name, found.curvature.values[name] + part, box)
+    return [name for name in found.curvature.values if name not in tabled]
 
 
-def _write(path: Path, name: str, value: Tensor, box: np.ndarray) -> None:
-    """Writes a field [z, y, x] or [C, z, y, x]; a map [C, h, w] as a slice of one."""
+def _write(found: Uncertainty, folder: Path, name: str, value: Tensor) -> None:
+    """Writes a field [z, y, x] or [C, z, y, x] to `folder`, or a map [C, h, w] of radiance."""
+    grid = found.curvature.scene.volume.grid
+    if tuple(value.shape[-3:]) != grid.shape:
+        write_linear(folder / name, value.expand(3, -1, -1).permute(1, 2, 0).float().cpu().numpy())
+        return
     array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
-    write_field(path, name, array.float().cpu().numpy(), box)
+    box = np.array(grid.bounds_xyz)
+    write_field(folder / f"{name}.npz", name, array.float().cpu().numpy(), box)
 
 
 def volumes_in(folder: Path) -> list[Path]:
