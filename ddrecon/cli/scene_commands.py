@@ -96,6 +96,7 @@ def render(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
+    from ddrecon.ranks import is_first
     from ddrecon.run.render_folder import (
         remove_targets,
         render_gradient_to_folder,
@@ -116,12 +117,14 @@ def render(
         views = list(loaded.views)
     if parameter is not None:
         require_variation(loaded, parameter)
-    with claim_folder(output, may_exist=overwrite):
+    with claim_folder(output, may_exist=overwrite) if is_first() else nullcontext():
         settings = views, output, components
         if parameter is None:
             report = render_to_folder(loaded, *settings, session.progress)
         else:
             report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
+        if not is_first():
+            return
         if count is not None:
             report["ring"] = write_ring(views, output, has_mp4)
         write_json(output / "render.json", report)
@@ -173,7 +176,8 @@ def optimize(
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
     from ddrecon.cli.uncertainty import add_uncertainty
-    from ddrecon.run.drive import drive_run, open_run, summary_lines
+    from ddrecon.ranks import is_first
+    from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
     from ddrecon.scene_file.doubts import find_doubts
 
@@ -185,6 +189,9 @@ def optimize(
     built, environment = session.build(scene_file), session.environment()
     for doubt in find_doubts(built):
         warnings.warn(doubt, DataWarning, 2)
+    if not is_first():
+        follow_run(built, scene_file, resume=resume)
+        return
     with (
         open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
             run,
@@ -193,7 +200,7 @@ def optimize(
         watched(output) if is_watched else nullcontext(),
     ):
         if is_watched:
-            folder.save_every = SAVE_EVERY
+            folder.save_often(SAVE_EVERY)
         summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
         lines = summary_lines(summary, output)
         if has_uncertainty:

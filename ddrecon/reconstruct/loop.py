@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import SolveError
+from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
@@ -25,12 +25,7 @@ from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.levels import factors, resample, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
-from ddrecon.reconstruct.objective import (
-    Comparison,
-    add_penalties,
-    read_numbers,
-    render_quality,
-)
+from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
 from ddrecon.reconstruct.schedule import Schedule
 from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
 from ddrecon.reconstruct.steps import share_out, solve_poses, solve_responses, step_parameters
@@ -128,6 +123,11 @@ class Reconstruction:
             else:
                 self.restore(self.before_step)
             raise failure from error.__cause__
+        except RanksError:
+            # Amid the step, when some parameters have moved, the state is that before it.
+            if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
+                self.restore(self.before_step)
+            raise
 
     def _iterate(self, start: float, solutions: dict[tuple[str, int], Tensor]) -> Row:
         """One iteration, begun at `start` [s] with these last `solutions`."""
@@ -146,7 +146,7 @@ class Reconstruction:
         self.before_step = self.state() | {"solutions": solutions}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
-        self._step(gradients, compared.pictures)
+        self._step(gradients, compared)
         # Judge: is there more to be done, here or at all?
         penalty = numbers.loss - numbers.of_images
         self.schedule.note(self.iteration, numbers.losses, numbers.chi_squares, penalty)
@@ -257,24 +257,26 @@ class Reconstruction:
             return differentiate(self.train_level, names, self._values(), compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
+            compared.gather()
             compared.require_finite()
             raise
         finally:
             self.memory.tolerance_floor = {}
 
-    def _step(self, gradients: dict[str, Tensor], pictures: dict[str, Tensor]) -> None:
+    def _step(self, gradients: dict[str, Tensor], compared: Comparison) -> None:
         """Every parameter against its derivative, but those of views not seen or not yet due.
 
-        What cameras do goes part of the way to what fits the `pictures` of this iteration best.
+        What cameras do goes part of the way to what fits the pictures of this iteration best.
         """
+        pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
-        seen = [p for p in self.parameters if p.view is None or p.view in pictures]
+        seen = [p for p in self.parameters if p.view is None or p.view in names]
         rate_of = functools.partial(self.schedule.rate, self.iteration)
         solved = step_parameters(seen, gradients, rate_of)
         solve_responses(solved, self.train_level, pictures, self.targets)
         if poses := [p for p in solved if p.key == "camera"]:
-            own = share_out(gradients, [self.train_level.view(name) for name in pictures])
-            solve_poses(poses, self.train_level, own, values, self.targets, self.memory.last)
+            own, known = share_out(gradients, compared.views), self.memory.last
+            solve_poses(poses, self.train_level, own, values, self.targets, known, pictures)
         for gauge in self.gauges:
             gauge.hold()
 

@@ -16,6 +16,7 @@ from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.responses import fit_held_out
+from ddrecon.reconstruct.shares import gather_numbers, own_views
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import variable_names, with_values
@@ -34,7 +35,8 @@ class Comparison:
 
     `losses`, `psnrs` [dB] and, where `has_similarity`, `similarities` are those compared so far, in
     their order, and `chi_squares` those of views that have a target among `noise_targets`;
-    `pictures` are the images by name.
+    `pictures` are the images by name. `gather` makes
+    the numbers those of all views.
     """
 
     views: Sequence[View]
@@ -63,6 +65,15 @@ class Comparison:
         value = self.share(view) * loss
         self.losses.append(value.detach())
         return value
+
+    def gather(self) -> None:
+        """Learns what other ranks have compared, of which they keep the pictures."""
+        names = [view.name for view in self.views]
+        kinds = self.losses, self.psnrs, self.similarities, self.chi_squares
+        wanted = True, True, self.has_similarity, bool(self.noise_targets)
+        rows = [row for row, is_wanted in zip(kinds, wanted, strict=True) if is_wanted]
+        for row, found in zip(rows, gather_numbers(rows, list(self.pictures), names), strict=True):
+            row[:] = found
 
     def share(self, view: View) -> float:
         """The part of the mean loss that `view` has, by weight."""
@@ -108,6 +119,7 @@ def read_numbers(
 
     Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
     """
+    compared.gather()
     extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
     groups = [
         [loss, objective.loss],
@@ -163,14 +175,17 @@ def render_quality(
     They are rendered with those `parameters` that the scene has, and with the exposure that fits
     each best where exposures are among them.
     """
-    known, pairs = variable_names(scene), []
+    known, names = variable_names(scene), [view.name for view in scene.views]
+    own, rows = own_views(scene, names), [list[Tensor](), list[Tensor]()]
     with torch.no_grad():
         values = {p.name: p.value for p in parameters if p.name in known}
         rendered = with_values(scene, values)
-        images = render_each(rendered, rendered.views, memory)
-        for view, image in zip(rendered.views, images, strict=True):
+        views = [rendered.view(name) for name in own]
+        for view, image in zip(views, render_each(rendered, views, memory), strict=True):
             target = targets[view.name]
-            pairs.append((target, fit_held_out(image, view, target, parameters)[0]))
-        quality = torch.stack([torch.stack([t.psnr_of(i), t.ssim_of(i)]) for t, i in pairs])
-    psnr, ssim = quality.mean(0).tolist()
+            fitted, _ = fit_held_out(image, view, target, parameters)
+            rows[0].append(target.psnr_of(fitted))
+            rows[1].append(target.ssim_of(fitted))
+    numbers = [torch.stack(row).mean() for row in gather_numbers(rows, own, names)]
+    psnr, ssim = torch.stack(numbers).tolist()
     return psnr, ssim

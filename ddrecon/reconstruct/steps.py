@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
+from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.poses import calibration_prior, pose_curvature, step_pose
 from ddrecon.reconstruct.responses import step_responses
+from ddrecon.reconstruct.shares import take_from_owners
 from ddrecon.renderer import solve_light
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import RESPONSE, with_values
@@ -42,10 +44,15 @@ def solve_responses(
     pictures: Mapping[str, Tensor],
     targets: Mapping[str, Target],
 ) -> None:
-    """Takes the exposures and offsets among `parameters` towards what fits the `pictures` best."""
+    """Takes the exposures and offsets among `parameters` towards what fits the `pictures` best.
+
+    Those are of the views that this rank has rendered; the others' values come from other ranks.
+    """
+    responses = [p for p in parameters if p.key in RESPONSE]
     for name, picture in pictures.items():
-        fitted = [p for p in parameters if p.view == name and p.key in RESPONSE]
+        fitted = [p for p in responses if p.view == name]
         step_responses(fitted, scene.view(name), picture, targets[name])
+    take_from_owners(responses, pictures)
 
 
 def solve_poses(
@@ -55,11 +62,13 @@ def solve_poses(
     values: Mapping[str, Tensor],
     targets: Mapping[str, Target],
     solutions: Mapping[tuple[str, int], Tensor],
+    own: Collection[str],
 ) -> None:
     """Takes the `poses` of the views of `scene` towards the least of the loss.
 
     `gradients` are those of each view's own loss, by the `values` of all parameters. A curvature is
-    found once for each resolution, in the light that `solutions` are near to.
+    found once for each resolution, in the light that `solutions` are near to, by the rank whose
+    `own` the view is.
     """
     lacking = [pose for pose in poses if pose.curvature is None]
     if lacking:
@@ -68,9 +77,14 @@ def solve_poses(
         with torch.no_grad():
             world = with_values(scene, values)
             light_field = solve_light(world, memory)
-        for pose in lacking:
-            assert pose.view is not None
-            pose.curvature = pose_curvature(light_field, world, pose.name, targets[pose.view])
+        found = [
+            pose_curvature(light_field, world, pose.name, targets[pose.view])
+            if pose.view is not None and pose.view in own
+            else pose.value.new_zeros(len(pose.value), len(pose.value))
+            for pose in lacking
+        ]
+        for pose, curvature in zip(lacking, sum_over_ranks(found), strict=True):
+            pose.curvature = curvature
     grid = scene.volume.grid
     for pose in poses:
         assert pose.view is not None and pose.curvature is not None

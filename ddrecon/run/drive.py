@@ -12,10 +12,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ddrecon.errors import DivergenceError, FormatError, SceneError, UsageError
+from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError, UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_width
+from ddrecon.ranks import from_first, is_any
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -46,10 +47,7 @@ def open_run(
     another process writes to or that is not empty, unless it may be or the run goes on from the
     checkpoint in it; SceneError for a scene that cannot be reconstructed.
     """
-    try:
-        run = Reconstruction(scene)
-    except SceneError as error:
-        raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
+    run = _begin(scene, scene_file)
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
     with claim_folder(path, may_exist=may_exist or resume):
@@ -61,6 +59,13 @@ def open_run(
         dump_scene(scene_file, path / "scene.yaml")
         write_json(path / "environment.json", folder.environment)
         yield run, folder
+
+
+def _begin(scene: Scene, scene_file: SceneFile) -> Reconstruction:
+    try:
+        return Reconstruction(scene)
+    except SceneError as error:
+        raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
 
 
 def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
@@ -75,7 +80,21 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
             f"{path}: {run.iteration} iterations are made already; "
             "ask for more than that, in all, with --iterations"
         )
+    # The other ranks, which may see no such folder, begin with the same.
+    from_first(run.state())
     return loaded
+
+
+def follow_run(scene: Scene, scene_file: SceneFile, *, resume: bool) -> None:
+    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes."""
+    run = _begin(scene, scene_file)
+    if resume:
+        run.restore(from_first(run.state()))
+    with defer_interrupt() as asked:
+        while not run.is_done:
+            run.step()
+            if is_any(bool(asked)):
+                raise KeyboardInterrupt
 
 
 def drive_run(
@@ -89,8 +108,8 @@ def drive_run(
 
     `preview_every` counts iterations between pictures; `has_events` logs for TensorBoard as well.
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
-    before it is passed on. So does a divergence; any other failure leaves the checkpoints written
-    so far.
+    before it is passed on. So do a divergence and the end of another rank; any other failure leaves
+    the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
     try:
@@ -119,12 +138,12 @@ def drive_run(
                 bar.update()
                 if preview_every and row.iteration % preview_every == 0:
                     folder.preview(run)
-                if asked:
+                if is_any(bool(asked)):
                     folder.save(run)
                     raise KeyboardInterrupt(
                         f"after {run.iteration} iterations; go on with --resume"
                     )
-    except DivergenceError as error:
+    except (DivergenceError, RanksError) as error:
         folder.save(run)
         raise error.with_advice(
             f"the state after {run.iteration} iterations is kept in {folder.checkpoints / LAST}: "

@@ -92,6 +92,10 @@ class RunFolder:
             save_checkpoint(self.checkpoints, run.state(), self.result_of)
             self._note_saved(run, monotonic() - start)
 
+    def save_often(self, seconds: float) -> None:
+        """Writes checkpoints every so many `seconds` from now on, for those who watch."""
+        self.save_every, self.next_save = seconds, monotonic() + seconds
+
     def save_in_time(self, run: Reconstruction) -> None:
         """Writes a checkpoint if the last is old."""
         if monotonic() >= self.next_save:
