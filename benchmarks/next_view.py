@@ -2,7 +2,7 @@
 
 python benchmarks/next_view.py
 
-The plume at a quarter of its resolution is seen by three cameras on one side, in pictures of our
+The plume at a quarter of its resolution, scattering evenly, is seen by three cameras on one side, in pictures of our
 own rendering with noise. Twelve candidates are ranked; then each picture is really taken, and the
 volume reconstructed with it.
 """
@@ -67,9 +67,10 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.02, help="of radiance")
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--iterations", type=int, default=60)
+    parser.add_argument("--tolerance", type=float, default=0.1, help="of samples")
     arguments = parser.parse_args()
     torch.manual_seed(0)
-    full = load_scene(ROOT / "configs/plume.yaml")
+    full = load_scene(ROOT / "configs/plume.yaml", overrides=["volume.g=0"])
     true = torch.as_tensor(read_field(ROOT / "data/plume/density.npz", "density").values)
     scene = scene_at_level(full, 4)
     truth = resample(true, scene.volume.grid)
@@ -84,7 +85,7 @@ def main() -> None:
     seen = photograph(scene, truth, scene.views[:SEEN], arguments.noise)
     run = reconstruct(scene, seen)
     print(f"{SEEN} pictures: L1 {error_of(run, truth):.4f}", flush=True)
-    found = Uncertainty(run, run.seed)
+    found = Uncertainty(run, run.seed, tolerance=arguments.tolerance)
     ring = place_turntable(scene, seen[0], CANDIDATES)
     ranking = NextView(found.curvature, ring, found.errors.deviation)
     for _ in range(arguments.samples):
