@@ -132,6 +132,17 @@ def is_first() -> bool:
     return own_rank() == 0
 
 
+@contextmanager
+def alone() -> Iterator[None]:
+    """Has each rank work by itself, as if there were no others."""
+    global _group
+    group, _group = _group, None
+    try:
+        yield
+    finally:
+        _group = group
+
+
 def exchanged() -> tuple[int, float]:
     """Bytes that this rank has handed to exchanges so far, and the seconds that they took."""
     return (0, 0.0) if _group is None else (_group.bytes, _group.seconds)
