@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,6 +18,17 @@ from ddrecon.errors import DataWarning
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+
+
+class CountOrAuto(click.IntRange):
+    """A whole number, or `auto`."""
+
+    name = "integer or auto"
+
+    def convert(
+        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
+    ) -> Any:
+        return value if value == "auto" else super().convert(value, parameter, context)
 
 
 @click.command()
@@ -126,8 +137,8 @@ def render(
 @OVERWRITE
 @click.option(
     "--iterations",
-    type=click.IntRange(min=1),
-    help="Total number of iterations, also after --resume.",
+    type=CountOrAuto(min=1),
+    help="Total number of iterations, also after --resume; auto: the run ends by itself.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
 @click.option(
@@ -142,6 +153,12 @@ def render(
 @click.option(
     "--watch", "is_watched", is_flag=True, help="Also serve the run's page, as ddrecon watch does."
 )
+@click.option(
+    "--uncertainty",
+    "has_uncertainty",
+    is_flag=True,
+    help="Then also say how sure the result is, as ddrecon uncertainty does.",
+)
 @DTYPE
 @AS_JSON
 @in_session
@@ -150,13 +167,15 @@ def optimize(
     scene: Path,
     output: Path,
     overwrite: bool,
-    iterations: int | None,
+    iterations: int | str | None,
     resume: bool,
     preview_every: int | None,
     has_events: bool,
     is_watched: bool,
+    has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
+    from ddrecon.cli.uncertainty import add_uncertainty
     from ddrecon.ranks import is_first
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
@@ -181,6 +200,10 @@ def optimize(
         watched(output) if is_watched else nullcontext(),
     ):
         if is_watched:
-            folder.save_every = SAVE_EVERY
+            folder.save_often(SAVE_EVERY)
         summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
-    session.show(summary, summary_lines(summary, output))
+        lines = summary_lines(summary, output)
+        if has_uncertainty:
+            record, more = add_uncertainty(run, output, session.is_quiet)
+            summary, lines = summary | {"uncertainty": record}, [*lines, *more]
+    session.show(summary, lines)

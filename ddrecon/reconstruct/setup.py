@@ -16,11 +16,11 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
-from ddrecon.settings import OptimizeSettings
+from ddrecon.settings import Iterations, OptimizeSettings
 from ddrecon.variables.values import value_of, variable_names
 
 
-def require_settings(scene: Scene, iterations: int | None) -> OptimizeSettings:
+def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
     """What `scene` asks for, with `iterations` in place of its own where given.
 
     Raises SceneError where it asks for nothing.
@@ -92,6 +92,30 @@ def noises_of(scene: Scene, settings: OptimizeSettings) -> dict[str, Noise]:
         or estimate_noise(target_of(view), view.step)
         for view in scene.views
     }
+
+
+def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
+    """The noise of the picture of each view of `scene`, by name, where it is known, else nothing.
+
+    It is known where the scene gives that of every training view, or where `loss` compares by it.
+    """
+    is_given = all(view.is_test or view.noise or settings.noise for view in scene.views)
+    return noises_of(scene, settings) if is_given or loss == "photon" else {}
+
+
+def noise_targets(level: Scene, scene: Scene, noises: Mapping[str, Noise]) -> dict[str, Target]:
+    """What tells chi^2 of the views of `level`, which is `scene` with fewer pixels, by name.
+
+    `noises` are those of the views of `scene`: larger pixels are means, and have less of it.
+    """
+    targets = {}
+    for view, fine in zip(level.views, scene.views, strict=True):
+        if noise := noises.get(view.name):
+            count = fine.camera.size[0] * fine.camera.size[1]
+            averaged = noise.averaged(count / (view.camera.size[0] * view.camera.size[1]))
+            image = target_of(view)
+            targets[view.name] = Target.of(image, view.mask, "photon", averaged)
+    return targets
 
 
 def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str, Target]:

@@ -12,12 +12,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
 
 from ddrecon.errors import SceneError
 from ddrecon.losses import Target
 from ddrecon.ranks import from_first
-from ddrecon.reconstruct.levels import factors, resample, scene_at_level
+from ddrecon.reconstruct.levels import factors, scene_at_level
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 
@@ -113,13 +112,7 @@ def _coarse_scene(scene: Scene, train: Sequence[View], left_out: str) -> Scene:
         if not name.startswith(f"views.{left_out}.")
     }
     short = replace(settings, parameters=parameters, iterations=ITERATIONS, refine_at=())
-    starts = {name: _at_level(start, scene, coarse) for name, start in scene.starts.items()}
-    return replace(coarse, optimize=short, starts=starts)
-
-
-def _at_level(start: Tensor, scene: Scene, coarse: Scene) -> Tensor:
-    is_field = tuple(start.shape[-3:]) == scene.volume.grid.shape
-    return resample(start, coarse.volume.grid) if is_field else start
+    return replace(coarse, optimize=short)
 
 
 def _quality(scene: Scene, left_out: str, weight: float, start: Callable[[Scene], Run]) -> float:

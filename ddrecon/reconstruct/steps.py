@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -12,7 +12,6 @@ from ddrecon.losses import Target
 from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.poses import calibration_prior, pose_curvature, step_pose
-from ddrecon.reconstruct.rates import rate_at
 from ddrecon.reconstruct.responses import step_responses
 from ddrecon.reconstruct.shares import take_from_owners
 from ddrecon.renderer import solve_light
@@ -23,16 +22,15 @@ from ddrecon.variables.values import RESPONSE, with_values
 def step_parameters(
     parameters: Sequence[Parameter],
     gradients: Mapping[str, Tensor],
-    iteration: int,
-    iterations: int,
+    rate_of: Callable[[float], float],
 ) -> list[Parameter]:
     """Moves those of `parameters` that are due along their `gradients`; returns those to be solved.
 
-    `iteration` is one of `iterations`.
+    `rate_of` is the part of its learning rate that counts now, by the `release` of a parameter.
     """
     solved = []
     for parameter in parameters:
-        rate = rate_at(iteration, iterations, round(parameter.release * iterations))
+        rate = rate_of(parameter.release)
         if rate and parameter.is_fitted:
             solved.append(parameter)
         elif rate:

@@ -48,10 +48,13 @@ class LateMeans:
 
     def __init__(self) -> None:
         self.means: dict[str, float] = {}
+        self.place: int | None = None
 
     def note(self, run: Reconstruction) -> None:
-        """Notes the means, if `run` is there now; after every iteration."""
-        if run.iteration == int((1 - LATE) * run.settings.iterations):
+        """Notes the means, if `run` comes there now; after every iteration."""
+        place, begin = run.schedule.place(run.iteration), int((1 - LATE) * run.schedule.planned)
+        was, self.place = place - 1 if self.place is None else self.place, place
+        if was < begin <= place:
             self.means = _means(run)
 
     def moved(self, run: Reconstruction) -> dict[str, float]:

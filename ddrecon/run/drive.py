@@ -16,7 +16,7 @@ from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError,
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_width
-from ddrecon.ranks import from_first, is_any
+from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -75,7 +75,7 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
         run.restore(state)
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise FormatError(loaded, UNUSABLE) from error
-    if run.iteration > run.settings.iterations:
+    if run.iteration > run.schedule.most:
         raise UsageError(
             f"{path}: {run.iteration} iterations are made already; "
             "ask for more than that, in all, with --iterations"
@@ -111,7 +111,7 @@ def drive_run(
     before it is passed on. So do a divergence and the end of another rank; any other failure leaves
     the checkpoints written so far.
     """
-    total = run.settings.iterations
+    total = None if run.schedule.is_auto else run.schedule.planned
     try:
         with (
             defer_interrupt() as asked,
@@ -149,6 +149,8 @@ def drive_run(
             f"the state after {run.iteration} iterations is kept in {folder.checkpoints / LAST}: "
             "go on from it with --resume"
         ) from error
+    # What is left the first rank does by itself.
+    leave_ranks()
     return folder.finish(run)
 
 
@@ -190,7 +192,8 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
     line += f", of {summary['compared']}"
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
-    lines = [line, *diagnoses, f"density and all else written to {folder}"]
+    ended = [] if summary["ended"]["kind"] == "iterations" else [summary["ended"]["text"]]
+    lines = [line, *ended, *diagnoses, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))
     if "smoothing" in summary:

@@ -13,13 +13,16 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import interleaved_tangent_of, pair, split
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 BLOCK = 128
 """Ways that one item does on a processor; on a GPU it is one."""
+
+_ARRAYS = "fields", "firsts", "lasts", "lengths", "fraction"
 
 
 def integrate_ways(
@@ -44,14 +47,17 @@ class _Integral(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
+        field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
     ) -> Tensor:
-        ctx.save_for_backward(field, first, last, length, fraction)
         total = field.new_empty(len(field), len(length))
         given = _ways(field, first, last, length, fraction)
         items, _ = cut(len(length), BLOCK, length)
         way_kernel(field.element_size() * 8).launch(items, given, {"totals": total})
         return total
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        keep(ctx, *inputs)
 
     @staticmethod
     @differentiate_once
@@ -69,6 +75,22 @@ class _Integral(torch.autograd.Function):
         kernel.launch(items, given, made | own[0], shares=own)
         return functools.reduce(Tensor.add_, shares), *bars, None
 
+    @staticmethod
+    def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
+        def change(*tensors: Any) -> Tensor:
+            ways, d_ways = split(tensors)
+            total = ways[0].new_empty(len(ways[0]), len(ways[3]), 2)
+            given = _ways(*ways)
+            for name, value, d_value in zip(_ARRAYS, ways, d_ways, strict=True):
+                given[name] = pair(value, d_value)
+            items, _ = cut(len(ways[3]), BLOCK, total)
+            kernel = interleaved_tangent_of(way_kernel(total.element_size() * 8))
+            kernel.launch(items, given, {"totals": total})
+            return total[..., 1].contiguous()
+
+        d_total: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_total
+
 
 def _ways(
     field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
@@ -77,8 +99,8 @@ def _ways(
     channels, depth, height, width = field.shape
     sizes = {"channels": channels, "depth": depth, "height": height, "width": width}
     sizes |= {"ways": len(length), "samples": len(fraction)}
-    arrays = {"fields": field, "firsts": first, "lasts": last, "lengths": length}
-    return sizes | arrays | {"fraction": fraction}
+    arrays = field, first, last, length, fraction
+    return sizes | dict(zip(_ARRAYS, arrays, strict=True))
 
 
 _GIVEN = """
