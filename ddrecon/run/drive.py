@@ -16,7 +16,7 @@ from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError,
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_width
-from ddrecon.ranks import from_first, is_any
+from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -149,6 +149,8 @@ def drive_run(
             f"the state after {run.iteration} iterations is kept in {folder.checkpoints / LAST}: "
             "go on from it with --resume"
         ) from error
+    # What is left the first rank does by itself.
+    leave_ranks()
     return folder.finish(run)
 
 
