@@ -76,6 +76,7 @@ class Posterior:
         scale = self.temperature**0.5
         noise, level = (scale * part for part in self.prior.root_noise(generator))
         even, shift = (self._solve_prior(part) for part in (noise, level))
+        even = self.prior.without_levels(even, self.is_kept)
         right = noise + level + scale * self.data_noise(generator) - self.gradient
         change, products, residual = self._minimize(right, self._within(even + shift))
         return Sample(change, self._within(even), products, residual)

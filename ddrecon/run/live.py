@@ -29,6 +29,7 @@ from ddrecon.run.report_volume import volume_section
 from ddrecon.run.run_folder import CHECKPOINTS
 from ddrecon.run.serve import serve_page
 from ddrecon.scene_file.build import load_scene
+from ddrecon.settings import AUTO, Iterations
 
 REPORT = "report.html"
 
@@ -43,7 +44,8 @@ class LiveRun:
         self.folder, self.checkpoint = folder, folder / CHECKPOINTS / LAST
         if not (folder / "scene.yaml").is_file() or not self.checkpoint.is_file():
             raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
-        self.seen, self.total, self.sections = 0, 0, ["", ""]
+        self.seen, self.sections = 0, ["", ""]
+        self.iterations: Iterations = AUTO
         self.maker = Thread()
 
     def page(self) -> str:
@@ -57,8 +59,9 @@ class LiveRun:
         lead = "just begun"
         if rows:
             last = rows[-1]
+            total = "" if self.iterations == AUTO else f" of {self.iterations}"
             lead = (
-                f"iteration {last.iteration} of {self.total} after {last.seconds:.0f} s, "
+                f"iteration {last.iteration}{total} after {last.seconds:.0f} s, "
                 f"PSNR {last.psnr:.2f} dB of views trained on"
             )
         loss = section("Loss", side_by_side(*curves(rows))) if rows else ""
@@ -95,7 +98,7 @@ class LiveRun:
         dtype = next(iter(state["parameters"].values()))["value"].dtype
         run = Reconstruction(load_scene(self.folder / "scene.yaml", dtype=dtype))
         run.restore(state)
-        self.total = run.settings.iterations
+        self.iterations = run.settings.iterations
         with torch.no_grad():
             scene = run.current_scene()
             light_field = solve(scene)

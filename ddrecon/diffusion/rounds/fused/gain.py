@@ -208,8 +208,9 @@ class _Gain(torch.autograd.Function):
             d_given = dict(zip(_TENSORS, d_values, strict=False))
             if is_so[1]:
                 d_given["scattering"] = d_given["extinction"]
-            given |= dict.fromkeys((name for name in _FOUND if name not in found), like)
-            launch_row_tangents(kernel, ctx.grid, len(like), given, d_given, found)
+            # What is not found, without flux, is not written to either.
+            unused = dict.fromkeys((name for name in _FOUND if name not in found), found["source"])
+            launch_row_tangents(kernel, ctx.grid, len(like), given, d_given, found | unused)
             return tuple(found.values())
 
         d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
