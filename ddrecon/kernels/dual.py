@@ -166,9 +166,16 @@ def _in_dual_numbers(text: str) -> str:
 
 
 def _deduce(found: re.Match[str]) -> str:
-    """A declaration of pointers whose types are those of what they are made of."""
+    """Declarations of pointers, each by itself, whose types are those of what they are made of.
+
+    And of the numbers between them.
+    """
     first = re.sub(rf"^(?:const )?{_POINTER}", "auto ", found[0])
-    return re.sub(r",\s*\*(?:__restrict )?(\w+ =)", r", \1", first)
+
+    def declare(one: re.Match[str]) -> str:
+        return f"; {'auto' if one[1] else 'const F'} {one[2]}"
+
+    return re.sub(r",\s*(\*?)(?:__restrict )?(\w+ =)", declare, first)
 
 
 def launch_row_tangents(
@@ -192,7 +199,7 @@ def launch_row_tangents(
         grid,
         colors,
         {**given, **with_changes(given, changes)},
-        {f"d_{name}": array for name, array in (made | kept).items()},
+        {f"d_{name}": array for name, array in {**made, **kept}.items()},
     )
 
 

@@ -104,7 +104,7 @@ def run_plainly(function: Callable[..., Any], *tensors: Tensor | None) -> Any:
 
 
 class _Plain(torch.autograd.Function):
-    """What a function makes of tensors, of which torch.func then hands it those without wrapping."""
+    """What a function makes of tensors, which torch.func hands to it as they are."""
 
     @staticmethod
     def forward(function: Callable[..., Any], *tensors: Tensor | None) -> Any:

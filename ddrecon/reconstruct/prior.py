@@ -68,6 +68,8 @@ class Prior:
     ) -> Tensor:
         """(R + T K + diag(`more`))^-1 times `right`, with 0 where `is_fixed`."""
         rights = self.curvature.split(right)
+        # Levels of smoothed fields are held so weakly that a draw needs more digits than a step.
+        has_more_digits = more is None
         nothing: dict[str, Tensor] = {}
         fixed = nothing if is_fixed is None else self.curvature.split(is_fixed)
         added = nothing if more is None else self.curvature.split(more)
@@ -85,8 +87,22 @@ class Prior:
                 if roughness is None:
                     solved = part / diagonal
                 else:
-                    solved = _solve_field(roughness, diagonal, part, fixed_here, tolerance)
+                    if has_more_digits:
+                        roughness, diagonal = roughness.double(), diagonal.double()
+                    exact = part.to(roughness.stiffness)
+                    solved = _solve_field(roughness, diagonal, exact, fixed_here, tolerance)
+                    solved = solved.to(part)
             parts[name] = solved if fixed_here is None else solved.masked_fill(fixed_here, 0)
+        return self.curvature.join(parts)
+
+    def without_levels(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
+        """`vector` less the mean of each smoothed field over cells that are not fixed."""
+        parts, fixed = self.curvature.split(vector), self.curvature.split(is_fixed)
+        for name in self.curvature.roughness:
+            free = (~fixed[name]).to(vector)
+            cells = free.sum((-3, -2, -1), keepdim=True).clamp(min=1)
+            level = (parts[name] * free).sum((-3, -2, -1), keepdim=True) / cells
+            parts[name] = parts[name] - level * free
         return self.curvature.join(parts)
 
 
@@ -122,9 +138,14 @@ def _solve_field(
     roughness: Roughness, diagonal: Tensor, right: Tensor, is_fixed: Tensor | None, tolerance: float
 ) -> Tensor:
     """(R + `diagonal`)^-1 `right` of a field, with 0 in cells that are fixed, by multigrid."""
-    colors = right.reshape(-1, *right.shape[-3:])
-    if not bool(right.any()):
+    colors, size = right.reshape(-1, *right.shape[-3:]), float(right.abs().max())
+    if not size:
         return right
+    # In units where numbers are near 1: squares of residuals would leave float32.
+    unit = float((roughness.diagonal() + diagonal).max())
+    roughness, diagonal, colors = roughness.times(1 / unit), diagonal / unit, colors / size
+    # No level is held so weakly that it is lost in rounding.
+    diagonal = diagonal.clamp(min=10 * torch.finfo(right.dtype).eps)
     # R has the form of the diffusion operator: stiffness is conductance between cells.
     conductances = roughness.conductances()
     loss = diagonal.expand(right.shape)
@@ -134,4 +155,5 @@ def _solve_field(
         loss = torch.where(is_fixed, strong, loss)
     z, y, x = (part.reshape(-1, *part.shape[-3:]) for part in conductances)
     operator = Operator((z, y, x), loss.reshape(colors.shape).contiguous())
-    return SOLVERS["multigrid"](operator, colors, None, tolerance).value.view(right.shape)
+    solved = SOLVERS["multigrid"](operator, colors, None, tolerance).value.view(right.shape)
+    return solved * (size / unit)

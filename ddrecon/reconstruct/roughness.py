@@ -32,6 +32,14 @@ class Roughness:
         square = torch.stack([slope.square() for slope in slopes(field, grid)]).sum(0)
         return Roughness(grid, weight / field.numel() / (square + ROUNDING**2).sqrt())
 
+    def times(self, factor: float) -> Roughness:
+        """That of `factor` times the weight."""
+        return Roughness(self.grid, factor * self.stiffness)
+
+    def double(self) -> Roughness:
+        """The same in float64."""
+        return Roughness(self.grid, self.stiffness.double())
+
     def product(self, change: Tensor) -> Tensor:
         """R times `change` [..., z, y, x]."""
         return join_slopes([self.stiffness * s for s in slopes(change, self.grid)], self.grid)

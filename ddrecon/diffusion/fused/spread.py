@@ -1,4 +1,4 @@
-"""What the flux of a source adds to the right side of E4, in one pass; with its backward pass.
+"""What the flux of a source adds to the right side of E4, in one pass; with its derivatives.
 
 That is the part of `system_kernels.py` that is linear in Q1: - div(D kappa_s Q1).
 """
@@ -22,10 +22,11 @@ from ddrecon.diffusion.fused.colors import (
 )
 from ddrecon.diffusion.fused.faces import FACES
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Vector
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 _ROWS = """
 const F* d = diffusion + color(own, size) + start;
@@ -81,7 +82,8 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
     qx_bars[i] = s * px_bar;
 });
 """
-_GIVEN = "diffusion scattering_scale scattering flux_z flux_y flux_x "
+_TENSORS = "diffusion", "scattering_scale", "scattering", *FLUX
+_GIVEN = " ".join(_TENSORS) + " "
 
 
 def spread_flux(medium: Medium, diffusion: Tensor, flux: Vector) -> Tensor:
@@ -104,7 +106,7 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.grid, *tensors = inputs
-        ctx.save_for_backward(*tensors)
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -119,6 +121,19 @@ class _Spread(torch.autograd.Function):
         diffusion_bar = sum_colors(found["diffusion_bar"], diffusion)
         flux_bars = (found[f"{name}_bar"] for name in FLUX)
         return None, diffusion_bar, *scattering.split(), *flux_bars
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *changes: Tensor | None) -> Tensor:
+        def change(*tensors: Any) -> Tensor:
+            values, d_values = split(tensors)
+            d_spread = values[3].new_empty(values[3].shape)
+            given, d_given = _given(*values), dict(zip(_TENSORS, d_values, strict=True))
+            made = {"spread": d_spread}
+            launch_row_tangents(spread_kernel, ctx.grid, len(d_spread), given, d_given, made)
+            return d_spread
+
+        d_spread: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_spread
 
 
 def _given(diffusion: Tensor, scale: Tensor, field: Tensor, *flux: Tensor) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.dual import interleaved_tangent_of, pair, split
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
@@ -21,8 +20,6 @@ from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 BLOCK = 128
 """Ways that one item does on a processor; on a GPU it is one."""
-
-_ARRAYS = "fields", "firsts", "lasts", "lengths", "fraction"
 
 
 def integrate_ways(
@@ -42,18 +39,14 @@ def integrate_ways(
 class _Integral(torch.autograd.Function):
     """The integral; `first` and `last` [3, P] are places counted in cells, 0 in the first's center.
 
-    Differentiable by all but `fraction`.
+    Differentiable by all but `fraction`; in forward mode by the field alone.
     """
 
     @staticmethod
     def forward(
         field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
     ) -> Tensor:
-        total = field.new_empty(len(field), len(length))
-        given = _ways(field, first, last, length, fraction)
-        items, _ = cut(len(length), BLOCK, length)
-        way_kernel(field.element_size() * 8).launch(items, given, {"totals": total})
-        return total
+        return _integrate(field, first, last, length, fraction)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -76,20 +69,20 @@ class _Integral(torch.autograd.Function):
         return functools.reduce(Tensor.add_, shares), *bars, None
 
     @staticmethod
-    def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
-        def change(*tensors: Any) -> Tensor:
-            ways, d_ways = split(tensors)
-            total = ways[0].new_empty(len(ways[0]), len(ways[3]), 2)
-            given = _ways(*ways)
-            for name, value, d_value in zip(_ARRAYS, ways, d_ways, strict=True):
-                given[name] = pair(value, d_value)
-            items, _ = cut(len(ways[3]), BLOCK, total)
-            kernel = interleaved_tangent_of(way_kernel(total.element_size() * 8))
-            kernel.launch(items, given, {"totals": total})
-            return total[..., 1].contiguous()
-
-        d_total: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+    def jvp(ctx: Any, d_field: Tensor | None, *_: None) -> Tensor:
+        _, *ways = ctx.saved_tensors
+        # Linear in the field.
+        d_total: Tensor = run_plainly(_integrate, d_field, *ways)
         return d_total
+
+
+def _integrate(field: Tensor, *ways: Tensor) -> Tensor:
+    """The integral of `field` along `ways`."""
+    total = field.new_empty(len(field), len(ways[2]))
+    items, _ = cut(len(ways[2]), BLOCK, field)
+    kernel = way_kernel(field.element_size() * 8)
+    kernel.launch(items, _ways(field, *ways), {"totals": total})
+    return total
 
 
 def _ways(
@@ -99,8 +92,8 @@ def _ways(
     channels, depth, height, width = field.shape
     sizes = {"channels": channels, "depth": depth, "height": height, "width": width}
     sizes |= {"ways": len(length), "samples": len(fraction)}
-    arrays = field, first, last, length, fraction
-    return sizes | dict(zip(_ARRAYS, arrays, strict=True))
+    arrays = {"fields": field, "firsts": first, "lasts": last, "lengths": length}
+    return sizes | arrays | {"fraction": fraction}
 
 
 _GIVEN = """

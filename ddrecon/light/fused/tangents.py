@@ -26,7 +26,7 @@ class BeamTangents:
         self.numbers = pair(numbers, d_numbers)
 
     def follow(self, shear: Shear, light: int) -> tuple[Tensor, Tensor]:
-        """The mass up to where beam number `light` enters each cell [K, z, y, x], and its change."""
+        """The mass up to where beam number `light` enters cells [K, z, y, x], and its change."""
         laid = pair(shear.lay(self.field), shear.lay(self.d_field))
         kernels = shear_kernels(laid.element_size() * 8)
         entered = torch.empty_like(laid)

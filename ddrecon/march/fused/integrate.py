@@ -16,11 +16,11 @@ from ddrecon.kernels.text import cut
 from ddrecon.march.fused.adjoint import adjoint_kernel
 from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 from ddrecon.march.fused.packet_walks import (
     packet_adjoint_kernel,
     packet_integral_kernel,
 )
-from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 from ddrecon.march.fused.rays import ray_types
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
