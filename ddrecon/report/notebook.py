@@ -12,7 +12,7 @@ from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 from ddrecon.scene import Scene
 from ddrecon.turntable import upright_axis
 
-HEIGHT = 620
+HEIGHT = 600
 """Pixels of the frame."""
 SIDEWAYS = (0.5, 0.4, 1.0)
 """Where a volume without cameras is looked at from."""
@@ -53,7 +53,7 @@ def _frame(volume: Volume, words: str, up: int, towards_eye: tuple[float, float,
     ]
     still = "".join(picture(png_of(slices(value)), name) for name, value in fields.items())
     viewer = volume_viewer(shown, still, up, towards_eye)
-    page = page_text("ddrecon", words, [viewer], is_alive=True)
+    page = page_text("ddrecon", words, [viewer], is_alive=True, is_small=True)
     return (
         f'<iframe sandbox="allow-scripts" srcdoc="{escape(page)}" title="{escape(words)}" '
         f'style="width: 100%; height: {HEIGHT}px; border: 0"></iframe>'

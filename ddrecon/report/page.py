@@ -45,16 +45,18 @@ def page_text(
     *,
     is_alive: bool = False,
     is_live: bool = False,
+    is_small: bool = False,
 ) -> str:
     """The page; with `is_alive`, with scripts that turn its volumes and compare its pictures.
 
-    With `is_live`, these ask for it again and again, and take up what is new.
+    With `is_live`, these ask for it again and again, and take up what is new. With `is_small`, it
+    is laid out for a frame within another page.
     """
     scripts = ""
     if is_alive:
         scripts = "".join(f"<script>{_asset(name)}</script>\n" for name in SCRIPTS)
     return PAGE.format(
-        state=" data-live" if is_live else "",
+        state=" data-live" * is_live + ' class="small"' * is_small,
         title=escape(title),
         style=_asset("page.css"),
         lead=escape(lead),

@@ -35,7 +35,8 @@ def volume_section(findings: Findings) -> str:
     scene = findings.scene
     named = {name: value_of(scene, name) for name in FIELDS}
     named = {name: value for name, value in named.items() if value.ndim >= 3}
-    whites = {name: find_white_value(value) for name, value in named.items()}
+    both = (*named.items(), *findings.given.items())
+    whites = {name: max(find_white_value(v) for n, v in both if n == name) for name in named}
     z, y, x = scene.volume.grid.extent
     fields = [
         Shown(name, of, value, (x, y, z), whites[name])

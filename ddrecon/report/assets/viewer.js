@@ -208,7 +208,7 @@ class Viewer {
         redrawAll();
       });
     canvas.addEventListener("wheel", (event) => {
-      if (isPageScrolled(event)) return;
+      if (isMeantForPage(event, canvas)) return;
       event.preventDefault();
       zoom(Math.exp(event.deltaY * 0.001));
       redrawAll();
@@ -232,13 +232,15 @@ function lookFrom(eye, upAxis) {
   sight.pitch = Math.atan2(upwards, Math.hypot(sideways, towards));
 }
 
-// Whether the wheel turned outside the viewers a moment ago: they pass by, and are not meant.
+// Whether the wheel scrolls the page: it turned outside the viewers a moment ago, and these pass by.
+// Within a frame that is not seen, so there a viewer must have been clicked.
 let lastScroll = -Infinity;
 addEventListener("wheel", (event) => {
   if (!event.target.closest("#viewers")) lastScroll = event.timeStamp;
 }, { passive: true });
 
-function isPageScrolled(event) {
+function isMeantForPage(event, canvas) {
+  if (document.body.classList.contains("small")) return document.activeElement !== canvas;
   if (event.timeStamp - lastScroll > 300) return false;
   lastScroll = event.timeStamp;
   return true;
