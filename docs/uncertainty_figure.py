@@ -1,6 +1,6 @@
-"""Draws docs/pictures/uncertainty.png from a folder of `ddrecon uncertainty` of the plume.
+"""Draws docs/pictures/uncertainty.png from a folder of `ddrecon uncertainty` of the ball.
 
-python docs/uncertainty_figure.py runs/plume_sure
+python docs/uncertainty_figure.py runs/ball_sure
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KINDS = {
 def main() -> None:
     """The middle slices across z, y upwards."""
     folder = Path(sys.argv[1])
-    figure, axes = plt.subplots(1, len(KINDS), figsize=(7.5, 4.2))
+    figure, axes = plt.subplots(1, len(KINDS), figsize=(8.5, 2.8))
     for axis, (kind, title) in zip(axes, KINDS.items(), strict=True):
         values = read_field(folder / "volumes" / f"density_{kind}.npz", f"density_{kind}").values
         white = 1 if kind == "told" else values.max()
