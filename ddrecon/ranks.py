@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from io import BytesIO
-from time import perf_counter
+from time import monotonic, perf_counter, sleep
 from typing import Any, TypeVar
 
 import torch
@@ -132,6 +132,17 @@ def is_first() -> bool:
     return own_rank() == 0
 
 
+@contextmanager
+def alone() -> Iterator[None]:
+    """Has each rank work by itself, as if there were no others."""
+    global _group
+    group, _group = _group, None
+    try:
+        yield
+    finally:
+        _group = group
+
+
 def exchanged() -> tuple[int, float]:
     """Bytes that this rank has handed to exchanges so far, and the seconds that they took."""
     return (0, 0.0) if _group is None else (_group.bytes, _group.seconds)
@@ -224,11 +235,13 @@ def tell_failure(error: BaseException) -> str | None:
         _group.store.set(f"ddrecon/failed/{_group.rank}", one_line(text))
         if _group.rank == 0:
             return text
-        _group.store.wait(["ddrecon/failed/0"], timedelta(seconds=TOLD_SECONDS))
-        if _note(0) == one_line(text):
+        end = monotonic() + TOLD_SECONDS
+        while monotonic() < end and not _group.store.check(["ddrecon/failed/0"]):
+            sleep(0.05)
+        if _group.store.check(["ddrecon/failed/0"]) and _note(0) == one_line(text):
             return None
     except RuntimeError:
-        pass  # the first rank has not failed, or has taken its notes with it
+        pass  # the first rank has ended, and has taken the notes with it
     return f"rank {_group.rank}: {text}"
 
 

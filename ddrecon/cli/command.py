@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +92,16 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
         try:
             from ddrecon.cli.session import open_session, show_compilations
-            from ddrecon.ranks import is_first, leave_ranks
+            from ddrecon.ranks import alone, is_first, leave_ranks
 
             dtype, as_json = others.pop("dtype", "float64"), others.pop("as_json", False)
             common = overrides, device, engine, threads, seed, quiet, verbose
             with show_warnings(), show_compilations(quiet):
                 session = open_session(*common, dtype, as_json)
-                if is_first() or command.__name__ in SHARED:
-                    command(session=session, **others)
+                is_shared = command.__name__ in SHARED
+                if is_shared or is_first():
+                    with nullcontext() if is_shared else alone():
+                        command(session=session, **others)
             leave_ranks()
         except DdreconError as error:
             from ddrecon.ranks import tell_failure

@@ -124,9 +124,10 @@ class Reconstruction:
                 self.restore(self.before_step)
             raise failure from error.__cause__
         except RanksError:
-            # Amid the step, when some parameters have moved, the state is that before it.
+            # The state is that before the iteration, even amid the step, when some have moved.
             if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
                 self.restore(self.before_step)
+            self.memory.last = solutions
             raise
 
     def _iterate(self, start: float, solutions: dict[tuple[str, int], Tensor]) -> Row:

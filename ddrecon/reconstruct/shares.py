@@ -25,20 +25,23 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
 
-CELL_COST = 1.0
+CELL_COST = 0.5
 """What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
 COARSE = 16
 """A view's rays are counted as if it had about so many pixels along its shorter side."""
 
 
 def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
-    """Those of the views of `scene` called `names` that this rank renders, in their order."""
+    """Those of the views of `scene` called `names` that this rank renders, in their order.
+
+    One that is named twice is rendered twice, by the same rank.
+    """
     if rank_count() == 1:
         return list(names)
-    costs = [_known_cost(scene, scene.view(name)) for name in names]
+    costs = {name: names.count(name) * _known_cost(scene, scene.view(name)) for name in names}
     # As the first rank shares them out: another machine may round costs another way.
-    owners = from_first(assign(costs, rank_count()))
-    return [name for name, owner in zip(names, owners, strict=True) if owner == own_rank()]
+    owners = dict(zip(costs, from_first(assign(list(costs.values()), rank_count())), strict=True))
+    return [name for name in names if owners[name] == own_rank()]
 
 
 _KNOWN: WeakKeyDictionary[View, tuple[Grid, RenderSettings, float]] = WeakKeyDictionary()
@@ -97,7 +100,7 @@ def gather_numbers(
     if rank_count() == 1:
         return [list(row) for row in rows]
     table = torch.zeros(len(rows), len(names), dtype=torch.float64)
-    places = [names.index(name) for name in own]
+    places = [place for place, name in enumerate(names) if name in own]
     for row, numbers in zip(table, rows, strict=True):
         for place, number in zip(places, numbers, strict=True):
             row[place] = number

@@ -93,11 +93,16 @@ def solve_poses(
 
 
 def share_out(gradients: Mapping[str, Tensor], views: Sequence[View]) -> dict[str, Tensor]:
-    """The `gradients` of the mean loss of `views` by what each has, as those of its own loss."""
-    total = sum(view.weight for view in views)
+    """The `gradients` of the mean loss of `views` by what each has, as those of its own loss.
+
+    A view may be among them twice.
+    """
+    weights = dict.fromkeys((f"views.{view.name}.camera" for view in views), 0.0)
+    for view in views:
+        weights[f"views.{view.name}.camera"] += view.weight
+    total = sum(weights.values())
     return {
-        name: gradient * (total / view.weight)
-        for view in views
-        if (name := f"views.{view.name}.camera") in gradients
-        for gradient in (gradients[name],)
+        name: gradients[name] * (total / weight)
+        for name, weight in weights.items()
+        if name in gradients
     }

@@ -117,8 +117,8 @@ def find_exposure(views: Sequence[View], images: Mapping[str, Tensor]) -> str | 
         return None
     named = ", ".join(f"{name} ({gain:.2f} times)" for name, gain in _worst(odd))
     return (
-        f"exposure? pictures brighter than their renders by a factor of their own: {named}; give "
-        "all pictures one exposure and white balance"
+        f"exposure? pictures brighter or darker, as a whole, than the others say: {named}; give "
+        "all one exposure and white balance, or optimize them (views.*.exposure)"
     )
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from socket import socket
 from socketserver import BaseServer
 from threading import Thread
+from time import monotonic
 
 import torch
 
@@ -29,8 +30,11 @@ from ddrecon.run.report_volume import volume_section
 from ddrecon.run.run_folder import CHECKPOINTS
 from ddrecon.run.serve import serve_page
 from ddrecon.scene_file.build import load_scene
+from ddrecon.settings import AUTO, Iterations
 
 REPORT = "report.html"
+SHARE = 0.25
+"""Volume and views are made in this part of the time at most: the run needs the machine."""
 
 
 class LiveRun:
@@ -43,8 +47,9 @@ class LiveRun:
         self.folder, self.checkpoint = folder, folder / CHECKPOINTS / LAST
         if not (folder / "scene.yaml").is_file() or not self.checkpoint.is_file():
             raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
-        self.seen, self.total, self.sections = 0, 0, ["", ""]
-        self.maker = Thread()
+        self.seen, self.sections = 0, ["", ""]
+        self.iterations: Iterations = AUTO
+        self.maker, self.next_make = Thread(), 0.0
 
     def page(self) -> str:
         """The run's report where it is finished, else the page of what there is."""
@@ -57,8 +62,9 @@ class LiveRun:
         lead = "just begun"
         if rows:
             last = rows[-1]
+            total = "" if self.iterations == AUTO else f" of {self.iterations}"
             lead = (
-                f"iteration {last.iteration} of {self.total} after {last.seconds:.0f} s, "
+                f"iteration {last.iteration}{total} after {last.seconds:.0f} s, "
                 f"PSNR {last.psnr:.2f} dB of views trained on"
             )
         loss = section("Loss", side_by_side(*curves(rows))) if rows else ""
@@ -76,7 +82,7 @@ class LiveRun:
     def _follow(self) -> None:
         """Has volume and views made anew if there is a new checkpoint; waits only for the first."""
         written = self.checkpoint.stat().st_mtime_ns
-        if written == self.seen or self.maker.is_alive():
+        if written == self.seen or self.maker.is_alive() or monotonic() < self.next_make:
             return
         is_first, self.seen = self.seen == 0, written
         self.maker = Thread(target=self._remake, daemon=True)
@@ -85,9 +91,11 @@ class LiveRun:
             self.maker.join()
 
     def _remake(self) -> None:
+        start = monotonic()
         # A checkpoint may be replaced while it is read: the next is as good.
         with suppress(FormatError):
             self.sections = self._make_sections()
+        self.next_make = monotonic() + (monotonic() - start) * (1 / SHARE - 1)
 
     def _make_sections(self) -> list[str]:
         """Volume and views as the last checkpoint has them."""
@@ -95,7 +103,7 @@ class LiveRun:
         dtype = next(iter(state["parameters"].values()))["value"].dtype
         run = Reconstruction(load_scene(self.folder / "scene.yaml", dtype=dtype))
         run.restore(state)
-        self.total = run.settings.iterations
+        self.iterations = run.settings.iterations
         with torch.no_grad():
             scene = run.current_scene()
             light_field = solve(scene)

@@ -166,6 +166,19 @@ def test_light_without_direction_is_the_limit_of_light_with(g: float):
     torch.testing.assert_close(render(nearly), render(plain), rtol=1e-6, atol=0)
 
 
+def test_derivatives_by_g_pass_through_zero_smoothly():
+    """Their second difference shrinks as the square of the step, where a kink's shrinks as it."""
+
+    def slope(g: float) -> float:
+        scene = make_scene(ball(6), directional=(3.0,), transport_rounds=2, tolerance=1e-12)
+        scene.volume.g = torch.tensor(g, dtype=torch.float64, requires_grad=True)
+        (by_g,) = torch.autograd.grad(render(scene).square().sum(), scene.volume.g)
+        return by_g.item()
+
+    long, short = ((slope(-step) - 2 * slope(0.0) + slope(step)) / step**2 for step in (1e-2, 1e-3))
+    assert long == pytest.approx(short, rel=0.02)
+
+
 def test_light_from_two_beams_is_the_sum_of_both():
     def lit(*lights: object) -> Tensor:
         return light_after(replace(scene, lights=list(lights)), 2)
