@@ -175,7 +175,7 @@ def optimize(
     has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.cli.uncertainty import add_uncertainty
+    from ddrecon.cli.uncertainty import add_uncertainty, require_one_process
     from ddrecon.ranks import is_first
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
@@ -183,6 +183,8 @@ def optimize(
 
     if has_events:
         require_tensorboard()
+    if has_uncertainty:
+        require_one_process()
     if iterations is not None:
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)

@@ -84,6 +84,7 @@ def uncertainty(
         uncertainty_lines,
     )
 
+    require_one_process()
     if ring and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     state = state_of(run)
@@ -103,6 +104,14 @@ def uncertainty(
             is_quiet=session.is_quiet,
         )
     session.show(record, uncertainty_lines(record, output))
+
+
+def require_one_process() -> None:
+    """Raises UsageError under torchrun: samples are drawn by one process."""
+    from ddrecon.ranks import rank_count
+
+    if rank_count() > 1:
+        raise click.UsageError("uncertainty takes one process; run it without torchrun")
 
 
 def add_uncertainty(

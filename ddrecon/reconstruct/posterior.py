@@ -33,8 +33,9 @@ PROBES = 3
 class Sample:
     """How far from the optimum a draw from the posterior is, `change` [n], and one from the prior.
 
-    Both are of the same disturbance of the prior; that from the prior leaves out what levels of
-    smoothed fields do. `products` with J^T W J were needed; `residual` is what is left.
+    Both are of the same disturbance of the prior; that from the prior leaves out what single
+    numbers and levels of smoothed fields do. `products` with J^T W J were needed; `residual` is
+    what is left.
     """
 
     change: Tensor

@@ -45,18 +45,20 @@ class Prior:
     def root_noise(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Two random vectors, the covariance of whose sum is R + T K.
 
-        The second is what a level of smoothed fields comes of, the first all else.
+        The second is what single numbers and levels of smoothed fields come of, the first all else.
         """
         parts, levels = dict[str, Tensor](), dict[str, Tensor]()
+        fields = {parameter.name for parameter in self.curvature.parameters if parameter.is_field}
         for name, value in self.curvature.values.items():
             held = self.held[name]
             root = torch.linalg.cholesky(held) if held.ndim == 2 else held.sqrt()
             weak = _times(root, normal_like(value, generator))
-            if (roughness := self.curvature.roughness.get(name)) is None:
-                parts[name] = weak
-            else:
+            if (roughness := self.curvature.roughness.get(name)) is not None:
                 noises = [normal_like(value, generator) for _ in AXES]
-                parts[name], levels[name] = roughness.root_product(noises), weak
+                parts[name] = roughness.root_product(noises)
+            # What is held so weakly is far off in a draw: pictures alone say where it is.
+            has_draw = name in fields and roughness is None
+            (parts if has_draw else levels)[name] = weak
         return self.curvature.join(parts), self.curvature.join(levels)
 
     def solve(
