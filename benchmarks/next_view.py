@@ -2,9 +2,9 @@
 
 python benchmarks/next_view.py
 
-The plume at a quarter of its resolution, scattering evenly, is seen by three cameras on one side, in pictures of our
-own rendering with noise. Twelve candidates are ranked; then each picture is really taken, and the
-volume reconstructed with it.
+The plume at a quarter of its resolution, scattering evenly, is seen by three cameras on one side,
+in pictures of our own rendering with noise. Twelve candidates are ranked; then each picture is
+really taken, and the volume reconstructed with it.
 """
 
 from __future__ import annotations

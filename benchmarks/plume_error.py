@@ -31,14 +31,12 @@ CASES = [
     ("ours", "", 1, 0.0),
     ("ours", "", 1, 3e-4),
     ("ours", "", 1, 3e-3),
-    ("ours", "noise", 1, 0.0),
-    ("ours", "noise", 1, 3e-4),
     ("ours", "noise", 1, 3e-3),
-    ("ours, of the fine grid", "", 1, 3e-4),
-    ("path-traced", "noise", 1, 3e-4),
     ("path-traced", "noise", 1, 3e-3),
+    ("ours, of the fine grid", "", 1, 3e-3),
     ("path-traced", "noise", 0, 3e-3),
     ("path-traced", "noise", 2, 3e-3),
+    ("ours", "noise", 1, 3e-4),
 ]
 """Whose pictures, with noise or without, transport rounds, weight of smoothing."""
 

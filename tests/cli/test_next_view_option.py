@@ -1,4 +1,4 @@
-"""`ddrecon uncertainty --next-view`: what it ranks, and that it goes on as if it had not stopped."""
+"""`ddrecon uncertainty --next-view`: what it ranks, also where it goes on after a stop."""
 
 from __future__ import annotations
 
