@@ -238,7 +238,8 @@ def tell_failure(error: BaseException) -> str | None:
         end = monotonic() + TOLD_SECONDS
         while monotonic() < end and not _group.store.check(["ddrecon/failed/0"]):
             sleep(0.05)
-        if _group.store.check(["ddrecon/failed/0"]) and _note(0) == one_line(text):
+        # The first adds where it has kept the state.
+        if _group.store.check(["ddrecon/failed/0"]) and _note(0).startswith(one_line(text)):
             return None
     except RuntimeError:
         pass  # the first rank has ended, and has taken the notes with it

@@ -74,6 +74,7 @@ JOBS = {
     "rendered": {"ranks": 3, "arguments": [*RENDER, "views"]},
     "alone": {"ranks": 1, "arguments": [*RENDER, "alone"]},
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
+    "measured": {"ranks": 2, "arguments": ["bench", "scene.yaml", "--json", "bench.json"]},
 }
 
 
@@ -174,6 +175,14 @@ def test_ranks_render_what_one_renders(runs: Runs) -> None:
     for name in arrays:
         one, other = (np.load(runs.folder / output / name) for output in ("alone", "views"))
         np.testing.assert_array_equal(one, other)
+
+
+def test_bench_measures_one_rank_and_all(runs: Runs) -> None:
+    assert runs.codes["measured"] == [0, 0]
+    one, both = json.loads((runs.folder / "bench.json").read_text())["iterations"]
+    assert (one["ranks"], both["ranks"]) == (1, 2)
+    # One exchanges nothing; two at least the derivative by each cell, in single precision.
+    assert one["bytes"] == 0 and both["bytes"] > 4 * 8 * 6 * 5
 
 
 def test_one_rank_imports_and_starts_nothing(runs: Runs) -> None:
