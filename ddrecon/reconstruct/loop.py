@@ -31,7 +31,7 @@ from ddrecon.reconstruct.objective import (
     render_quality,
 )
 from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
-from ddrecon.reconstruct.steps import share_out, solve_poses, solve_responses, step_parameters
+from ddrecon.reconstruct.steps import Seen, solve_parameters, step_parameters
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
@@ -95,6 +95,7 @@ class Reconstruction:
         self.noises = setup.noises_of(views, self.settings) if self.loss == "photon" else {}
         self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
         self.parameters = setup.start_parameters(scene, self.settings)
+        setup.choose_light_steps(self.parameters)
         setup.choose_pose_steps(self.parameters, self.train, self.loss in QUADRATIC)
         self.gauges = find_gauges(self.train, self.parameters)
         self.support = setup.start_support(self.train, self.settings)
@@ -267,15 +268,15 @@ class Reconstruction:
     def _step(self, gradients: dict[str, Tensor], pictures: dict[str, Tensor]) -> None:
         """Every parameter against its derivative, but those of views not seen or not yet due.
 
-        What cameras do goes part of the way to what fits the `pictures` of this iteration best.
+        What cameras do, and how bright lights are, goes part of the way to what fits the `pictures`
+        of this iteration best.
         """
         values = {name: value.detach() for name, value in self._values().items()}
-        seen = [p for p in self.parameters if p.view is None or p.view in pictures]
-        solved = step_parameters(seen, gradients, self.iteration, self.settings.iterations)
-        solve_responses(solved, self.train_level, pictures, self.targets)
-        if poses := [p for p in solved if p.key == "camera"]:
-            own = share_out(gradients, [self.train_level.view(name) for name in pictures])
-            solve_poses(poses, self.train_level, own, values, self.targets, self.memory.last)
+        due = [p for p in self.parameters if p.view is None or p.view in pictures]
+        solved = step_parameters(due, gradients, self.iteration, self.settings.iterations)
+        level, light = self.train_level, self.memory.last
+        seen = Seen(self.iteration, level, values, gradients, pictures, self.targets, light)
+        solve_parameters(solved, seen)
         for gauge in self.gauges:
             gauge.hold()
 

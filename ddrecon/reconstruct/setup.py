@@ -141,3 +141,13 @@ def choose_pose_steps(parameters: Sequence[Parameter], train: Scene, is_quadrati
     if not is_quadratic or not len(poses) == len(train.views) > 1:
         for pose in poses:
             pose.is_fitted = False
+
+
+def choose_light_steps(parameters: Sequence[Parameter]) -> None:
+    """Has lights among `parameters` descend whose brightness is not to be solved for (E39).
+
+    That is a map of it, and one that starts from black: it has no share in pictures yet.
+    """
+    for light in parameters:
+        if light.name.startswith("lights.") and light.is_fitted:
+            light.is_fitted = light.value.numel() <= 3 and bool((light.value > 0).all())
