@@ -8,6 +8,8 @@ so that `import ddrecon` costs nothing.
 from importlib import import_module
 from typing import Any
 
+from ddrecon.display import draw_by
+
 __version__ = "0.1.0"
 _HOMES = {
     "load_scene": "ddrecon.scene_file.build",
@@ -34,3 +36,13 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'ddrecon' has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def _draw(record: Any) -> str:
+    """A scene or a volume in a notebook."""
+    from ddrecon.report.notebook import html_of
+
+    return html_of(record)
+
+
+draw_by(_draw)

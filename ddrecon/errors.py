@@ -101,5 +101,15 @@ class DivergenceError(SolveError):
         return DivergenceError(self.iterations, self.what, self.residual, f"{self.advice}; {more}")
 
 
+class RanksError(DdreconError):
+    """Processes that share a run and lost, or never found, one another."""
+
+    exit_code = 5
+
+    def with_advice(self, more: str) -> RanksError:
+        """The same error, followed by `more`."""
+        return RanksError(f"{self}; {more}")
+
+
 class DataWarning(UserWarning):
     """Data that was used, but not as it stands."""

@@ -24,6 +24,8 @@ HUBER = 0.05
 RELATIVE = 0.05
 """The same part, added to a pixel's target, keeps relative errors finite where targets are black.
 """
+SMALL = 1e-3
+"""Errors below this part of the targets' root mean square are as good as none."""
 WHITE = 1 - 1e-4
 """A displayed target this bright says only that it is at least white."""
 
@@ -131,6 +133,21 @@ class Target:
     def loss_of(self, image: Tensor) -> Tensor:
         """The mean of the loss over the pixels and colors of `image` [3, h, w]."""
         return self._mean(LOSSES[self.loss](image - self.image, self))
+
+    def weights_at(self, image: Tensor) -> Tensor:
+        """The second derivative of `loss_of` by each entry of `image` [3, h, w].
+
+        Of what is no square it is that of the parabola around 0 that touches the loss from above
+        (Huber 1981, doi:10.1002/0471725250): its slope over the error, which counts as at least
+        `SMALL` of the target's scale.
+        """
+        error = (image - self.image).detach()
+        least = SMALL * self.scale
+        error = torch.where(error.abs() < least, least.copysign(error), error).requires_grad_()
+        with torch.enable_grad():
+            (slope,) = torch.autograd.grad(LOSSES[self.loss](error, self).sum(), error)
+        weights = slope / error.detach() / self.count
+        return weights if self.seen is None else weights * self.seen
 
     @property
     def power(self) -> Tensor:

@@ -7,13 +7,13 @@ in a file.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from ddrecon.cameras import Camera
+from ddrecon.display import Displayed
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures.noise import Noise
@@ -49,7 +49,7 @@ class View:
 
 
 @dataclass(eq=False)
-class Scene:
+class Scene(Displayed):
     """A loaded scene.
 
     `support` [z, y, x] is above 0 where density may be, if a file says so.
@@ -67,11 +67,6 @@ class Scene:
     starts: dict[str, Tensor] = field(default_factory=dict)
     support: Tensor | None = None
     path: Path | None = None
-
-    def _repr_html_(self) -> str:
-        """The scene in a notebook. What draws it is of a room above, and so is loaded by name."""
-        html: str = import_module("ddrecon.report.notebook").scene_html(self)
-        return html
 
     def view(self, name: str) -> View:
         """The view called `name`; raises KeyError with the known names."""

@@ -147,6 +147,8 @@ Start = float | tuple[float, ...] | FieldFile
 
 Weight = float | str
 """A weight, or `auto`: it is found."""
+Iterations = int | str
+"""How many iterations a run has, or `auto`: it ends by itself."""
 AUTO = "auto"
 Support = float | str | FieldFile
 """Where medium may be: `masks`, the displayed value above which a pixel shows some, or a field."""
@@ -208,15 +210,16 @@ class NoiseSettings:
 class OptimizeSettings:
     """What is optimized, and how.
 
+    `iterations`: in all; with `auto` a run ends when it is done, see `reconstruct.schedule`.
     `refine_at`: the fractions of the run at which the grid becomes finer, coarse to fine.
     `views_per_iteration`: how many training views, drawn at random, an iteration looks at; 0 for
     all. `derivatives`: which radiance passes derivatives on: all of it, that scattered once, or
     that scattered more often. `loss`: None is what the kind of pictures deserves. `noise` is that
-    of all pictures that have none of their own, for the loss `photon`.
+    of all pictures that have none of their own, for the loss `photon` and to know when it is left.
     """
 
     parameters: Mapping[str, ParameterSettings]
-    iterations: int = bounded(300, minimum=1)
+    iterations: Iterations = bounded(300, minimum=1)
     loss: str | None = one_of(None, LOSSES)
     noise: NoiseSettings | None = None
     views_per_iteration: int = bounded(3, minimum=0)

@@ -26,6 +26,7 @@ KIND_NAMES = {
     phase_schema.PhaseSection: "{type: ...}",
     settings.Start: "number, list or {file: ...}",
     settings.Weight: "number or `auto`",
+    settings.Iterations: "whole number or `auto`",
     settings.Support: "`masks`, number or {file: ...}",
     schema.Triple: "[x, y, z]",
     schema.Count: "[nx, ny, nz]",
@@ -223,7 +224,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "What the picture shows where the volume is empty: a picture without it, or a "
                 "color. Unless given, the lights behind it, or black."
             ),
-            "noise": "How this picture errs, for `loss: photon`; see below.",
+            "noise": "How this picture errs; see `optimize.noise` below.",
         },
     ),
     (
@@ -348,12 +349,18 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "What `ddrecon optimize` finds, and how.",
         {
             "parameters": "What to find: names, as in the last table, with their settings.",
-            "iterations": "In all.",
+            "iterations": (
+                "In all. With `auto` a run ends by itself: "
+                "[when to stop](settings.md#when-to-stop)."
+            ),
             "loss": (
                 "What is made small, as a mean over pixels. Unless given, `display` where pictures "
                 "are sRGB files, `l2` where they are linear. [Settings](settings.md) says more."
             ),
-            "noise": "How pictures err, for `loss: photon`; estimated from them unless given.",
+            "noise": (
+                "How pictures err, for `loss: photon`, which estimates it unless given, and for "
+                "`iterations: auto`, which then ends when it alone is left."
+            ),
             "views_per_iteration": "Training views drawn at random for each iteration; 0 for all.",
             "derivatives": (
                 "Which light passes derivatives on: all, only light scattered once, or only the "

@@ -7,7 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,8 @@ THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
 
 That is 1.5 times faster than sleeping at once, without the stalls of endless spinning.
 """
+SHARED = ("optimize", "render", "bench")
+"""Commands whose work the ranks of torchrun share; others are the first rank's alone."""
 DTYPE = click.option(
     "--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
 )
@@ -85,21 +87,36 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     ) -> None:
         for name, value in THREADING.items():
             os.environ.setdefault(name, value)
+        if "RANK" in os.environ:
+            # Where others cannot be reached, one line says so, and not a page of torch's.
+            os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
         try:
             from ddrecon.cli.session import open_session, show_compilations
+            from ddrecon.ranks import alone, is_first, leave_ranks
 
             dtype, as_json = others.pop("dtype", "float64"), others.pop("as_json", False)
             common = overrides, device, engine, threads, seed, quiet, verbose
             with show_warnings(), show_compilations(quiet):
-                command(session=open_session(*common, dtype, as_json), **others)
+                session = open_session(*common, dtype, as_json)
+                is_shared = command.__name__ in SHARED
+                if is_shared or is_first():
+                    with nullcontext() if is_shared else alone():
+                        command(session=session, **others)
+            leave_ranks()
         except DdreconError as error:
+            from ddrecon.ranks import tell_failure
+
+            told = tell_failure(error)
             if debug:
                 raise
-            click.echo(str(error), err=True)
+            if told is not None:
+                click.echo(told, err=True)
             sys.exit(error.exit_code)
         except (MemoryError, RuntimeError) as error:
             from ddrecon.memory import is_shortage
+            from ddrecon.ranks import tell_failure
 
+            tell_failure(error)
             if debug or not is_shortage(error):
                 raise
             reason = str(error).partition("\n")[0] or "no more is given"
@@ -109,7 +126,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             click.echo(f"out of memory: {reason}; {advice}", err=True)
             sys.exit(2)
         except KeyboardInterrupt as error:
-            click.echo(f"interrupted {error}".strip(), err=True)
+            _show(f"interrupted {error}".strip())
             sys.exit(130)
 
     for option in reversed(COMMON):
@@ -131,5 +148,13 @@ def show_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = lambda message, *_: click.echo(f"warning: {message}", err=True)
+        warnings.showwarning = lambda message, *_: _show(f"warning: {message}")
         yield
+
+
+def _show(line: str) -> None:
+    """Prints `line` on stderr, of several ranks the first alone."""
+    from ddrecon.ranks import is_first
+
+    if is_first():
+        click.echo(line, err=True)

@@ -6,6 +6,7 @@ import click
 
 from ddrecon.cli.file_commands import export, info
 from ddrecon.cli.scene_commands import check, optimize, render
+from ddrecon.cli.uncertainty import uncertainty
 from ddrecon.cli.validation_commands import bench, gradcheck, reference
 from ddrecon.cli.version import show_version
 from ddrecon.cli.watch import watch
@@ -24,5 +25,16 @@ def main() -> None:
     """Density volumes from pictures of smoke and clouds, by differential diffusion."""
 
 
-for command in (check, render, optimize, watch, gradcheck, reference, bench, export, info):
+for command in (
+    check,
+    render,
+    optimize,
+    uncertainty,
+    watch,
+    gradcheck,
+    reference,
+    bench,
+    export,
+    info,
+):
     main.add_command(command)

@@ -43,10 +43,14 @@ def export(
     """Write SCENE for Mitsuba 3 (FILE.xml, and its volumes beside it), its cameras (.json, as
     NeRF's transforms.json), or all fields of SCENE, or of VOLUMEs, in the format of FILE's suffix.
 
-    SCENE is a scene file or the folder of a finished run.
+    SCENE is a scene file or the folder of a finished run; a folder of `ddrecon uncertainty` counts
+    as its volumes.
     """
+    from ddrecon.run.uncertainty_folder import volumes_in
+
+    sources = tuple(path for source in sources for path in volumes_in(source) or [source])
     kind = output.suffix.lower()
-    has_scene = any(source.is_dir() or source.suffix in (".yaml", ".yml") for source in sources)
+    has_scene = any(map(_is_scene, sources))
     if (has_scene or kind in (".xml", ".json")) and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
     if kind in (".xml", ".json") and up == "z":
@@ -101,13 +105,22 @@ def _words(value: Any) -> str:
     return " ".join(f"{number:.6g}" for number in value.flatten().tolist())
 
 
+def _is_scene(source: Path) -> bool:
+    """Whether `source` is a scene file or, perhaps, the folder of a run."""
+    return source.is_dir() or source.suffix in (".yaml", ".yml")
+
+
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
 @AS_JSON
 @in_session
 def info(session: Session, file: Path) -> None:
-    """Print what is in FILE: a volume's box, cells and fields, or an image's size and values."""
-    from ddrecon.io.info import describe, lines
+    """Print what is in FILE: a volume's box, cells and fields, or an image's size and values.
 
-    report = describe(file)
+    Of a scene file or the folder of a finished run, it is its volume.
+    """
+    from ddrecon.io.info import describe, describe_medium, lines
+    from ddrecon.scene_file.export_fields import fields_of
+
+    report = describe_medium(*fields_of(session.load(file))) if _is_scene(file) else describe(file)
     session.show(report, lines(report))

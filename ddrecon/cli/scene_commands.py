@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,6 +18,17 @@ from ddrecon.errors import DataWarning
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
+
+
+class CountOrAuto(click.IntRange):
+    """A whole number, or `auto`."""
+
+    name = "integer or auto"
+
+    def convert(
+        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
+    ) -> Any:
+        return value if value == "auto" else super().convert(value, parameter, context)
 
 
 @click.command()
@@ -85,6 +96,7 @@ def render(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
+    from ddrecon.ranks import is_first
     from ddrecon.run.render_folder import (
         remove_targets,
         render_gradient_to_folder,
@@ -105,12 +117,14 @@ def render(
         views = list(loaded.views)
     if parameter is not None:
         require_variation(loaded, parameter)
-    with claim_folder(output, may_exist=overwrite):
+    with claim_folder(output, may_exist=overwrite) if is_first() else nullcontext():
         settings = views, output, components
         if parameter is None:
             report = render_to_folder(loaded, *settings, session.progress)
         else:
             report = render_gradient_to_folder(loaded, *settings, parameter, session.progress)
+        if not is_first():
+            return
         if count is not None:
             report["ring"] = write_ring(views, output, has_mp4)
         write_json(output / "render.json", report)
@@ -123,8 +137,8 @@ def render(
 @OVERWRITE
 @click.option(
     "--iterations",
-    type=click.IntRange(min=1),
-    help="Total number of iterations, also after --resume.",
+    type=CountOrAuto(min=1),
+    help="Total number of iterations, also after --resume; auto: the run ends by itself.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the folder's checkpoint.")
 @click.option(
@@ -139,6 +153,12 @@ def render(
 @click.option(
     "--watch", "is_watched", is_flag=True, help="Also serve the run's page, as ddrecon watch does."
 )
+@click.option(
+    "--uncertainty",
+    "has_uncertainty",
+    is_flag=True,
+    help="Then also say how sure the result is, as ddrecon uncertainty does.",
+)
 @DTYPE
 @AS_JSON
 @in_session
@@ -147,14 +167,17 @@ def optimize(
     scene: Path,
     output: Path,
     overwrite: bool,
-    iterations: int | None,
+    iterations: int | str | None,
     resume: bool,
     preview_every: int | None,
     has_events: bool,
     is_watched: bool,
+    has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.run.drive import drive_run, open_run, summary_lines
+    from ddrecon.cli.uncertainty import add_uncertainty
+    from ddrecon.ranks import is_first
+    from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
     from ddrecon.scene_file.doubts import find_doubts
 
@@ -166,6 +189,9 @@ def optimize(
     built, environment = session.build(scene_file), session.environment()
     for doubt in find_doubts(built):
         warnings.warn(doubt, DataWarning, 2)
+    if not is_first():
+        follow_run(built, scene_file, resume=resume)
+        return
     with (
         open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
             run,
@@ -174,6 +200,10 @@ def optimize(
         watched(output) if is_watched else nullcontext(),
     ):
         if is_watched:
-            folder.save_every = SAVE_EVERY
+            folder.save_often(SAVE_EVERY)
         summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
-    session.show(summary, summary_lines(summary, output))
+        lines = summary_lines(summary, output)
+        if has_uncertainty:
+            record, more = add_uncertainty(run, output, session.is_quiet)
+            summary, lines = summary | {"uncertainty": record}, [*lines, *more]
+    session.show(summary, lines)

@@ -23,6 +23,7 @@ from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
 from ddrecon.memory import keep_freed_memory
 from ddrecon.progress import bar_width
+from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import build_scene
@@ -90,8 +91,9 @@ class Session:
         )
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
-        """Prints `report` as JSON where that was asked for, else `lines`."""
-        click.echo(json.dumps(report, indent=1) if self.as_json else "\n".join(lines))
+        """Prints `report` as JSON where that was asked for, else `lines`; the first rank alone."""
+        if is_first():
+            click.echo(json.dumps(report, indent=1) if self.as_json else "\n".join(lines))
 
     def environment(self) -> dict[str, Any]:
         """What a run's result may depend on besides its scene."""
@@ -107,6 +109,7 @@ class Session:
             else "cpu",
             "dtype": str(self.dtype).removeprefix("torch."),
             "threads": torch.get_num_threads(),
+            **({"ranks": rank_count()} if rank_count() > 1 else {}),
             "seed": self.seed,
             "overrides": list(self.overrides),
             "command": sys.argv,
@@ -140,7 +143,8 @@ def open_session(
 ) -> Session:
     """Sets torch and the engine up as the options say.
 
-    Raises UsageError for a device that is not there, MissingExtraError for such an engine.
+    Under torchrun it meets the other ranks. Raises UsageError for a device that is not there,
+    MissingExtraError for such an engine, RanksError where the other ranks are not there.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError(
@@ -149,20 +153,36 @@ def open_session(
         )
     place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
     use_engine(engine or current_engine())
-    threads = threads or (
-        torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else os.cpu_count() or 1
-    )
+    join_ranks(place.type == "cuda")
+    if place.type == "cuda" and rank_count() > 1:
+        place = _own_gpu()
+    cores = max(1, (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+    threads = threads or (torch.get_num_threads() if "OMP_NUM_THREADS" in os.environ else cores)
     torch.set_num_threads(threads)
     keep_freed_memory()
     torch.manual_seed(seed)
+    is_quiet = is_quiet or not is_first()
     return Session(overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json)
+
+
+def _own_gpu() -> torch.device:
+    """The GPU of this rank, by its place on its machine; raises UsageError without one."""
+    place, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
+    if place >= count:
+        raise UsageError(
+            f"--nproc-per-node: {place + 1} processes or more, but torch sees {count} GPU here; "
+            "start one for each, or say --device cpu"
+        )
+    torch.cuda.set_device(place)
+    return torch.device("cuda", place)
 
 
 class _LinesAboveBars(logging.Handler):
     """Prints each message as a line on stderr, above the progress bar that may be there."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        tqdm.write(record.getMessage(), file=sys.stderr)
+        if is_first():
+            tqdm.write(record.getMessage(), file=sys.stderr)
 
 
 @contextmanager

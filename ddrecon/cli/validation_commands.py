@@ -156,7 +156,13 @@ def bench(
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     require_folder_of(report)
     from ddrecon.io.files.folders import claim_folder
+    from ddrecon.ranks import rank_count
 
+    if rank_count() > 1:
+        if scene is None or is_hard or output is not None:
+            raise click.UsageError("torchrun shares the views of a SCENE: name one, and no -o")
+        _bench_shared(session, scene, report)
+        return
     with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
         if is_hard:
             has_passed = _bench_hard(session, output, report)
@@ -190,6 +196,22 @@ def _bench_speed(
     if report is not None:
         write_json(report, measured)
     return True
+
+
+def _bench_shared(session: Session, path: Path, report: Path | None) -> None:
+    """Measures what it brings that ranks share the views of the scene at `path`."""
+    import torch
+
+    from ddrecon.bench.shared import describe_shared, measure_shared, shared_lines
+    from ddrecon.io.files.json_file import write_json
+    from ddrecon.ranks import is_first
+
+    scene = replace(session, dtype=torch.float32).load(path)
+    measured = measure_shared(scene, session.progress)
+    if is_first():
+        click.echo("\n".join(shared_lines(scene, measured)))
+    if is_first() and report is not None:
+        write_json(report, describe_shared(measured, session.environment()))
 
 
 def _bench_hard(session: Session, output: Path | None, report: Path | None) -> bool:

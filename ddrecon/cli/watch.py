@@ -5,11 +5,10 @@ torch is imported inside the command, so that `--help` answers at once.
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +19,6 @@ from ddrecon.cli.command import in_session
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
 
-PORT = 8765
 SAVE_EVERY = 5.0
 """A run that is watched writes its state about every so many seconds."""
 LAST_LOOK = 5.0
@@ -30,31 +28,39 @@ LAST_LOOK = 5.0
 @click.command()
 @click.argument("run", type=click.Path(path_type=Path))
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: a free one."
+    "--port",
+    type=click.IntRange(0, 65535),
+    show_default="8765, or a free one if that is taken",
+    help="Where to serve it; 0 is a free one.",
 )
 @in_session
-def watch(session: Session, run: Path, port: int) -> None:
+def watch(session: Session, run: Path, port: int | None) -> None:
     """Serve the page of RUN, the folder of a run, on this machine alone, while the run goes on.
 
     Ctrl-C ends it.
     """
     from ddrecon.run.live import LiveRun
-    from ddrecon.run.serve import HOST, serve_page
+    from ddrecon.run.serve import listen, serve_page, url_of
 
     live = LiveRun(run)
-    with serve_page(live.page, port) as server:
-        click.echo(f"http://{HOST}:{server.server_address[1]}/  (Ctrl-C ends)")
+    with listen(port) as listening, serve_page(live.page, listening) as server:
+        click.echo(f"{url_of(listening)}  (Ctrl-C ends)")
         server.serve_forever()
 
 
 @contextmanager
 def watched(folder: Path) -> Iterator[None]:
-    """`watch` of `folder` in a process of its own, which ends a little after the block does."""
-    command = [sys.executable, "-m", "ddrecon", "watch", str(folder), "--threads", "1"]
-    process = subprocess.Popen(command, stdout=sys.stderr)
+    """The page of the run in `folder`, by a process of its own that ends soon after the block."""
+    from ddrecon.run.live import serve_run
+    from ddrecon.run.serve import listen, url_of
+
+    with listen(None) as listening:
+        click.echo(f"{url_of(listening)} shows the run", err=True)
+        process = get_context("spawn").Process(target=serve_run, args=(folder, listening))
+        process.start()
     try:
         yield
         time.sleep(LAST_LOOK)
     finally:
         process.terminate()
-        process.wait()
+        process.join()

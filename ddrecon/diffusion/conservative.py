@@ -22,7 +22,7 @@ from ddrecon.diffusion.operator import (
     conductance,
     face_fluxes,
 )
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import is_fused, recompute
 
@@ -76,7 +76,7 @@ class DiffusionProblem:
         """L1 of L0 = `mean`, with `more` flux in the source; None without directions."""
         if not self.has_flux:
             return None
-        source = Moments(mean, self.source.flux).plus(Moments(mean, more)).flux
+        source = add_vectors(self.source.flux, more)
         if is_fused():
             from ddrecon.diffusion.fused.flux import find_flux
 
@@ -89,6 +89,10 @@ class DiffusionProblem:
 
     def spread(self, flux: Vector) -> Tensor:
         """- div(D kappa_s `flux`), what a source of that flux adds to the right side of E4."""
+        if is_fused():
+            from ddrecon.diffusion.fused.spread import spread_flux
+
+            return spread_flux(self.medium, self.diffusion, flux)
         z, y, x = (
             recompute(_divergence, self.medium, self.diffusion, along, axis)
             for axis, along in zip(AXES, flux, strict=True)

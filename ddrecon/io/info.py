@@ -10,6 +10,7 @@ import numpy as np
 
 from ddrecon.io.images.table import READERS, read_image
 from ddrecon.io.images.tiff import is_stack
+from ddrecon.io.volumes.field import Fields
 from ddrecon.io.volumes.table import FORMATS, field_names, read_field
 
 
@@ -28,16 +29,29 @@ def _is_volume(path: Path) -> bool:
 
 
 def _describe_volume(path: Path) -> dict[str, Any]:
-    report: dict[str, Any] = {"resolution": None, "bounds": None, "fields": {}}
+    fields, bounds = {}, None
     for name in field_names(path):
         field = read_field(path, name)
-        report["resolution"] = list(field.resolution)
-        report["bounds"] = None if field.bounds is None else field.bounds.tolist()
-        report["fields"][name] = {
-            "colors": 1 if field.values.ndim == 3 else 3,
-            **_summarize(field.values),
-        }
-    return report
+        fields[name], bounds = field.values, field.bounds
+    return describe_medium(fields, {}, bounds)
+
+
+def describe_medium(fields: Fields, constants: Fields, bounds: np.ndarray | None) -> dict[str, Any]:
+    """`fields` [z, y, x] or [z, y, x, 3] in a box [2, 3], for `lines` or JSON.
+
+    `constants`, of one number or three, are the same in every cell.
+    """
+    first = next(iter(fields.values()), None)
+    report: dict[str, Any] = {
+        "resolution": None if first is None else list(first.shape[2::-1]),
+        "bounds": None if bounds is None else bounds.tolist(),
+        "fields": {
+            name: {"colors": 1 if values.ndim == 3 else 3, **_summarize(values)}
+            for name, values in fields.items()
+        },
+    }
+    everywhere = {name: value.tolist() for name, value in constants.items()}
+    return report | ({"constants": everywhere} if everywhere else {})
 
 
 def _describe_image(path: Path) -> dict[str, Any]:
@@ -79,6 +93,10 @@ def lines(report: dict[str, Any]) -> list[str]:
         *(
             f"{name}: {_colors(field)}, {_values(field)}"
             for name, field in report["fields"].items()
+        ),
+        *(
+            f"{name}: {' '.join(f'{part:.4g}' for part in np.atleast_1d(value))} everywhere"
+            for name, value in report.get("constants", {}).items()
         ),
     ]
 

@@ -21,6 +21,7 @@ import warp as wp
 from torch import Tensor
 
 from ddrecon import engine
+from ddrecon.kernels.spare import keep_freed_memory
 
 wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
 LOG = logging.getLogger(engine.LOG)
@@ -113,6 +114,7 @@ def _start() -> None:
 
     It does so past Python, to the process's error stream, on every machine without a GPU.
     """
+    keep_freed_memory()
     sys.stderr.flush()
     kept = os.dup(2)
     try:

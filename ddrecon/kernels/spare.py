@@ -3,11 +3,15 @@
 The system clears a page when it is first written to, a few hundred microseconds for each megabyte,
 and what a large tensor gives up goes back to the system at once. A solve would spend half its time
 on that. On a GPU torch keeps the memory itself.
+
+What torch's own tensors give up is kept as well, where the C library can be told so.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 import threading
 
 import torch
@@ -15,10 +19,28 @@ from torch import Tensor
 
 MOST_BYTES = 2**28
 """So much is kept unused at most: of large volumes little, whose memory is needed elsewhere."""
+LARGEST, MOST_FREE = 2**28, 2**30
+"""Bytes of arrays that the system gives and takes each time; and so much free stays at most.
+
+GNU's C library itself has at most 32 and 64 MiB.
+"""
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""What GNU's mallopt calls the two."""
+_OWN_CHOICES = "GLIBC_TUNABLES", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"
 _spare: list[tuple[int, Tensor]] = []
 """Memory that nobody uses, with its number of bytes: asking a tensor takes a microsecond."""
 # Reentrant: the collector of garbage, which may begin anywhere, gives memory back.
 _lock = threading.RLock()
+
+
+def keep_freed_memory() -> None:
+    """Has the C library keep what tensors give up for those to come, unless the user chose."""
+    if sys.platform != "linux" or any(name in os.environ for name in _OWN_CHOICES):
+        return
+    # Other libraries than GNU's have no such choice, or decide for themselves.
+    choose = getattr(ctypes.CDLL(None), "mallopt", None)
+    if choose is not None and choose(_MMAP_THRESHOLD, LARGEST):
+        choose(_TRIM_THRESHOLD, MOST_FREE)
 
 
 def borrow(count: int, like: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ class TextKernel:
         types = _TYPES | {"F": ("F", F, torch.float64 if bits == 64 else torch.float32)}
         members, locals_, self.arrays = {}, [], {}
         self.lists: dict[str, list[str]] = {}
-        for word, is_array, one, count in _declared(given):
+        for word, is_array, one, count in declarations(given):
             written, number, dtype = types[word]
             entries = [f"{one}_{k}" for k in range(count)] or [one]
             members |= dict.fromkeys(entries, wp.uint64 if is_array else number)
@@ -73,6 +73,7 @@ class TextKernel:
         def do_items(first: int, given: Record):
             do_item(first + wp.tid(), given)
 
+        self.name, self.bits, self.text, self.given = name, bits, text, given
         self.names, self.kernel, self.module = set(members), do_items, do_items.module
         # Warp's own records check each value that they are given, which takes longer than the rest.
         plain = type(Record().__ctype__())
@@ -157,7 +158,7 @@ class Bound:
         launch(self.kernel.kernel, count, [self.record], self.like, threads, work)
 
 
-def _declared(given: str) -> Iterator[tuple[str, bool, str, int]]:
+def declarations(given: str) -> Iterator[tuple[str, bool, str, int]]:
     """Of each name declared: the word for its type, whether it is an array, of how many in a list.
 
     0 is no list.

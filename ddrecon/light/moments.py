@@ -84,13 +84,10 @@ class Moments:
 
     def plus(self, other: Moments) -> Moments:
         """The sum of two lights; what one of them lacks is zero there."""
-        flux = other.flux if self.flux is None else self.flux
-        if self.flux is not None and other.flux is not None:
-            flux = _vector(a + b for a, b in zip(self.flux, other.flux, strict=True))
         higher = other.higher if self.higher is None else self.higher
         if self.higher is not None and other.higher is not None:
             higher = self.higher + other.higher
-        return Moments(self.mean + other.mean, flux, higher)
+        return Moments(self.mean + other.mean, add_vectors(self.flux, other.flux), higher)
 
     def along(self, direction: Vector) -> Tensor:
         """Radiance along `direction`, whose components broadcast to `[C, z, y, x]`."""
@@ -121,6 +118,13 @@ class Moments:
         divisor = margin.clamp(min=1e6 * torch.finfo(margin.dtype).tiny)
         bent = margin * (1 + (radiance / divisor).clamp(-1, 1)) ** 2 / 4
         return torch.where(radiance >= margin, radiance, bent)
+
+
+def add_vectors(one: Vector | None, other: Vector | None) -> Vector | None:
+    """The sum of two vectors; None is zero."""
+    if one is None or other is None:
+        return one or other
+    return _vector(a + b for a, b in zip(one, other, strict=True))
 
 
 def _vector(components: Iterable[Tensor]) -> Vector:

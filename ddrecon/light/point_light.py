@@ -144,7 +144,7 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
         values = sample_volume(field, places.flip(-1))
         return values.mean(1) * (inside * distance)
 
-    if is_fused():
+    if is_fused(position):
         from ddrecon.light.fused.point_light import integrate_ways
 
         inside = _part_inside(grid, position, ends)

@@ -73,7 +73,7 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
     directional = {
         i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
     }
-    if directional and is_fused():
+    if directional and is_fused(*(light.direction for light in directional.values())):
         from ddrecon.light.fused.beams import follow_beams
 
         found, moments = follow_beams(medium, list(directional.values()), degree > 0)
@@ -93,7 +93,7 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
 def _follow(
     medium: Medium, light: DirectionalLight | PointLight, degree: int
 ) -> tuple[Beam | PointBeam, Moments]:
-    if isinstance(light, DirectionalLight) and is_fused():
+    if isinstance(light, DirectionalLight) and is_fused(light.direction):
         from ddrecon.light.fused.beams import follow_beams
 
         (beam,), received = follow_beams(medium, [light], has_flux=False)

@@ -37,7 +37,7 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
-    if is_fused():
+    if is_fused(direction):
         from ddrecon.light.fused.sum_mass import sum_mass
 
         return sum_mass(field, grid, direction, bound)

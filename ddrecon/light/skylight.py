@@ -38,7 +38,7 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     as going along its middle (E17).
     """
     skies = _lit_skies(lights)
-    if skies and is_fused():
+    if skies and is_fused(*(sky.travel for sky in skies)):
         return _sum_fused(medium, skies, degree)
     total = None
     for sky in skies:
@@ -115,7 +115,7 @@ def _attenuate_direction(medium: Medium, direction: Tensor, weights: Tensor) -> 
 
     tau is averaged over each cell.
     """
-    if is_fused() and len(weights) == 1:
+    if is_fused(direction) and len(weights) == 1:
         from ddrecon.light.fused.beams import attenuate
 
         return attenuate(medium, direction[None], weights[None])[0].mean[None]

@@ -97,9 +97,11 @@ def _key(camera: Camera, grid: Grid, settings: RenderSettings) -> tuple[Any, ...
     values = (getattr(camera, part.name) for part in fields(camera))
     plain = (value for value in values if not isinstance(value, Tensor))
     versions = tuple(map(version_of, camera.tensors))
-    # The numbers themselves, which NumPy may have changed; but a GPU would be waited for.
+    # The numbers themselves where an array of NumPy has the same memory: nobody counts its changes.
     numbers = tuple(
-        tensor.detach().numpy().tobytes() for tensor in camera.tensors if not tensor.is_cuda
+        tensor.detach().numpy().tobytes()
+        for tensor in camera.tensors
+        if not tensor.untyped_storage().resizable()
     )
     is_interpolated = settings.tolerance > 0
     return (versions, numbers, *plain, grid, settings.samples_per_pixel, is_interpolated)

@@ -7,11 +7,11 @@ cross sections are constant, rays need march through one field only, the density
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
 
 import torch
 from torch import Tensor
 
+from ddrecon.display import Displayed
 from ddrecon.grid import Grid
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_peak import SeenPhase
@@ -24,7 +24,7 @@ P1_DEGREE = 1
 
 
 @dataclass(eq=False, init=False)
-class Volume:
+class Volume(Displayed):
     """What a user describes: density, and cross sections per unit density, on a `grid`.
 
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
@@ -72,11 +72,6 @@ class Volume:
     @g.setter
     def g(self, g: Tensor) -> None:
         self.phase = HenyeyGreenstein(g)
-
-    def _repr_html_(self) -> str:
-        """The volume in a notebook. What draws it is of a room above, and so is loaded by name."""
-        html: str = import_module("ddrecon.report.notebook").volume_html(self)
-        return html
 
 
 @dataclass(frozen=True)

@@ -74,12 +74,14 @@ def version_of(tensor: Tensor) -> int:
     return -1 if tensor.is_inference() else tensor._version
 
 
-def is_fused() -> bool:
-    """Whether kernels that have a backward pass only may stand for torch's operations.
+def is_fused(*steady: Tensor) -> bool:
+    """Whether fused kernels stand for torch's operations.
 
-    Not in forward mode, whose derivatives are those of the operations.
+    They have no tangents by tensors `steady`: where these vary in forward mode, they do not.
     """
-    return current_engine() == "warp" and not is_forward()
+    if current_engine() != "warp":
+        return False
+    return not any(forward_ad.unpack_dual(one).tangent is not None for one in steady)
 
 
 def keep(ctx: Any, *tensors: Tensor) -> None:
@@ -91,6 +93,27 @@ def keep(ctx: Any, *tensors: Tensor) -> None:
     ctx.save_for_backward(*tensors)
     if is_forward():
         ctx.save_for_forward(*tensors)
+
+
+def run_plainly(function: Callable[..., Any], *tensors: Tensor | None) -> Any:
+    """`function(*tensors)`, a tensor or several, which have no derivatives.
+
+    For the `jvp` of custom functions: within torch.func as well, kernels get plain tensors.
+    """
+    return _Plain.apply(function, *tensors)
+
+
+class _Plain(torch.autograd.Function):
+    """What a function makes of tensors, which torch.func hands to it as they are."""
+
+    @staticmethod
+    def forward(function: Callable[..., Any], *tensors: Tensor | None) -> Any:
+        return function(*tensors)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        found = output if isinstance(output, tuple) else (output,)
+        ctx.mark_non_differentiable(*(one for one in found if isinstance(one, Tensor)))
 
 
 def differentiate_once(backward: Callable[..., T]) -> Callable[..., T]:

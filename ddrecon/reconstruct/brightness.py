@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
+from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
@@ -32,6 +33,13 @@ ROUNDING = 1e-6
 """Lights that no picture tells apart better than this keep their ratio."""
 
 
+def lights_due(parameters: Sequence[Parameter], iteration: int) -> list[Parameter]:
+    """The lights among `parameters` whose brightness takes a step in this `iteration`."""
+    if iteration % EVERY:
+        return []
+    return [parameter for parameter in parameters if parameter.name.startswith("lights.")]
+
+
 def step_brightness(
     lights: Sequence[Parameter],
     scene: Scene,
@@ -42,16 +50,21 @@ def step_brightness(
 ) -> None:
     """Takes the brightness of `lights` part of the way to what fits the `pictures` best.
 
-    Those are of views of `scene`, rendered with the `values` of all parameters; `solutions` are
-    near to the light in it.
+    Those are of views of `scene`, rendered by this rank with the `values` of all parameters;
+    `solutions` are near to the light in it. Nothing happens without lights.
     """
+    if not lights:
+        return
     with torch.no_grad():
         shares = light_shares(lights, scene, values, pictures, solutions)
     sums = [
         normal_sums(share, picture, targets[name], scene.view(name).weight)
         for (name, picture), share in zip(pictures.items(), shares, strict=True)
     ]
-    matrix, right = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+    count = len(lights)
+    nothing = values[lights[0].name].new_zeros(3, count, count + 1, dtype=torch.float64)
+    (total,) = sum_over_ranks([sum(sums, start=nothing)])
+    matrix, right = total[..., :count], total[..., count]
     changes = solve_brightness(matrix, right, [light.value.numel() for light in lights])
     for light, change in zip(lights, changes, strict=True):
         before = values[light.name].detach()
@@ -82,10 +95,8 @@ def light_shares(
     return [torch.stack(shares) for shares in zip(*lacking, strict=True)]
 
 
-def normal_sums(
-    shares: Tensor, picture: Tensor, target: Target, weight: float
-) -> tuple[Tensor, Tensor]:
-    """The normal matrix [3, n, n] and right side [3, n] of the relative changes of n lights.
+def normal_sums(shares: Tensor, picture: Tensor, target: Target, weight: float) -> Tensor:
+    """The normal equations [3, n, n + 1] of the relative changes of n lights, right side last.
 
     By color, of the squares of what `picture` [3, h, w] lacks to its target, weighed as its loss
     weighs small errors; `shares` [n, 3, h, w] are parts of the picture.
@@ -94,7 +105,7 @@ def normal_sums(
     columns = (shares * slope).flatten(2).transpose(0, 1).double()
     error = ((target.image - picture) * slope).flatten(1)[..., None].double()
     part = weight / target.count.double()
-    return part * columns @ columns.mT, part * (columns @ error)[..., 0]
+    return part * columns @ torch.cat([columns.mT, error], 2)
 
 
 def solve_brightness(matrix: Tensor, right: Tensor, sizes: Sequence[int]) -> list[Tensor]:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
 from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.kinds import VOLUME
@@ -23,7 +24,7 @@ from ddrecon.variables.values import with_values
 
 @dataclass(frozen=True)
 class Differentiated:
-    """Rendered `images` [3, h, w] of the views, their `loss`, and its derivatives by name."""
+    """The `loss` of all views, its derivatives by name, and `images` [3, h, w] of this rank's."""
 
     images: list[Tensor]
     loss: Tensor
@@ -40,6 +41,8 @@ def differentiate(
     """The sum of `loss_of(view, image)` over the views called `names`, and its derivatives.
 
     They are those by the leaves `values`, which stand in `scene` for the variables of their names.
+    The views are shared out over ranks, which sum what reaches the light field; its way back is the
+    same on all of them.
     """
     derivatives = scene.optimize.derivatives if scene.optimize else "all"
     # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
@@ -50,7 +53,7 @@ def differentiate(
     inputs = [*values.values(), *cut.leaves]
     sums: list[Tensor | None] = [None] * len(inputs)
     images, loss = list[Tensor](), scene.volume.density.new_zeros(())
-    for name in names:
+    for name in own_views(scene, names):
         lit = with_values(scene, outside)
         view = lit.view(name)
         image = view_picture(light_field, lit, view, derivatives)
@@ -59,6 +62,7 @@ def differentiate(
             sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))
         images.append(image.detach())
         loss = loss + view_loss.detach()
+    (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
     # What reached the leaves goes back through the light field, and so through the solve (E9).
     reached = [pair for pair in zip(cut.tensors, leaf_bars, strict=True) if pair[1] is not None]
@@ -72,7 +76,7 @@ def differentiate(
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
     }
-    return Differentiated(images, loss, gradients)
+    return Differentiated(images, loss if total is None else total, agree_on(gradients))
 
 
 class _Product(torch.autograd.Function):

@@ -44,9 +44,12 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
         _resample_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s)
     )
     coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, volume.phase)
-    return replace(
-        scene, volume=coarse, views=[_view_at_level(view, factor) for view in scene.views]
-    )
+    starts = {
+        name: resample(start, grid) if start.shape[-3:] == volume.grid.shape else start
+        for name, start in scene.starts.items()
+    }
+    views = [_view_at_level(view, factor) for view in scene.views]
+    return replace(scene, volume=coarse, views=views, starts=starts)
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:

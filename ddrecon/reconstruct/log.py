@@ -1,9 +1,11 @@
-"""The log of a reconstruction: one row an iteration, and the sum of all rows so far."""
+"""What a reconstruction comes to: its log, one row an iteration, their sum, and the result."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+
+from ddrecon.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -12,7 +14,8 @@ class Row:
 
     `loss` is the sum of `data_loss`, that of the images, and `penalty`, those of the parameters.
     `seconds` count from the start of the run; `cells` are those of the grid. The numbers of test
-    views are None where none was rendered, and SSIMs where they were not looked at.
+    views are None where none was rendered, and SSIMs where they were not looked at. `chi_square` is
+    that of the images per pixel, None where their noise is not known.
     """
 
     iteration: int
@@ -27,6 +30,7 @@ class Row:
     penalty: float
     ssim: float | None = None
     test_ssim: float | None = None
+    chi_square: float | None = None
 
 
 NO_ROWS = Row(0, 0.0, math.nan, math.nan, None, 0, 0, 0, math.nan, math.nan)
@@ -50,3 +54,19 @@ def sum_rows(total: Row, row: Row) -> Row:
         forward_iterations=total.forward_iterations + row.forward_iterations,
         adjoint_iterations=total.adjoint_iterations + row.adjoint_iterations,
     )
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished reconstruction: the `scene` with its reconstructed volume, and the log."""
+
+    scene: Scene
+    rows: list[Row]
+
+    def _repr_html_(self) -> str:
+        """The reconstructed scene, in a notebook, and how well it fits."""
+        last = self.rows[-1]
+        test = [row.test_psnr for row in self.rows if row.test_psnr is not None][-1:]
+        held = f", {test[0]:.2f} dB of views held out" if test else ""
+        fit = f"{last.iteration} iterations, PSNR {last.psnr:.2f} dB of views trained on{held}"
+        return f"<p>{fit}</p>{self.scene._repr_html_()}"

@@ -6,9 +6,10 @@ one iteration at a time, so that whoever drives it may log, preview, stop or sav
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -16,54 +17,36 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.errors import SolveError
+from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
 from ddrecon.reconstruct import setup
+from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
-from ddrecon.reconstruct.levels import factors, resample, scene_at_level, stage_of
-from ddrecon.reconstruct.log import NO_ROWS, Row, sum_rows
-from ddrecon.reconstruct.objective import (
-    Comparison,
-    add_penalties,
-    read_numbers,
-    render_quality,
-)
+from ddrecon.reconstruct.levels import factors, resample, scene_at_level
+from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
+from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
+from ddrecon.reconstruct.schedule import Schedule
 from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
-from ddrecon.reconstruct.steps import Seen, solve_parameters, step_parameters
+from ddrecon.reconstruct.steps import share_out, solve_poses, solve_responses, step_parameters
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
-from ddrecon.settings import AUTO
+from ddrecon.settings import AUTO, Iterations
 from ddrecon.variables.values import with_values
 
 TEST_EVERY = 10
 """Test views are rendered every so many iterations, and at the last."""
 
 
-@dataclass(frozen=True)
-class Result:
-    """A finished reconstruction: the `scene` with its reconstructed volume, and the log."""
-
-    scene: Scene
-    rows: list[Row]
-
-    def _repr_html_(self) -> str:
-        """The reconstructed scene, in a notebook, and how well it fits."""
-        last = self.rows[-1]
-        test = [row.test_psnr for row in self.rows if row.test_psnr is not None][-1:]
-        held = f", {test[0]:.2f} dB of those held out" if test else ""
-        fit = f"{last.iteration} iterations, PSNR {last.psnr:.2f} dB of the views seen last{held}"
-        return f"<p>{fit}</p>{self.scene._repr_html_()}"
-
-
 def optimize(
-    scene: Scene, iterations: int | None = None, watch: Callable[[Row], None] | None = None
+    scene: Scene, iterations: Iterations | None = None, watch: Callable[[Row], None] | None = None
 ) -> Result:
     """What `scene.optimize` names, reconstructed from the scene's training views.
 
-    `iterations` replaces those of the scene; `watch` is called with the log's row after each.
+    `iterations`, a number or `auto`, replaces those of the scene; `watch` is called with the log's
+    row after each.
     Raises SceneError when the scene does not say what to optimize or has no training image,
     SolveError when the run diverges.
     """
@@ -80,11 +63,10 @@ class Reconstruction:
 
     The objective is the weighted mean of the views' image loss plus, for each parameter, its
     penalty times `power`, the mean square of the targets as the `loss` compares them. `misfit` is
-    the root of the last mean loss over `power`. `before_step` is the state before the last step was
-    made.
+    the root of the last mean loss over `power`. `before_step` is the state before the last step.
     """
 
-    def __init__(self, scene: Scene, iterations: int | None = None):
+    def __init__(self, scene: Scene, iterations: Iterations | None = None):
         self.settings = setup.require_settings(scene, iterations)
         self.scene = scene
         self.train = setup.select_views(scene, is_test=False)
@@ -92,14 +74,15 @@ class Reconstruction:
         setup.require_usable(self.train, self.settings)
         self.loss = setup.choose_loss(self.settings, self.train)
         views = replace(scene, views=[*self.train.views, *self.test.views])
-        self.noises = setup.noises_of(views, self.settings) if self.loss == "photon" else {}
+        self.noises = setup.known_noises(views, self.settings, self.loss)
         self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
         self.parameters = setup.start_parameters(scene, self.settings)
-        setup.choose_light_steps(self.parameters)
-        setup.choose_pose_steps(self.parameters, self.train, self.loss in QUADRATIC)
+        setup.choose_steps(self.parameters, self.train, self.loss in QUADRATIC)
         self.gauges = find_gauges(self.train, self.parameters)
         self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
+        weights = {view.name: view.weight for view in self.train.views}
+        self.schedule = Schedule(self.settings, weights)
         self.total = NO_ROWS
         self.misfit = 1.0
         self.seed = torch.initial_seed()
@@ -115,8 +98,8 @@ class Reconstruction:
 
     @property
     def is_done(self) -> bool:
-        """Whether all iterations have been made."""
-        return self.iteration >= self.settings.iterations
+        """Whether all iterations have been made, or what ends the run by itself has come."""
+        return self.schedule.is_over(self.iteration)
 
     def step(self) -> Row:
         """The log's row of one more iteration.
@@ -127,7 +110,7 @@ class Reconstruction:
         start = perf_counter()
         if self.iteration == 0:
             self._settle_smoothing()
-        stage = stage_of(self.iteration, self.settings.iterations, self.settings.refine_at)
+        stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
         solutions = dict(self.memory.last)
@@ -140,13 +123,21 @@ class Reconstruction:
             else:
                 self.restore(self.before_step)
             raise failure from error.__cause__
+        except RanksError:
+            # The state is that before the iteration, even amid the step, when some have moved.
+            if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
+                self.restore(self.before_step)
+            self.memory.last = solutions
+            raise
 
     def _iterate(self, start: float, solutions: dict[tuple[str, int], Tensor]) -> Row:
         """One iteration, begun at `start` [s] with these last `solutions`."""
         # See: which views this iteration compares.
         views = self._views()
         # Differentiate: the objective and its derivative by every parameter.
-        compared = Comparison(views, self.targets, self._is_test_due)
+        compared = Comparison(
+            views, self.targets, self._is_test_due, noise_targets=self.noise_targets
+        )
         objective = self._differentiate(views, compared)
         loss, gradients = add_penalties(objective, self.parameters, self.power)
         # Check: a derivative that is not finite would spoil the parameters for good.
@@ -156,7 +147,10 @@ class Reconstruction:
         self.before_step = self.state() | {"solutions": solutions}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
-        self._step(gradients, compared.pictures)
+        self._step(gradients, compared)
+        # Judge: is there more to be done, here or at all?
+        penalty = numbers.loss - numbers.of_images
+        self.schedule.note(self.iteration, numbers.losses, numbers.chi_squares, penalty)
         # Test: now and then, how good the parameters are for views they were not made from.
         solves = [(record.kind, record.iterations) for record in self.memory.records]
         test_psnr, test_ssim = self._test_quality()
@@ -166,7 +160,7 @@ class Reconstruction:
             seconds=self.total.seconds + perf_counter() - start,
             loss=numbers.loss,
             data_loss=numbers.of_images,
-            penalty=numbers.loss - numbers.of_images,
+            penalty=penalty,
             psnr=numbers.psnr,
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),
@@ -174,6 +168,7 @@ class Reconstruction:
             cells=self.train_level.volume.grid.cells,
             ssim=numbers.ssim,
             test_ssim=test_ssim,
+            chi_square=numbers.chi_square,
         )
         self.total = sum_rows(self.total, row)
         return row
@@ -194,6 +189,7 @@ class Reconstruction:
             "solutions": dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
+            "schedule": self.schedule.state(),
             "smoothing": None if self.smoothing is None else self.smoothing.described(),
         }
 
@@ -203,6 +199,7 @@ class Reconstruction:
             parameter.restore(state["parameters"][parameter.name])
         self.total = Row(**state["total"])
         self.misfit, self.seed = state["misfit"], state["seed"]
+        self.schedule.restore(state["schedule"])
         if state["smoothing"] is not None:
             self._smooth(Smoothing(**state["smoothing"]))
         self._enter_stage(state["stage"])
@@ -235,6 +232,7 @@ class Reconstruction:
             setup.targets_of(level, self.loss, self.noises)
             for level in (self.train_level, self.test_level)
         )
+        self.noise_targets = setup.noise_targets(self.train_level, self.train, self.noises)
         grid = self.train_level.volume.grid
         for parameter in self.parameters:
             if parameter.grid != grid:
@@ -260,23 +258,28 @@ class Reconstruction:
             return differentiate(self.train_level, names, self._values(), compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
+            compared.gather()
             compared.require_finite()
             raise
         finally:
             self.memory.tolerance_floor = {}
 
-    def _step(self, gradients: dict[str, Tensor], pictures: dict[str, Tensor]) -> None:
+    def _step(self, gradients: dict[str, Tensor], compared: Comparison) -> None:
         """Every parameter against its derivative, but those of views not seen or not yet due.
 
-        What cameras do, and how bright lights are, goes part of the way to what fits the `pictures`
-        of this iteration best.
+        What cameras do, and how bright lights are, goes part of the way to what fits best.
         """
+        pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
-        due = [p for p in self.parameters if p.view is None or p.view in pictures]
-        solved = step_parameters(due, gradients, self.iteration, self.settings.iterations)
-        level, light = self.train_level, self.memory.last
-        seen = Seen(self.iteration, level, values, gradients, pictures, self.targets, light)
-        solve_parameters(solved, seen)
+        seen = [p for p in self.parameters if p.view is None or p.view in names]
+        rate_of = functools.partial(self.schedule.rate, self.iteration)
+        solved = step_parameters(seen, gradients, rate_of)
+        solve_responses(solved, self.train_level, pictures, self.targets)
+        lights, level = lights_due(solved, self.iteration), self.train_level
+        step_brightness(lights, level, values, pictures, self.targets, self.memory.last)
+        if poses := [p for p in solved if p.key == "camera"]:
+            own = share_out(gradients, compared.views)
+            solve_poses(poses, level, own, values, self.targets, self.memory.last, pictures)
         for gauge in self.gauges:
             gauge.hold()
 
@@ -284,7 +287,7 @@ class Reconstruction:
     def _is_test_due(self) -> bool:
         """Whether test views, and SSIM, are looked at in this iteration."""
         iteration = self.iteration + 1
-        return iteration % TEST_EVERY == 0 or iteration == self.settings.iterations
+        return iteration % TEST_EVERY == 0 or self.schedule.is_over(iteration)
 
     def _test_quality(self) -> tuple[float | None, float | None]:
         """The mean PSNR [dB] and SSIM of the test views.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.responses import fit_held_out
+from ddrecon.reconstruct.shares import gather_numbers, own_views
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import variable_names, with_values
@@ -32,16 +34,20 @@ class Comparison:
     """Compares images of `views` with their `targets` by name, each once.
 
     `losses`, `psnrs` [dB] and, where `has_similarity`, `similarities` are those compared so far, in
-    their order; `pictures` are the images by name.
+    their order, and `chi_squares` those of views that have a target among `noise_targets`;
+    `pictures` are the images by name. `gather` makes
+    the numbers those of all views.
     """
 
     views: Sequence[View]
     targets: Mapping[str, Target]
     has_similarity: bool = False
+    noise_targets: Mapping[str, Target] = field(default_factory=dict)
     pictures: dict[str, Tensor] = field(default_factory=dict)
     losses: list[Tensor] = field(default_factory=list)
     psnrs: list[Tensor] = field(default_factory=list)
     similarities: list[Tensor] = field(default_factory=list)
+    chi_squares: list[Tensor] = field(default_factory=list)
 
     def __call__(self, view: View, image: Tensor) -> Tensor:
         """What `view` and its rendered `image` add to the objective.
@@ -54,9 +60,24 @@ class Comparison:
         self.psnrs.append(target.psnr_of(image.detach()))
         if self.has_similarity:
             self.similarities.append(target.ssim_of(image.detach()))
-        value = view.weight / sum(view.weight for view in self.views) * loss
+        if view.name in self.noise_targets:
+            self.chi_squares.append(self.noise_targets[view.name].loss_of(image.detach()))
+        value = self.share(view) * loss
         self.losses.append(value.detach())
         return value
+
+    def gather(self) -> None:
+        """Learns what other ranks have compared, of which they keep the pictures."""
+        names = [view.name for view in self.views]
+        kinds = self.losses, self.psnrs, self.similarities, self.chi_squares
+        wanted = True, True, self.has_similarity, bool(self.noise_targets)
+        rows = [row for row, is_wanted in zip(kinds, wanted, strict=True) if is_wanted]
+        for row, found in zip(rows, gather_numbers(rows, list(self.pictures), names), strict=True):
+            row[:] = found
+
+    def share(self, view: View) -> float:
+        """The part of the mean loss that `view` has, by weight."""
+        return view.weight / sum(view.weight for view in self.views)
 
     def require_finite(self) -> None:
         """Raises NotFiniteError where a loss is not finite."""
@@ -69,13 +90,22 @@ class Comparison:
 class Numbers:
     """What Python knows of an iteration: the `loss`, its part of the images, their mean `psnr`.
 
-    And their mean `ssim`, None where that was not looked at.
+    And their mean `ssim`, None where that was not looked at; `losses`, and chi^2 per pixel where
+    noise is known, of each view by name.
     """
 
     loss: float
     of_images: float
     psnr: float
     ssim: float | None
+    losses: Mapping[str, float]
+    chi_squares: Mapping[str, float]
+
+    @property
+    def chi_square(self) -> float | None:
+        """Their mean chi^2 per pixel; None where noise is not known."""
+        known = self.chi_squares.values()
+        return sum(known) / len(known) if known else None
 
 
 def read_numbers(
@@ -89,16 +119,32 @@ def read_numbers(
 
     Raises NotFiniteError where a loss, or a derivative by one of the `parameters`, is not finite.
     """
+    compared.gather()
     extremes = [x for gradient in gradients.values() for x in gradient.aminmax()]
-    quality = [*compared.psnrs, *compared.similarities]
-    read = torch.stack([loss, objective.loss, *quality, *compared.losses, *extremes]).tolist()
-    if not all(math.isfinite(number) for number in read[2 + len(quality) :]):
+    groups = [
+        [loss, objective.loss],
+        compared.psnrs,
+        compared.similarities,
+        compared.chi_squares,
+        compared.losses,
+        extremes,
+    ]
+    flat = iter(torch.stack([number for group in groups for number in group]).tolist())
+    (total, of_images), psnrs, similarities, chi_squares, losses, ends = (
+        list(islice(flat, len(group))) for group in groups
+    )
+    if not all(math.isfinite(number) for number in losses + ends):
         compared.require_finite()
         require_finite(parameters, gradients)
-    count = len(compared.psnrs)
-    psnrs, similarities = read[2 : 2 + count], read[2 + count : 2 + len(quality)]
-    ssim = sum(similarities) / count if similarities else None
-    return Numbers(read[0], read[1], sum(psnrs) / count, ssim)
+    count, names = len(psnrs), [view.name for view in compared.views]
+    return Numbers(
+        total,
+        of_images,
+        sum(psnrs) / count,
+        sum(similarities) / count if similarities else None,
+        {v.name: x / compared.share(v) for v, x in zip(compared.views, losses, strict=True)},
+        dict(zip(names, chi_squares, strict=False)),
+    )
 
 
 def add_penalties(
@@ -129,14 +175,17 @@ def render_quality(
     They are rendered with those `parameters` that the scene has, and with the exposure that fits
     each best where exposures are among them.
     """
-    known, pairs = variable_names(scene), []
+    known, names = variable_names(scene), [view.name for view in scene.views]
+    own, rows = own_views(scene, names), [list[Tensor](), list[Tensor]()]
     with torch.no_grad():
         values = {p.name: p.value for p in parameters if p.name in known}
         rendered = with_values(scene, values)
-        images = render_each(rendered, rendered.views, memory)
-        for view, image in zip(rendered.views, images, strict=True):
+        views = [rendered.view(name) for name in own]
+        for view, image in zip(views, render_each(rendered, views, memory), strict=True):
             target = targets[view.name]
-            pairs.append((target, fit_held_out(image, view, target, parameters)[0]))
-        quality = torch.stack([torch.stack([t.psnr_of(i), t.ssim_of(i)]) for t, i in pairs])
-    psnr, ssim = quality.mean(0).tolist()
+            fitted, _ = fit_held_out(image, view, target, parameters)
+            rows[0].append(target.psnr_of(fitted))
+            rows[1].append(target.ssim_of(fitted))
+    numbers = [torch.stack(row).mean() for row in gather_numbers(rows, own, names)]
+    psnr, ssim = torch.stack(numbers).tolist()
     return psnr, ssim

@@ -19,13 +19,14 @@ FINAL_RATE = 0.2
 def rate_at(iteration: int, iterations: int, begin: int = 0) -> float:
     """The part of their value that learning rates have in an iteration, in (0, 1].
 
-    It is for parameters that move from iteration `begin` on, and 0 before.
+    It is for parameters that move from iteration `begin` on, and 0 before. After the last of
+    `iterations` it falls no more.
     """
     if iteration < begin:
         return 0.0
     made = iteration - begin
     warm_up: float = min(1.0, (made + 1) / WARM_UP)
-    fall: float = FINAL_RATE ** (made / (iterations - begin))
+    fall: float = FINAL_RATE ** min(1.0, made / (iterations - begin))
     return warm_up * fall
 
 

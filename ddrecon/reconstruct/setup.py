@@ -16,11 +16,11 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
-from ddrecon.settings import OptimizeSettings
+from ddrecon.settings import Iterations, OptimizeSettings
 from ddrecon.variables.values import value_of, variable_names
 
 
-def require_settings(scene: Scene, iterations: int | None) -> OptimizeSettings:
+def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
     """What `scene` asks for, with `iterations` in place of its own where given.
 
     Raises SceneError where it asks for nothing.
@@ -94,6 +94,30 @@ def noises_of(scene: Scene, settings: OptimizeSettings) -> dict[str, Noise]:
     }
 
 
+def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
+    """The noise of the picture of each view of `scene`, by name, where it is known, else nothing.
+
+    It is known where the scene gives that of every training view, or where `loss` compares by it.
+    """
+    is_given = all(view.is_test or view.noise or settings.noise for view in scene.views)
+    return noises_of(scene, settings) if is_given or loss == "photon" else {}
+
+
+def noise_targets(level: Scene, scene: Scene, noises: Mapping[str, Noise]) -> dict[str, Target]:
+    """What tells chi^2 of the views of `level`, which is `scene` with fewer pixels, by name.
+
+    `noises` are those of the views of `scene`: larger pixels are means, and have less of it.
+    """
+    targets = {}
+    for view, fine in zip(level.views, scene.views, strict=True):
+        if noise := noises.get(view.name):
+            count = fine.camera.size[0] * fine.camera.size[1]
+            averaged = noise.averaged(count / (view.camera.size[0] * view.camera.size[1]))
+            image = target_of(view)
+            targets[view.name] = Target.of(image, view.mask, "photon", averaged)
+    return targets
+
+
 def targets_of(scene: Scene, loss: str, noises: Mapping[str, Noise]) -> dict[str, Target]:
     """What the views of `scene` are compared with by `loss`, by name."""
     return {
@@ -130,24 +154,18 @@ def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     return support
 
 
-def choose_pose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bool) -> None:
-    """Has the poses among `parameters` descend where they are not to be solved for (E29).
+def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bool) -> None:
+    """Has poses and lights among `parameters` descend where they are not to be solved for.
 
-    That is with a loss that is no sum of squares; and where poses of only some of several views of
-    `train` are sought, or of a single one: then no calibration of all is to be mended, but a camera
-    to be found, which may be far off.
+    Poses with a loss that is no sum of squares (E29); and where those of only some of several views
+    of `train` are sought, or of a single one: then no calibration of all is to be mended, but a
+    camera to be found, which may be far off. Lights that are a map, or start from black: that has
+    no share in pictures yet (E39).
     """
     poses = [parameter for parameter in parameters if parameter.key == "camera"]
     if not is_quadratic or not len(poses) == len(train.views) > 1:
         for pose in poses:
             pose.is_fitted = False
-
-
-def choose_light_steps(parameters: Sequence[Parameter]) -> None:
-    """Has lights among `parameters` descend whose brightness is not to be solved for (E39).
-
-    That is a map of it, and one that starts from black: it has no share in pictures yet.
-    """
     for light in parameters:
         if light.name.startswith("lights.") and light.is_fitted:
             light.is_fitted = light.value.numel() <= 3 and bool((light.value > 0).all())

@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
 
 from ddrecon.errors import SceneError
 from ddrecon.losses import Target
-from ddrecon.reconstruct.levels import factors, resample, scene_at_level
+from ddrecon.ranks import from_first
+from ddrecon.reconstruct.levels import factors, scene_at_level
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 
@@ -112,13 +112,7 @@ def _coarse_scene(scene: Scene, train: Sequence[View], left_out: str) -> Scene:
         if not name.startswith(f"views.{left_out}.")
     }
     short = replace(settings, parameters=parameters, iterations=ITERATIONS, refine_at=())
-    starts = {name: _at_level(start, scene, coarse) for name, start in scene.starts.items()}
-    return replace(coarse, optimize=short, starts=starts)
-
-
-def _at_level(start: Tensor, scene: Scene, coarse: Scene) -> Tensor:
-    is_field = tuple(start.shape[-3:]) == scene.volume.grid.shape
-    return resample(start, coarse.volume.grid) if is_field else start
+    return replace(coarse, optimize=short)
 
 
 def _quality(scene: Scene, left_out: str, weight: float, start: Callable[[Scene], Run]) -> float:
@@ -142,4 +136,5 @@ def _quality(scene: Scene, left_out: str, weight: float, start: Callable[[Scene]
             (seen * image * other).sum((1, 2), keepdim=True) for other in (target.image, image)
         )
         gain = both / square.clamp(min=torch.finfo(image.dtype).tiny)
-        return float(target.psnr_of(gain * image))
+        # What is decided by it is decided alike on all ranks.
+        return from_first(float(target.psnr_of(gain * image)))

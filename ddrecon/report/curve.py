@@ -48,7 +48,8 @@ def draw_curve(
     for index, (name, points) in enumerate(drawn.items()):
         color = COLORS[index % len(COLORS)]
         parts.append(_path([(horizontal.place(x), vertical.place(y)) for x, y in points], color))
-        parts.append(_text(WIDTH - RIGHT - LEGEND * index, 16, name, "end", color=color))
+        end = WIDTH - RIGHT - LEGEND * (len(drawn) - 1 - index)
+        parts.append(_text(end, 16, name, "end", color=color))
     label = f'role="img" aria-label="{escape(title)}"'
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" {label}>{"".join(parts)}</svg>'
 

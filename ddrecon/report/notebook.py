@@ -19,12 +19,14 @@ SIDEWAYS = (0.5, 0.4, 1.0)
 FIELDS = ("density", "sigma_a", "sigma_s")
 
 
-def volume_html(volume: Volume) -> str:
-    """A frame with the fields of `volume`, to turn and to cut."""
-    return _frame(volume, _describe(volume), 1, SIDEWAYS)
+def html_of(shown: Scene | Volume) -> str:
+    """A frame with the fields of a volume, or of a scene's, to turn and to cut."""
+    if isinstance(shown, Volume):
+        return _frame(shown, _describe(shown), 1, SIDEWAYS)
+    return _scene_html(shown)
 
 
-def scene_html(scene: Scene) -> str:
+def _scene_html(scene: Scene) -> str:
     """A frame with the volume of `scene`, seen from its first camera, and a line about it."""
     words = f"{_describe(scene.volume)}; {len(scene.lights)} lights, {len(scene.views)} views"
     if not scene.views:

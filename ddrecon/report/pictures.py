@@ -50,14 +50,14 @@ def comparison(target: Tensor, image: Tensor) -> np.ndarray:
     return place_beside([expected / white, rendered / white, difference])
 
 
-def slices(field: Tensor) -> np.ndarray:
+def slices(field: Tensor, white: float | None = None) -> np.ndarray:
     """The middle slices of `field` [z, y, x] or [C, z, y, x] across z, x and y.
 
-    y (or z) is up; the largest value is white.
+    y (or z) is up; the largest value is white, unless another is.
     """
     array = _cells_of(field)
     z, y, x = (size // 2 for size in array.shape[:3])
-    white = max(float(np.quantile(array, 0.999)), 1e-6)
+    white = white or max(float(np.quantile(array, 0.999)), 1e-6)
     return _three_sides([array[z], array[:, :, x], array[:, y]], white)
 
 

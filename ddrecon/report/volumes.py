@@ -23,6 +23,7 @@ CONTROLS = (
     ("high", "to", 0.05, 1, 0.01),
 )
 """Sliders of the transfer function: names, labels, ends and steps."""
+HINT = "Drag to turn, wheel or two fingers to zoom."
 PALETTES = ("lit smoke", "values")
 
 
@@ -59,7 +60,7 @@ def volume_viewer(
     return "\n".join(
         [
             f'<div class="still">{still}</div>',
-            f'<div class="lively">{room}</div>',
+            f'<div class="lively">{room}<small>{HINT}</small></div>',
             f'<div class="controls lively">{_controls()}</div>',
             f'<div class="slices lively">{slices}</div>',
             *map(_data, fields),

@@ -48,10 +48,13 @@ class LateMeans:
 
     def __init__(self) -> None:
         self.means: dict[str, float] = {}
+        self.place: int | None = None
 
     def note(self, run: Reconstruction) -> None:
-        """Notes the means, if `run` is there now; after every iteration."""
-        if run.iteration == int((1 - LATE) * run.settings.iterations):
+        """Notes the means, if `run` comes there now; after every iteration."""
+        place, begin = run.schedule.place(run.iteration), int((1 - LATE) * run.schedule.planned)
+        was, self.place = place - 1 if self.place is None else self.place, place
+        if was < begin <= place:
             self.means = _means(run)
 
     def moved(self, run: Reconstruction) -> dict[str, float]:
@@ -114,8 +117,8 @@ def find_exposure(views: Sequence[View], images: Mapping[str, Tensor]) -> str | 
         return None
     named = ", ".join(f"{name} ({gain:.2f} times)" for name, gain in _worst(odd))
     return (
-        f"exposure? pictures brighter than their renders by a factor of their own: {named}; give "
-        "all pictures one exposure and white balance"
+        f"exposure? pictures brighter or darker, as a whole, than the others say: {named}; give "
+        "all one exposure and white balance, or optimize them (views.*.exposure)"
     )
 
 

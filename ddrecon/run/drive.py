@@ -12,10 +12,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ddrecon.errors import DivergenceError, FormatError, SceneError, UsageError
+from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError, UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_width
+from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -46,10 +47,7 @@ def open_run(
     another process writes to or that is not empty, unless it may be or the run goes on from the
     checkpoint in it; SceneError for a scene that cannot be reconstructed.
     """
-    try:
-        run = Reconstruction(scene)
-    except SceneError as error:
-        raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
+    run = _begin(scene, scene_file)
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
     with claim_folder(path, may_exist=may_exist or resume):
@@ -63,6 +61,13 @@ def open_run(
         yield run, folder
 
 
+def _begin(scene: Scene, scene_file: SceneFile) -> Reconstruction:
+    try:
+        return Reconstruction(scene)
+    except SceneError as error:
+        raise SceneError([f"{scene_file.path}: {problem}" for problem in error.problems]) from None
+
+
 def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     """Restores `run` from the run folder `path`; returns the file it took."""
     state, loaded = load_checkpoint(path / CHECKPOINTS, scene)
@@ -70,12 +75,26 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
         run.restore(state)
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise FormatError(loaded, UNUSABLE) from error
-    if run.iteration > run.settings.iterations:
+    if run.iteration > run.schedule.most:
         raise UsageError(
             f"{path}: {run.iteration} iterations are made already; "
             "ask for more than that, in all, with --iterations"
         )
+    # The other ranks, which may see no such folder, begin with the same.
+    from_first(run.state())
     return loaded
+
+
+def follow_run(scene: Scene, scene_file: SceneFile, *, resume: bool) -> None:
+    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes."""
+    run = _begin(scene, scene_file)
+    if resume:
+        run.restore(from_first(run.state()))
+    with defer_interrupt() as asked:
+        while not run.is_done:
+            run.step()
+            if is_any(bool(asked)):
+                raise KeyboardInterrupt
 
 
 def drive_run(
@@ -89,10 +108,10 @@ def drive_run(
 
     `preview_every` counts iterations between pictures; `has_events` logs for TensorBoard as well.
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
-    before it is passed on. So does a divergence; any other failure leaves the checkpoints written
-    so far.
+    before it is passed on. So do a divergence and the end of another rank; any other failure leaves
+    the checkpoints written so far.
     """
-    total = run.settings.iterations
+    total = None if run.schedule.is_auto else run.schedule.planned
     try:
         with (
             defer_interrupt() as asked,
@@ -119,17 +138,19 @@ def drive_run(
                 bar.update()
                 if preview_every and row.iteration % preview_every == 0:
                     folder.preview(run)
-                if asked:
+                if is_any(bool(asked)):
                     folder.save(run)
                     raise KeyboardInterrupt(
                         f"after {run.iteration} iterations; go on with --resume"
                     )
-    except DivergenceError as error:
+    except (DivergenceError, RanksError) as error:
         folder.save(run)
         raise error.with_advice(
             f"the state after {run.iteration} iterations is kept in {folder.checkpoints / LAST}: "
             "go on from it with --resume"
         ) from error
+    # What is left the first rank does by itself.
+    leave_ranks()
     return folder.finish(run)
 
 
@@ -171,7 +192,8 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
         line += f", test PSNR {summary['test_psnr']:.2f} dB, SSIM {summary['test_ssim']:.4f}"
     line += f", of {summary['compared']}"
     diagnoses = [diagnosis["text"] for diagnosis in summary["diagnoses"]]
-    lines = [line, *diagnoses, f"density and all else written to {folder}"]
+    ended = [] if summary["ended"]["kind"] == "iterations" else [summary["ended"]["text"]]
+    lines = [line, *ended, *diagnoses, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))
     if "smoothing" in summary:

@@ -1,16 +1,22 @@
 """The page of a run while it goes on: what its folder holds, made into the report's own sections.
 
-The loss is that of `loss.csv`; volume and views are those of the last checkpoint, rendered here.
+The loss is that of `loss.csv`. Volume and views are those of the last checkpoint, rendered here,
+beside what is asked for meanwhile.
 """
 
 from __future__ import annotations
 
+import signal
+from contextlib import suppress
+from multiprocessing import parent_process
 from pathlib import Path
-from typing import Any
+from socket import socket
+from socketserver import BaseServer
+from threading import Thread
 
 import torch
 
-from ddrecon.errors import UsageError
+from ddrecon.errors import FormatError, UsageError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import page_text, section, side_by_side
 from ddrecon.run.checkpoint import LAST, read_state
@@ -21,7 +27,9 @@ from ddrecon.run.report import curves
 from ddrecon.run.report_views import view_section
 from ddrecon.run.report_volume import volume_section
 from ddrecon.run.run_folder import CHECKPOINTS
+from ddrecon.run.serve import serve_page
 from ddrecon.scene_file.build import load_scene
+from ddrecon.settings import AUTO, Iterations
 
 REPORT = "report.html"
 
@@ -37,6 +45,8 @@ class LiveRun:
         if not (folder / "scene.yaml").is_file() or not self.checkpoint.is_file():
             raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
         self.seen, self.sections = 0, ["", ""]
+        self.iterations: Iterations = AUTO
+        self.maker = Thread()
 
     def page(self) -> str:
         """The run's report where it is finished, else the page of what there is."""
@@ -44,22 +54,43 @@ class LiveRun:
         if self._is_finished():
             return report.read_text(encoding="utf-8")
         rows = LossLog(self.folder / "loss.csv").rows()
-        written = self.checkpoint.stat().st_mtime_ns
-        if written != self.seen:
-            self.seen, self.sections = written, self._make_sections()
+        self._follow()
         volume, views = self.sections
         lead = "just begun"
         if rows:
-            lead = f"iteration {rows[-1].iteration}, PSNR {rows[-1].psnr:.2f} dB"
+            last = rows[-1]
+            total = "" if self.iterations == AUTO else f" of {self.iterations}"
+            lead = (
+                f"iteration {last.iteration}{total} after {last.seconds:.0f} s, "
+                f"PSNR {last.psnr:.2f} dB of views trained on"
+            )
         loss = section("Loss", side_by_side(*curves(rows))) if rows else ""
         sections = [volume, loss, views]
         title = f"ddrecon: {self.folder.absolute().name}"
         return page_text(title, lead, sections, is_alive=True, is_live=True)
 
     def _is_finished(self) -> bool:
-        """Whether the report was written after the run last saved its state."""
+        """Whether the report was written after the run last began, or saved its state."""
         report = self.folder / REPORT
-        return report.is_file() and report.stat().st_mtime_ns >= self.checkpoint.stat().st_mtime_ns
+        files = [self.folder / "environment.json", self.checkpoint]
+        last = max(file.stat().st_mtime_ns for file in files if file.is_file())
+        return report.is_file() and report.stat().st_mtime_ns >= last
+
+    def _follow(self) -> None:
+        """Has volume and views made anew if there is a new checkpoint; waits only for the first."""
+        written = self.checkpoint.stat().st_mtime_ns
+        if written == self.seen or self.maker.is_alive():
+            return
+        is_first, self.seen = self.seen == 0, written
+        self.maker = Thread(target=self._remake, daemon=True)
+        self.maker.start()
+        if is_first:
+            self.maker.join()
+
+    def _remake(self) -> None:
+        # A checkpoint may be replaced while it is read: the next is as good.
+        with suppress(FormatError):
+            self.sections = self._make_sections()
 
     def _make_sections(self) -> list[str]:
         """Volume and views as the last checkpoint has them."""
@@ -67,21 +98,27 @@ class LiveRun:
         dtype = next(iter(state["parameters"].values()))["value"].dtype
         run = Reconstruction(load_scene(self.folder / "scene.yaml", dtype=dtype))
         run.restore(state)
+        self.iterations = run.settings.iterations
         with torch.no_grad():
             scene = run.current_scene()
             light_field = solve(scene)
             images, quality = render_views(run, scene, light_field)
-        summary: dict[str, Any] = {}
-        findings = Findings(
-            scene,
-            given_fields(run.scene),
-            light_field,
-            images,
-            quality,
-            [],
-            summary,
-            {},
-            "",
-        )
+        given = given_fields(run.scene)
+        findings = Findings(scene, given, light_field, images, quality, [], {}, {}, "")
         volume = section("Volume", volume_section(findings))
         return [volume, section("Views", *view_section(findings))]
+
+
+def serve_run(folder: Path, listening: socket) -> None:
+    """Serves the page of the run in `folder` until the process ends that has started this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is meant for the run
+    torch.set_num_threads(1)
+    with serve_page(LiveRun(folder).page, listening) as server:
+        Thread(target=_end_with_parent, args=(server,), daemon=True).start()
+        server.serve_forever()
+
+
+def _end_with_parent(server: BaseServer) -> None:
+    if (parent := parent_process()) is not None:
+        parent.join()
+        server.shutdown()

@@ -14,6 +14,12 @@ from ddrecon.io.files.atomic import flush, refusals, replace_file
 from ddrecon.reconstruct.log import Row
 
 COLUMNS = [field.name for field in fields(Row)]
+
+
+def _known(text: str) -> float | None:
+    return float(text) if text else None
+
+
 READERS: dict[str, Callable[[str], Any]] = {
     "iteration": int,
     "seconds": float,
@@ -21,12 +27,13 @@ READERS: dict[str, Callable[[str], Any]] = {
     "data_loss": float,
     "penalty": float,
     "psnr": float,
-    "test_psnr": lambda text: float(text) if text else None,
+    "test_psnr": _known,
     "forward_iterations": int,
     "adjoint_iterations": int,
     "cells": int,
-    "ssim": lambda text: float(text) if text else None,
-    "test_ssim": lambda text: float(text) if text else None,
+    "ssim": _known,
+    "test_ssim": _known,
+    "chi_square": _known,
 }
 """What reads the text of a cell, by column."""
 

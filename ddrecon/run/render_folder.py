@@ -17,8 +17,10 @@ from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
+from ddrecon.ranks import is_first, own_rank, rank_count, sum_numbers
 from ddrecon.renderer import LightField, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
+from ddrecon.run.shared_views import bring, render_in_turns
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.problems import suggestion
 from ddrecon.terms import needed_terms
@@ -33,16 +35,25 @@ GRADIENT = "gradient"
 def render_to_folder(
     scene: Scene, views: list[View], folder: Path, has_components: bool, progress: Progress
 ) -> dict[str, Any]:
-    """The report of rendering `views` of `scene`, with their components if wanted, to `folder`."""
+    """The report of rendering `views` of `scene`, with their components if wanted, to `folder`.
+
+    The first rank alone writes.
+    """
     memory, files, seconds, quality = SolveMemory(), {}, {}, {}
     with torch.no_grad():
         start = perf_counter()
         light_field = solve_light(scene, memory)
         light_seconds = perf_counter() - start
-        for view in progress(views, "render"):
-            start = perf_counter()
-            images = _images(light_field, scene, view, has_components)
-            seconds[view.name] = perf_counter() - start
+        turns = render_in_turns(
+            views,
+            lambda view: _names(view, has_components),
+            lambda view: _images(light_field, scene, view, has_components),
+            progress,
+        )
+        for view, images, taken in turns:
+            if not is_first():
+                continue
+            seconds[view.name] = taken
             files[view.name] = [
                 path.name
                 for name, image in images.items()
@@ -70,32 +81,42 @@ def render_gradient_to_folder(
     `require_variation` must allow it.
     """
     memory, scales = SolveMemory(), {}
-    seconds: dict[str, Any] = {"views": {}}
+    seconds: dict[str, Any] = {}
+    taken = {view.name: 0.0 for view in views}
     files: dict[str, list[str]] = {view.name: [] for view in views}
 
     def images_of(world: Scene) -> dict[tuple[str, str], Tensor]:
         start, images = perf_counter(), dict[tuple[str, str], Tensor]()
         light_field = solve_light(world, memory)
         seconds["light"] = perf_counter() - start
-        for view in progress([world.view(view.name) for view in views], "render"):
+        own = views[own_rank() :: rank_count()]
+        for view in progress([world.view(view.name) for view in own], "render"):
             begun = perf_counter()
             images |= {
                 (view.name, name): image
                 for name, image in _images(light_field, world, view, has_components).items()
             }
-            seconds["views"][view.name] = perf_counter() - begun
+            taken[view.name] = perf_counter() - begun
         return images
 
     with torch.no_grad():
         rendered = render_tangent(scene, parameter, images_of)
-    for (view, name), (image, derivative) in rendered.items():
-        derived = f"{view}.{GRADIENT}{name.removeprefix(view)}"
-        picture, scales[derived] = diverging(derivative)
-        written = write_picture(folder / name, pixels(image)) + write_picture(
-            folder / derived, pixels(derivative), picture
-        )
-        files[view] += [path.name for path in written]
-    return _report(scene, memory, seconds, files) | {
+    found = {name: image for (_, name), (image, _) in rendered.items()}
+    derived = {_derived(*key): derivative for key, (_, derivative) in rendered.items()}
+    taken = dict(zip(taken, sum_numbers(list(taken.values())), strict=True))
+    for view in views:
+        names = _names(view, has_components)
+        images = bring(view, found, names)
+        derivatives = bring(view, derived, [_derived(view.name, name) for name in names])
+        if not is_first():
+            continue
+        for name in names:
+            written = write_picture(folder / name, pixels(images[name]))
+            name = _derived(view.name, name)
+            picture, scales[name] = diverging(derivatives[name])
+            written += write_picture(folder / name, pixels(derivatives[name]), picture)
+            files[view.name] += [path.name for path in written]
+    return _report(scene, memory, seconds | {"views": taken}, files) | {
         "psnr": {},
         "gradient": {"parameter": parameter, "full_scale": scales},
     }
@@ -167,6 +188,17 @@ def _report(
         "files": files,
         "preview": PREVIEW,
     }
+
+
+def _derived(view: str, name: str) -> str:
+    """What the derivative of the image of `view` called `name` is called."""
+    return f"{view}.{GRADIENT}{name.removeprefix(view)}"
+
+
+def _names(view: View, has_components: bool) -> list[str]:
+    """What the images of `view` are called, in their order."""
+    parts = ("reduced", "single", "multiple") if has_components else ()
+    return [view.name, *(f"{view.name}.{part}" for part in parts)]
 
 
 def _images(

@@ -60,11 +60,14 @@ def _lead(findings: Findings) -> str:
     cells = " x ".join(str(count) for count in reversed(findings.scene.volume.grid.shape))
     summary, test = findings.summary, ""
     if summary["test_psnr"] is not None:
-        test = f", {summary['test_psnr']:.2f} dB of those held out, SSIM {summary['test_ssim']:.4f}"
+        test = (
+            f", {summary['test_psnr']:.2f} dB (SSIM {summary['test_ssim']:.4f}) of views held out"
+        )
     return (
         f"{cells} cells, {summary['iterations']} iterations in {summary['seconds']:.1f} s. "
-        f"PSNR {summary['psnr']:.2f} dB of the views seen last{test}. "
-        f"What is compared is {summary['compared']}, by the loss {summary['loss_function']}."
+        f"PSNR {summary['psnr']:.2f} dB of views trained on{test}. "
+        f"All of these compare {summary['compared']}; the loss is {summary['loss_function']}."
+        f" It {summary['ended']['text']}."
     )
 
 
@@ -74,7 +77,7 @@ def curves(rows: Sequence[Row]) -> list[str]:
         "images": [(float(row.iteration), row.data_loss) for row in rows],
         "penalties": [(float(row.iteration), row.penalty) for row in rows],
     }
-    quality = {"seen": [(float(row.iteration), row.psnr) for row in rows]}
+    quality = {"trained on": [(float(row.iteration), row.psnr) for row in rows]}
     tests = [(float(row.iteration), row.test_psnr) for row in rows if row.test_psnr is not None]
     if tests:
         quality["held out"] = tests

@@ -32,9 +32,9 @@ def view_section(findings: Findings) -> list[str]:
     most = min(LARGEST, int((PIXELS / (2 * len(shown))) ** 0.5))
     parts = [
         paragraph(
-            f"Target, left or on top, and render, both as displayed (sRGB; radiance {white:.3g} is "
-            "white). Where scripts run, a wiper lies between them, and the difference of what is "
-            "displayed is shown four times enlarged around gray."
+            f"The picture on the left, its render on the right, as displayed (sRGB; radiance "
+            f"{white:.3g} is white). Move over a picture to shift the line between them; "
+            "'difference' shows what differs in them, four times enlarged around gray."
         )
     ]
     for label, is_test in (("Held out", True), ("Trained on", False)):

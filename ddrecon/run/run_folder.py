@@ -92,6 +92,10 @@ class RunFolder:
             save_checkpoint(self.checkpoints, run.state(), self.result_of)
             self._note_saved(run, monotonic() - start)
 
+    def save_often(self, seconds: float) -> None:
+        """Writes checkpoints every so many `seconds` from now on, for those who watch."""
+        self.save_every, self.next_save = seconds, monotonic() + seconds
+
     def save_in_time(self, run: Reconstruction) -> None:
         """Writes a checkpoint if the last is old."""
         if monotonic() >= self.next_save:
@@ -194,6 +198,7 @@ def _plain(value: Tensor) -> Any:
 def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
     summary = {"iterations": total.pop("iteration"), **total} | compared_by(run)
+    summary["ended"] = run.schedule.ending(run.iteration)
     support = describe_support(run.support, run.scene.volume.grid)
     if support is not None:
         summary["support"] = support

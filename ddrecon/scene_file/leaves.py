@@ -18,7 +18,7 @@ from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.nodes import Node, describe_found, show_value
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.schema import Backdrop, Count, Paths
-from ddrecon.settings import AUTO, Weight
+from ddrecon.settings import AUTO, Iterations, Weight
 
 T = TypeVar("T")
 
@@ -177,6 +177,13 @@ def read_weight(node: Node, rule: Rule) -> float | str:
     return read_number(node, rule)
 
 
+def read_iterations(node: Node, rule: Rule) -> int | str:
+    """A whole number, or `auto`."""
+    if isinstance(node.value, str):
+        return read_text(node, Rule(str, {"choices": (AUTO,)}, rule.folder))
+    return read_whole(node, rule)
+
+
 def _entries(node: Node, count: int, what: str) -> list[Node]:
     if not isinstance(node.value, list) or len(node.value) != count:
         raise node.refused(f"expected a list of {count} {what}, found {describe_found(node)}")
@@ -198,5 +205,6 @@ LEAVES: dict[Any, Callable[[Node, Rule], Any]] = {
     Color: read_color,
     Backdrop: read_backdrop,
     Weight: read_weight,
+    Iterations: read_iterations,
     tuple[float, ...]: read_fraction_list,
 }

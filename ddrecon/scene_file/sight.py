@@ -52,6 +52,11 @@ def explain_blindness(cameras: Sequence[Camera], grid: Grid, seeing: Sequence[Ca
     `seeing` are those of the scene that do, which they may by chance.
     """
     middle = grid.center_xyz
+    if all(_looks_at(camera, grid) for camera in cameras):
+        return (
+            "it is in the picture, but smaller than a pixel: are volume.bounds and the cameras in"
+            " the same unit?"
+        )
     for group in ([*cameras, *seeing], cameras):
         for what, convert in CONVENTIONS.items() if len(group) > 1 else ():
             if all(_looks_at(replace(one, pose=convert(one.pose)), grid) for one in group):

@@ -46,7 +46,8 @@ def value_of(scene: Scene, name: str) -> Tensor:
     [1] or [3].
     """
     if (known := _own_name(scene.volume, name)) not in variable_names(scene):
-        raise KeyError(name)
+        names = [known for known in variable_names(scene) if not known.startswith("views.")]
+        raise KeyError(f"no variable {name!r}; besides views, the scene has {', '.join(names)}")
     if known in VOLUME:
         return _volume_value(scene.volume, known)
     section, _, path = name.partition(".")

@@ -53,6 +53,15 @@ def test_json(succeed: Run) -> None:
     )
 
 
+def test_the_volume_of_a_scene(succeed: Run) -> None:
+    """Its fields as their file has them, and what is the same everywhere."""
+    override = ["-D", "volume.density={file: density.npz}"]
+    told = succeed("info", "scene.yaml", *override).stdout.splitlines()
+    assert told[:2] == succeed("info", "density.npz").stdout.splitlines()
+    assert [line.split(":")[0] for line in told[2:]] == ["sigma_t", "albedo", "g"]
+    assert all(line.endswith(" everywhere") for line in told[2:])
+
+
 def test_an_image(succeed: Run) -> None:
     np.save("picture.npy", np.concatenate([np.full((4, 5, 3), 2.0), np.zeros((4, 5, 3))]))
     assert (

@@ -240,3 +240,16 @@ def test_the_camera_of_a_view_that_is_not_looked_at_is_refused(
 ) -> None:
     (told,) = refuse(2, *OPTIMIZE, "out", "-D", "optimize.parameters={views.side.camera: {}}")
     assert "optimize.parameters.views.side.camera" in told and "no training view" in told
+
+
+def test_a_run_that_ends_by_itself_says_why(succeed: Run, run: Run) -> None:
+    noisy = ["--iterations", "auto", "-D", "optimize.noise={read: 1}"]
+    result = succeed(*OPTIMIZE, "out", *noisy)
+    summary, log = read_json("out/summary.json"), rows("out")
+    assert summary["ended"]["kind"] == "noise" and summary["iterations"] == len(log) < 10
+    assert summary["ended"]["chi_square"] == pytest.approx(float(log[-1]["chi_square"]))
+    assert summary["ended"]["text"] in result.stdout.splitlines()
+    assert summary["ended"]["text"] in Path("out/report.html").read_text()
+    assert succeed(*OPTIMIZE, "out", "--resume", *noisy).exit_code == 0 and rows("out") == log
+    refused = run(*OPTIMIZE, "other", "--iterations", "some")
+    assert refused.exit_code == 2 and "'some' is not a valid integer or auto" in refused.stderr

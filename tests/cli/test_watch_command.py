@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
+from ddrecon.errors import UsageError
 from ddrecon.progress import bar_width
 from ddrecon.run.live import LiveRun
-from ddrecon.run.serve import serve_page
+from ddrecon.run.serve import HOST, listen, serve_page, url_of
 
 Run = Callable[..., Result]
 
@@ -30,7 +31,7 @@ def test_a_run_is_shown_before_its_end(succeed: Run, stopped: Path) -> None:
     """With its loss, volume and views; then, when it is done, as its report."""
     live = LiveRun(stopped)
     page = live.page()
-    assert "<body data-live>" in page and "iteration 2, PSNR" in page
+    assert "<body data-live>" in page and "iteration 2 of 2 after" in page
     for section in ("volume", "loss", "views"):
         assert f'<section id="{section}">' in page
     assert re.findall(r'class="field">{"name": "(\w+)", "of": "result"', page) == ["density"]
@@ -41,7 +42,7 @@ def test_a_run_is_shown_before_its_end(succeed: Run, stopped: Path) -> None:
 
 def test_only_this_machine_sees_it() -> None:
     """Not under another's name for this address, and nothing but the page."""
-    with serve_page(lambda: "<p>hello</p>", 0) as server:
+    with listen(0) as listening, serve_page(lambda: "<p>hello</p>", listening) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         port = server.server_address[1]
         assert server.server_address[0] == "127.0.0.1"
@@ -59,6 +60,24 @@ def test_only_this_machine_sees_it() -> None:
         server.shutdown()
     assert answers["127.0.0.1/"] == answers["localhost/"] == (200, b"<p>hello</p>")
     assert answers["elsewhere.example/"][0] == answers["127.0.0.1/etc/passwd"][0] == 404
+
+
+def test_a_port_that_is_taken() -> None:
+    """Another is found where none was asked for; one that was is refused."""
+    with listen(None) as first, listen(None) as second:
+        port = first.getsockname()[1]
+        assert url_of(second) != url_of(first) == f"http://{HOST}:{port}/"
+        with pytest.raises(UsageError, match=f"--port {port}: .* leave it out"):
+            listen(port)
+
+
+def test_a_run_that_is_watched(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says where, its page is served by another process, and that ends with the run."""
+    monkeypatch.setattr("ddrecon.cli.watch.LAST_LOOK", 0.0)
+    told = succeed("optimize", "scene.yaml", "-o", "out", "--iterations", "2", "--watch").stderr
+    (url,) = re.findall(r"(http://127.0.0.1:\d+/) shows the run", told)
+    with pytest.raises(OSError):
+        http.client.HTTPConnection(url.split("/")[2], timeout=5).request("GET", "/")
 
 
 def test_what_is_no_run_is_refused(refuse: Callable[..., list[str]]) -> None:

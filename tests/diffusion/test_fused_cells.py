@@ -22,7 +22,7 @@ from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.diffusion.fused import closure_kernels, flux_kernels, system_kernels  # noqa: E402
+from ddrecon.diffusion.fused import closure_kernels, flux_kernels, spread, system_kernels  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -86,7 +86,9 @@ def problem_of(
     mean = random_values(*right.shape, seed=5, dtype=dtype).requires_grad_()
     flux = problem.flux(mean)
     assert flux is not None
-    return weigh([*operator.conductances, operator.loss, right, *flux], [*leaves, *more, mean])
+    spread = problem.spread(flux)
+    results = [*operator.conductances, operator.loss, right, *flux, spread]
+    return weigh(results, [*leaves, *more, mean])
 
 
 def assert_equal(find: Callable[[str], Found], error: float) -> None:
@@ -191,6 +193,8 @@ def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     kernels = [
         system_kernels.system_kernel(True, 32),
         system_kernels.system_adjoint_kernel(True, 32),
+        spread.spread_kernel(32),
+        spread.spread_adjoint_kernel(64),
         flux_kernels.flux_kernel(True, 64),
         flux_kernels.flux_adjoint_kernel(True, 64),
         closure_kernels.geometric_kernel(True, 32),

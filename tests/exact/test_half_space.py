@@ -2,39 +2,27 @@
 give exactly.
 
 I(mu) = w / (4 pi) E mu0 / (mu + mu0) H(mu) H(mu0), with albedo w and irradiance E on a plane facing
-the light (Chandrasekhar, Radiative Transfer, 1950, chapter III). Only optical depth matters, so the
-half-space is one column of cells, 1e9 times as wide as deep (nothing leaves sideways), whose
-density grows downwards: from a few thousandths of an optical depth a cell at the surface to
-hundreds at the bottom. The closure's floor is set to nothing: what is compared is P1 itself, or
-what transport rounds make of it.
+the light (Chandrasekhar, Radiative Transfer, 1950, chapter III).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-import torch
-from media import convergence_order, make_scene
-from torch import Tensor
+from half_spaces import IRRADIANCE, VIEWS, half_space, relative_rms, seen
+from media import convergence_order
 
-from ddrecon.cameras import Camera, look_at
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.grid import Grid
-from ddrecon.renderer import render, solve_light, view_components
-from ddrecon.scene import Scene, View
+from ddrecon.renderer import solve_light, view_components
 
 pytestmark = pytest.mark.slow
 
 ALBEDOS = (0.5, 0.9, 0.99, 1.0)
 SUNS = (1.0, 0.6, 0.3)
 """Cosines mu0 of the light with the normal."""
-VIEWS = (1.0, 0.8, 0.5, 0.25)
-"""Cosines mu of the views."""
-IRRADIANCE = 3.0
 ROUNDS = (0, 1, 4)
 """Values of diffusion.transport_rounds."""
 ERRORS = {
@@ -47,38 +35,6 @@ ERRORS = {
 after one round and 0.0138 after four, where 50 directions have converged.
 """
 each_albedo = pytest.mark.parametrize("albedo", ALBEDOS)
-
-
-def half_space(albedo: float, sun: float, cells: int = 192, rounds: int = 0) -> Scene:
-    """5,000 optical depths below z = 0, lit from above at cosine `sun`, seen at all of `VIEWS`."""
-    ratio = 1.06 ** (192 / cells)
-    layers = ratio ** torch.arange(cells, dtype=torch.float64)
-    density = (5000 / layers.sum() * layers * cells).view(-1, 1, 1)
-    grid = Grid((cells, 1, 1), (0.0, -5e8, -5e8), (1.0, 5e8, 5e8))
-    scene = make_scene(
-        density,
-        grid=grid,
-        sigma_a=(1 - albedo,),
-        sigma_s=(albedo,),
-        directional=(IRRADIANCE,),
-        travel=(math.sqrt(1 - sun**2), 0.0, sun),
-        closure="smooth",
-        floor=1e-6,
-        transport_rounds=rounds,
-        degree=5,
-    )
-    return replace(scene, views=[View(f"mu {cosine}", looking_down(cosine)) for cosine in VIEWS])
-
-
-def looking_down(cosine: float) -> Camera:
-    """One pixel on the surface that looks into the medium at `cosine` with the normal."""
-    target = torch.tensor([0.0, math.sqrt(1 - cosine**2), cosine], dtype=torch.float64)
-    return Camera(
-        look_at(torch.zeros_like(target), target, target.new_tensor([1.0, 0.0, 0.0])),
-        (1, 1),
-        1e-6,
-        is_perspective=False,
-    )
 
 
 NODES, WEIGHTS = (
@@ -131,15 +87,6 @@ def p1_multiple(albedo: float, sun: float, view: float) -> float:
     a = albedo * IRRADIANCE / (4 * math.pi) / ((1 - albedo) - 1 / (3 * sun**2))
     b = -a * (1 / 2 + 1 / (3 * sun)) / (1 / 2 + decay / 3)
     return albedo * (a * sun / (view + sun) + b / (1 + decay * view))
-
-
-def relative_rms(found: list[float], wanted: list[float]) -> float:
-    return math.dist(found, wanted) / math.hypot(*wanted)
-
-
-def seen(scene: Scene) -> list[float]:
-    image: Tensor = render(scene)
-    return image[:, 0, 0, 0].tolist()
 
 
 @each_albedo

@@ -18,7 +18,8 @@ from torch import Tensor
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.levels import scene_at_level
-from ddrecon.reconstruct.loop import Result, optimize
+from ddrecon.reconstruct.log import Result
+from ddrecon.reconstruct.loop import optimize
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene

@@ -45,3 +45,9 @@ def test_quantization_is_that_of_rounded_values() -> None:
 
 def test_a_picture_too_small_to_tell_has_read_noise_only() -> None:
     assert estimate_noise(torch.rand(3, 2, 9), 0.0).shot == 0
+
+
+def test_means_of_pixels_err_by_the_root_of_their_count_less() -> None:
+    noise, values = Noise(0.02, 1e-3, 1 / 255), torch.linspace(0, 1, 9)
+    expected = noise.deviation(values) / 3
+    torch.testing.assert_close(noise.averaged(9).deviation(values), expected)

@@ -45,8 +45,8 @@ def test_the_step_is_least_squares(loss: str, sizes: tuple[int, int]) -> None:
     seen = (torch.rand(5, 4, dtype=torch.float64) > 0.2).double()
     target = Target.of(torch.rand(3, 5, 4, dtype=torch.float64), seen, loss)
     picture = shares.sum(0)
-    matrix, right = normal_sums(shares, picture, target, 2.0)
-    found = torch.cat(solve_brightness(matrix, right, sizes))
+    sums = normal_sums(shares, picture, target, 2.0)
+    found = torch.cat(solve_brightness(sums[..., :2], sums[..., 2], sizes))
     # The same by a column for each value, written out.
     weight, columns = target.slope * seen, []
     for share, size in zip(shares, sizes, strict=True):
@@ -63,8 +63,8 @@ def test_a_light_that_no_picture_shows_stays() -> None:
     share = torch.rand(3, 4, 4, dtype=torch.float64)
     shares = torch.stack([share, torch.zeros_like(share)])
     target = Target.of(1.3 * share, None)
-    matrix, right = normal_sums(shares, share, target, 1.0)
-    first, second = solve_brightness(matrix, right, (1, 3))
+    sums = normal_sums(shares, share, target, 1.0)
+    first, second = solve_brightness(sums[..., :2], sums[..., 2], (1, 3))
     assert float(first) == pytest.approx(0.3, rel=1e-4)
     assert second.tolist() == [0.0] * 3
 

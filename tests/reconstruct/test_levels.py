@@ -1,5 +1,7 @@
 """Coarse to fine: what resampling keeps, and which stage an iteration belongs to."""
 
+from dataclasses import replace
+
 import torch
 
 from ddrecon.cameras import Camera, cast_rays
@@ -36,6 +38,14 @@ def test_a_coarser_camera_sees_the_same_frame(ball_scene) -> None:
         cast_rays(camera.resize(2), (0.0, 0.0)).direction[0],
     )
     assert torch.allclose(*corners, atol=1e-6)
+
+
+def test_what_a_coarser_scene_starts_from_is_coarser_too(ball_scene) -> None:
+    fine = ball_scene.volume.density
+    starts = {"density": fine, "sigma_a": torch.tensor([1.0, 2.0, 3.0])}
+    coarse = scene_at_level(replace(ball_scene, starts=starts), 2)
+    assert torch.equal(coarse.starts["density"], coarse.volume.density)
+    assert torch.equal(coarse.starts["sigma_a"], starts["sigma_a"])
 
 
 def test_stages_follow_the_fractions() -> None:

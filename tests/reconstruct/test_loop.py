@@ -111,7 +111,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
 
 def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
     torch.save({"format": 1, "scene": {}, "state": {}}, tmp_path / "last.pt")
-    with pytest.raises(FormatError, match="a checkpoint of format 1; this version reads 4"):
+    with pytest.raises(FormatError, match="a checkpoint of format 1; this version reads 5"):
         load_checkpoint(tmp_path, {})
 
 

@@ -9,8 +9,7 @@ import re
 import torch
 from media import make_scene, random_values
 
-from ddrecon.reconstruct.log import Row
-from ddrecon.reconstruct.loop import Result
+from ddrecon.reconstruct.log import Result, Row
 
 
 def framed(text: str) -> str:
@@ -29,6 +28,6 @@ def test_scene_volume_and_result_show_their_fields() -> None:
         fields = [json.loads(content) for content in data]
         assert [field["name"] for field in fields] == ["density", "sigma_s"]
         assert fields[0]["size"] == [5, 4, 3] and "5 x 4 x 3 cells, density up to" in page
-    assert "31.25 dB of the views seen last, 28.50 dB of those held out" in (
+    assert "31.25 dB of views trained on, 28.50 dB of views held out" in (
         Result(scene, [row])._repr_html_()
     )

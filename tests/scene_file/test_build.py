@@ -287,6 +287,12 @@ def test_cameras_that_all_miss_the_volume_are_one_problem(write: Write):
     assert "the cameras look at about (9, " in line
 
 
+def test_a_box_smaller_than_a_pixel_is_not_taken_for_turned_cameras(write: Write):
+    ring = {"count": 3, "radius": 900, "fov": 20, "target": [0, 0, 0], "resolution": [16, 16]}
+    (line,) = problems(write(changed(views={"ring": ring})))
+    assert "views: none looks through the volume; it is in the picture, but smaller" in line
+
+
 def test_a_field_may_have_another_name_in_its_file(write: Write, tmp_path: Path):
     """In the volume and where a parameter starts."""
     lwc, ice = np.random.default_rng(0).random((2, 4, 3, 2)).astype(np.float32)

@@ -1,6 +1,6 @@
-"""D from a medium's coefficients as one function of tensors, with its backward pass.
+"""D from a medium's coefficients as one function of tensors, with its derivatives.
 
-Forward mode takes the formulas of `diffusion/closures.py` instead. Distances are linear in the
+Distances are linear in the
 medium's fields: one Fourier transform serves all colors of a field that they share.
 """
 
@@ -23,9 +23,12 @@ from ddrecon.diffusion.fused.closure_kernels import (
 )
 from ddrecon.diffusion.fused.colors import FieldBar, per_color, sum_colors, total
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+
+_TERMS = "scale", "field", "other_scale", "other_field"
 
 
 def close_medium(medium: Medium, closure: Closure) -> Tensor:
@@ -113,7 +116,7 @@ class _Geometric(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.grid, *tensors = inputs
-        ctx.save_for_backward(*tensors)
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -127,6 +130,17 @@ class _Geometric(torch.autograd.Function):
         weights = _weights(ctx.grid.shape[2], inverse.shape[3], inverse.dtype, inverse.device)
         return None, inverse_bar @ weights, *terms_bars
 
+    @staticmethod
+    def jvp(ctx: Any, _: None, *changes: Tensor | None) -> Tensor:
+        def change(*tensors: Any) -> Tensor:
+            (inverse, *terms), (d_inverse, *d_terms) = split(tensors)
+            kernel = functools.partial(geometric_kernel, len(terms) > 2)
+            given, d_given = _distances(ctx.grid, inverse), {"inverse_distance": d_inverse}
+            return _run_tangent(kernel, ctx.grid, terms, d_terms, given, d_given)
+
+        d_diffusion: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_diffusion
+
 
 class _Smooth(torch.autograd.Function):
     """D by `smooth` from scales and fields; `least`: kappa_tr of empty space."""
@@ -139,7 +153,7 @@ class _Smooth(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.grid, ctx.least, *terms = inputs
-        ctx.save_for_backward(*terms)
+        keep(ctx, *terms)
 
     @staticmethod
     @differentiate_once
@@ -151,6 +165,17 @@ class _Smooth(torch.autograd.Function):
         terms_bars = _run_adjoint(kernel, ctx, terms, given, {})
         return None, None, *terms_bars
 
+    @staticmethod
+    def jvp(ctx: Any, _: None, _least: None, *changes: Tensor | None) -> Tensor:
+        def change(*tensors: Any) -> Tensor:
+            terms, d_terms = split(tensors)
+            kernel = functools.partial(smooth_kernel, len(terms) > 2)
+            given = {"least": terms[0].new_tensor([ctx.least])}
+            return _run_tangent(kernel, ctx.grid, terms, d_terms, given, {})
+
+        d_diffusion: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_diffusion
+
 
 def _run(kernel: Any, grid: Grid, terms: Sequence[Tensor], **given: Any) -> Tensor:
     """D by `kernel`."""
@@ -158,6 +183,23 @@ def _run(kernel: Any, grid: Grid, terms: Sequence[Tensor], **given: Any) -> Tens
     colors = len(diffusion)
     launch_rows(kernel, grid, colors, given | _given(colors, *terms), {"diffusion": diffusion})
     return diffusion
+
+
+def _run_tangent(
+    kernel: Any,
+    grid: Grid,
+    terms: Sequence[Tensor],
+    d_terms: Sequence[Tensor | None],
+    given: dict[str, Any],
+    d_given: dict[str, Tensor | None],
+) -> Tensor:
+    """The change of D by `kernel`, which is `given` more, with those of `d_given` and of terms."""
+    d_diffusion = terms[1].new_empty(max(map(len, terms)), *grid.shape)
+    colors = len(d_diffusion)
+    given = given | _given(colors, *terms)
+    d_given = d_given | dict(zip(_TERMS, d_terms, strict=False))
+    launch_row_tangents(kernel, grid, colors, given, d_given, {"diffusion": d_diffusion})
+    return d_diffusion
 
 
 def _run_adjoint(

@@ -1,7 +1,4 @@
-"""The flux of E5 as one function of tensors, with its backward pass.
-
-Forward mode takes the formulas of `diffusion/operator.py` instead.
-"""
+"""The flux of E5 as one function of tensors, with its derivatives."""
 
 from __future__ import annotations
 
@@ -12,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.fused.colors import (
+    FLUX,
     FieldBar,
     empty_bars,
     name_flux,
@@ -23,12 +21,14 @@ from ddrecon.diffusion.fused.colors import (
 from ddrecon.diffusion.fused.flux_kernels import flux_adjoint_kernel, flux_kernel
 from ddrecon.diffusion.operator import AXES, escape
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.light.moments import Vector
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 _NAMES = "light_z", "light_y", "light_x"
+_TENSORS = "diffusion", "scattering_scale", "scattering", "outside", "mean", *FLUX
 
 
 def find_flux(
@@ -55,7 +55,7 @@ class _Flux(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.grid, *tensors = inputs
-        ctx.save_for_backward(*tensors)
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -75,6 +75,20 @@ class _Flux(torch.autograd.Function):
             for bar, like in zip(found.values(), (diffusion, mean, *flux), strict=True)
         )
         return None, diffusion_bar, *scattering_bars, outside_bar, *mean_bars
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *changes: Tensor | None) -> tuple[Tensor, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            values, d_values = split(tensors)
+            mean = values[4]
+            kernel = functools.partial(flux_kernel, len(values) > 5)
+            made = {name: mean.new_empty(mean.shape) for name in _NAMES}
+            given, d_given = _given(*values), dict(zip(_TENSORS, d_values, strict=False))
+            launch_row_tangents(kernel, ctx.grid, len(mean), given, d_given, made)
+            return tuple(made.values())
+
+        d_light: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_light
 
 
 def _inflow_bar(bars: tuple[Tensor, ...], diffusion: Tensor, grid: Grid, outside: Tensor) -> Tensor:

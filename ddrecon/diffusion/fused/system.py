@@ -1,7 +1,4 @@
-"""The system of E7 as one function of tensors, with its backward pass.
-
-Forward mode takes the formulas of `diffusion/operator.py` instead.
-"""
+"""The system of E7 as one function of tensors, with its derivatives."""
 
 from __future__ import annotations
 
@@ -12,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.fused.colors import (
+    FLUX,
     FieldBar,
     empty_bars,
     name_flux,
@@ -23,12 +21,17 @@ from ddrecon.diffusion.fused.colors import (
 from ddrecon.diffusion.fused.system_kernels import system_adjoint_kernel, system_kernel
 from ddrecon.diffusion.operator import boundary_loss
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 _NAMES = "conductance_z", "conductance_y", "conductance_x", "loss", "right"
+_TENSORS = (
+    *("diffusion", "absorption_scale", "absorption", "scattering_scale", "scattering"),
+    *("outside", "mean", *FLUX),
+)
 
 
 def assemble_system(
@@ -58,22 +61,15 @@ class _System(torch.autograd.Function):
 
     @staticmethod
     def forward(grid: Grid, is_shared: bool, *tensors: Tensor) -> tuple[Tensor, ...]:
-        diffusion, is_directed = tensors[0], len(tensors) > 7
-        nz, ny, nx = grid.shape
-        shapes = (nz - 1, ny, nx), (nz, ny - 1, nx), (nz, ny, nx - 1)
-        conductances = [diffusion.new_empty(len(diffusion), *shape) for shape in shapes]
-        right = diffusion.new_empty(_colors(*tensors), *grid.shape)
-        loss = diffusion.new_empty(diffusion.shape)
-        made = *conductances, loss, right
-        kernel = functools.partial(system_kernel, is_directed)
-        given = _given(len(right), *tensors)
-        launch_rows(kernel, grid, len(right), given, dict(zip(_NAMES, made, strict=True)))
-        return made
+        kernel, made = functools.partial(system_kernel, len(tensors) > 7), _empty(grid, *tensors)
+        colors = len(made["right"])
+        launch_rows(kernel, grid, colors, _given(colors, *tensors), made)
+        return tuple(made.values())
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.grid, ctx.is_shared, *tensors = inputs
-        ctx.save_for_backward(*tensors)
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -107,6 +103,29 @@ class _System(torch.autograd.Function):
             *(None, None, diffusion_bar, *absorption_bars, *scattering.split()),
             *(outside_bar, *source_bars),
         )
+
+    @staticmethod
+    def jvp(ctx: Any, _grid: None, _is_shared: None, *changes: Tensor | None) -> tuple[Tensor, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            values, d_values = split(tensors)
+            kernel = functools.partial(system_kernel, len(values) > 7)
+            made = _empty(ctx.grid, *values)
+            colors = len(made["right"])
+            given, d_given = _given(colors, *values), dict(zip(_TENSORS, d_values, strict=False))
+            launch_row_tangents(kernel, ctx.grid, colors, given, d_given, made)
+            return tuple(made.values())
+
+        d_system: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_system
+
+
+def _empty(grid: Grid, *tensors: Tensor) -> dict[str, Tensor]:
+    """Room for conductances, loss and right side, by their names."""
+    diffusion, (nz, ny, nx) = tensors[0], grid.shape
+    shapes = (nz - 1, ny, nx), (nz, ny - 1, nx), (nz, ny, nx - 1)
+    made = [diffusion.new_empty(len(diffusion), *shape) for shape in (*shapes, grid.shape)]
+    made.append(diffusion.new_empty(_colors(*tensors), *grid.shape))
+    return dict(zip(_NAMES, made, strict=True))
 
 
 def _colors(*tensors: Tensor) -> int:

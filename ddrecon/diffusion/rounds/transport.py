@@ -170,7 +170,7 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
     """theta = 1 / (1 + rho^2), the share of a sweep's change that counts (E14).
 
     The rest is diffusion's. rho = (d / 2) coth(d / 2) - 1 is by how much a characteristic diffuses
-    too much if its source is linear over steps of optical depth d; here d is that of the mean step.
+    too much if its source is linear over steps of optical depth d, that of `_share_length`.
     Returns `[C, z, y, x]` in (0, 1].
     """
     # d / 2, from 1e-3: (d/2) / tanh(d/2) is 0 / 0 in empty cells, and at 1e-3, where rho is below
@@ -183,10 +183,9 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
 def _share_length(medium: Medium, degree: int) -> Tensor:
     """The length of a step, by whose optical depth theta is [u] (E14), [C or 1, 1, 1, 1].
 
-    It is that of the mean step where scattering is not backward.
+    It is exp(-p_1) times that of the mean step.
     """
-    cosine = remaining_moments(medium)[1].clamp(max=0)
-    return _mean_step(medium.grid, degree) * (1 + 2 * cosine**2)
+    return _mean_step(medium.grid, degree) * torch.exp(-remaining_moments(medium)[1])
 
 
 @functools.cache

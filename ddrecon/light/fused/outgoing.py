@@ -1,7 +1,4 @@
-"""E3 towards a camera as one function of tensors, with its backward pass.
-
-Forward mode takes the formulas of `Moments.positive_along` instead.
-"""
+"""E3 towards a camera as one function of tensors, with its derivatives."""
 
 from __future__ import annotations
 
@@ -14,12 +11,14 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.light.fused.outgoing_kernels import scatter_adjoint_kernel, scatter_kernel
 from ddrecon.light.moments import Moments, Vector
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 _FLUX = "flux_z", "flux_y", "flux_x"
+_TENSORS = "point", "factors", "more", "mean", "higher", *_FLUX
 
 
 def scatter_fused(
@@ -65,7 +64,7 @@ class _Scatter(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.grid, ctx.is_eye, *tensors = inputs
-        ctx.save_for_backward(*tensors)
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -104,6 +103,21 @@ class _Scatter(torch.autograd.Function):
                 for name, one in zip(_FLUX, flux, strict=False)
             ),
         )
+
+    @staticmethod
+    def jvp(ctx: Any, _grid: None, _is_eye: None, *changes: Tensor | None) -> Tensor:
+        def change(*tensors: Any) -> Tensor:
+            values, d_values = split(tensors)
+            given, is_so = _given(ctx.is_eye, *values)
+            d_given = dict(zip(_TENSORS, d_values, strict=False))
+            d_radiance = given["mean"].new_empty(given["colors"], *ctx.grid.shape)
+            kernel = functools.partial(scatter_kernel, *is_so)
+            made = {"radiance": d_radiance}
+            launch_row_tangents(kernel, ctx.grid, len(d_radiance), given, d_given, made)
+            return d_radiance
+
+        d_radiance: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_radiance
 
 
 def _point_bar(ctx: Any, along_bar: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 BLOCK = 128
 """Ways that one item does on a processor; on a GPU it is one."""
@@ -39,19 +39,18 @@ def integrate_ways(
 class _Integral(torch.autograd.Function):
     """The integral; `first` and `last` [3, P] are places counted in cells, 0 in the first's center.
 
-    Differentiable by all but `fraction`.
+    Differentiable by all but `fraction`; in forward mode by the field alone.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
+        field: Tensor, first: Tensor, last: Tensor, length: Tensor, fraction: Tensor
     ) -> Tensor:
-        ctx.save_for_backward(field, first, last, length, fraction)
-        total = field.new_empty(len(field), len(length))
-        given = _ways(field, first, last, length, fraction)
-        items, _ = cut(len(length), BLOCK, length)
-        way_kernel(field.element_size() * 8).launch(items, given, {"totals": total})
-        return total
+        return _integrate(field, first, last, length, fraction)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        keep(ctx, *inputs)
 
     @staticmethod
     @differentiate_once
@@ -68,6 +67,22 @@ class _Integral(torch.autograd.Function):
         kernel = way_adjoint_kernel(field.element_size() * 8)
         kernel.launch(items, given, made | own[0], shares=own)
         return functools.reduce(Tensor.add_, shares), *bars, None
+
+    @staticmethod
+    def jvp(ctx: Any, d_field: Tensor | None, *_: None) -> Tensor:
+        _, *ways = ctx.saved_tensors
+        # Linear in the field.
+        d_total: Tensor = run_plainly(_integrate, d_field, *ways)
+        return d_total
+
+
+def _integrate(field: Tensor, *ways: Tensor) -> Tensor:
+    """The integral of `field` along `ways`."""
+    total = field.new_empty(len(field), len(ways[2]))
+    items, _ = cut(len(ways[2]), BLOCK, field)
+    kernel = way_kernel(field.element_size() * 8)
+    kernel.launch(items, _ways(field, *ways), {"totals": total})
+    return total
 
 
 def _ways(

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.light.fused.shear import Shear, Sum
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.light.fused.tangents import BeamTangents
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
 
@@ -46,13 +47,19 @@ def follow(
 
 
 class _SumMass(torch.autograd.Function):
-    """The mass entered; differentiable by the field and by the beam's numbers."""
+    """The mass entered; differentiable by the field and by the beam's numbers.
+
+    Tangents are by the field and the bound alone.
+    """
 
     @staticmethod
-    def forward(ctx: Any, shear: Shear, field: Tensor, numbers: Tensor) -> Tensor:
-        ctx.shear = shear
-        ctx.save_for_backward(field, numbers)
+    def forward(shear: Shear, field: Tensor, numbers: Tensor) -> Tensor:
         return shear.lift(Sum(shear, shear.lay(field.detach()), numbers, 0).entered)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.shear, *tensors = inputs
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -66,3 +73,12 @@ class _SumMass(torch.autograd.Function):
         )
         numbers_bar = None if found is None else found.to(numbers)[None]
         return None, shear.lift(field_bar), numbers_bar
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, d_field: Tensor | None, d_numbers: Tensor | None) -> Tensor:
+        def change(field: Tensor, numbers: Tensor, *changes: Tensor | None) -> Tensor:
+            beams = BeamTangents(field, changes[0], numbers, changes[1])
+            return beams.follow(ctx.shear, 0)[1]
+
+        d_entered: Tensor = run_plainly(change, *ctx.saved_tensors, d_field, d_numbers)
+        return d_entered

@@ -7,9 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.kernels.dual import split
 from ddrecon.light.fused.receive import Receiver
 from ddrecon.light.fused.shear import Shear, Sum
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.light.fused.tangents import BeamTangents, change_received
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 MOST_BEAMS = 8
 MOST_NUMBERS = 1 << 22
@@ -25,12 +27,11 @@ class Unscattered(torch.autograd.Function):
     [K, z, y, x] and `scale` [C] of the extinction; `numbers` [L, 4]: of each beam its slope by rows
     and by columns, its path in a slice [u] and the bound of corrections; `weights` [L, moments, C]:
     what transmittance is multiplied by. Moments are the mean, or the mean and three of a flux.
-    Nothing but these is kept for the backward pass.
+    Nothing but these is kept for derivatives. Tangents by `numbers` are those by the bound alone.
     """
 
     @staticmethod
     def forward(
-        ctx: Any,
         shears: tuple[Shear, ...],
         has_mass: bool,
         field: Tensor,
@@ -38,9 +39,6 @@ class Unscattered(torch.autograd.Function):
         numbers: Tensor,
         weights: Tensor,
     ) -> tuple[Tensor, ...]:
-        ctx.set_materialize_grads(False)
-        ctx.shears, ctx.has_mass = shears, has_mass
-        ctx.save_for_backward(field, scale, numbers, weights)
         receiver = Receiver(field, scale, numbers, weights)
         moments, masses = receiver.new_moments(), []
         laid = _Laid(field)
@@ -59,6 +57,12 @@ class Unscattered(torch.autograd.Function):
                     for light, one in zip(lights, entered, strict=True)
                 ]
         return *moments, *masses
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.set_materialize_grads(False)
+        ctx.shears, ctx.has_mass, *tensors = inputs
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -102,6 +106,29 @@ class Unscattered(torch.autograd.Function):
             return None, None, field_bar, None, None, None
         by_numbers = (bar.to(field) for bar in (scale_bar, numbers_bar, weights_bar))
         return None, None, field_bar, *by_numbers
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, _has: None, *changes: Tensor | None) -> tuple[Tensor, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            (field, scale, numbers, weights), d_tensors = split(tensors)
+            d_field, d_scale, d_numbers, d_weights = d_tensors
+            receiver = Receiver(field, scale, numbers, weights)
+            beams = BeamTangents(field, d_field, numbers, d_numbers)
+            d_given = {"field": d_field, "scale": d_scale, "all_weights": d_weights}
+            d_moments, d_masses = receiver.new_moments(), []
+            for light, shear in enumerate(ctx.shears):
+                entered, d_entered = beams.follow(shear, light)
+                change_received(
+                    receiver, light, entered, d_given | {"entered": d_entered}, d_moments
+                )
+                if ctx.has_mass and d_field is None:
+                    d_masses.append(d_entered)
+                elif ctx.has_mass:
+                    d_masses.append(torch.addcmul(d_entered, d_field, 0.5 * numbers[light, 2]))
+            return *d_moments, *d_masses
+
+        d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_found
 
 
 def _batches(lights: int, field: Tensor) -> list[range]:

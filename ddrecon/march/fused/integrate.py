@@ -9,19 +9,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.kernels.dual import split
 from ddrecon.kernels.launch import array, launch, thread_count
 from ddrecon.kernels.packets import LANES
 from ddrecon.kernels.text import cut
 from ddrecon.march.fused.adjoint import adjoint_kernel
 from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 from ddrecon.march.fused.packet_walks import (
     packet_adjoint_kernel,
     packet_integral_kernel,
 )
 from ddrecon.march.fused.rays import ray_types
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
-from ddrecon.numerics.autodiff import differentiate_once, keep
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 
 class Integrate(torch.autograd.Function):
@@ -58,11 +60,16 @@ class Integrate(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         ctx.layout, ctx.cells = inputs[:2]
         ctx.mark_non_differentiable(output[2])
+        ctx.set_materialize_grads(False)
         keep(ctx, output[2], *inputs[2:])
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, out_bar: Tensor, masses_bar: Tensor, _: None) -> tuple[Any, ...]:
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
+        out_bar, masses_bar = (
+            room.zero_() if bar is None else bar
+            for bar, room in zip(bars, _empty(ctx.layout, ctx.saved_tensors[1]), strict=False)
+        )
         needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
         varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))
         if ctx.cells.is_sliced and not varies_rays:
@@ -75,37 +82,58 @@ class Integrate(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
-        varied = ctx.saved_tensors[1:]
-        d_varied = [
-            torch.zeros_like(tensor) if change is None else change
-            for tensor, change in zip(varied, changes[2:], strict=True)
-        ]
-        d_out, d_masses = _Tangent.apply(ctx.layout, ctx.cells, *varied, *d_varied)
-        return d_out, d_masses, None
+        d_rays, d_angles = changes[2:4]
+        varies_rays = d_rays is not None or (d_angles is not None and any(ctx.layout.beams))
+
+        def change(*tensors: Any) -> tuple[Tensor, Tensor]:
+            values, d_values = split(tensors)
+            if ctx.cells.is_sliced and not varies_rays:
+                return _change_packets(ctx.layout, ctx.cells, values, d_values)
+            return _change(ctx.layout, ctx.cells, values, d_values)
+
+        return *run_plainly(change, *ctx.saved_tensors[1:], *changes[2:]), None
 
 
-class _Tangent(torch.autograd.Function):
-    """The changes of outputs and masses with those of all tensors.
+def _change(
+    layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
+) -> tuple[Tensor, Tensor]:
+    """The changes of outputs and masses with those of all tensors, a ray a thread."""
+    d_out, d_masses = _empty(layout, values[0])
+    whole = [
+        torch.zeros_like(value) if change is None else change
+        for value, change in zip(values, d_values, strict=True)
+    ]
+    bundles = [
+        _bundle(layout, cells.planes, cells.pack(part[5:]), *part[:5]) for part in (values, whole)
+    ]
+    arguments = [*bundles, array(d_out), array(d_masses)]
+    launch(tangent_kernel(layout, cells.is_sliced), len(d_out[0]), arguments, d_out)
+    return d_out, d_masses
 
-    A function of its own, so that torch.func hands it plain tensors, which kernels need.
-    """
 
-    @staticmethod
-    def forward(layout: Layout, cells: Cells, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        rays, count = tensors[0], len(tensors) // 2
-        bundles = [
-            _bundle(layout, cells.planes, cells.pack(part[5:]), *part[:5])
-            for part in (tensors[:count], tensors[count:])
-        ]
-        d_out = rays.new_empty(layout.outputs, len(rays))
-        d_masses = rays.new_empty(layout.extinction, len(rays))
-        arguments = [*bundles, array(d_out), array(d_masses)]
-        launch(tangent_kernel(layout, cells.is_sliced), len(rays), arguments, rays)
-        return d_out, d_masses
+def _change_packets(
+    layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
+) -> tuple[Tensor, Tensor]:
+    """The same in packets, of rays that do not change themselves."""
+    rays, fields = values[0], values[5:]
+    d_out, d_masses = _empty(layout, rays)
+    d_coefficients, d_numbers, d_table, *d_fields = d_values[2:]
+    given = _packets(cells, values[:5], fields)
+    nothing = torch.zeros_like(fields[0][0])
+    of_changes = _channels(d_fields, fields)
+    channels = [nothing if one is None else one for one in of_changes]
+    given["all_fields"] = [*given.pop("fields"), *channels]
+    given |= {"d_coefficients": d_coefficients, "d_table": d_table}
+    given["d_numbers"] = torch.zeros_like(values[3]) if d_numbers is None else d_numbers
+    made = {"d_out": d_out, "d_masses": d_masses}
+    packet_tangent_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
+    return d_out, d_masses
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        ctx.mark_non_differentiable(*output)
+
+def _empty(layout: Layout, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Room for the changes of outputs and masses."""
+    count = len(rays)
+    return rays.new_empty(layout.outputs, count), rays.new_empty(layout.extinction, count)
 
 
 def _transpose(

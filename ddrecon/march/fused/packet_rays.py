@@ -228,11 +228,18 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 """
 
 
-def packet_kernel(name: str, layout: Layout, walk: str, given: str) -> TextKernel:
-    """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`."""
+def packet_kernel(
+    name: str, layout: Layout, walk: str, given: str, changes: bool = False
+) -> TextKernel:
+    """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`.
+
+    With `changes` it is given `all_fields`: `fields`, from which it samples, and their changes.
+    """
     structs = PLACES + RUNS + ROWS + VALUES + DECAYS + POLYNOMIALS + POINTS + _RECORDS
-    text = _constants(layout) + structs + _BEGIN + walk
-    declared = f"{GIVEN} F *fields[{layout.channels}]; {given}"
+    chosen = "const F* const* fields = all_fields;" if changes else ""
+    text = _constants(layout) + structs + chosen + _BEGIN + walk
+    fields = f"all_fields[{2 * layout.channels}]" if changes else f"fields[{layout.channels}]"
+    declared = f"{GIVEN} F *{fields}; {given}"
     return TextKernel(name, layout.bits, text, declared, packet_program)
 
 

@@ -3,6 +3,7 @@
 "use strict";
 
 const PAUSE = 2000; // milliseconds
+let answered = new Date();
 const taken = new Map(); // what each part was when it was last taken
 
 function takePart(next, id) {
@@ -24,15 +25,31 @@ async function takeVolume(next) {
   showField();
 }
 
+// Nobody answers any more: says so, and since when.
+function tellLost(isLost) {
+  const note = document.querySelector("#lost") ?? document.createElement("p");
+  note.id = "lost";
+  note.className = "doubts";
+  note.hidden = !isLost;
+  note.textContent =
+    `No answer since ${answered.toLocaleTimeString()}: the run has ended or was stopped, or this page ` +
+    "is no longer served. A finished run has its report.html; ddrecon watch serves the page again.";
+  document.querySelector("#lead").after(note);
+}
+
 async function refresh() {
   try {
     const answer = await fetch(location.href, { cache: "no-store" });
     const next = new DOMParser().parseFromString(await answer.text(), "text/html");
     if (!("live" in next.body.dataset)) return location.reload(); // the run is done
+    if (!document.querySelector("#viewers") && next.querySelector("#viewers")) return location.reload();
     for (const id of ["lead", "loss", "views"]) takePart(next, id);
     await takeVolume(next);
+    answered = new Date();
+    tellLost(false);
   } catch (error) {
-    console.warn(error); // the server is gone, or busy
+    console.warn(error);
+    tellLost(true);
   }
   setTimeout(refresh, PAUSE);
 }

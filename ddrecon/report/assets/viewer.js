@@ -208,6 +208,7 @@ class Viewer {
         redrawAll();
       });
     canvas.addEventListener("wheel", (event) => {
+      if (isPageScrolled(event)) return;
       event.preventDefault();
       zoom(Math.exp(event.deltaY * 0.001));
       redrawAll();
@@ -229,6 +230,18 @@ function lookFrom(eye, upAxis) {
   const [sideways, upwards, towards] = [parts[(upAxis + 2) % 3], parts[upAxis], parts[(upAxis + 1) % 3]];
   sight.yaw = Math.atan2(sideways, towards);
   sight.pitch = Math.atan2(upwards, Math.hypot(sideways, towards));
+}
+
+// Whether the wheel turned outside the viewers a moment ago: they pass by, and are not meant.
+let lastScroll = -Infinity;
+addEventListener("wheel", (event) => {
+  if (!event.target.closest("#viewers")) lastScroll = event.timeStamp;
+}, { passive: true });
+
+function isPageScrolled(event) {
+  if (event.timeStamp - lastScroll > 300) return false;
+  lastScroll = event.timeStamp;
+  return true;
 }
 
 function turn(yaw, pitch) {

@@ -84,16 +84,15 @@ def sweep_by_loops(medium: Medium, source: Tensor, inflow: float, directions: in
 
 
 def share_by_loops(medium: Medium, degree: int) -> Tensor:
-    """theta = 1 / (1 + rho^2), rho = (d/2) coth(d/2) - 1, at the depth d of the mean step."""
+    """theta = 1 / (1 + rho^2), rho = (d/2) coth(d/2) - 1, d exp(-p_1) times a mean step's depth."""
     length = weights = 0.0
     for w, weight in quadrature({3: 26, 5: 50}[degree]):
         axis, step = fastest_axis(medium.grid, w)
         if medium.grid.shape[axis] > 1:
             length, weights = length + weight * step, weights + weight
-    backward = 1 + 2 * min(float(medium.mean_cosine), 0.0) ** 2
     share = torch.ones_like(medium.extinction.value)
     for cell, extinction in enumerate(medium.extinction.value.flatten().tolist()):
-        half = 0.5 * backward * extinction * length / max(weights, 1e-9)
+        half = 0.5 * math.exp(-float(medium.mean_cosine)) * extinction * length / max(weights, 1e-9)
         rho = half / math.tanh(half) - 1 if half > 1e-3 else 0.0
         share.view(-1)[cell] = 1 / (1 + rho**2)
     return share

@@ -10,6 +10,7 @@ import pytest
 import torch
 from media import half_empty, make_scene
 from torch import Tensor
+from torch.nn.functional import interpolate
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ddrecon.diffusion.implicit import SolveMemory
@@ -56,7 +57,16 @@ def test_rounds_lead_to_where_sweeps_change_nothing_and_each_shrinks_what_is_lef
 
 @pytest.mark.parametrize(
     ("g", "thickness"),
-    [(0.0, 1e-8), (0.0, 1.0), (0.0, 1e2), (0.0, 1e4), (-0.8, 4.0), (-0.4, 2.0), (0.8, 8.0)],
+    [
+        (0.0, 1e-8),
+        (0.0, 1.0),
+        (0.0, 1e2),
+        (0.0, 1e4),
+        (-0.8, 4.0),
+        (-0.4, 2.0),
+        (0.8, 8.0),
+        (0.6, 4.0),
+    ],
 )
 @pytest.mark.parametrize("pattern", ["ball", "checkerboard"])
 def test_no_thickness_of_cells_lets_rounds_grow(g: float, thickness: float, pattern: str):
@@ -77,6 +87,35 @@ def test_no_thickness_of_cells_lets_rounds_grow(g: float, thickness: float, patt
     first, later = (light_after(scene, rounds) for rounds in (int(g != 0), 10))
     assert bool(torch.isfinite(later).all()) and float(later.norm()) < 2 * float(first.norm())
     assert float((later - light_after(scene, 11)).norm()) < 0.05 * float(later.norm())
+
+
+@pytest.mark.parametrize(
+    ("g", "thickness"), [(-0.8, 4.0), (0.0, 4.0), (0.0, 20.0), (0.8, 4.0), (0.8, 20.0)]
+)
+def test_rounds_bring_an_image_of_thick_cells_no_farther_from_that_of_fine_ones(
+    g: float, thickness: float
+):
+    """The finer grid holds the same density, linear between the centers of the coarse one."""
+
+    def image(density: Tensor, rounds: int) -> Tensor:
+        scene = make_scene(
+            density,
+            sigma_a=(0.4 * thickness,),
+            sigma_s=(7.6 * thickness,),
+            g=g,
+            directional=(3.0,),
+            transport_rounds=rounds,
+            tolerance=1e-6,
+        )
+        return render(scene)
+
+    coarse = ball(8, 0.4)
+    fine = interpolate(coarse[None, None], scale_factor=3, mode="trilinear")[0, 0]
+    truth = image(fine, 4)
+    diffuse, few, many = (
+        float((image(coarse, rounds) - truth).norm() / truth.norm()) for rounds in (0, 3, 12)
+    )
+    assert max(few, many) < diffuse + 0.005, (diffuse, few, many)
 
 
 def test_in_the_limit_of_thick_cells_rounds_leave_diffusion_as_it_is():
@@ -125,6 +164,19 @@ def test_light_without_direction_is_the_limit_of_light_with(g: float):
         for value in (0.0, g)
     )
     torch.testing.assert_close(render(nearly), render(plain), rtol=1e-6, atol=0)
+
+
+def test_derivatives_by_g_pass_through_zero_smoothly():
+    """Their second difference shrinks as the square of the step, where a kink's shrinks as it."""
+
+    def slope(g: float) -> float:
+        scene = make_scene(ball(6), directional=(3.0,), transport_rounds=2, tolerance=1e-12)
+        scene.volume.g = torch.tensor(g, dtype=torch.float64, requires_grad=True)
+        (by_g,) = torch.autograd.grad(render(scene).square().sum(), scene.volume.g)
+        return by_g.item()
+
+    long, short = ((slope(-step) - 2 * slope(0.0) + slope(step)) / step**2 for step in (1e-2, 1e-3))
+    assert long == pytest.approx(short, rel=0.02)
 
 
 def test_light_from_two_beams_is_the_sum_of_both():

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.share import SHARE, SHARE_SLOPE, numbers_by_color
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 _FIRST = "mean", "z", "y", "x"
 _PARTS = *_FIRST, "higher"
@@ -105,6 +106,7 @@ _GIVEN = [
     "extinction", "numbers", "shares", "swept_higher", "light_higher",
     *(f"{of}_{part}" for of in ("light", "diffuse", "gain") for part in _FIRST),
 ]  # fmt: skip
+_TENSORS = "numbers", "extinction", "light_higher", "swept_higher", *_GIVEN[5:]
 _FOUND = [f"new_{part}" for part in _PARTS]
 _BARS = [
     "extinction_bar", "share_bar", "swept_higher_bar", "light_higher_bar",
@@ -139,14 +141,16 @@ class _Blend(torch.autograd.Function):
     """The parts of new light."""
 
     @staticmethod
-    def forward(ctx: Any, grid: Grid, *tensors: Any) -> tuple[Tensor, ...]:
-        ctx.grid = grid
-        ctx.save_for_backward(*tensors)
+    def forward(grid: Grid, *tensors: Any) -> tuple[Tensor, ...]:
         given, mean, swept = _given(*tensors)
-        found = dict(zip(_FOUND, (mean.new_empty(mean.shape) for _ in _FIRST), strict=False))
-        found["new_higher"] = swept.new_empty(swept.shape)
+        found = _empty(mean, swept)
         launch_rows(blend_kernel, grid, len(mean), given, found)
         return tuple(found.values())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.grid, *tensors = inputs
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -177,6 +181,25 @@ class _Blend(torch.autograd.Function):
             *diffuse_bars,
             *diffuse_bars,
         )
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *changes: Tensor | None) -> tuple[Tensor, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            values, d_values = split(tensors)
+            given, mean, swept = _given(*values)
+            found, d_given = _empty(mean, swept), dict(zip(_TENSORS, d_values, strict=True))
+            shares = {"shares": mean.new_empty(mean.shape)}
+            launch_row_tangents(blend_kernel, ctx.grid, len(mean), given, d_given, found, shares)
+            return tuple(found.values())
+
+        d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_found
+
+
+def _empty(mean: Tensor, swept: Tensor) -> dict[str, Tensor]:
+    """Room for the parts of new light, by their names."""
+    found = {name: mean.new_empty(mean.shape) for name in _FOUND[:-1]}
+    return found | {_FOUND[-1]: swept.new_empty(swept.shape)}
 
 
 def _given(

@@ -38,17 +38,14 @@ class Cells:
         found = torch.zeros_like(self.like)
         for steps, values, weights in self._parts(arrays=2):
             light = self._follow(steps, values)["light"]
-            weighted = self.units * values * weights
-            found += torch.tensordot(weighted.to(light), light, 1)
+            found += torch.tensordot((self.units * values * weights).to(light), light, 1)
             found[0] += float(weights.sum()) * self.swept.scales[2].view(-1, 1, 1, 1)
         return found
 
     def transpose(self, bars: Parts, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light."""
         swept, (_, back, collect) = self.swept, self.kernels(varies_numbers)
-        fields = [
-            torch.zeros_like(f) for f in (swept.extinction, swept.scattering) if f is not None
-        ]
+        fields = [torch.zeros_like(field) for field in swept.fields]
         given_bars = torch.zeros_like(self.like)
         for k, total in enumerate(given_bars):
             if (bar := moment_of(bars, k)) is not None:
@@ -66,7 +63,7 @@ class Cells:
                 self._launch(back, given | {"slice": number}, len(steps) * self.colors * self.most)
             given["q_bars"] = q_bars = torch.empty_like(light)
             self._launch(collect, given, light.numel())
-            found += torch.tensordot(values.to(q_bars), q_bars, 1)
+            found += torch.tensordot((values / self.units).to(q_bars), q_bars, 1)
             for field, bar in zip(fields, (given["returning"], light), strict=False):
                 field += bar.sum(0).sum_to_size(field.shape)
             if varies_numbers:
@@ -95,7 +92,7 @@ class Cells:
     def _follow(self, steps: list[Step], values: Tensor) -> dict[str, Any]:
         """Radiance along `steps`, `light` [D, C, z, y, x], and what else kernels are given."""
         swept, like = self.swept, self.like
-        near = torch.tensordot(values.T.to(like), like, 1).contiguous()
+        near = torch.tensordot((values / self.units).T.to(like), like, 1).contiguous()
         numbers, parts = _tables(tuple(steps))
         scattering = swept.extinction if swept.scattering is None else swept.scattering
         depth, height, width = self.shape

@@ -15,11 +15,12 @@ from ddrecon.diffusion.rounds.fused.share import (
     numbers_by_color,
 )
 from ddrecon.grid import Grid
+from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 _FLUX = "z", "y", "x"
 _SWEPT = "swept", *(f"swept_{axis}" for axis in _FLUX)
@@ -27,6 +28,10 @@ _DIFFUSE = "diffuse", *(f"diffuse_{axis}" for axis in _FLUX)
 _LIGHT = tuple(f"light_{axis}" for axis in _FLUX)
 _FOUND = "source", "gain", *(f"gain_{a}" for a in _FLUX), *(f"turned_{a}" for a in _FLUX)
 _OF_MEDIUM = "extinction", "scattering", "numbers"
+_TENSORS = (
+    *("numbers", "extinction", "scattering", "imbalance", "swept", "diffuse"),
+    *(*_SWEPT[1:], *_DIFFUSE[1:], *_LIGHT),
+)
 # The row's part of each array; those that light has not are the first.
 _ROWS = """
 const long long at = c * size + start;
@@ -152,16 +157,17 @@ class _Gain(torch.autograd.Function):
     """The source, the gains and what is turned."""
 
     @staticmethod
-    def forward(ctx: Any, grid: Grid, *tensors: Any) -> tuple[Tensor, ...]:
-        ctx.grid = grid
-        ctx.save_for_backward(*tensors)
+    def forward(grid: Grid, *tensors: Any) -> tuple[Tensor, ...]:
         given, is_so = _given(*tensors)
-        like = given["swept"]
-        names = _FOUND if is_so[0] else _FOUND[:2]
-        found = {name: like.new_empty(like.shape) for name in names}
+        like, found = given["swept"], _empty(given, is_so)
         kernel = functools.partial(gain_kernel, is_so)
         launch_rows(kernel, grid, len(like), given | dict.fromkeys(_FOUND, like), found)
         return tuple(found.values())
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.grid, *tensors = inputs
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
@@ -191,6 +197,30 @@ class _Gain(torch.autograd.Function):
         light = ("swept", "diffuse", *_SWEPT[1:], *_DIFFUSE[1:], *_LIGHT)
         light_bars = (found[f"{name}_bar"] for name in light[: 11 if has_flux else 2])
         return None, sums, e_bar, s_bar, off_bar, *light_bars
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *changes: Tensor | None) -> tuple[Tensor, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            values, d_values = split(tensors)
+            given, is_so = _given(*values)
+            found, like = _empty(given, is_so), given["swept"]
+            kernel = functools.partial(gain_kernel, is_so)
+            d_given = dict(zip(_TENSORS, d_values, strict=False))
+            if is_so[1]:
+                d_given["scattering"] = d_given["extinction"]
+            # What is not found, without flux, is not written to either.
+            unused = dict.fromkeys((name for name in _FOUND if name not in found), found["source"])
+            launch_row_tangents(kernel, ctx.grid, len(like), given, d_given, found | unused)
+            return tuple(found.values())
+
+        d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
+        return d_found
+
+
+def _empty(given: dict[str, Any], is_so: tuple[bool, bool, bool]) -> dict[str, Tensor]:
+    """Room for what is found, by its names."""
+    like = given["swept"]
+    return {name: like.new_empty(like.shape) for name in (_FOUND if is_so[0] else _FOUND[:2])}
 
 
 def _given(

@@ -1,4 +1,4 @@
-"""The kernels of a sweep whose items are jobs: many directions through all rows of a color."""
+"""The kernels of a sweep whose items are lanes: directions through all rows."""
 
 import functools
 
@@ -10,12 +10,12 @@ from ddrecon.kernels.text import TextKernel
 
 
 @functools.cache
-def follow_kernel(bits: int, shares_field: bool, keeps: bool) -> TextKernel:
-    """The kernel that follows radiance; it finds moments, or `keeps` lines of all slices.
+def follow_kernel(bits: int, shares_field: bool) -> TextKernel:
+    """The kernel that follows radiance and finds its moments.
 
     `shares_field`: whether extinction and scattering have the same field.
     """
-    text = constants(SHARES_FIELD=shares_field, KEEPS=keeps) + FOLLOW
+    text = constants(SHARES_FIELD=shares_field, KEEPS=False) + FOLLOW
     return TextKernel("follow_rows", bits, text, GIVEN)
 
 

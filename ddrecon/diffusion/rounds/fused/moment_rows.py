@@ -60,16 +60,21 @@ auto pair_row = [&](int i) -> F* { return scratch_row(POINTERS + i); };
 auto ask_for = [&](const F* row, int from, int to) {
     for (int c = from; c < to; c += 64 / (int)sizeof(F)) __builtin_prefetch(row + ahead + c);
 };
-// One of the moments that scatter, from a cell on; those of `bars` and of light follow each other.
+// A moment of light; light is given as mean, flux along z, y, x, and what is higher.
+auto part_of = [&](F* const* parts, int k) -> const F* {
+    const int places[4] = {0, 2, 1, 3};
+    return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
+};
+// One of the moments that scatter, from a cell on.
 auto read_scattering = [&](long long at, int k, F* row, int from, int to) {
-    const F *light = (const F*)moments[2 * k], *source = (const F*)moments[2 * k + 1];
-    const F by_light = light ? factors[k * colors + color] : F(0);
-    const F by_source = source ? factors[(count + k) * colors + color] : F(0);
-    const F *one = (light ? light : source) + at, *other = (source ? source : light) + at;
+    const F *light = part_of(light_parts, k), *source = part_of(source_parts, k);
     if (!light && !source) {
         for (int c = from; c < to; ++c) row[c] = F(0);
         return;
     }
+    const F by_light = light ? factors[k * colors + color] : F(0);
+    const F by_source = source ? F(1) : F(0);
+    const F *one = (light ? light : source) + at, *other = (source ? source : light) + at;
     INDEPENDENT
     for (int c = from; c < to; ++c) row[c] = by_light * one[c] + by_source * other[c];
     ask_for(one, from, to);

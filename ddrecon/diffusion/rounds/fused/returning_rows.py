@@ -1,7 +1,7 @@
 """Rows of cells along which radiance is followed backward: the adjoint of `rows.py`, in C++.
 
-`rows.FOLLOW` kept what scatters and I of all slices of a slab. Of a row and a direction there are
-these lines of the last slice, which is the next one that light crosses:
+`rows.FOLLOW_ROWS` kept what scatters and I of all slices of a slab. Of a row and a direction there
+are these lines of the last slice, which is the next one that light crosses:
 
     RETURNING            exp(-depth) source_bar, which goes to the cells where the step began
     FAR, MASS            cotangents of q and of extinction's field at these cells
@@ -15,6 +15,7 @@ from ddrecon.diffusion.rounds.fused.rows import (
     DECAYED,
     DIRECTION,
     ENDS,
+    FOLLOW_ROWS,
     GROUP,
     PLACES,
     SLOPES,
@@ -37,9 +38,8 @@ for (int i = 0; i < point_count; ++i) {
         }
 }
 """
-RETURN = (
-    PLACES
-    + """
+_RETURN_ROWS = (
+    """
 enum { NEAR, LIGHT };
 enum { RETURNING, FAR, MASS, SCATTERED };
 const long long stride = 2LL * most * pitch, places = (slab + 1LL) * height;
@@ -47,9 +47,9 @@ const int kinds = SHARES_FIELD ? 3 : 4;
 const long long back_stride = (long long)kinds * most * pitch;
 const F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
 F* own_back = returning + lane * ((height + 2) * back_stride + MARGIN) + MARGIN;
-double* own_sums = sums + 3 * job[8];
-F* e_bars = e_bar + job[9] * cells;
-F* sc_bars = sc_bar + job[10] * cells;
+double* own_sums = sums + 3 * sums_at;
+F* e_bars = e_bar + (extinction_channels > 1 ? own_bar : shared_bar) * cells;
+F* sc_bars = sc_bar + (scattering_channels > 1 ? own_bar : shared_bar) * cells;
 for (int s = slice_to - 1; s >= slice_from; --s)
 for (int g = group_to - 1; g >= group_from; --g) {"""
     + GROUP
@@ -72,11 +72,12 @@ for (int t = height - 1; t >= 0; --t) {
     auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
     auto read = [&](int k, F* row, int from, int to) {
-        if (!bars[k]) {
+        const F* moment = part_of(bars, k);
+        if (!moment) {
             for (int c = from; c < to; ++c) row[c] = F(0);
             return;
         }
-        const F* moment = (const F*)bars[k] + color * cells + at;
+        moment += color * cells + at;
         for (int c = from; c < to; ++c) row[c] = moment[c];
         ask_for(moment, from, to);
     };
@@ -195,9 +196,18 @@ for (int t = height - 1; t >= 0; --t) {
         own_sums[2] += total(inflow_bar, width);
     }
     const bool is_adding = adds || g < group_to - 1;
-    F* found_row = found + job[11] * count * all + color * cells + at;
+    F* found_row = found + piece * count * all + color * cells + at;
     to_moments(to_sums, found_row, bar_of, is_adding, 0, width);
 }
 }
 """
 )
+# Slabs are gone through from the last one on: forward, and then back.
+RETURN = f"""{PLACES}
+for (int slice_from, slice_to = job_to; slice_to > job_from; slice_to = slice_from) {{
+slice_from = slab_of(slice_to - 1);
+{{ const bool KEEPS = true; {FOLLOW_ROWS} }}
+{{ {_RETURN_ROWS} }}
+}}
+}}
+"""

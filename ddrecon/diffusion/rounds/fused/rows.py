@@ -12,29 +12,31 @@ Behind each row there are at least two cells that hold what is beyond its ends. 
 no medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row.
 """
 
+from ddrecon.diffusion.rounds.fused.jobs import Job
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 
 MARGIN = 16
 """Cells before an array of lines, whose rows begin where vectors do."""
 POINTERS = 64
 """Moments and pairs of a group at most: so many rows are multiplied at once."""
-JOB = 13
-"""Whole numbers of a job: see `by_rows.py`."""
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
-    F *found, *saved, *returning, *e_bar, *sc_bar; double *sums; long *moments, *bars;
-    int *ranges, *jobs, *groups, *points, *pairs, *order;
+    F *found, *saved, *returning, *e_bar, *sc_bar, *light_parts[5], *source_parts[5], *bars[5];
+    double *sums; int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
     int directions, extinction_channels, scattering_channels
 """
 """What kernels of rows are given; what is not used, is none."""
 
+_NUMBERS = ", ".join(f"{name} = job[{i}]" for i, name in enumerate(Job._fields))
+# For each job of a lane.
 PLACES = (
-    f"const int MARGIN = {MARGIN}, POINTERS = {POINTERS}, JOB = {JOB};"
+    f"""
+const int MARGIN = {MARGIN}, POINTERS = {POINTERS}, JOB = {len(Job._fields)};
+for (const int* job = jobs + JOB * starts[item]; job < jobs + JOB * starts[item + 1]; job += JOB) {{
+const int {_NUMBERS};
+"""
     + """
-const int* job = jobs + JOB * item;
-const int color = job[0], way = job[1], group_from = job[2], group_to = job[3];
-const int slice_from = job[4], slice_to = job[5], adds = job[6], lane = job[7];
 const long long plane = (long long)height * width, cells = depth * plane, all = colors * cells;
 const int odd = count - even;
 // fields have a layer of empty cells around them
@@ -46,8 +48,7 @@ const F scale = scales[color], strength = scales[colors + color];
 const F inflow = scales[2 * colors + color];
 const F* empty_row = nothing + MARGIN;
 // Slabs of slices begin anew in the middle, where the ways meet; of those but the first I is saved.
-const int middle = job[12];
-auto begins = [&](int s) { return (s < middle ? s : s - middle) % slab == 0; };
+auto slab_of = [&](int s) { return s - (s < middle ? s : s - middle) % slab; };
 auto save_of = [&](int s, int t, int direction) -> long long {
     const int before = s < middle ? 0 : (middle + slab - 1) / slab;
     const long long number = before + (s < middle ? s : s - middle) / slab - 1;
@@ -131,9 +132,8 @@ const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * pas
 const F scattering_depth_bar = source_bar * line_mean;
 const F scattered = half_step * (scattering_depth_bar * strength);
 """
-FOLLOW = (
-    PLACES
-    + """
+FOLLOW_ROWS = (
+    """
 enum { NEAR, LIGHT };
 const long long stride = 2LL * most * pitch;
 const long long places = KEEPS ? (slab + 1LL) * height : height + 2;
@@ -217,18 +217,19 @@ for (int t = 0; t < height; ++t) {
         }
         else if (point_count == 1) pass_all(One(), Across());
         else pass_all(Four(), Across());
-        if (!KEEPS && saved && s + 1 < depth && begins(s + 1)) {
+        if (!KEEPS && saved && s + 1 < depth && slab_of(s + 1) == s + 1) {
             F* row = saved + save_of(s + 1, t, begin + j);
             for (int c = 0; c < width; ++c) row[c] = light_row[c];
         }
     }
     if (KEEPS) continue;
-    F* found_row = found + job[11] * count * all + color * cells + at;
+    F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
     to_moments(to_weighted_sums, found_row, light_of, is_adding, 0, width);
-    if (!is_adding && job[11] == 0)
+    if (!is_adding && piece == 0)
         for (int c = 0; c < width; ++c) found_row[c] += inflow;
 }
 }
 """
 )
+FOLLOW = f"{PLACES} const int slice_from = job_from, slice_to = job_to; {FOLLOW_ROWS} }}"

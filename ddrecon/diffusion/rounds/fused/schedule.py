@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Course, Direction
+from ddrecon.diffusion.rounds.fused.jobs import Chunks
 from ddrecon.diffusion.rounds.fused.swept import units_of_parts
 from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
@@ -105,7 +106,7 @@ class Tables:
     moments: Tensor
     even: int
     most: int
-    chunks: tuple[tuple[tuple[tuple[int, int], ...], ...], ...]
+    chunks: Chunks
 
 
 @functools.cache
@@ -162,6 +163,7 @@ class _Maker:
         point = torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
         image = point * point.new_tensor([1, 1, -1])
         is_odd = (harmonics(point, self.degree) * harmonics(image, self.degree) < 0).tolist()
+        self.units = units_of_parts(self.degree)
         self.order = sorted(range(moments), key=lambda k: is_odd[k])
         self.odd, self.most = sum(is_odd), 0
         self.groups, self.points, self.pairs = (
@@ -212,11 +214,10 @@ class _Maker:
         self.groups.append(list(group))
         # Y_k of pairs as sums over moments, and as sums over pairs; the same with weights.
         ways = torch.tensor([unit[0][0].direction for unit in units], dtype=torch.float64)
-        values = harmonics(ways, self.degree)[self.order].T
-        weighted = values * values.new_tensor([unit[0][1] for unit in units])[:, None]
-        weighted = weighted * units_of_parts(self.degree)[self.order]
+        values, of_parts = harmonics(ways, self.degree)[self.order].T, self.units[self.order]
+        weights = values.new_tensor([unit[0][1] for unit in units])[:, None]
         even = len(self.order) - self.odd
-        for matrix in (values, weighted):
+        for matrix in (values / of_parts, values * of_parts * weights):
             parts = matrix[:, :even], matrix[: sum(has_odd), even:]
             self.matrices += [part.reshape(-1) for part in parts]
             self.matrices += [part.T.reshape(-1) for part in parts]

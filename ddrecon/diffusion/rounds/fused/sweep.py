@@ -9,12 +9,15 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, parts_of, split, units_of_parts
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, choose, parts_of, split
+from ddrecon.diffusion.rounds.fused.tangents import CellTangents, RowTangents, changes_of
+from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.harmonics import degrees_of_harmonics
+from ddrecon.numerics.remember import remember
 
 
 def sweep_fused(
@@ -32,17 +35,19 @@ def sweep_fused(
     thread does a cell of a slice, not rows of directions; None: on a GPU.
     """
     colors = len(medium.extinction.value) if light is None else len(light.mean)
-    strength = (1 - medium.forward_fraction) * medium.scattering.scale
-    entering = source.mean.new_zeros(1) if inflow is None else inflow
-    scales = torch.stack(
-        [each.reshape(-1).expand(colors) for each in (medium.extinction.scale, strength, entering)]
-    )
     shares_field = medium.scattering.field is medium.extinction.field
-    mean, *rest = _Sweep.apply(
+    mean, *rest, _ = _Sweep.apply(
         source.mean.is_cuda if by_cells is None else by_cells,
+        torch.is_grad_enabled(),
         medium.grid,
         directions,
-        scales,
+        _scales(
+            medium.extinction.scale,
+            medium.scattering.scale,
+            medium.forward_fraction,
+            inflow,
+            colors,
+        ),
         medium.extinction.field,
         None if shares_field else medium.scattering.field,
         _spread_factors(factors, colors),
@@ -53,36 +58,56 @@ def sweep_fused(
     return Moments(mean, (z, y, x) if rest else None, higher)
 
 
+@remember
+def _scales(
+    extinction: Tensor, scattering: Tensor, fraction: Tensor, inflow: Tensor | None, colors: int
+) -> Tensor:
+    """Of extinction, of scattering that remains, and the inflow of each of `colors`, [3, C]."""
+    entering = torch.zeros_like(extinction) if inflow is None else inflow
+    each = extinction, (1 - fraction) * scattering, entering
+    return torch.stack([one.reshape(-1).expand(colors) for one in each])
+
+
+@remember
 def _spread_factors(factors: Tensor, colors: int) -> Tensor:
-    """`factors` [L + 1, 1 or C, 1, 1, 1] of light and those of sources, by harmonic: [2, K, C]."""
-    degree = len(factors) - 1
-    each = factors.reshape(degree + 1, -1).expand(-1, colors)[list(degrees_of_harmonics(degree))]
-    units = (1 / units_of_parts(degree)).to(each)[:, None]
-    return torch.stack([each * units, units.expand(-1, colors)])
+    """`factors` [L + 1, 1 or C, 1, 1, 1] by harmonic, [K, C]."""
+    degrees = torch.tensor(degrees_of_harmonics(len(factors) - 1), device=factors.device)
+    return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
 
 
 class _Sweep(torch.autograd.Function):
-    """The parts of light, and their derivatives by all tensors of `Swept`."""
+    """The parts of light, and their derivatives by all tensors of `Swept`.
+
+    At last what the backward pass needs, where gradients may be asked for: the numbers of threads,
+    and what `Rows` saves.
+    """
 
     @staticmethod
-    def forward(ctx: Any, by_cells: bool, *given: Any) -> tuple[Tensor, ...]:
-        grid, directions, *tensors = given
-        ctx.by_cells, ctx.of = by_cells, (grid, directions)
-        ctx.save_for_backward(*tensors)
-        swept, is_saved = Swept.of(*given), any(ctx.needs_input_grad)
-        ctx.set_materialize_grads(False)
-        ctx.threads, ctx.saved = thread_count(swept.like), None
+    def forward(by_cells: bool, may_save: bool, *given: Any) -> tuple[Any, ...]:
+        swept, threads = Swept.of(*given), thread_count(Swept.of(*given).like)
         if by_cells:
-            return split(Cells(swept).follow())
-        moments, ctx.saved = Rows(swept, ctx.threads).follow(is_saved)
-        return split(moments)
+            return *split(Cells(swept).follow()), None
+        is_saved = may_save and any(
+            isinstance(each, Tensor) and each.requires_grad for each in given
+        )
+        moments, saved = Rows(swept, threads).follow(is_saved)
+        return *split(moments), saved
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
+        ctx.by_cells, _, grid, directions, *tensors = inputs
+        ctx.of, ctx.threads, ctx.saved = (grid, directions), thread_count(output[0]), output[-1]
+        ctx.set_materialize_grads(False)
+        if ctx.saved is not None:
+            ctx.mark_non_differentiable(ctx.saved)
+        keep(ctx, *tensors)
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
-        _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
-        parts = *bars, *[None] * (PARTS - len(bars))
+        _, _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
+        parts = (*bars[:-1], *[None] * PARTS)[:PARTS]
         if ctx.by_cells:
             found = Cells(swept).transpose(parts, needs_scales)
         else:
@@ -93,10 +118,23 @@ class _Sweep(torch.autograd.Function):
             None,
             None,
             None,
+            None,
             scales_bar if needs_scales else None,
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
             swept.factor_bar(moments_bar) if needs_factors else None,
-            *swept.part_bars(0, moments_bar, needs_parts[:PARTS]),
-            *swept.part_bars(1, moments_bar, needs_parts[PARTS:]),
+            *swept.light_bars(moments_bar, needs_parts[:PARTS]),
+            *choose(moments_bar, needs_parts[PARTS:]),
         )
+
+    @staticmethod
+    def jvp(ctx: Any, *changes: Any) -> tuple[Tensor | None, ...]:
+        def change(*tensors: Any) -> tuple[Tensor, ...]:
+            values, d_values = halve(tensors)
+            swept = Swept.of(*ctx.of, *values)
+            d_swept = changes_of(swept, *d_values)
+            if ctx.by_cells:
+                return split(CellTangents(swept, d_swept).change())
+            return split(RowTangents(swept, d_swept, ctx.threads).change())
+
+        return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None

@@ -37,7 +37,7 @@ def units_of_parts(degree: int) -> Tensor:
 
 
 def split(moments: Tensor) -> tuple[Tensor, ...]:
-    """The parts of light in `moments` [K, C, z, y, x], which are in units of parts."""
+    """The parts of light in `moments` [K, C, z, y, x]."""
     if len(moments) == 1:
         return (moments[0],)
     first = (moments[_OF_HARMONIC.index(part)] for part in range(PARTS - 1))
@@ -58,7 +58,7 @@ class Swept:
 
     `scales` [3, C]: of extinction, of scattering, and inflow; `extinction` and `scattering`: fields
     [1 or C, z, y, x], None where the second is the first. What scatters has the moments
-    `factors`[0, k] times those of `light` and `factors`[1, k] times those of `source`, [2, K, C].
+    `factors` [K, C] times those of `light`, and those of `source`.
     """
 
     grid: Grid
@@ -91,37 +91,39 @@ class Swept:
         return like
 
     @property
-    def moments(self) -> list[tuple[Tensor | None, Tensor | None]]:
-        """The moments [C, z, y, x] of `light` and of `source`, harmonic by harmonic."""
-        count = self.factors.shape[1]
-        return [(moment_of(self.light, k), moment_of(self.source, k)) for k in range(count)]
+    def fields(self) -> list[Tensor]:
+        """Those of extinction and of scattering; one where they share it."""
+        return [field for field in (self.extinction, self.scattering) if field is not None]
 
     def total(self) -> Tensor:
-        """The moments of what scatters, [K, C, z, y, x]."""
-        found = self.like.new_zeros(self.factors.shape[1], *self.like.shape)
-        for total, pair, factors in zip(found, self.moments, self.factors.unbind(1), strict=True):
-            for moment, factor in zip(pair, factors, strict=True):
-                if moment is not None:
-                    total += factor.view(-1, 1, 1, 1) * moment
+        """The moments of what scatters, [K, C, z, y, x], in units of parts."""
+        found = self.like.new_zeros(len(self.factors), *self.like.shape)
+        for k, total in enumerate(found):
+            light, source = moment_of(self.light, k), moment_of(self.source, k)
+            if light is not None:
+                total += self.factors[k].view(-1, 1, 1, 1) * light
+            if source is not None:
+                total += source
         return found
 
-    def part_bars(self, which: int, bar: Tensor, needs: Sequence[bool]) -> list[Tensor | None]:
-        """Cotangents of parts of light (0) or source (1) that need them, of `bar` of moments."""
-        factors = self.factors[which].view(*self.factors.shape[1:], 1, 1, 1)
-        found: list[Tensor | None] = []
-        for part, need in zip(range(PARTS), needs, strict=True):
-            ks = slice(4, None) if part == PARTS - 1 else _OF_HARMONIC.index(part)
-            # A source counts as it is, but for the units of its flux.
-            is_itself = which == 1 and part in (0, PARTS - 1)
-            found.append((bar[ks] if is_itself else factors[ks] * bar[ks]) if need else None)
-        return found
+    def light_bars(self, bar: Tensor, needs: Sequence[bool]) -> Parts:
+        """Cotangents of those parts of light that need them, of `bar` of moments."""
+        if not any(needs):
+            return (None,) * PARTS
+        count = len(bar) if needs[PARTS - 1] else min(4, len(bar))
+        return choose(self.factors[:count, :, None, None, None] * bar[:count], needs)
 
     def factor_bar(self, bar: Tensor) -> Tensor:
         """The cotangent of `factors`, of `bar` of moments."""
         found = torch.zeros_like(self.factors, dtype=torch.float64)
-        for k, pair in enumerate(self.moments):
-            for which, moment in enumerate(pair):
-                if moment is not None:
-                    terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
-                    found[which, k] = torch.stack([torch.dot(*each) for each in terms])
+        for k in range(len(bar)):
+            if (moment := moment_of(self.light, k)) is not None:
+                terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
+                found[k] = torch.stack([torch.dot(*each) for each in terms])
         return found.to(bar.dtype)
+
+
+def choose(bar: Tensor, needs: Sequence[bool]) -> Parts:
+    """The parts of `bar` of moments that are needed."""
+    parts = (*split(bar), *[None] * PARTS)[:PARTS]
+    return tuple(part if need else None for part, need in zip(parts, needs, strict=True))

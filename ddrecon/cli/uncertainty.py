@@ -1,0 +1,128 @@
+"""The command `uncertainty`.
+
+torch is imported inside the command, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ddrecon.cli.command import AS_JSON, OUTPUT, OVERWRITE, in_session
+
+if TYPE_CHECKING:
+    from ddrecon.cli.session import Session
+    from ddrecon.reconstruct.loop import Reconstruction
+
+SAMPLES = 16
+CANDIDATES = 12
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@OUTPUT
+@OVERWRITE
+@click.option(
+    "--samples",
+    type=click.IntRange(min=2),
+    default=SAMPLES,
+    show_default=True,
+    metavar="N",
+    help="Samples of the posterior in all, also after --resume.",
+)
+@click.option(
+    "--noise",
+    "read",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="X",
+    help="Standard deviation of pictures, in radiance. Left out: as the scene says, or by what the "
+    "reconstruction leaves.",
+)
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0, max=1, min_open=True),
+    help="Relative residual of a sample.",
+)
+@click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
+@click.option(
+    "--next-view",
+    "ring",
+    type=click.Choice(["ring"]),
+    help=f"Rank {CANDIDATES} cameras, turned around the volume from the first: which picture would "
+    "tell most?",
+)
+@click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
+@AS_JSON
+@in_session
+def uncertainty(
+    session: Session,
+    run: Path,
+    output: Path,
+    overwrite: bool,
+    samples: int,
+    read: float | None,
+    tolerance: float | None,
+    has_samples: bool,
+    ring: str | None,
+    resume: bool,
+) -> None:
+    """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
+    they do not.
+    """
+    from ddrecon.io.files.folders import claim_folder
+    from ddrecon.pictures.noise import Noise
+    from ddrecon.reconstruct.next_view import FEWEST
+    from ddrecon.reconstruct.posterior import TOLERANCE
+    from ddrecon.run.uncertainty_folder import (
+        drive_uncertainty,
+        dtype_of,
+        state_of,
+        take_up,
+        uncertainty_lines,
+    )
+
+    if ring and samples < FEWEST:
+        raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
+    state = state_of(run)
+    session = replace(session, dtype=dtype_of(state))
+    taken = take_up(session.build(session.read(run / "scene.yaml")), state, run)
+    with claim_folder(output, may_exist=overwrite or resume):
+        record = drive_uncertainty(
+            taken,
+            output,
+            samples,
+            seed=session.seed,
+            noise=None if read is None else Noise(read, 0.0),
+            tolerance=tolerance or TOLERANCE,
+            has_samples=has_samples,
+            candidates=CANDIDATES if ring else 0,
+            resume=resume,
+            is_quiet=session.is_quiet,
+        )
+    session.show(record, uncertainty_lines(record, output))
+
+
+def add_uncertainty(
+    run: Reconstruction, folder: Path, is_quiet: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """How sure `run` is, told in `uncertainty` within its `folder`: the record, and its lines."""
+    from ddrecon.reconstruct.posterior import TOLERANCE
+    from ddrecon.run.uncertainty_folder import drive_uncertainty, uncertainty_lines
+
+    path = folder / "uncertainty"
+    path.mkdir(exist_ok=True)
+    record = drive_uncertainty(
+        run,
+        path,
+        SAMPLES,
+        seed=run.seed,
+        noise=None,
+        tolerance=TOLERANCE,
+        has_samples=False,
+        resume=False,
+        is_quiet=is_quiet,
+    )
+    return record, uncertainty_lines(record, path)

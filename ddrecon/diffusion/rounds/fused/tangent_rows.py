@@ -1,0 +1,183 @@
+"""The tangent of a sweep along rows of cells, in C++: light and its change, side by side (E11).
+
+As `rows.py` follows radiance, with two lines more of each row and direction: what of the change
+scatters along it, `D_NEAR`, and the change of I, `D_LIGHT`. Names of changes begin with `d_`.
+"""
+
+from __future__ import annotations
+
+import functools
+
+from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
+from ddrecon.diffusion.rounds.fused.rows import (
+    DECAYED,
+    DIRECTION,
+    ENDS,
+    GIVEN,
+    GROUP,
+    PLACES,
+    UPSTREAM,
+)
+from ddrecon.diffusion.rounds.fused.share import constants
+from ddrecon.kernels.text import TextKernel
+
+_GIVEN = "F *d_light_parts[5], *d_source_parts[5], *d_factors, *d_scales"
+# The change of one of the moments that scatter, from a cell on.
+_READ_CHANGE = """
+auto read_change = [&](long long at, int k, F* __restrict row, int from, int to) {
+    const F* terms[3] = {part_of(d_source_parts, k), part_of(d_light_parts, k),
+                         part_of(light_parts, k)};
+    const F by[3] = {F(1), factors[k * colors + color], d_factors[k * colors + color]};
+    for (int c = from; c < to; ++c) row[c] = F(0);
+    for (int i = 0; i < 3; ++i) {
+        if (!terms[i] || by[i] == F(0)) continue;
+        const F* __restrict term = terms[i] + at;
+        for (int c = from; c < to; ++c) row[c] += by[i] * term[c];
+    }
+};
+"""
+_CHANGES_UPSTREAM = """
+const F *d_near_from[4], *d_light_from[4], *d_e_from[4], *d_sc_from[4];
+for (int i = 0; i < 4; ++i) {
+    const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
+    const bool is_inside = s >= dk && t >= dr;
+    d_near_from[i] = line(s >= dk ? s - dk : 0, t >= dr ? t - dr : 0, D_NEAR, j) - shift;
+    d_light_from[i] = (is_inside ? line(s - dk, t - dr, D_LIGHT, j) : empty_row) - shift;
+    d_e_from[i] = e_from[i] + (d_e_cells - e_cells);
+    d_sc_from[i] = sc_from[i] + (d_sc_cells - sc_cells);
+}
+"""
+# The change of I at the end of a step, with those of its light, its matter and its scattering.
+_CHANGE = """
+const F d_far = gather(points, d_near_from, part, c), d_near_here = d_near_row[c];
+const F d_mass = half_step * (d_e[c] + gather(points, d_e_from, part, c));
+const F d_scattering_mass
+    = SHARES_FIELD ? d_mass : half_step * (d_sc[c] + gather(points, d_sc_from, part, c));
+const F d_depth = scale * d_mass + d_scale * mass;
+const F slope_series = psi_slope_series(is_thin ? depth_of_step : F(0));
+const F psi_slope = is_thin ? slope_series : (phi - F(2) * psi) * inverse;
+const F line_slope = far * (psi - phi) + (near_here - far) * psi_slope;
+const F d_line = d_far * phi + (d_near_here - d_far) * psi + line_slope * d_depth;
+const F scattered = scattering_mass * strength;
+const F d_scattered = d_scattering_mass * strength + scattering_mass * d_strength;
+const F d_passed = -passed * d_depth;
+d_light_row[c] = passed * d_arriving + d_passed * (arriving + inflow) - d_inflow * lost
+    + (d_line * scattered + line_mean * d_scattered);
+light_row[c] = passed * arriving + (line_mean * scattered - inflow * lost);
+"""
+_FOLLOW = (
+    PLACES
+    + """
+enum { NEAR, LIGHT, D_NEAR, D_LIGHT, LINES };
+// changes of fields lie behind them
+const F* d_e_cells = e_cells + extinction_channels * padded;
+const F* d_sc_cells = sc_cells + scattering_channels * padded;
+const int slice_from = job_from, slice_to = job_to;
+const F d_scale = d_scales[color], d_strength = d_scales[colors + color];
+const F d_inflow = d_scales[2 * colors + color];
+const long long stride = (long long)LINES * most * pitch;
+F* own_lines = lines + lane * ((height + 2) * stride + MARGIN) + MARGIN;
+for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_to; ++g) {"""
+    + GROUP
+    + "const int ahead = y_way * width;"
+    + MULTIPLY
+    + _READ_CHANGE
+    + """
+const int k = way > 0 ? s : depth - 1 - s;
+for (int t = 0; t < height; ++t) {
+    const int r = y_way > 0 ? t : height - 1 - t;
+    const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
+    auto line = [&](int slice, int turn, int which, int j) -> F* {
+        const long long place = (turn + 2LL * (depth - slice)) % (height + 2);
+        return own_lines + place * stride + (LINES * (before + j) + which) * (long long)pitch;
+    };
+    auto near_of = [&](int j) -> F* { return line(s, t, NEAR, j); };
+    auto d_near_of = [&](int j) -> F* { return line(s, t, D_NEAR, j); };
+    auto d_light_of = [&](int j) -> F* { return line(s, t, D_LIGHT, j); };
+    // Where steps meet a medium or its change, and where what scatters is asked for.
+    const int* range = ranges + 4 * (k * height + r);
+    const int from = range[0], to = range[1];
+    auto read = [&](int k, F* row, int from, int to) {
+        read_scattering(color * cells + at, k, row, from, to);
+    };
+    auto read_changes = [&](int k, F* row, int from, int to) {
+        read_change(color * cells + at, k, row, from, to);
+    };
+    to_directions(to_light, read, near_of, range[2], range[3]);
+    to_directions(to_light, read_changes, d_near_of, range[2], range[3]);
+    const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
+    const F *__restrict d_e = d_e_cells + row, *__restrict d_sc = d_sc_cells + row;
+    F *__restrict carried = scratch_row(3 * POINTERS);
+    F *__restrict d_carried = scratch_row(3 * POINTERS + 1);
+    for (int j = 0; j < members; ++j) {"""
+    + DIRECTION
+    + """
+        F *near_row = near_of(j), *d_near_row = d_near_of(j);
+        F *__restrict light_row = line(s, t, LIGHT, j), *__restrict d_light_row = d_light_of(j);
+        light_row[-1] = light_row[width] = d_light_row[-1] = d_light_row[width] = F(0);
+        if (x_way > 0) near_row[-1] = near_row[0], d_near_row[-1] = d_near_row[0];
+        else near_row[width] = near_row[width - 1], d_near_row[width] = d_near_row[width - 1];"""
+    + UPSTREAM
+    + _CHANGES_UPSTREAM
+    + """
+        auto pass = [&](auto points, auto along, auto empty, int from, int to) {
+            constexpr bool is_empty = decltype(empty)::value;
+            INDEPENDENT
+            for (int c = from; c < to; ++c) {
+                const F arriving = gather(points, light_from, part, c);
+                const F d_arriving = gather(points, d_light_from, part, c);
+                if constexpr (is_empty) {
+                    light_row[c] = arriving;
+                    d_light_row[c] = d_arriving;
+                    if (decltype(along)::value) carried[c] = part[0], d_carried[c] = F(0);
+                } else {"""
+    + ENDS
+    + DECAYED
+    + _CHANGE
+    + """
+                    if (decltype(along)::value)
+                        carried[c] = part[0] * passed, d_carried[c] = part[0] * d_passed;
+                }
+            }
+        };
+        auto pass_all = [&](auto points, auto along) {
+            pass(points, along, Empty(), 0, from);
+            pass(points, along, Filled(), from, to);
+            pass(points, along, Empty(), to, width);
+        };
+        if (is_along) {
+            // What comes along the row itself is carried on cell by cell.
+            for (int i = 0; i < 4; ++i)
+                if (!point[3 * i] && !point[3 * i + 1]) light_from[i] = d_light_from[i] = empty_row;
+            pass_all(Four(), Along());
+            F last = F(0), d_last = F(0);
+            for (int n = 0; n < width; ++n) {
+                const int c = x_way > 0 ? n : width - 1 - n;
+                d_last = d_light_row[c] = d_light_row[c] + carried[c] * d_last
+                    + d_carried[c] * last;
+                last = light_row[c] = light_row[c] + carried[c] * last;
+            }
+        }
+        else if (point_count == 1) pass_all(One(), Across());
+        else pass_all(Four(), Across());
+    }
+    F* found_row = found + piece * count * all + color * cells + at;
+    const bool is_adding = adds || g > group_from;
+    to_moments(to_weighted_sums, found_row, d_light_of, is_adding, 0, width);
+    if (!is_adding && piece == 0)
+        for (int c = 0; c < width; ++c) found_row[c] += d_inflow;
+}
+}
+}
+"""
+)
+
+
+@functools.cache
+def tangent_kernel(bits: int, shares_field: bool) -> TextKernel:
+    """The kernel that finds the change of moments, with those of all that is swept.
+
+    `shares_field`: whether extinction and scattering have the same field.
+    """
+    text = constants(SHARES_FIELD=shares_field, KEEPS=False) + _FOLLOW
+    return TextKernel("change_rows", bits, text, f"{GIVEN}; {_GIVEN}")

@@ -1,0 +1,95 @@
+"""How a sweep changes with all that is swept, by fused kernels (E11, E17)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.rounds.fused.by_cells import Cells
+from ddrecon.diffusion.rounds.fused.by_rows import Rows
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept
+from ddrecon.diffusion.rounds.fused.tangent_rows import tangent_kernel
+from ddrecon.kernels.dual import tangent_of, with_changes
+
+
+def changes_of(swept: Swept, *changes: Tensor | None) -> Swept:
+    """What is added to all tensors of `swept`, as `Swept.of` takes them; None for nothing."""
+    tensors = swept.scales, swept.extinction, swept.scattering, swept.factors
+    whole = [
+        tensor if tensor is None else torch.zeros_like(tensor) if change is None else change
+        for tensor, change in zip(tensors, changes, strict=False)
+    ]
+    scales, extinction, scattering, factors = whole
+    assert scales is not None and extinction is not None and factors is not None
+    parts = changes[len(whole) :]
+    return Swept.of(swept.grid, swept.directions, scales, extinction, scattering, factors, *parts)
+
+
+class RowTangents(Rows):
+    """The change of a sweep on a processor: light and its change go through the rows together."""
+
+    def __init__(self, swept: Swept, changes: Swept, threads: int):
+        self.changes = changes
+        super().__init__(swept, threads)
+
+    def change(self) -> Tensor:
+        """The change of the moments of radiance [K, C, z, y, x]."""
+        changes, sums = self.changes, self._sums()
+        given = self._given() | {
+            "d_light_parts": changes.light, "d_source_parts": changes.source,
+            "d_factors": changes.factors, "d_scales": changes.scales,
+        }  # fmt: skip
+        lines = 2 * self._line_count(self.height + 2)
+        made = {"found": sums, **self._zeros(lines=lines)}
+        self._launch(tangent_kernel(self.bits, self._shares_field), False, given, made)
+        return sums.sum(0) if len(sums) > 1 else sums[0]
+
+    def _matter(self) -> list[Tensor]:
+        # Each with its change behind it: steps meet a medium where that changes, too.
+        return [
+            torch.cat(pair) for pair in zip(self.swept.fields, self.changes.fields, strict=True)
+        ]
+
+
+class CellTangents(Cells):
+    """The change of a sweep on a GPU: the kernel that follows radiance, in dual numbers."""
+
+    def __init__(self, swept: Swept, changes: Swept):
+        super().__init__(swept)
+        self.changes = changes
+        # Both the factors and what they multiply change.
+        nothing = (None,) * PARTS
+        crossed = replace(swept, light=changes.light, source=changes.source)
+        by_factors = replace(swept, factors=changes.factors, source=nothing)
+        self.d_moments = torch.zeros_like(self.like)
+        for part in (crossed, by_factors):
+            if any(each is not None for each in (*part.light, *part.source)):
+                self.d_moments += part.total()
+
+    def change(self) -> Tensor:
+        """The change of the moments of radiance [K, C, z, y, x]."""
+        found = torch.zeros_like(self.like)
+        changes = self.changes
+        for steps, values, weights in self._parts(arrays=4):
+            given = self._follow(steps, values)
+            d_near = torch.tensordot(values.T.to(self.like), self.d_moments, 1).contiguous()
+            d_fields = changes.extinction, changes.scattering
+            d_given = {
+                "near": d_near, "extinction": d_fields[0], "scales": changes.scales,
+                "scattering": d_fields[0] if d_fields[1] is None else d_fields[1],
+            }  # fmt: skip
+            kernel = tangent_of(self.kernels(False)[0], "", "light")
+            d_light = torch.empty_like(given["light"])
+            whole: dict[str, Any] = given | with_changes(given, d_given)
+            light = whole.pop("light")
+            made = {"d_light": d_light, "light": light}
+            for number in range(max(self.shape)):
+                count = len(steps) * self.colors * self.most
+                kernel.launch(count, whole | {"slice": number}, made)
+            weighted = self.units * values * weights
+            found += torch.tensordot(weighted.to(d_light), d_light, 1)
+            found[0] += float(weights.sum()) * changes.scales[2].view(-1, 1, 1, 1)
+        return found

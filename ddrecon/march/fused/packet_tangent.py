@@ -1,0 +1,150 @@
+"""The walk along packets of rays that finds the change of their integral.
+
+With those of fields, numbers, polynomials and the table of p; changes of the rays themselves are
+left to `walks`. A node and its change are two records of the same kind: that of the change has
+changes for values, emission and depth.
+"""
+
+from __future__ import annotations
+
+import functools
+
+from ddrecon.kernels.text import TextKernel
+from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_rays import packet_kernel
+
+_WALK = """
+const F *d_scale = d_numbers, *d_peaks = d_numbers + C;
+const F d_bound = d_numbers[2 * C];
+const V none = P::all(F(0));
+V d_coefficients_of[BEAMS * PHASES * COEFFICIENTS + 1];
+if (HAS_PEAK && d_coefficients)
+    for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k)
+        d_coefficients_of[k] = P::load(d_coefficients + k * (last + 1), begin, 1, last);
+auto sample_change = [&](Node& change, int n, int from, int to) {
+    fields = all_fields + CHANNELS;
+    sample(change, n, from, to);
+    fields = all_fields;
+};
+// The change of the matter at node n, where that is known: the same place.
+auto locate_change = [&](int n, Node& node, Node& change) {
+    change.y = node.y;
+    change.x = node.x;
+    change.q = node.q;
+    change.runs = node.runs;
+#if !defined(__CUDA_ARCH__)
+    for (int r = 0; r < node.runs && r < LANES; ++r) change.run[r] = node.run[r];
+#endif
+    sample_change(change, n, 0, EXTINCTION);
+    if (SCATTERING) sample_change(change, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
+    for (int c = 0; c < EXTINCTION; ++c)
+        node.is_empty = node.is_empty && P::every(change.v[c] == none);
+    for (int c = FIRST_OWN_SCATTERING; c < FIRST_PEAK; ++c)
+        node.is_empty = node.is_empty && P::every(change.v[c] == none);
+};
+// The change of p in the depth of its peak, `depth`, and in its coefficients.
+auto change_of_p = [&](Node& node, int b, int c, V p, V depth, V d_depth) -> V {
+    const int phase = b * PHASES + c * PHASE_STEP;
+    V d_curve[TERMS];
+    const V* d_terms = d_coefficients ? d_coefficients_of + phase * COEFFICIENTS : nullptr;
+    if (IS_POINT[b] && d_table) {
+        Point::curve(node.point[b], d_table + c * PHASE_STEP * TABLE_STEP, d_curve);
+        d_terms = d_curve;
+    } else if (IS_POINT[b]) d_terms = nullptr;
+    if (!HAS_PEAK) return IS_POINT[b] && d_terms ? d_terms[0] : none;
+    const V place = Polynomial::place(depth);
+    V d_p = d_depth * Polynomial::slope(curve_of(node, b, c), place);
+    if (d_terms) d_p += Polynomial::at(d_terms, place);
+    return P::pick(p > none, d_p, none);
+};
+// The change of all else at node n, behind the mass `m` and its change.
+auto emit_change = [&](int n, Node& node, Node& change, const W* m, const V* d_m) {
+    sample_change(change, n, EXTINCTION, FIRST_OWN_SCATTERING);
+    if (IS_PEAK_FIELD) sample_change(change, n, FIRST_PEAK, CHANNELS);
+    for (int k = 0; k < MASSES; ++k) {
+        const V bend = node.bend[k], bent = bound * bend;
+        const V inverse = F(1) / P::root(F(1) + bent * bent);
+        change.v[FIRST_MASS + k] -= inverse * inverse * inverse
+            * (change.bend[k] - bent * bend * bend * d_bound);
+    }
+    for (int c = 0; c < C; ++c) {
+        const int s = FIRST_SCATTERING + c * SCATTERING_STEP, k = c * MASS_STEP;
+        const int d = FIRST_DIFFUSE + c * DIFFUSE_STEP;
+        change.w[c] = change.v[s] * node.v[d] + node.v[s] * change.v[d];
+        change.u[c] = scale[c] * d_m[k] + d_scale[c] * P::narrow(m[k]);
+    }
+    for (int b = 0; b < BEAMS; ++b) {
+        for (int c = 0; c < C; ++c) {
+            const int i = C + b * C + c, k = c * MASS_STEP, j = FIRST_MASS + b * EXTINCTION + k;
+            const int s = FIRST_SCATTERING + c * SCATTERING_STEP;
+            const V way = P::narrow(m[k]) + node.v[j], d_way = d_m[k] + change.v[j];
+            V depth = none, d_depth = none;
+            if (HAS_PEAK) {
+                const V peak = peak_of(node, c);
+                const V d_peak = IS_PEAK_FIELD ? change.v[FIRST_PEAK + c * PEAK_STEP]
+                                               : P::all(d_peaks[c]);
+                depth = peak * way;
+                d_depth = peak * d_way + d_peak * way;
+            }
+            const V d_p = change_of_p(node, b, c, node.p[i], depth, d_depth);
+            change.w[i] = change.v[s] * node.p[i] + node.v[s] * d_p;
+            change.u[i] = scale[c] * d_way + d_scale[c] * way;
+        }
+    }
+};
+V total[OUT], d_m[EXTINCTION];
+W m[EXTINCTION];
+for (int i = 0; i < OUT; ++i) total[i] = none;
+for (int k = 0; k < EXTINCTION; ++k) d_m[k] = none, m[k] = P::wide(none);
+Node nodes[2], changes[2];
+Node *a = nodes, *b = nodes + 1, *d_a = changes, *d_b = changes + 1;
+locate(first_node, *a);
+locate_change(first_node, *a, *d_a);
+a->is_lit = false;
+for (int n = first_node + 1; n <= last_node; ++n) {
+    locate(n, *b);
+    locate_change(n, *b, *d_b);
+    b->is_lit = !(a->is_empty && b->is_empty);
+    if (b->is_lit) {
+        if (!a->is_lit) {
+            emit(n - 1, *a, m);
+            emit_change(n - 1, *a, *d_a, m, d_m);
+        }
+        // The mass passed on the way to the next node, and what it emits behind that.
+        for (int k = 0; k < EXTINCTION; ++k) {
+            m[k] += mass_between(*a, *b, k);
+            d_m[k] += F(0.5) * (d_a->v[k] + d_b->v[k]) * (b->t - a->t);
+        }
+        emit(n, *b, m);
+        emit_change(n, *b, *d_b, m, d_m);
+        // E2, E3: what arrives from the segment between both.
+        for (int i = 0; i < OUT; ++i) {
+            V by_a, by_b;
+            const V decay
+                = Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
+            const V brighter = (d_a->w[i] + d_b->w[i]) * decay;
+            const V deeper = (a->w[i] + b->w[i]) * (by_a * d_a->u[i] + by_b * d_b->u[i]);
+            total[i] += F(0.5) * measure(*a, *b, i) * (brighter + deeper);
+        }
+    }
+    Node *passed = a, *d_passed = d_a;
+    a = b, d_a = d_b;
+    b = passed, d_b = d_passed;
+}
+for (int l = 0; l < LANES && begin + l <= last; ++l) {
+    for (int i = 0; i < OUT; ++i)
+        d_out[(long long)i * (last + 1) + begin + l] = P::lane(total[i], l);
+    for (int k = 0; k < EXTINCTION; ++k)
+        d_masses[(long long)k * (last + 1) + begin + l] = P::lane(d_m[k], l);
+}
+"""
+
+
+@functools.cache
+def packet_tangent_kernel(layout: Layout) -> TextKernel:
+    """The kernel of the changes `d_out` [outputs, R] and `d_masses` [K, R] of packets of rays.
+
+    `d_coefficients` and `d_table`, as what they are changes of, may be left out.
+    """
+    given = "F *d_coefficients, *d_numbers, *d_table, *d_out, *d_masses"
+    return packet_kernel("integrate_tangent", layout, _WALK, given, changes=True)

@@ -1,0 +1,268 @@
+"""Ranks: the processes that share the work of one run, as torchrun starts them.
+
+Each does its own part, and what they find is summed. Without torchrun, or with a single process of
+it, there is one rank: nothing is imported, nothing is exchanged. What is drawn or decided alike on
+all ranks needs no exchange either.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from io import BytesIO
+from time import monotonic, perf_counter, sleep
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from ddrecon.errors import RanksError, UsageError, one_line
+
+MEET_SECONDS = 120.0
+"""So long ranks wait for each other at the start; the environment variable says otherwise."""
+MEET_VARIABLE = "DDRECON_MEET_SECONDS"
+EXCHANGE_SECONDS = 1800.0
+"""So long they wait in an exchange. A rank that has ended is noticed at once."""
+TOLD_SECONDS = 3.0
+"""So long a rank that fails waits whether the first fails of the same."""
+
+T = TypeVar("T")
+
+
+@dataclass
+class _Group:
+    """This process's place among `count` ranks, and where they leave each other notes, `store`.
+
+    `bytes` were handed to exchanges so far, which took `seconds`.
+    """
+
+    rank: int
+    count: int
+    store: Any
+    bytes: int = 0
+    seconds: float = 0.0
+
+
+_group: _Group | None = None
+"""Of this process, once it has joined others."""
+
+
+def join_ranks(has_gpu: bool) -> None:
+    """Meets the other ranks where torchrun has started several; nothing happens elsewhere.
+
+    With `has_gpu`, sums of tensors on a GPU go by NCCL; all else goes by gloo. Raises RanksError
+    where the others cannot be reached, UsageError for an environment that torchrun does not make.
+    """
+    global _group
+    if _group is not None or int(os.environ.get("WORLD_SIZE", 1)) < 2 or "RANK" not in os.environ:
+        return
+    import torch.distributed as dist
+
+    missing = [name for name in ("MASTER_ADDR", "MASTER_PORT") if name not in os.environ]
+    if missing:
+        raise UsageError(
+            f"RANK and WORLD_SIZE are set, but not {' and '.join(missing)}; start by torchrun"
+        )
+    rank, count = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    wait = timedelta(seconds=float(os.environ.get(MEET_VARIABLE, MEET_SECONDS)))
+    try:
+        store, *_ = next(dist.rendezvous("env://", timeout=wait))
+    except (RuntimeError, ValueError, OSError) as error:
+        place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+        raise RanksError(
+            f"rank {rank} of {count} cannot meet the others at {place}"
+            f" within {wait.total_seconds():g} s ({_reason(error)});"
+            " check MASTER_ADDR and MASTER_PORT, or torchrun's rendezvous"
+        ) from error
+    _meet(store, rank, count, wait)
+    backend = "cpu:gloo,cuda:nccl" if has_gpu else "gloo"
+    try:
+        dist.init_process_group(
+            backend,
+            store=dist.PrefixStore("ddrecon", store),
+            rank=rank,
+            world_size=count,
+            timeout=timedelta(seconds=EXCHANGE_SECONDS),
+        )
+    except RuntimeError as error:
+        raise RanksError(
+            f"rank {rank} of {count} cannot connect to the others ({_reason(error)}); "
+            "GLOO_SOCKET_IFNAME and NCCL_SOCKET_IFNAME name the network to use"
+        ) from error
+    _group = _Group(rank, count, store)
+
+
+def _meet(store: Any, rank: int, count: int, wait: timedelta) -> None:
+    """Returns when all ranks are there; raises RanksError that names those that are not."""
+    keys = [f"ddrecon/here/{other}" for other in range(count)]
+    store.set(keys[rank], "here")
+    try:
+        store.wait(keys, wait)
+    except RuntimeError as error:
+        missing = [str(other) for other, key in enumerate(keys) if not store.check([key])]
+        raise RanksError(
+            f"rank {rank} of {count} has waited {wait.total_seconds():g} s in vain"
+            f" for rank {', '.join(missing)}"
+        ) from error
+
+
+def leave_ranks() -> None:
+    """Parts from the other ranks, which need not do so at the same time."""
+    global _group
+    if _group is not None:
+        _group = None
+        torch.distributed.destroy_process_group()
+
+
+def rank_count() -> int:
+    """How many ranks share the work."""
+    return 1 if _group is None else _group.count
+
+
+def own_rank() -> int:
+    """The number of this rank, from 0."""
+    return 0 if _group is None else _group.rank
+
+
+def is_first() -> bool:
+    """Whether this is the rank that writes and prints."""
+    return own_rank() == 0
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """Has each rank work by itself, as if there were no others."""
+    global _group
+    group, _group = _group, None
+    try:
+        yield
+    finally:
+        _group = group
+
+
+def exchanged() -> tuple[int, float]:
+    """Bytes that this rank has handed to exchanges so far, and the seconds that they took."""
+    return (0, 0.0) if _group is None else (_group.bytes, _group.seconds)
+
+
+def assign(costs: Sequence[float], ranks: int) -> list[int]:
+    """The rank that does each of some jobs with these `costs`, so that all end at about one time.
+
+    The longest jobs are given out first, each to the rank with the least to do (Graham 1969,
+    doi:10.1137/0117039): no rank has more than 4/3 of what it must have.
+    """
+    owners, loads = [0] * len(costs), [0.0] * ranks
+    for job in sorted(range(len(costs)), key=lambda job: -costs[job]):
+        owners[job] = min(range(ranks), key=lambda rank: loads[rank])
+        loads[owners[job]] += costs[job]
+    return owners
+
+
+def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """The sums over ranks of each of `tensors`, of one device: the same bits on all of them.
+
+    They go in one exchange. Raises RanksError where a rank has ended.
+    """
+    if _group is None or not tensors:
+        return list(tensors)
+    flat = torch.cat([tensor.detach().flatten() for tensor in tensors])
+    with _exchange(flat.nbytes):
+        torch.distributed.all_reduce(flat)
+        if flat.is_cuda:
+            torch.cuda.synchronize(flat.device)
+    parts = flat.split([tensor.numel() for tensor in tensors])
+    return [part.view(like.shape).to(like.dtype) for part, like in zip(parts, tensors, strict=True)]
+
+
+def sum_numbers(numbers: Sequence[float]) -> list[float]:
+    """The sums over ranks of each of `numbers`."""
+    sums: list[float] = sum_over_ranks([torch.tensor(numbers, dtype=torch.float64)])[0].tolist()
+    return sums
+
+
+def is_any(flag: bool) -> bool:
+    """Whether `flag` is true on any rank."""
+    return sum_numbers([flag])[0] > 0
+
+
+def from_first(value: T) -> T:
+    """The `value` that the first rank has: plain values and tensors, these on the processor."""
+    if _group is None:
+        return value
+    # As a file of tensors and plain values: what is read can run no code.
+    stream = BytesIO()
+    if _group.rank == 0:
+        torch.save(value, stream)
+    content = torch.frombuffer(bytearray(stream.getvalue() or b"0"), dtype=torch.uint8)
+    size = torch.tensor(len(content))
+    with _exchange(0):
+        torch.distributed.broadcast(size, 0)
+    content = content if _group.rank == 0 else content.new_empty(int(size))
+    with _exchange(content.nbytes):
+        torch.distributed.broadcast(content, 0)
+    copy: T = torch.load(BytesIO(content.numpy().tobytes()), map_location="cpu", weights_only=True)
+    return copy
+
+
+@contextmanager
+def _exchange(count: int) -> Iterator[None]:
+    """An exchange of `count` bytes, which becomes a RanksError where a rank has ended."""
+    assert _group is not None
+    begun = perf_counter()
+    try:
+        yield
+    except RuntimeError as error:
+        raise RanksError(_told() or f"another rank has ended ({_reason(error)})") from error
+    _group.bytes += count
+    _group.seconds += perf_counter() - begun
+
+
+def tell_failure(error: BaseException) -> str | None:
+    """What this rank is to print as it ends by `error`; None where another says the same.
+
+    The others learn of it, as the reason why this rank has ended.
+    """
+    text = str(error)
+    if _group is None:
+        return text
+    if isinstance(error, RanksError):
+        # All ranks have lost the one that failed: it is told once a machine.
+        return text if os.environ.get("LOCAL_RANK", "0") == "0" else None
+    try:
+        _group.store.set(f"ddrecon/failed/{_group.rank}", one_line(text))
+        if _group.rank == 0:
+            return text
+        end = monotonic() + TOLD_SECONDS
+        while monotonic() < end and not _group.store.check(["ddrecon/failed/0"]):
+            sleep(0.05)
+        if _group.store.check(["ddrecon/failed/0"]) and _note(0) == one_line(text):
+            return None
+    except RuntimeError:
+        pass  # the first rank has ended, and has taken the notes with it
+    return f"rank {_group.rank}: {text}"
+
+
+def _told() -> str | None:
+    """What a rank that failed has said of it."""
+    assert _group is not None
+    try:
+        failed = [
+            rank for rank in range(_group.count) if _group.store.check([f"ddrecon/failed/{rank}"])
+        ]
+        return f"rank {failed[0]} has failed: {_note(failed[0])}" if failed else None
+    except RuntimeError:
+        return None
+
+
+def _note(rank: int) -> str:
+    assert _group is not None
+    return str(_group.store.get(f"ddrecon/failed/{rank}").decode())
+
+
+def _reason(error: BaseException) -> str:
+    """The first sentence of what torch says, without where in its source that was."""
+    line = str(error).partition("\n")[0].partition(". ")[0]
+    return one_line(line.rpartition("] ")[2] or line if line.startswith("[") else line).rstrip(".")

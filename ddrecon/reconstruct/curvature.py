@@ -1,0 +1,128 @@
+"""The second derivative of a run's objective by Gauss and Newton: products with J^T W J + R (E33).
+
+J is the derivative of all training pictures by all parameters, W how strongly each pixel counts, R
+what the regularizers add (E34). Nobody has the matrix: a product is one tangent and one adjoint,
+view by view, in one light field each. Its memory grows with the views by their pictures alone.
+Parameters stand in one vector, entry by entry, in their own units and in their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.losses import Target
+from ddrecon.reconstruct.gradients import differentiate
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.roughness import Roughness
+from ddrecon.renderer import render_each, solve_light, view_picture
+from ddrecon.scene import Scene, View
+from ddrecon.variables.values import with_values
+
+
+class Curvature:
+    """J^T W J + R at the values of `parameters`, which stand in `scene` with its training views.
+
+    `targets` are the views' by name, `power` is the unit of penalties, as in `add_penalties`.
+    `images` [3, h, w] are the views' as rendered, `weights` [3, h, w] is W: that of the objective,
+    unless it is replaced. `roughness` is R, by name, of the parameters that have one.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        parameters: Sequence[Parameter],
+        targets: Mapping[str, Target],
+        power: float,
+        solutions: Mapping[tuple[str, int], Tensor] | None = None,
+    ):
+        self.scene, self.parameters = scene, list(parameters)
+        self.values = {p.name: p.value.detach() for p in parameters}
+        self.solutions = dict(solutions or {})
+        memory = self.new_memory()
+        with torch.no_grad():
+            world = with_values(scene, self.values)
+            images = render_each(world, world.views, memory)
+        # Later solves of the same light begin where this one ended.
+        self.solutions = {key: u for key, u in memory.last.items() if key[0] == "forward"}
+        self.images = {v.name: image for v, image in zip(scene.views, images, strict=True)}
+        total = sum(view.weight for view in scene.views)
+        self.weights = {
+            view.name: view.weight / total * targets[view.name].weights_at(self.images[view.name])
+            for view in scene.views
+        }
+        self.roughness = {
+            p.name: Roughness.about(self.values[p.name], p.grid, power * p.tv)
+            for p in parameters
+            if p.tv
+        }
+
+    @property
+    def size(self) -> int:
+        """How many entries a vector has."""
+        return sum(value.numel() for value in self.values.values())
+
+    def join(self, parts: Mapping[str, Tensor]) -> Tensor:
+        """`parts` by name as one vector; what is lacking is 0."""
+        like = self.values.items()
+        joined = [parts.get(name, torch.zeros_like(value)).reshape(-1) for name, value in like]
+        return torch.cat(joined)
+
+    def split(self, vector: Tensor) -> dict[str, Tensor]:
+        """The parts of `vector` by name, each in the shape of its parameter."""
+        parts = vector.split([value.numel() for value in self.values.values()])
+        named = zip(self.values.items(), parts, strict=True)
+        return {name: part.view(value.shape) for (name, value), part in named}
+
+    def product(self, vector: Tensor) -> Tensor:
+        """(J^T W J + R) times `vector`."""
+        return self.data_product(vector) + self.penalty_product(vector)
+
+    def data_product(self, vector: Tensor) -> Tensor:
+        """J^T W J times `vector`."""
+        changes = self.tangents(vector)
+        return self.adjoint({name: self.weights[name] * changes[name] for name in changes})
+
+    def penalty_product(self, vector: Tensor) -> Tensor:
+        """R times `vector`."""
+        parts = self.split(vector)
+        return self.join({name: r.product(parts[name]) for name, r in self.roughness.items()})
+
+    def tangents(self, vector: Tensor) -> dict[str, Tensor]:
+        """J times `vector`: how the picture [3, h, w] of each view changes, by its name."""
+        changes, found = self.split(vector), dict[str, Tensor]()
+        derivatives = self.scene.optimize.derivatives if self.scene.optimize else "all"
+        with torch.no_grad(), forward_ad.dual_level():
+            duals = {
+                name: forward_ad.make_dual(value, changes[name])
+                for name, value in self.values.items()
+            }
+            world = with_values(self.scene, duals)
+            light_field = solve_light(world, self.new_memory())
+            for view in world.views:
+                picture = view_picture(light_field, world, view, derivatives)
+                tangent = forward_ad.unpack_dual(picture).tangent
+                found[view.name] = torch.zeros_like(picture) if tangent is None else tangent.clone()
+        return found
+
+    def adjoint(self, pictures: Mapping[str, Tensor]) -> Tensor:
+        """J^T times `pictures` [3, h, w] of all views by name."""
+
+        def along(view: View, image: Tensor) -> Tensor:
+            return (image * pictures[view.name]).sum()
+
+        leaves = {name: value.clone().requires_grad_() for name, value in self.values.items()}
+        names = [view.name for view in self.scene.views]
+        return self.join(
+            differentiate(self.scene, names, leaves, along, self.new_memory()).gradients
+        )
+
+    def new_memory(self) -> SolveMemory:
+        """What solves begin from: the same each time, so that a product depends on nothing else."""
+        memory = SolveMemory()
+        memory.last = dict(self.solutions)
+        return memory

@@ -1,0 +1,139 @@
+"""Which picture to take next: how much of the posterior's variance a picture would take away (E36).
+
+Samples of the posterior say how its volumes differ, and how they would differ in a picture that is
+not yet taken. Few samples differ in every picture, so that it seems to tell them all apart: the
+usual update of an ensemble promises far too much. What is used here are means over pairs and
+triples of different samples, which have no such bias, and a bound made of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.renderer import solve_light, view_picture
+from ddrecon.scene import View
+from ddrecon.variables.kinds import FIELDS
+from ddrecon.variables.values import with_values
+
+FEWEST = 5
+"""Samples that there must be: four are independent of their mean, and without one of them three."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A `view` whose picture takes at least the part `gain` of the variance; `error` is of that."""
+
+    view: View
+    gain: float
+    error: float
+
+    def described(self) -> dict[str, Any]:
+        """As plain values; the camera as a scene file has it."""
+        matrix = [*self.view.camera.pose.tolist(), [0, 0, 0, 1]]
+        return {
+            "name": self.view.name,
+            "gain": self.gain,
+            "error": self.error,
+            "matrix": matrix,
+        }
+
+
+class NextView:
+    """Ranks `views` that were not taken, by samples of the posterior about `curvature`.
+
+    Their pictures would err by `deviation` [radiance] at each pixel.
+    """
+
+    def __init__(self, curvature: Curvature, views: Sequence[View], deviation: float):
+        self.curvature, self.views, self.deviation = curvature, list(views), deviation
+        self.changes: list[Tensor] = []
+        self.pictures: list[Tensor] = []
+
+    def add(self, change: Tensor) -> None:
+        """Takes in a sample, [n] away from the optimum."""
+        fields = {name: p for name, p in self.curvature.split(change).items() if name in FIELDS}
+        parts = fields or self.curvature.split(change)
+        self.changes.append(torch.cat([part.reshape(-1) for part in parts.values()]).cpu())
+        self.pictures.append(self._tangents(change) / self.deviation)
+
+    def rank(self) -> list[Candidate]:
+        """The candidates, best first."""
+        alike = find_products(torch.stack(self.changes))
+        pictures = torch.stack(self.pictures)
+        sizes = [3 * view.camera.size[0] * view.camera.size[1] for view in self.views]
+        found = []
+        for view, shown in zip(self.views, pictures.split(sizes, dim=1), strict=True):
+            pair = alike, find_products(shown)
+            found.append(Candidate(view, find_gain(*pair), find_error(*pair)))
+        return sorted(found, key=lambda candidate: -candidate.gain)
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {"changes": list(self.changes), "pictures": list(self.pictures)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Takes up where `state` was."""
+        self.changes, self.pictures = list(state["changes"]), list(state["pictures"])
+
+    def _tangents(self, change: Tensor) -> Tensor:
+        """How the pictures of all candidates change, one after another."""
+        curvature, found = self.curvature, list[Tensor]()
+        parts = curvature.split(change)
+        with torch.no_grad(), forward_ad.dual_level():
+            duals = {
+                name: forward_ad.make_dual(value, parts[name])
+                for name, value in curvature.values.items()
+            }
+            world = with_values(curvature.scene, duals)
+            light_field = solve_light(world, curvature.new_memory())
+            for view in self.views:
+                picture = forward_ad.unpack_dual(view_picture(light_field, world, view))
+                nothing = torch.zeros_like(picture.primal)
+                tangent = nothing if picture.tangent is None else picture.tangent
+                found.append(tangent.expand(3, -1, -1).reshape(-1).cpu())
+        return torch.cat(found)
+
+
+def find_gain(alike: Tensor, shown: Tensor) -> float:
+    """The part of the variance that a picture takes at least: t1^2 / (t1 + t2) of all (E36).
+
+    `alike` and `shown` [m, m] are inner products of independent samples, and of how they change the
+    picture in units of its noise. t1 and t2 are means over pairs and triples of different ones.
+    """
+    count = len(alike)
+    pairs, triples = count * (count - 1), count * (count - 1) * (count - 2)
+    across, seen = (matrix - matrix.diag().diag() for matrix in (alike, shown))
+    once = float((across * seen).sum()) / pairs
+    twice = max(float((across * (seen @ seen)).sum()) / triples, 0.0)
+    total = float(alike.trace()) / count
+    return min(once**2 / ((once + twice) * total), 1.0) if once > 0 and total > 0 else 0.0
+
+
+def find_error(alike: Tensor, shown: Tensor) -> float:
+    """The standard error of `find_gain`, by leaving out one sample after another (jackknife)."""
+    gains = torch.zeros(len(alike), dtype=torch.float64)
+    for left_out in range(len(alike)):
+        kept = torch.arange(len(alike)) != left_out
+        gains[left_out] = find_gain(*(matrix[kept][:, kept] for matrix in (alike, shown)))
+    return float(gains.std(correction=0) * (len(alike) - 1) ** 0.5)
+
+
+def find_products(samples: Tensor) -> Tensor:
+    """Inner products [m, m] of what `samples` [m + 1, n] are apart from their mean.
+
+    They are turned so that m of them are independent, and the mean is the other (Helmert).
+    """
+    count, wide = len(samples), samples.double()
+    turn = torch.zeros(count - 1, count, dtype=torch.float64)
+    for row in range(1, count):
+        turn[row - 1, :row] = 1.0
+        turn[row - 1, row] = -row
+        turn[row - 1] /= (row * (row + 1)) ** 0.5
+    return turn @ (wide @ wide.T) @ turn.T

@@ -1,0 +1,159 @@
+"""What a run assumes of its parameters before it looks at pictures, as a Gaussian: R + T K (E35).
+
+R is its smoothing (E34). K makes it proper, where smoothing says nothing: how bright a whole field
+is, and what single numbers are. It is so weak that it counts only where pictures say nothing.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ddrecon.diffusion.operator import Operator
+from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.poses import calibration_prior
+from ddrecon.reconstruct.roughness import AXES, Roughness
+from ddrecon.scene import Scene
+
+WIDE = 10.0
+"""A number may be off by so many times itself, or by so many hundred steps of its optimizer."""
+STEPS = 100.0
+SOLVE = 1e-4
+"""Relative residual of a draw from the prior."""
+PRECONDITION = 1e-2
+"""And of the solves that conjugate gradients are preconditioned with."""
+
+
+class Prior:
+    """R + `temperature` K of the parameters of `curvature`, whose vectors it takes and gives."""
+
+    def __init__(self, curvature: Curvature, temperature: float):
+        self.curvature = curvature
+        self.held = {
+            p.name: temperature * _held(p, curvature.scene, p.name in curvature.roughness)
+            for p in curvature.parameters
+        }
+
+    def product(self, vector: Tensor) -> Tensor:
+        """(R + T K) times `vector`."""
+        parts = self.curvature.split(vector)
+        weak = {name: _times(held, parts[name]) for name, held in self.held.items()}
+        return self.curvature.penalty_product(vector) + self.curvature.join(weak)
+
+    def root_noise(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Two random vectors, the covariance of whose sum is R + T K.
+
+        The second is what a level of smoothed fields comes of, the first all else.
+        """
+        parts, levels = dict[str, Tensor](), dict[str, Tensor]()
+        for name, value in self.curvature.values.items():
+            held = self.held[name]
+            root = torch.linalg.cholesky(held) if held.ndim == 2 else held.sqrt()
+            weak = _times(root, normal_like(value, generator))
+            if (roughness := self.curvature.roughness.get(name)) is None:
+                parts[name] = weak
+            else:
+                noises = [normal_like(value, generator) for _ in AXES]
+                parts[name], levels[name] = roughness.root_product(noises), weak
+        return self.curvature.join(parts), self.curvature.join(levels)
+
+    def solve(
+        self,
+        right: Tensor,
+        is_fixed: Tensor | None = None,
+        more: Tensor | None = None,
+        tolerance: float = SOLVE,
+    ) -> Tensor:
+        """(R + T K + diag(`more`))^-1 times `right`, with 0 where `is_fixed`."""
+        rights = self.curvature.split(right)
+        # Levels of smoothed fields are held so weakly that a draw needs more digits than a step.
+        has_more_digits = more is None
+        nothing: dict[str, Tensor] = {}
+        fixed = nothing if is_fixed is None else self.curvature.split(is_fixed)
+        added = nothing if more is None else self.curvature.split(more)
+        parts = {}
+        for name, part in rights.items():
+            held, more_here, fixed_here = self.held[name], added.get(name), fixed.get(name)
+            roughness = self.curvature.roughness.get(name)
+            if fixed_here is not None:
+                part = part.masked_fill(fixed_here, 0)
+            if held.ndim == 2:
+                matrix = held if more_here is None else held + more_here.diag()
+                solved = torch.linalg.solve(matrix, part)
+            else:
+                diagonal = held if more_here is None else held + more_here
+                if roughness is None:
+                    solved = part / diagonal
+                else:
+                    if has_more_digits:
+                        roughness, diagonal = roughness.double(), diagonal.double()
+                    exact = part.to(roughness.stiffness)
+                    solved = _solve_field(roughness, diagonal, exact, fixed_here, tolerance)
+                    solved = solved.to(part)
+            parts[name] = solved if fixed_here is None else solved.masked_fill(fixed_here, 0)
+        return self.curvature.join(parts)
+
+    def without_levels(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
+        """`vector` less the mean of each smoothed field over cells that are not fixed."""
+        parts, fixed = self.curvature.split(vector), self.curvature.split(is_fixed)
+        for name in self.curvature.roughness:
+            free = (~fixed[name]).to(vector)
+            cells = free.sum((-3, -2, -1), keepdim=True).clamp(min=1)
+            level = (parts[name] * free).sum((-3, -2, -1), keepdim=True) / cells
+            parts[name] = parts[name] - level * free
+        return self.curvature.join(parts)
+
+
+def normal_like(value: Tensor, generator: torch.Generator) -> Tensor:
+    """Independent standard normal numbers of the shape, precision and device of `value`."""
+    noise = torch.randn(value.shape, generator=generator, dtype=value.dtype)
+    return noise.to(value.device)
+
+
+def _held(parameter: Parameter, scene: Scene, is_smoothed: bool) -> Tensor:
+    """K of `parameter`: a number for all its entries, or the matrix [6, 6] of a camera.
+
+    A smoothed field may be brighter or darker, as a whole, by its root mean square; without
+    smoothing each cell may be, by itself. Cameras err as a calibration does (E29).
+    """
+    value = parameter.value.detach()
+    if parameter.key == "camera" and parameter.view is not None:
+        camera = scene.view(parameter.view).camera
+        return calibration_prior(camera, scene.volume.grid).to(value)
+    if parameter.is_field:
+        inside = value[value != 0]
+        square = inside.square().mean() if len(inside) else value.new_ones(())
+        return 1 / (square * (value.numel() if is_smoothed else 1))
+    largest = WIDE * value.abs().max() + STEPS * parameter.largest_rate
+    return 1 / largest**2
+
+
+def _times(held: Tensor, part: Tensor) -> Tensor:
+    return held @ part if held.ndim == 2 else held * part
+
+
+def _solve_field(
+    roughness: Roughness, diagonal: Tensor, right: Tensor, is_fixed: Tensor | None, tolerance: float
+) -> Tensor:
+    """(R + `diagonal`)^-1 `right` of a field, with 0 in cells that are fixed, by multigrid."""
+    colors, size = right.reshape(-1, *right.shape[-3:]), float(right.abs().max())
+    if not size:
+        return right
+    # In units where numbers are near 1: squares of residuals would leave float32.
+    unit = float((roughness.diagonal() + diagonal).max())
+    roughness, diagonal, colors = roughness.times(1 / unit), diagonal / unit, colors / size
+    # No level is held so weakly that it is lost in rounding.
+    diagonal = diagonal.clamp(min=10 * torch.finfo(right.dtype).eps)
+    # R has the form of the diffusion operator: stiffness is conductance between cells.
+    conductances = roughness.conductances()
+    loss = diagonal.expand(right.shape)
+    if is_fixed is not None:
+        # Cells that are fixed lose so much that nothing is left in them.
+        strong = 1e4 * (roughness.diagonal().max() + diagonal.max())
+        loss = torch.where(is_fixed, strong, loss)
+    z, y, x = (part.reshape(-1, *part.shape[-3:]) for part in conductances)
+    operator = Operator((z, y, x), loss.reshape(colors.shape).contiguous())
+    solved = SOLVERS["multigrid"](operator, colors, None, tolerance).value.view(right.shape)
+    return solved * (size / unit)

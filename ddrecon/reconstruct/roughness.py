@@ -1,0 +1,90 @@
+"""The quadratic that total variation is held under: what smoothing says of a field, as a Gaussian.
+
+The length of a slope, |s|, lies below (|s|^2 / |s0| + |s0|) / 2, and touches it at the slope s0
+that the field has (lagged diffusivity: Vogel and Oman 1996, doi:10.1137/0917016). So about a
+field total variation is half of x^T R x, R = D^T V D (E34): D takes slopes, V has the weight over
+the length of each cell's slope. Along an edge it hardly holds, where a field is flat it holds most.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ddrecon.grid import Grid
+from ddrecon.losses import ROUNDING
+
+AXES = (-3, -2, -1)
+
+
+@dataclass(frozen=True)
+class Roughness:
+    """R = D^T V D of a field on `grid` (E34); `stiffness` >= 0 [..., z, y, x] is V of each cell."""
+
+    grid: Grid
+    stiffness: Tensor
+
+    @staticmethod
+    def about(field: Tensor, grid: Grid, weight: float) -> Roughness:
+        """That of `weight` times `losses.total_variation`, about `field` [..., z, y, x]."""
+        square = torch.stack([slope.square() for slope in slopes(field, grid)]).sum(0)
+        return Roughness(grid, weight / field.numel() / (square + ROUNDING**2).sqrt())
+
+    def times(self, factor: float) -> Roughness:
+        """That of `factor` times the weight."""
+        return Roughness(self.grid, factor * self.stiffness)
+
+    def double(self) -> Roughness:
+        """The same in float64."""
+        return Roughness(self.grid, self.stiffness.double())
+
+    def product(self, change: Tensor) -> Tensor:
+        """R times `change` [..., z, y, x]."""
+        return join_slopes([self.stiffness * s for s in slopes(change, self.grid)], self.grid)
+
+    def root_product(self, noises: list[Tensor]) -> Tensor:
+        """D^T V^(1/2) times `noises`, a field for each axis; of white ones its covariance is R."""
+        return join_slopes([self.stiffness.sqrt() * noise for noise in noises], self.grid)
+
+    def conductances(self) -> list[Tensor]:
+        """What holds neighbors together, along each axis: one entry shorter than cells there."""
+        return [
+            self.stiffness.narrow(axis, 0, self.stiffness.shape[axis] - 1) * factor**2
+            for axis, factor in zip(AXES, _factors(self.grid), strict=True)
+        ]
+
+    def diagonal(self) -> Tensor:
+        """The diagonal of R."""
+        total = torch.zeros_like(self.stiffness)
+        for axis, held in zip(AXES, self.conductances(), strict=True):
+            total.narrow(axis, 0, held.shape[axis]).add_(held)
+            total.narrow(axis, 1, held.shape[axis]).add_(held)
+        return total
+
+
+def slopes(field: Tensor, grid: Grid) -> list[Tensor]:
+    """How `field` [..., z, y, x] rises to the next cell, along each axis; 0 where there is none.
+
+    By position in units of the box's shortest side.
+    """
+    found = []
+    for axis, factor in zip(AXES, _factors(grid), strict=True):
+        last = torch.zeros_like(field.narrow(axis, 0, 1))
+        found.append(torch.cat([field.diff(dim=axis) * factor, last], axis))
+    return found
+
+
+def join_slopes(rises: list[Tensor], grid: Grid) -> Tensor:
+    """The transpose of `slopes`."""
+    total = torch.zeros_like(rises[0])
+    for rise, axis, factor in zip(rises, AXES, _factors(grid), strict=True):
+        inner = rise.narrow(axis, 0, rise.shape[axis] - 1) * factor
+        total.narrow(axis, 0, rise.shape[axis] - 1).sub_(inner)
+        total.narrow(axis, 1, rise.shape[axis] - 1).add_(inner)
+    return total
+
+
+def _factors(grid: Grid) -> list[float]:
+    return [min(grid.extent) / spacing for spacing in grid.spacing]

@@ -1,0 +1,144 @@
+"""Which rank renders which view, and how each learns what the others have found of theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from ddrecon.cameras import cast_rays
+from ddrecon.grid import Grid
+from ddrecon.march.box import cross_box
+from ddrecon.ranks import (
+    assign,
+    from_first,
+    is_any,
+    is_first,
+    own_rank,
+    rank_count,
+    sum_numbers,
+    sum_over_ranks,
+)
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.scene import Scene, View
+from ddrecon.settings import RenderSettings
+
+CELL_COST = 1.0
+"""What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
+COARSE = 16
+"""A view's rays are counted as if it had about so many pixels along its shorter side."""
+
+
+def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
+    """Those of the views of `scene` called `names` that this rank renders, in their order.
+
+    One that is named twice is rendered twice, by the same rank.
+    """
+    if rank_count() == 1:
+        return list(names)
+    costs = {name: names.count(name) * _known_cost(scene, scene.view(name)) for name in names}
+    # As the first rank shares them out: another machine may round costs another way.
+    owners = dict(zip(costs, from_first(assign(list(costs.values()), rank_count())), strict=True))
+    return [name for name in names if owners[name] == own_rank()]
+
+
+_KNOWN: WeakKeyDictionary[View, tuple[Grid, RenderSettings, float]] = WeakKeyDictionary()
+"""By view, as long as it is there: what its cost was found for, and its cost."""
+
+
+def _known_cost(scene: Scene, view: View) -> float:
+    """`view_cost`, not found again for a view that stays."""
+    known = _KNOWN.get(view)
+    if known is None or known[:2] != (scene.volume.grid, scene.render):
+        known = scene.volume.grid, scene.render, view_cost(scene, view)
+        _KNOWN[view] = known
+    return known[2]
+
+
+def view_cost(scene: Scene, view: View) -> float:
+    """About how long `view` takes to render, in cells: those that its rays cross, and all once.
+
+    All, because the light that leaves towards a camera is found in each cell.
+    """
+    grid, camera = scene.volume.grid, view.camera
+    coarse = camera.resize(max(1, min(camera.size) // COARSE))
+    with torch.no_grad():
+        rays = cast_rays(coarse)
+        crossing = cross_box(grid, rays)
+        length = float((crossing.far - crossing.near).sum()) / len(rays.direction)
+    height, width = camera.size
+    on_rays = height * width * scene.render.samples_per_pixel * length / min(grid.spacing)
+    return on_rays * scene.render.steps_per_voxel + CELL_COST * grid.cells
+
+
+def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:
+    """The sums over ranks of what was `found`; None is zero, and stays where all ranks have it.
+
+    `likes` are of the shapes of `found`.
+    """
+    if rank_count() == 1:
+        return list(found)
+    is_found = [count > 0 for count in sum_numbers([one is not None for one in found])]
+    chosen = [
+        torch.zeros_like(like) if one is None else one
+        for one, like, is_any in zip(found, likes, is_found, strict=True)
+        if is_any
+    ]
+    sums = iter(sum_over_ranks(chosen))
+    return [next(sums) if is_any else None for is_any in is_found]
+
+
+def gather_numbers(
+    rows: Sequence[Sequence[Tensor]], own: Collection[str], names: Sequence[str]
+) -> list[list[Tensor]]:
+    """What the ranks have found of views: `rows` of numbers, one of each view called `names`.
+
+    Those given are of this rank's `own` views, in the order of these.
+    """
+    if rank_count() == 1:
+        return [list(row) for row in rows]
+    table = torch.zeros(len(rows), len(names), dtype=torch.float64)
+    places = [place for place, name in enumerate(names) if name in own]
+    for row, numbers in zip(table, rows, strict=True):
+        for place, number in zip(places, numbers, strict=True):
+            row[place] = number
+    return [list(row) for row in sum_over_ranks([table])[0]]
+
+
+def take_from_owners(parameters: Sequence[Parameter], own: Collection[str]) -> None:
+    """Gives `parameters` of views the values found by the rank that rendered these.
+
+    `own` are the views that this one did.
+    """
+    if rank_count() == 1:
+        return
+    values = [parameter.value.detach() for parameter in parameters]
+    values = [
+        value if parameter.view in own else torch.zeros_like(value)
+        for value, parameter in zip(values, parameters, strict=True)
+    ]
+    for parameter, value in zip(parameters, sum_over_ranks(values), strict=True):
+        parameter.value = value.clone().requires_grad_()
+
+
+def agree_on(gradients: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The first rank's `gradients` by name.
+
+    Those of others are the same, unless a GPU or another kind of processor adds in another order:
+    then they differ by rounding, of which Adam makes whole steps where a derivative is nearly 0.
+    """
+    if rank_count() == 1:
+        return dict(gradients)
+    digits = [_digits(gradient) for gradient in gradients.values()]
+    if not is_any(digits != from_first(digits)):
+        return dict(gradients)
+    ours = [gradient if is_first() else 0 * gradient for gradient in gradients.values()]
+    return dict(zip(gradients, sum_over_ranks(ours), strict=True))
+
+
+def _digits(numbers: Tensor) -> int:
+    """A sum that differs where `numbers` do, most likely."""
+    bits = torch.int32 if numbers.element_size() == 4 else torch.int64
+    return int(numbers.contiguous().view(bits).sum())

@@ -1,0 +1,169 @@
+"""How sure a reconstruction is: samples of its posterior, and what they say together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ddrecon.pictures.noise import Noise
+from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.gradients import differentiate
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.objective import Comparison, add_penalties
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors
+from ddrecon.reconstruct.posterior import TOLERANCE, Posterior, Sample
+from ddrecon.variables.values import component_names
+
+
+class Uncertainty:
+    """Samples of the posterior about where `run` is, and the sums they leave.
+
+    A sample is drawn with `step`; which one depends on `seed` and on how many there were. `noise`
+    is that of all pictures, where their scene is not to say. `errors` is what was found before.
+    """
+
+    def __init__(
+        self,
+        run: Reconstruction,
+        seed: int,
+        noise: Noise | None = None,
+        tolerance: float = TOLERANCE,
+        errors: PictureErrors | None = None,
+    ):
+        self.parameters = run.parameters
+        self.curvature = curvature_of(run)
+        gradient = gradient_of(run, self.curvature)
+        noises = _noises(run, noise)
+        # What residuals said takes a solve to find: a run that goes on has it.
+        if errors is None or errors.is_known:
+            errors = find_errors(self.curvature, run.targets, noises, gradient, seed)
+        self.errors = errors
+        temperature = self.errors.temperature
+        self.posterior = Posterior(self.curvature, gradient, temperature, seed, tolerance)
+        nothing = torch.zeros(self.curvature.size, dtype=torch.float64)
+        self.count, self.products, self.residual = 0, 0, 0.0
+        self.sums = {key: nothing.clone() for key in ("post", "post2", "prior", "prior2")}
+        self.numbers: list[Tensor] = []
+
+    def step(self) -> Sample:
+        """One more sample."""
+        sample = self.posterior.sample(self.count)
+        post, prior = sample.change.cpu().double(), sample.prior.cpu().double()
+        for key, part in (("post", post), ("prior", prior)):
+            self.sums[key] += part
+            self.sums[f"{key}2"] += part.square()
+        self.numbers.append(self._numbers_in(post))
+        self.count += 1
+        self.products += sample.products
+        self.residual = max(self.residual, sample.residual)
+        return sample
+
+    @property
+    def means(self) -> dict[str, Tensor]:
+        """The mean of the samples, by name."""
+        change = self.curvature.split(self.sums["post"] / max(self.count, 1))
+        return {n: value.cpu().double() + change[n] for n, value in self.curvature.values.items()}
+
+    @property
+    def deviations(self) -> dict[str, Tensor]:
+        """The standard deviation of the samples, by name."""
+        return self.curvature.split(self._variance("post").sqrt())
+
+    @property
+    def told(self) -> dict[str, Tensor]:
+        """The part of each entry's variance that pictures took away: 0 none, 1 all; by name."""
+        before, after = self._variance("prior"), self._variance("post")
+        tiny = torch.finfo(torch.float64).tiny
+        return self.curvature.split((1 - after / before.clamp(min=tiny)).clamp(0, 1) * (before > 0))
+
+    def number_names(self) -> list[str]:
+        """The names of the entries of all parameters that are no fields, in their order."""
+        names = []
+        for parameter in self.tabled:
+            value = parameter.value
+            parts = component_names(parameter.name, value) if value.ndim else ()
+            parts = parts or tuple(str(i) for i in range(value.numel()))
+            one = [parameter.name]
+            names += one if value.numel() == 1 else [f"{parameter.name}.{part}" for part in parts]
+        return names
+
+    def number_values(self) -> Tensor:
+        """Their values at the optimum."""
+        values = {name: value.cpu().double() for name, value in self.curvature.values.items()}
+        return self._numbers_in(self.curvature.join(values))
+
+    def correlations(self) -> Tensor:
+        """The correlation [m, m] of each of them with each other."""
+        numbers = torch.stack(self.numbers)
+        centered = numbers - numbers.mean(0)
+        size = centered.norm(dim=0).clamp(min=torch.finfo(torch.float64).tiny)
+        return (centered / size).T @ (centered / size)
+
+    def number_deviations(self) -> Tensor:
+        """Their standard deviations."""
+        return self._numbers_in(self._variance("post").sqrt())
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {
+            "count": self.count,
+            "products": self.products,
+            "residual": self.residual,
+            "sums": self.sums,
+            "numbers": self.numbers,
+            "errors": vars(self.errors),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Takes up where `state` was."""
+        self.count, self.products = state["count"], state["products"]
+        self.residual, self.numbers = state["residual"], list(state["numbers"])
+        self.sums = dict(state["sums"])
+
+    def _variance(self, key: str) -> Tensor:
+        mean = self.sums[key] / max(self.count, 1)
+        spread = self.sums[f"{key}2"] - self.count * mean.square()
+        return spread.clamp(min=0) / max(self.count - 1, 1)
+
+    @property
+    def tabled(self) -> list[Parameter]:
+        """The parameters whose entries are a table of numbers: no fields and no maps."""
+        return [p for p in self.parameters if not p.is_field and p.value.ndim < 3]
+
+    def _numbers_in(self, vector: Tensor) -> Tensor:
+        parts = self.curvature.split(vector)
+        tabled = [parts[parameter.name].flatten() for parameter in self.tabled]
+        return torch.cat(tabled) if tabled else vector[:0]
+
+
+def curvature_of(run: Reconstruction) -> Curvature:
+    """The curvature of the objective of `run` where it is."""
+    level, memory = run.train_level, run.memory
+    return Curvature(level, run.parameters, run.targets, run.power, memory.last)
+
+
+def gradient_of(run: Reconstruction, curvature: Curvature) -> Tensor:
+    """The derivative of the objective of `run`, of all its training views, where it is."""
+    views = list(run.train_level.views)
+    compared = Comparison(views, run.targets)
+    names = [view.name for view in views]
+    values = {parameter.name: parameter.value for parameter in run.parameters}
+    objective = differentiate(run.train_level, names, values, compared, curvature.new_memory())
+    return curvature.join(add_penalties(objective, run.parameters, run.power)[1])
+
+
+def _noises(run: Reconstruction, noise: Noise | None) -> dict[str, Noise]:
+    """The noise of training pictures by name, as `noise` or their scene says."""
+    given = run.settings.noise
+    found = {}
+    for view in run.train_level.views:
+        said = noise or view.noise
+        if said is None and given is not None:
+            said = Noise(given.read, given.shot, view.step)
+        if said is not None:
+            found[view.name] = said
+    return found

@@ -1,0 +1,132 @@
+"""The page about how sure a run is: mean, deviation and what pictures told, and error bars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from ddrecon.io.images.table import png_of
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.uncertainty import Uncertainty
+from ddrecon.report.page import paragraph, picture, section, table, write_page
+from ddrecon.report.pictures import slices
+from ddrecon.report.volumes import find_white_value
+
+STRONG = 0.5
+"""Correlations above this are told of."""
+
+
+def write_uncertainty_report(
+    path: Path, run: Reconstruction, found: Uncertainty, record: Mapping[str, Any]
+) -> None:
+    """Writes the page about what was `found` of `run`, whose `record` has it in numbers."""
+    means, deviations, told = found.means, found.deviations, found.told
+    sections = [
+        section(
+            name.capitalize(),
+            *_field(name, means[name], deviations[name], told[name], record["fields"][name]),
+        )
+        for name in record["fields"]
+    ]
+    if record["numbers"]:
+        sections.append(section("Numbers", *_numbers(record)))
+    if record["next_views"]:
+        sections.append(section("Next picture", *_next_views(record)))
+    sections.append(section("How", *_how(record)))
+    title = f"ddrecon: how sure {path.absolute().parent.name} is"
+    write_page(path, title, _lead(record), sections, is_alive=False)
+
+
+def _lead(record: Mapping[str, Any]) -> str:
+    noise = record["noise"]
+    source = "what the reconstruction leaves" if noise["told"] is not None else "the scene"
+    return (
+        f"{record['samples']} samples in {record['seconds']:.1f} s. "
+        f"Pictures err by {noise['deviation']:.3g} of radiance, by {source}."
+    )
+
+
+def _field(
+    name: str, mean: Tensor, deviation: Tensor, told: Tensor, numbers: Mapping[str, float]
+) -> list[str]:
+    """Slices of a field."""
+    white = find_white_value(mean)
+    strongest = find_white_value(deviation)
+    pictures = [
+        (mean, white, f"{name}, mean of the samples: white is {white:.3g}"),
+        (deviation, strongest, f"standard deviation: white is {strongest:.3g}"),
+        (told, 1.0, "told by pictures: black is nothing, white is all"),
+    ]
+    shown = "".join(
+        picture(png_of(slices(field.float(), white)), caption) for field, white, caption in pictures
+    )
+    return [
+        paragraph(
+            f"Deviation {numbers['deviation']:.3g} of {numbers['root_mean_square']:.3g} (root mean"
+            f" squares over all cells); {100 * numbers['told']:.0f} % told on average."
+            " Slices across z, x and y from left to right."
+        ),
+        f'<div class="views">{shown}</div>',
+    ]
+
+
+def _numbers(record: Mapping[str, Any]) -> list[str]:
+    """The table of numbers with their error bars, and of those that hang together."""
+    names = list(record["numbers"])
+    rows = [
+        (name, f"{number['value']:.5g}", f"± {number['deviation']:.2g}")
+        for name, number in record["numbers"].items()
+    ]
+    parts = [table(["number", "value", "deviation"], rows)]
+    pairs = [
+        (names[i], names[j], f"{row[j]:+.2f}")
+        for i, row in enumerate(record["correlations"])
+        for j in range(i)
+        if abs(row[j]) > STRONG
+    ]
+    if pairs:
+        parts += [
+            paragraph(f"Numbers that hang together (correlation above {STRONG} by these samples):"),
+            table(["", "", "correlation"], pairs),
+        ]
+    return parts
+
+
+def _next_views(record: Mapping[str, Any]) -> list[str]:
+    """The table of cameras whose pictures would tell most."""
+    rows = [
+        (
+            view["name"],
+            f"{100 * view['gain']:.1f} ± {100 * view['error']:.1f} %",
+            ", ".join(f"{row[3]:.3g}" for row in view["matrix"][:3]),
+        )
+        for view in record["next_views"]
+    ]
+    return [
+        paragraph(
+            "How much of the variance of all cells a picture by each of these cameras would take"
+            " away at least, if it errs as the others do. Their matrices are in uncertainty.json."
+        ),
+        table(["camera", "of the variance, at least", "stands at x, y, z"], rows),
+    ]
+
+
+def _how(record: Mapping[str, Any]) -> list[str]:
+    """What stands behind the numbers."""
+    count = record["samples"]
+    error = 100 / max(2 * (count - 1), 1) ** 0.5
+    return [
+        paragraph(
+            f"A deviation from {count} samples is itself off by about {error:.0f} %."
+            " Told is the part of a cell's variance that pictures took away from what smoothing"
+            " alone leaves open."
+        ),
+        paragraph(
+            "All this is about the optimum that was found, for pictures that err by noise alone:"
+            " what the model of light lacks is not in it."
+        ),
+        table(["", ""], [(k, v) for k, v in record["noise"].items() if v is not None]),
+    ]

@@ -1,0 +1,43 @@
+"""`ddrecon uncertainty --next-view`: what it ranks, and that it goes on as if it had not stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import Result
+
+Run = Callable[..., Result]
+SCENE = ["-D", "diffusion.model=none", "-D", "lights.1.radiance=0", "--iterations", "4"]
+RANK = ["-q", "--tolerance", "0.3", "--noise", "0.05", "--next-view", "ring"]
+
+
+@pytest.fixture
+def finished(folder: Path, succeed: Run) -> None:
+    """A run of density from one picture."""
+    succeed("optimize", "scene.yaml", "-o", "run", "-q", *SCENE)
+
+
+def ranked(path: str) -> list[dict[str, Any]]:
+    return json.loads(Path(path, "uncertainty.json").read_text())["next_views"]
+
+
+def test_cameras_around_the_volume_are_ranked(finished: None, succeed: Run, run: Run) -> None:
+    result = succeed("uncertainty", "run", "-o", "whole", "--samples", "6", *RANK)
+    views = ranked("whole")
+    gains = [view["gain"] for view in views]
+    assert len({view["name"] for view in views}) == 12
+    assert gains == sorted(gains, reverse=True) and 0 <= gains[-1] < gains[0] <= 1
+    assert f"next view: {views[0]['name']}, " in result.stdout
+    assert views[0]["name"] in Path("whole/report.html").read_text()
+    # Each stands as far from the middle as the camera of the run.
+    for view in views:
+        assert sum(row[3] ** 2 for row in view["matrix"][:3]) == pytest.approx(2.5**2, rel=1e-4)
+    succeed("uncertainty", "run", "-o", "parts", "--samples", "5", *RANK)
+    succeed("uncertainty", "run", "-o", "parts", "--samples", "6", "--resume", *RANK)
+    assert ranked("parts") == views
+    few = run("uncertainty", "run", "-o", "few", "--samples", "4", *RANK)
+    assert few.exit_code == 2 and "--next-view takes at least 5 samples" in few.stderr

@@ -1,0 +1,88 @@
+"""What `ddrecon uncertainty` writes and says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from test_resume import press_ctrl_c_in
+
+from ddrecon.io.volumes.table import field_names, read_field
+from ddrecon.reconstruct.posterior import Posterior
+
+Run = Callable[..., Result]
+Refuse = Callable[..., list[str]]
+FREE = "-D optimize.parameters={density: {init: 0.2}, g: {}, lights.0.irradiance: {}}"
+FAST = ["-D", "diffusion.transport_rounds=0", "-D", "volume.sigma_s=5", "-D", "lights.1.radiance=0"]
+QUICK = ["-q", "--tolerance", "0.3"]
+KNOWN = [*QUICK, "--noise", "0.05"]
+
+
+@pytest.fixture
+def finished(folder: Path, succeed: Run) -> Path:
+    """A run that is finished, of density and two kinds of numbers."""
+    succeed("optimize", "scene.yaml", "-o", "run", "-q", *FREE.split(" ", 1), *FAST)
+    return folder / "run"
+
+
+def volume(folder: str, name: str) -> np.ndarray:
+    return read_field(Path(folder, "volumes", f"{name}.npz"), name).values
+
+
+def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -> None:
+    del finished
+    found = succeed("uncertainty", "run", "-o", "sure", "--samples", "3", "--keep-samples", *QUICK)
+    record = json.loads(Path("sure/uncertainty.json").read_text())
+    samples = np.stack(
+        [read_field(Path(f"sure/samples/000{i}/density.npz"), "density").values for i in range(3)]
+    )
+    # What is written is what the samples say, each within its bounds.
+    assert samples.min() >= 0
+    np.testing.assert_allclose(volume("sure", "density_mean"), samples.mean(0), atol=1e-6)
+    deviation = volume("sure", "density_std")
+    np.testing.assert_allclose(deviation, samples.std(0, ddof=1), atol=1e-6)
+    told = volume("sure", "density_told")
+    assert 0 <= told.min() <= told.max() <= 1
+    size = float(np.sqrt((deviation**2).mean()))
+    assert record["fields"]["density"]["deviation"] == pytest.approx(size, rel=1e-4)
+    assert list(record["numbers"]) == ["g", "lights.0.irradiance"]
+    assert all(number["deviation"] > 0 for number in record["numbers"].values())
+    matrix = np.array(record["correlations"])
+    assert matrix.shape == (2, 2)
+    np.testing.assert_allclose(matrix.diagonal(), 1)
+    assert "g: " in found.stdout
+    assert "lights.0.irradiance" in Path("sure/report.html").read_text()
+    succeed("export", "sure", "-o", "sure.npz")
+    assert set(field_names(Path("sure.npz"))) == {"density_std", "density_mean", "density_told"}
+
+
+def test_one_that_stops_goes_on_to_the_same_bits(
+    finished: Path, run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    del finished
+    succeed("uncertainty", "run", "-o", "whole", "--samples", "3", *KNOWN)
+    with monkeypatch.context() as context:
+        press_ctrl_c_in(context, Posterior, "sample", 2)
+        assert run("uncertainty", "run", "-o", "half", "--samples", "3", *KNOWN).exit_code == 130
+    succeed("uncertainty", "run", "-o", "half", "--samples", "3", "--resume", *KNOWN)
+    assert np.array_equal(volume("whole", "density_std"), volume("half", "density_std"))
+    succeed("uncertainty", "run", "-o", "other", "--samples", "3", "--seed", "1", *KNOWN)
+    assert not np.array_equal(volume("whole", "density_std"), volume("other", "density_std"))
+
+
+def test_a_run_says_it_at_its_end(
+    folder: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ddrecon.cli.uncertainty.SAMPLES", 2)
+    short = ["-D", "optimize.iterations=1", *FAST]
+    succeed("optimize", "scene.yaml", "-o", "run", "-q", "--uncertainty", *short)
+    assert json.loads((folder / "run/uncertainty/uncertainty.json").read_text())["samples"] == 2
+
+
+def test_what_is_no_run_is_refused(refuse: Refuse) -> None:
+    (line,) = refuse(2, "uncertainty", "nowhere", "-o", "sure")
+    assert "nowhere: holds no run" in line

@@ -1,0 +1,54 @@
+"""Beams in pairs: what a light along an axis brings into a column is all found again."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from media import make_scene
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.grid import Grid
+from ddrecon.light.pairs import follow_pair
+from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.remaining import backward_fraction
+from ddrecon.renderer import solve_light
+from ddrecon.validate.balance import balance_of
+
+IRRADIANCE = 3.0
+
+
+@pytest.mark.parametrize("g", [-0.8, -0.4])
+def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
+    """E20's beams leave with F at the far end and G at the near one; the rest is the source of E4,
+    whose solution is balanced.
+    """
+    density = 0.2 + torch.rand(9, 1, 1, dtype=torch.float64)
+    scene = make_scene(
+        density,
+        grid=Grid((9, 1, 1), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+        sigma_a=(0.5,),
+        sigma_s=(6.0,),
+        g=g,
+        directional=(IRRADIANCE,),
+        travel=(0.0, 0.0, 2.0),
+        transport_rounds=1,
+        degree=3,
+    )
+    medium = scale_medium(scene.volume, 3)
+    _, pair = follow_pair(medium, scene.lights[0])
+    beams = 4 * math.pi * (pair.along + pair.against)
+    volume = medium.grid.extent[0] / 9
+    received = (medium.absorption.value * beams).sum() * volume
+    scattered = 4 * math.pi * volume * (medium.scattering.value * pair.source(medium).mean).sum()
+    # what leaves, by the closed form of E20 for all the depth
+    beta = float(backward_fraction(medium)) * 6.0 / 6.5
+    rate, depth = math.sqrt(1 - beta**2), 6.5 * float(density.mean())
+    turned, passed = beta / (1 + rate), math.exp(-rate * depth)
+    leaves = (1 - turned**2) * passed + turned * (1 - passed**2)
+    leaves = IRRADIANCE * leaves / (1 - (turned * passed) ** 2)
+    assert float(received + scattered) + leaves == pytest.approx(IRRADIANCE, rel=1e-12)
+    memory = SolveMemory()
+    solve_light(scene, memory)
+    assert balance_of(scene, memory.last["forward", 0]).energy < 1e-11

@@ -1,0 +1,61 @@
+"""How jobs are shared out, and what one rank does without others."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ddrecon.errors import RanksError, UsageError
+from ddrecon.ranks import assign, from_first, is_any, is_first, join_ranks, sum_over_ranks
+
+COSTS = st.lists(st.floats(0.1, 100), min_size=1, max_size=30)
+
+
+@given(COSTS, st.integers(1, 8))
+def test_no_rank_has_much_more_than_it_must(costs: list[float], ranks: int) -> None:
+    owners = assign(costs, ranks)
+    loads = [sum(c for c, o in zip(costs, owners, strict=True) if o == r) for r in range(ranks)]
+    # Whatever the order, a load is at most the mean and the longest job; see Graham 1969.
+    assert max(loads) <= sum(costs) / ranks + (1 - 1 / ranks) * max(costs) + 1e-9
+    assert sum(loads) == pytest.approx(sum(costs))
+
+
+@given(st.integers(1, 8), st.integers(1, 6))
+def test_like_jobs_are_shared_out_evenly(ranks: int, each: int) -> None:
+    owners = assign([2.5] * (ranks * each), ranks)
+    assert [owners.count(rank) for rank in range(ranks)] == [each] * ranks
+
+
+def test_one_rank_exchanges_nothing() -> None:
+    tensor, value = torch.rand(3), object()
+    assert sum_over_ranks([tensor])[0] is tensor
+    assert from_first(value) is value
+    assert is_first() and is_any(True) and not is_any(False)
+
+
+def started(monkeypatch: pytest.MonkeyPatch, **variables: str) -> None:
+    for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+
+
+def test_ranks_that_cannot_be_reached_are_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    started(monkeypatch, RANK="1", WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT="9")
+    monkeypatch.setenv("DDRECON_MEET_SECONDS", "0.2")
+    with pytest.raises(RanksError, match=r"^rank 1 of 2 cannot meet .* 127\.0\.0\.1:9 within 0\.2"):
+        join_ranks(has_gpu=False)
+
+
+def test_half_an_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    started(monkeypatch, RANK="0", WORLD_SIZE="2", MASTER_ADDR="127.0.0.1")
+    with pytest.raises(UsageError, match="MASTER_PORT"):
+        join_ranks(has_gpu=False)
+
+
+def test_a_single_process_of_torchrun_meets_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    started(monkeypatch, RANK="0", WORLD_SIZE="1", MASTER_ADDR="192.0.2.1", MASTER_PORT="9")
+    join_ranks(has_gpu=False)
+    assert is_first() and not torch.distributed.is_initialized()

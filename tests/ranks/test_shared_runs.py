@@ -1,0 +1,180 @@
+"""A run shared by several processes is the run of one, and loses nothing where one is killed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ddrecon.run.checkpoint import read_state
+
+SCENE = """\
+volume:
+  bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}
+  resolution: [8, 6, 5]
+  density: 0.5
+  sigma_a: 0.5
+  sigma_s: [6, 5, 4]
+  g: 0.3
+lights:
+  - {type: directional, direction: [-1, -2, -1], irradiance: 3}
+diffusion: {transport_rounds: 0}
+optimize:
+  views_per_iteration: 2
+  loss: l2
+  parameters:
+    density: {init: 0.4, tv: 1e-3}
+    sigma_s: {field: true}
+    g: {}
+    views.*.camera: {}
+    views.*.exposure: {}
+    views.*.offset: {}
+views:
+"""
+VIEWS = {"a": (0, 0, 2.5), "b": (2.5, 0, 0), "c": (0, 0.5, -2)}
+TESTS = {"d": (2, 1, 1), "e": (-2, -1, 1)}
+
+
+def write_scene(folder: Path) -> None:
+    """A scene of five training views of two sizes, and two test views."""
+    text = SCENE
+    for number, (name, origin) in enumerate((VIEWS | TESTS).items()):
+        width, height = (8, 6) if number % 2 else (10, 8)
+        y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+        blob = np.maximum(0.4 + 0.03 * number - x**2 - (y - 0.05 * number) ** 2, 0.1)
+        np.save(folder / f"{name}.npy", blob[..., None] * [1.0, 0.8, 0.6])
+        camera = f"origin: {list(origin)}, target: [0, 0, 0], resolution: [{width}, {height}]"
+        split = "test" if name in TESTS else "train"
+        text += f"  - {{name: {name}, image: {name}.npy, split: {split},\n"
+        text += f"     camera: {{type: perspective, fov: 30, {camera}}}}}\n"
+    (folder / "scene.yaml").write_text(text)
+
+
+def job(ranks: int, output: str, *options: str, **others: Any) -> dict[str, Any]:
+    command = ["optimize", "scene.yaml", "-o", output, "--dtype", "float64", "--engine", "torch"]
+    return {"ranks": ranks, "arguments": [*command, "--iterations", "6", *options]} | others
+
+
+RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density", "-o"]
+JOBS = {
+    "one": job(1, "one"),
+    "four": job(4, "four"),
+    "killed": job(2, "broken", failing=[1, 3, "killed"]),
+    "resumed": job(3, "broken", "--resume"),
+    "first killed": job(2, "headless", failing=[0, 2, "killed"]),
+    "failed": job(2, "failed", failing=[1, 1, "is odd"]),
+    "refused": job(2, "one"),
+    "rendered": {"ranks": 3, "arguments": [*RENDER, "views"]},
+    "alone": {"ranks": 1, "arguments": [*RENDER, "alone"]},
+    "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
+}
+
+
+class Runs:
+    """The folder in which all `JOBS` were run, and what became of them."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.codes = dict(zip(JOBS, json.loads((folder / "codes.json").read_text()), strict=True))
+
+    def text(self, name: str, rank: int, end: str) -> str:
+        return (self.folder / f"{list(JOBS).index(name)}.{rank}.{end}").read_text()
+
+    def log(self, output: str) -> np.ndarray:
+        """The log in the folder `output`, without the times."""
+        with (self.folder / output / "loss.csv").open() as stream:
+            rows = [row | {"seconds": "0"} for row in csv.DictReader(stream)]
+        return np.array([[float(cell or 0) for cell in row.values()] for row in rows])
+
+    def found(self, output: str) -> dict[str, np.ndarray]:
+        """All that a run found."""
+        path = self.folder / output
+        numbers = json.loads((path / "parameters.json").read_text())
+        fields = {name: np.load(path / f"volumes/{name}.npz")[name] for name in FIELDS}
+        views = {
+            name: np.ravel(value["matrix"] if isinstance(value, dict) else value)
+            for name, value in numbers.items()
+        }
+        return fields | views
+
+
+FIELDS = "density", "sigma_s"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    folder = tmp_path_factory.mktemp("ranks")
+    write_scene(folder)
+    script = Path(__file__).with_name("forked.py")
+    known = {
+        name: os.environ[name] for name in ("PATH", "PYTHONPATH", "HOME") if name in os.environ
+    }
+    subprocess.run(
+        [sys.executable, str(script), json.dumps(list(JOBS.values())), str(folder)],
+        cwd=folder,
+        # The last as commands set it, before they import torch.
+        env=known | {"OMP_NUM_THREADS": "1", "TORCH_CPP_LOG_LEVEL": "FATAL"},
+        check=True,
+    )
+    return Runs(folder)
+
+
+@pytest.mark.parametrize("output", ["four", "broken"])
+def test_ranks_find_what_one_finds(runs: Runs, output: str) -> None:
+    np.testing.assert_allclose(runs.log(output), runs.log("one"), rtol=1e-7)
+    expected, found = runs.found("one"), runs.found(output)
+    assert expected.keys() == found.keys()
+    assert "views.c.exposure" in found and "views.d.camera" in found
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-6, atol=1e-8, err_msg=name)
+
+
+def test_the_first_rank_alone_prints(runs: Runs) -> None:
+    for name in ("four", "rendered", "checked"):
+        assert set(runs.codes[name]) == {0}
+        assert runs.text(name, 0, "out")
+        assert (runs.text(name, 1, "out"), runs.text(name, 1, "err")) == ("", "")
+
+
+def test_a_killed_rank_loses_nothing(runs: Runs) -> None:
+    assert runs.codes["killed"] == [5, -9]
+    line = runs.text("killed", 0, "err").splitlines()[-1]
+    assert line.startswith("another rank has ended (")
+    assert "the state after 2 iterations is kept in broken/checkpoints/last.pt" in line
+    assert runs.codes["resumed"] == [0, 0, 0]
+
+
+def test_a_checkpoint_stands_where_the_first_rank_is_killed(runs: Runs) -> None:
+    assert runs.codes["first killed"] == [-9, 5]
+    state = read_state(runs.folder / "headless" / "checkpoints" / "last.pt")
+    assert state["total"]["iteration"] == 0
+
+
+def test_ranks_learn_why_another_failed(runs: Runs) -> None:
+    assert runs.codes["failed"] == [5, 3]
+    assert runs.text("failed", 1, "err").splitlines() == ["rank 1: some.file: is odd"]
+    assert "rank 1 has failed: some.file: is odd; the state" in runs.text("failed", 0, "err")
+    assert runs.codes["refused"] == [2, 5]
+    assert runs.text("refused", 0, "err").startswith("one: the folder is not empty")
+    assert runs.text("refused", 1, "err") == ""
+
+
+def test_ranks_render_what_one_renders(runs: Runs) -> None:
+    files = sorted(path.name for path in (runs.folder / "alone").iterdir())
+    assert files == sorted(path.name for path in (runs.folder / "views").iterdir())
+    arrays = [name for name in files if name.endswith(".npy")]
+    assert len(arrays) == 2 * len(VIEWS | TESTS)
+    for name in arrays:
+        one, other = (np.load(runs.folder / output / name) for output in ("alone", "views"))
+        np.testing.assert_array_equal(one, other)
+
+
+def test_one_rank_imports_and_starts_nothing(runs: Runs) -> None:
+    assert runs.text("one", 0, "out").splitlines()[-2:] == ["[]", "False"]
