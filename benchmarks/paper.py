@@ -79,9 +79,8 @@ class Experiment:
 
 G_ALONE = (
     *(f"volume.{name}={{file: ../../data/shapes/cloud.npz}}" for name in ("sigma_a", "sigma_s")),
-    "optimize.parameters={g: {init: 0.67}}",
-    "optimize.refine_at=[]",
-    "optimize.iterations=60",
+    "optimize.parameters={g: {init: 0.67, lr: 0.1}}",
+    "optimize.iterations=100",
 )
 """Overrides that leave nothing but g to be found."""
 HALF = ("volume.resolution=[32, 48, 32]", "optimize.refine_at=[0.5]", "optimize.iterations=120")

@@ -33,7 +33,7 @@ from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings
 
-STEPS = 4
+STEPS = 3
 """Steps of Gauss and Newton to an optimum."""
 ROUGHEST = 0.25
 """Deviation of the field that a volume is drawn from, as a part of its mean."""
@@ -84,7 +84,7 @@ def exact_case(scene: Scene, base: Tensor, noise: float, seed: int, samples: int
         misfit = {n: about.weights[n] * (about.images[n] - targets[n].image) for n in targets}
         slope = about.adjoint(misfit) + posterior.prior.product((value - base).flatten())
         nothing = torch.zeros(about.size) > 1
-        step = posterior._correct(-slope, nothing, 40, 1e-2).value.view_as(value)
+        step = posterior._correct(-slope, nothing, 20, 1e-1).value.view_as(value)
         value = (value + step).clamp(min=0)
     changes = torch.stack([posterior.sample(number).change for number in range(samples)])
     deviation = changes.square().mean(0).sqrt().view_as(value)

@@ -11,13 +11,13 @@ Progress = Callable[[Sequence[Any], str], Iterable[Any]]
 """`progress(items, what)` gives the `items` one by one, and shows that `what` is being done."""
 
 
-def bar_width() -> int | None:
-    """The columns of a progress bar; None leaves them to tqdm, which finds out the terminal's.
+def bar_room() -> tuple[int | None, int | None]:
+    """Columns and rows for a progress bar; None leaves them to tqdm, which asks the terminal.
 
     A terminal that says it has none, as some containers' do, would see nothing at all.
     """
     try:
-        columns = os.get_terminal_size(sys.stderr.fileno()).columns
+        columns, rows = os.get_terminal_size(sys.stderr.fileno())
     except (OSError, ValueError, AttributeError):
-        return None
-    return None if columns else 80
+        return None, None
+    return (None if columns else 80), (None if rows else 24)

@@ -15,6 +15,7 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments, turned_phase
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.numerics.remember import remember
 
 
 def scatter_once_more(medium: Medium, light: Moments) -> Moments:
@@ -24,7 +25,12 @@ def scatter_once_more(medium: Medium, light: Moments) -> Moments:
 
 def _factors(medium: Medium) -> Tensor:
     """(1 - f) p_l, by the degree l."""
-    return (1 - medium.forward_fraction) * remaining_moments(medium)
+    return _weigh(medium.forward_fraction, remaining_moments(medium))
+
+
+@remember
+def _weigh(fraction: Tensor, moments: Tensor) -> Tensor:
+    return (1 - fraction) * moments
 
 
 def scatter_towards(

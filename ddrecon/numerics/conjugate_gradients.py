@@ -11,11 +11,11 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Solved:
-    """The `value` [n] after so many `products`, and its residual, relative to the start's."""
+    """The `value` [n] after so many `products`, and what is `lacking` of the right side [n]."""
 
     value: Tensor
+    lacking: Tensor
     products: int
-    residual: float
 
 
 def conjugate_gradients(
@@ -28,7 +28,8 @@ def conjugate_gradients(
     """x [n] with A x = `right`, from zero, after at most so many products.
 
     `product` gives A v, A being symmetric and positive, and `precondition` about A^-1 v: it may
-    vary a little from call to call (Golub and Ye 1999, doi:10.1137/S1064827597323415). It stops
+    vary a little from call to call (Golub and Ye 1999, doi:10.1137/S1064827597323415). Entries that
+    it leaves at 0 stay there, and the rest is solved for. It stops
     where the preconditioned norm of the residual, sqrt(r^T M r), is below `tolerance` of what it
     was.
     """
@@ -47,4 +48,4 @@ def conjugate_gradients(
         new, lasting = float(residual @ ready), float(before @ ready)
         direction.mul_((new - lasting) / square).add_(ready)
         square = new
-    return Solved(value, count, (max(square, 0.0) / first) ** 0.5 if first > 0 else 0.0)
+    return Solved(value, residual, count)

@@ -17,14 +17,14 @@ from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.limits import find_bounds, find_gauge, find_kept
 from ddrecon.reconstruct.prior import PRECONDITION, Prior, normal_like
 
-TOLERANCE = 0.03
+TOLERANCE = 0.2
 """How small a sample's residual is to be, of what it was for a draw from the prior."""
 MOST = 40
 """Products with J^T W J that a sample may take."""
-ROUGH = 0.1
-"""The same where only the size of all of it matters."""
 ROUNDS = 10
 """Times that cells are let go of or held at a bound."""
+CUT = 1e-3
+"""A step of which less than this part is cut at bounds counts as whole."""
 PROBES = 3
 """Random pictures that the diagonal of J^T W J is found by."""
 
@@ -75,19 +75,27 @@ class Posterior:
         generator = self._generator(number)
         scale = self.temperature**0.5
         noise, level = (scale * part for part in self.prior.root_noise(generator))
-        even, shift = (self._solve_prior(part) for part in (noise, level))
-        even = self.prior.without_levels(even, self.is_kept)
-        right = noise + level + scale * self.data_noise(generator) - self.gradient
-        change, products, residual = self._minimize(right, self._within(even + shift))
-        return Sample(change, self._within(even), products, residual)
+        even = self.prior.without_levels(self._solve_prior(noise), self.is_kept)
+        prior = self._within(even)
+        right = noise + level - self.gradient - self.prior.product(prior)
+        # What is lacking at the draw from the prior: both parts of the data in one adjoint.
+        changes, disturbed = self.curvature.tangents(prior), self._disturbances(generator)
+        weights = self.curvature.weights
+        right += self.curvature.adjoint(
+            {name: scale * disturbed[name] - w * changes[name] for name, w in weights.items()}
+        )
+        change, products, residual = self._minimize(prior, right)
+        return Sample(change, prior, products, residual)
 
     def data_noise(self, generator: torch.Generator) -> Tensor:
         """A random vector whose covariance is J^T W J."""
-        weights = self.curvature.weights.items()
+        return self.curvature.adjoint(self._disturbances(generator))
+
+    def _disturbances(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """W^(1/2) times white noise, by the name of a view."""
         images = self.curvature.images
-        return self.curvature.adjoint(
-            {name: w.sqrt() * normal_like(images[name], generator) for name, w in weights}
-        )
+        weights = self.curvature.weights.items()
+        return {name: w.sqrt() * normal_like(images[name], generator) for name, w in weights}
 
     def count_told(self) -> float:
         """How many numbers the pictures tell: an estimate of the trace of H^-1 J^T W J.
@@ -95,35 +103,38 @@ class Posterior:
         By one random vector, without bounds.
         """
         noise = self.data_noise(self._generator(-2))
-        change = self._correct(noise, self.is_kept, self.most, ROUGH).value
+        change = self._correct(noise, self.is_kept, self.most).value
         return float(noise @ change)
 
     def product(self, vector: Tensor) -> Tensor:
         """H times `vector`, H being J^T W J + R + T K."""
         return self.curvature.data_product(vector) + self.prior.product(vector)
 
-    def _minimize(self, right: Tensor, start: Tensor) -> tuple[Tensor, int, float]:
-        """The least of d^T H d / 2 - `right`^T d within bounds, from `start`.
+    def _minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
+        """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.
 
-        And how many products that took, and what is left.
-
-        Which cells are at a bound is guessed, the others are solved for, and the guess is mended
-        (active sets: Bertsekas 1982, doi:10.1137/0320018).
+        And how many products that took, and what is left. Which cells are at a bound is guessed,
+        the others are solved for, and the guess is mended (active sets: Bertsekas 1982,
+        doi:10.1137/0320018).
         """
-        change, products, first, left = start, 0, 0.0, 1.0
-        for turn in range(ROUNDS):
-            residual = right - self.product(change)
-            products += 1
+        products, first, left = 1, 0.0, 1.0
+        for _ in range(ROUNDS):
             is_held = (change <= self.low) & (residual < 0) | (change >= self.high) & (residual > 0)
             is_fixed = self.is_kept | is_held
             size = self._size(residual, is_fixed)
             first = first or size
             left = size / first if first else 0.0
-            if left <= self.tolerance or products >= self.most or turn == ROUNDS - 1:
+            if left <= self.tolerance or products >= self.most:
                 break
             solved = self._correct(residual, is_fixed, self.most - products, self.tolerance / left)
-            products += solved.products
-            change = self._within(change + solved.value)
+            products, residual = products + solved.products, solved.lacking
+            wanted = change + solved.value
+            change = self._within(wanted)
+            # Where hardly anything was cut at a bound, no product is spent on it.
+            cut = change - wanted
+            if float(cut.norm()) > CUT * float(solved.value.norm()):
+                residual = residual - self.product(cut)
+                products += 1
         return change, products, left
 
     def _correct(
@@ -131,16 +142,12 @@ class Posterior:
     ) -> Solved:
         """The change of all that is not fixed that H takes to `right`."""
 
-        def free(vector: Tensor) -> Tensor:
-            return self._without_gauge(vector.masked_fill(is_fixed, 0))
-
-        def product(vector: Tensor) -> Tensor:
-            return free(self.product(vector))
-
         def precondition(vector: Tensor) -> Tensor:
-            return free(self._precondition(vector, is_fixed))
+            free = self._without_gauge(vector.masked_fill(is_fixed, 0))
+            ready = self._precondition(free, is_fixed)
+            return self._without_gauge(ready.masked_fill(is_fixed, 0))
 
-        return conjugate_gradients(product, precondition, free(right), tolerance, most)
+        return conjugate_gradients(self.product, precondition, right, tolerance, most)
 
     def _precondition(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
         """About H^-1 `vector`: what pictures say counts by its diagonal alone."""

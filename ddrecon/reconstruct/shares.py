@@ -25,7 +25,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
 
-CELL_COST = 1.0
+CELL_COST = 0.5
 """What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
 COARSE = 16
 """A view's rays are counted as if it had about so many pixels along its shorter side."""

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError, UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
-from ddrecon.progress import bar_width
+from ddrecon.progress import bar_room
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
@@ -112,6 +112,7 @@ def drive_run(
     the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
+    columns, rows = bar_room()
     try:
         with (
             defer_interrupt() as asked,
@@ -122,7 +123,8 @@ def drive_run(
                 desc="optimize",
                 file=sys.stderr,
                 disable=is_quiet,
-                ncols=bar_width(),
+                ncols=columns,
+                nrows=rows,
             ) as bar,
         ):
             if not is_quiet:

@@ -13,6 +13,7 @@ from pathlib import Path
 from socket import socket
 from socketserver import BaseServer
 from threading import Thread
+from time import monotonic
 
 import torch
 
@@ -32,6 +33,8 @@ from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import AUTO, Iterations
 
 REPORT = "report.html"
+SHARE = 0.25
+"""Volume and views are made in this part of the time at most: the run needs the machine."""
 
 
 class LiveRun:
@@ -46,7 +49,7 @@ class LiveRun:
             raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
         self.seen, self.sections = 0, ["", ""]
         self.iterations: Iterations = AUTO
-        self.maker = Thread()
+        self.maker, self.next_make = Thread(), 0.0
 
     def page(self) -> str:
         """The run's report where it is finished, else the page of what there is."""
@@ -79,7 +82,7 @@ class LiveRun:
     def _follow(self) -> None:
         """Has volume and views made anew if there is a new checkpoint; waits only for the first."""
         written = self.checkpoint.stat().st_mtime_ns
-        if written == self.seen or self.maker.is_alive():
+        if written == self.seen or self.maker.is_alive() or monotonic() < self.next_make:
             return
         is_first, self.seen = self.seen == 0, written
         self.maker = Thread(target=self._remake, daemon=True)
@@ -88,9 +91,11 @@ class LiveRun:
             self.maker.join()
 
     def _remake(self) -> None:
+        start = monotonic()
         # A checkpoint may be replaced while it is read: the next is as good.
         with suppress(FormatError):
             self.sections = self._make_sections()
+        self.next_make = monotonic() + (monotonic() - start) * (1 / SHARE - 1)
 
     def _make_sections(self) -> list[str]:
         """Volume and views as the last checkpoint has them."""

@@ -19,7 +19,7 @@ from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear
 from ddrecon.io.volumes.table import write_field
 from ddrecon.pictures.noise import Noise
-from ddrecon.progress import bar_width
+from ddrecon.progress import bar_room
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.next_view import Candidate, NextView
 from ddrecon.reconstruct.picture_errors import PictureErrors
@@ -117,6 +117,7 @@ def drive_uncertainty(
         if ranking is not None:
             ranking.restore(state["ranking"])
         before = state["seconds"]
+    columns, rows = bar_room()
     with (
         defer_interrupt() as asked,
         tqdm(
@@ -125,7 +126,8 @@ def drive_uncertainty(
             desc="uncertainty",
             file=sys.stderr,
             disable=is_quiet,
-            ncols=bar_width(),
+            ncols=columns,
+            nrows=rows,
         ) as bar,
     ):
         while found.count < samples:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import fcntl
 import http.client
+import os
+import pty
 import re
+import struct
+import termios
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from click.testing import Result
+from tqdm import tqdm
 
 from ddrecon.errors import UsageError
-from ddrecon.progress import bar_width
+from ddrecon.progress import bar_room
 from ddrecon.run.live import LiveRun
 from ddrecon.run.serve import HOST, listen, serve_page, url_of
 
@@ -86,11 +92,14 @@ def test_what_is_no_run_is_refused(refuse: Callable[..., list[str]]) -> None:
 
 
 def test_a_terminal_without_a_size_gets_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Size:
-        columns = 0
-
-    monkeypatch.setattr("os.get_terminal_size", lambda _: Size)
-    monkeypatch.setattr("sys.stderr.fileno", lambda: 2, raising=False)
-    assert bar_width() == 80
-    Size.columns = 120
-    assert bar_width() is None
+    """As containers and `script` open them: 0 columns, 0 rows; another's are left to tqdm."""
+    reader, writer = pty.openpty()
+    with os.fdopen(writer, "w") as terminal:
+        monkeypatch.setattr("sys.stderr", terminal)
+        columns, rows = bar_room()
+        for _ in tqdm(range(2), file=terminal, ncols=columns, nrows=rows):
+            pass
+        assert b"2/2" in os.read(reader, 100_000)
+        fcntl.ioctl(writer, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 120, 0, 0))
+        assert bar_room() == (None, None)
+    os.close(reader)

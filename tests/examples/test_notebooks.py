@@ -15,6 +15,7 @@ FOLDER = Path(__file__).parents[2] / "examples"
 def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cell by cell in one namespace, in its folder; a cell's last expression is shown."""
     monkeypatch.chdir(FOLDER)
+    monkeypatch.setenv("MPLBACKEND", "agg")
     book = json.loads(path.read_text(encoding="utf-8"))
     assert book["nbformat"] == 4
     namespace: dict[str, object] = {}

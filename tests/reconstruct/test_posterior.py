@@ -101,7 +101,8 @@ def test_within_bounds_a_sample_is_the_least_of_its_quadratic(
     matrix = exact(curvature, posterior, jacobian)
     generator = posterior._generator(0)
     scale = TEMPERATURE**0.5
-    right = scale * (sum(posterior.prior.root_noise(generator)) + posterior.data_noise(generator))
+    right = scale * sum(posterior.prior.root_noise(generator))
+    right += scale * posterior.data_noise(generator)
     change = posterior.sample(0).change
     slope = matrix @ change - right + pressed
     size = float((right - pressed).abs().max())
@@ -126,5 +127,6 @@ def test_conjugate_gradients_solve_and_count() -> None:
     matrix, right = root @ root.T + torch.eye(9).double(), random_values(9, seed=1)
     solved = conjugate_gradients(lambda v: matrix @ v, lambda v: v / 3, right, 1e-10, 50)
     torch.testing.assert_close(matrix @ solved.value, right)
+    torch.testing.assert_close(solved.lacking, torch.zeros_like(right), rtol=0, atol=1e-9)
     assert solved.products <= 12
     assert conjugate_gradients(lambda v: matrix @ v, lambda v: v, right, 1e-10, 3).products == 3

@@ -95,7 +95,10 @@ def sweep_scattered(
 
     `inflow` and `degree` as of `sweep`.
     """
-    factors = remaining_moments(medium)[: medium.degree + 1]
+    factors = remaining_moments(medium)
+    if len(factors) > medium.degree + 1:
+        # A slice is another tensor each time, of which nothing can be remembered.
+        factors = factors[: medium.degree + 1]
     if is_fused():
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 

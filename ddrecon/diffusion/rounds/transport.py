@@ -181,10 +181,7 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
 
 
 def _share_length(medium: Medium, degree: int) -> Tensor:
-    """The length of a step, by whose optical depth theta is [u] (E14), [C or 1, 1, 1, 1].
-
-    It is exp(-p_1) times that of the mean step.
-    """
+    """exp(-p_1) (mean step) [u], by whose optical depth theta is (E30), [C or 1, 1, 1, 1]."""
     return _mean_step(medium.grid, degree) * torch.exp(-remaining_moments(medium)[1])
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.diffusion.fused.colors import remaining_scale
 from ddrecon.diffusion.rounds.fused.share import (
     SHARE,
     SHARE_SLOPE,
@@ -131,8 +132,7 @@ def gain_fused(
     None (E12); the third theta `cosine` times the change of the flux of `light` (E17). `length`: of
     the mean step [u], by which theta is (E14).
     """
-    strength = (1 - medium.forward_fraction) * medium.scattering.scale
-    numbers = numbers_by_color(medium, length, [strength, cosine])
+    numbers = numbers_by_color(medium, length, [remaining_scale(medium), cosine])
     numbers = numbers.expand(-1, len(swept.mean))
     shares_field = medium.scattering.field is medium.extinction.field
     source, mean, *flux = _Gain.apply(
