@@ -20,6 +20,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
 from ddrecon.reconstruct import setup
+from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
@@ -62,8 +63,7 @@ class Reconstruction:
 
     The objective is the weighted mean of the views' image loss plus, for each parameter, its
     penalty times `power`, the mean square of the targets as the `loss` compares them. `misfit` is
-    the root of the last mean loss over `power`. `before_step` is the state before the last step was
-    made.
+    the root of the last mean loss over `power`. `before_step` is the state before the last step.
     """
 
     def __init__(self, scene: Scene, iterations: Iterations | None = None):
@@ -77,7 +77,7 @@ class Reconstruction:
         self.noises = setup.known_noises(views, self.settings, self.loss)
         self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
         self.parameters = setup.start_parameters(scene, self.settings)
-        setup.choose_pose_steps(self.parameters, self.train, self.loss in QUADRATIC)
+        setup.choose_steps(self.parameters, self.train, self.loss in QUADRATIC)
         self.gauges = find_gauges(self.train, self.parameters)
         self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
@@ -267,7 +267,7 @@ class Reconstruction:
     def _step(self, gradients: dict[str, Tensor], compared: Comparison) -> None:
         """Every parameter against its derivative, but those of views not seen or not yet due.
 
-        What cameras do goes part of the way to what fits the pictures of this iteration best.
+        What cameras do, and how bright lights are, goes part of the way to what fits best.
         """
         pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
@@ -275,9 +275,11 @@ class Reconstruction:
         rate_of = functools.partial(self.schedule.rate, self.iteration)
         solved = step_parameters(seen, gradients, rate_of)
         solve_responses(solved, self.train_level, pictures, self.targets)
+        lights, level = lights_due(solved, self.iteration), self.train_level
+        step_brightness(lights, level, values, pictures, self.targets, self.memory.last)
         if poses := [p for p in solved if p.key == "camera"]:
-            own, known = share_out(gradients, compared.views), self.memory.last
-            solve_poses(poses, self.train_level, own, values, self.targets, known, pictures)
+            own = share_out(gradients, compared.views)
+            solve_poses(poses, level, own, values, self.targets, self.memory.last, pictures)
         for gauge in self.gauges:
             gauge.hold()
 

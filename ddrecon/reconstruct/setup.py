@@ -154,14 +154,18 @@ def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     return support
 
 
-def choose_pose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bool) -> None:
-    """Has the poses among `parameters` descend where they are not to be solved for (E29).
+def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bool) -> None:
+    """Has poses and lights among `parameters` descend where they are not to be solved for.
 
-    That is with a loss that is no sum of squares; and where poses of only some of several views of
-    `train` are sought, or of a single one: then no calibration of all is to be mended, but a camera
-    to be found, which may be far off.
+    Poses with a loss that is no sum of squares (E29); and where those of only some of several views
+    of `train` are sought, or of a single one: then no calibration of all is to be mended, but a
+    camera to be found, which may be far off. Lights that are a map, or start from black: that has
+    no share in pictures yet (E39).
     """
     poses = [parameter for parameter in parameters if parameter.key == "camera"]
     if not is_quadratic or not len(poses) == len(train.views) > 1:
         for pose in poses:
             pose.is_fitted = False
+    for light in parameters:
+        if light.name.startswith("lights.") and light.is_fitted:
+            light.is_fitted = light.value.numel() <= 3 and bool((light.value > 0).all())

@@ -194,7 +194,10 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
                 f"those of this camera {camera.pixel_aspect:.6g} times as high as wide"
             )
         if camera.lens is not None:
-            raise SceneError(f"view {view.name!r}: Mitsuba's cameras have no lens distortion")
+            raise SceneError(
+                f"view {view.name!r}: Mitsuba's cameras have no lens distortion; leave the view"
+                " out, or undistort its picture and give it a camera without"
+            )
         fov = 2 * math.degrees(math.atan(camera.half_width))
         offsets = {
             f"principal_point_offset_{axis}": 0.5 - float(place)

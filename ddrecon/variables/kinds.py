@@ -67,7 +67,7 @@ _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True
 _MEAN_COSINE = Kind(
     fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
-_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True)
+_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, is_fitted=True)
 
 KINDS: Mapping[str, Kind] = {
     "density": Kind(density_rate, low=0, is_cellwise=True, tv=3e-3),
@@ -83,7 +83,7 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
-    "lights.N.scale": Kind(brightness_rate, low=0),
+    "lights.N.scale": Kind(brightness_rate, low=0, is_fitted=True),
     # in degrees
     "lights.N.rotation": Kind(fixed_rate(1.0), difference_steps=SHORT_STEPS),
     "lights.N.direction": Kind(

@@ -104,12 +104,12 @@ def degrees_between(one: Tensor, other: Tensor) -> float:
     return math.degrees(math.acos(min(1.0, float(one @ other / one.norm() / other.norm()))))
 
 
-def test_the_color_of_a_light() -> None:
+def test_the_colors_of_two_lights() -> None:
     scene = photographed(scene_of(cloud(12), 3, 16))
-    found = value_of(
-        recovered(scene, {"lights.0.irradiance": torch.ones(3)}, 200), "lights.0.irradiance"
-    )
-    assert float((found / value_of(scene, "lights.0.irradiance") - 1).abs().max()) < 1e-3
+    starts = {"lights.0.irradiance": torch.ones(3), "lights.1.radiance": torch.full((3,), 0.3)}
+    found = recovered(scene, starts, 64)
+    for name in starts:
+        assert float((value_of(found, name) / value_of(scene, name) - 1).abs().max()) < 1e-3
 
 
 def test_the_direction_of_a_light() -> None:
