@@ -1,4 +1,4 @@
-"""How bright lights are, found from pictures: what fits best, as for exposures (E39).
+"""How bright lights are, found from pictures: what fits best, as for exposures (E35).
 
 A picture is linear in the brightness of every light. Descent along a derivative leaves it where a
 run's first steps took it, since Adam remembers their size; and a volume that is lit wrongly becomes

@@ -1,4 +1,4 @@
-"""Which picture to take next: how much of the posterior's variance a picture would take away (E36).
+"""Which picture to take next: how much of the posterior's variance a picture would take away (E34).
 
 Samples of the posterior say how its volumes differ, and how they would differ in a picture that is
 not yet taken. Few samples differ in every picture, so that it seems to tell them all apart: the
@@ -102,7 +102,7 @@ class NextView:
 
 
 def find_gain(alike: Tensor, shown: Tensor) -> float:
-    """The part of the variance that a picture takes at least: t1^2 / (t1 + t2) of all (E36).
+    """The part of the variance that a picture takes at least: t1^2 / (t1 + t2) of all (E34).
 
     `alike` and `shown` [m, m] are inner products of independent samples, and of how they change the
     picture in units of its noise. t1 and t2 are means over pairs and triples of different ones.

@@ -1,4 +1,4 @@
-"""How much the pictures of a run err: as its scene says, or by what its optimum leaves (E35)."""
+"""How much the pictures of a run err: as its scene says, or by what its optimum leaves (E33)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEAST_LEFT = 0.1
 
 @dataclass(frozen=True)
 class PictureErrors:
-    """How much pictures err. `temperature` is the objective's unit of it (E35).
+    """How much pictures err. `temperature` is the objective's unit of it (E33).
 
     `deviation` [radiance] is the root mean square error of a number of a picture, `count` how many
     independent ones there are. `told` is how many numbers they tell, None where that was not needed

@@ -1,4 +1,4 @@
-"""Samples of what a reconstruction may as well be: its posterior about its optimum (E35).
+"""Samples of what a reconstruction may as well be: its posterior about its optimum (E33).
 
 Randomize, then optimize (Bardsley, Solonen, Haario and Laine 2014, doi:10.1137/140964023), with
 pictures as they change to first order: each sample is the least, within bounds, of a quadratic

@@ -1,6 +1,6 @@
-"""What a run assumes of its parameters before it looks at pictures, as a Gaussian: R + T K (E35).
+"""What a run assumes of its parameters before it looks at pictures, as a Gaussian: R + T K (E33).
 
-R is its smoothing (E34). K makes it proper, where smoothing says nothing: how bright a whole field
+R is its smoothing (E32). K makes it proper, where smoothing says nothing: how bright a whole field
 is, and what single numbers are. It is so weak that it counts only where pictures say nothing.
 """
 

@@ -2,7 +2,7 @@
 
 The length of a slope, |s|, lies below (|s|^2 / |s0| + |s0|) / 2, and touches it at the slope s0
 that the field has (lagged diffusivity: Vogel and Oman 1996, doi:10.1137/0917016). So about a
-field total variation is half of x^T R x, R = D^T V D (E34): D takes slopes, V has the weight over
+field total variation is half of x^T R x, R = D^T V D (E32): D takes slopes, V has the weight over
 the length of each cell's slope. Along an edge it hardly holds, where a field is flat it holds most.
 """
 
@@ -21,7 +21,7 @@ AXES = (-3, -2, -1)
 
 @dataclass(frozen=True)
 class Roughness:
-    """R = D^T V D of a field on `grid` (E34); `stiffness` >= 0 [..., z, y, x] is V of each cell."""
+    """R = D^T V D of a field on `grid` (E32); `stiffness` >= 0 [..., z, y, x] is V of each cell."""
 
     grid: Grid
     stiffness: Tensor

@@ -160,7 +160,7 @@ def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bo
     Poses with a loss that is no sum of squares (E29); and where those of only some of several views
     of `train` are sought, or of a single one: then no calibration of all is to be mended, but a
     camera to be found, which may be far off. Lights that are a map, or start from black: that has
-    no share in pictures yet (E39).
+    no share in pictures yet (E35).
     """
     poses = [parameter for parameter in parameters if parameter.key == "camera"]
     if not is_quadratic or not len(poses) == len(train.views) > 1:
