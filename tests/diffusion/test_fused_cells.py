@@ -22,7 +22,12 @@ from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.diffusion.fused import closure_kernels, flux_kernels, spread, system_kernels  # noqa: E402
+from ddrecon.diffusion.fused import (  # noqa: E402
+    closure_kernels,
+    flux_kernels,
+    spread,
+    system_kernels,
+)
 from ddrecon.diffusion.fused.product import multiply  # noqa: E402
 
 pytestmark = pytest.mark.slow

@@ -62,7 +62,9 @@ def test_empty_cells_are_among_those_of_density() -> None:
 
 def test_forward_peaks_and_backward_scattering_pass() -> None:
     for g in ("0.8", "-0.6", "0.0"):
-        for result in check("g", "sigma_s", overrides=(f"optimize.parameters.g.init={g}",)):
+        for result in check(
+            "g", "sigma_s", samples=1, overrides=(f"optimize.parameters.g.init={g}",)
+        ):
             assert result.has_passed, "\n".join(result.lines())
 
 
