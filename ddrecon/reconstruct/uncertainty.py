@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool3d
 
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
@@ -17,6 +18,9 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors
 from ddrecon.reconstruct.posterior import TOLERANCE, Posterior, Sample
 from ddrecon.variables.values import component_names
+
+AROUND = 5
+"""Cells along each axis over which variances are averaged where they are compared."""
 
 
 class Uncertainty:
@@ -75,10 +79,19 @@ class Uncertainty:
 
     @property
     def told(self) -> dict[str, Tensor]:
-        """The part of each entry's variance that pictures took away: 0 none, 1 all; by name."""
-        before, after = self._variance("prior"), self._variance("post")
+        """The part of each entry's variance that pictures took away: 0 none, 1 all; by name.
+
+        In fields, of the mean variance of the cells around: of one alone, few samples say little.
+        """
+        before, after = (
+            {name: _mean_around(part) for name, part in self.curvature.split(variance).items()}
+            for variance in (self._variance("prior"), self._variance("post"))
+        )
         tiny = torch.finfo(torch.float64).tiny
-        return self.curvature.split((1 - after / before.clamp(min=tiny)).clamp(0, 1) * (before > 0))
+        return {
+            name: (1 - after[name] / part.clamp(min=tiny)).clamp(0, 1) * (part > 0)
+            for name, part in before.items()
+        }
 
     def number_names(self) -> list[str]:
         """The names of the entries of all parameters that are no fields, in their order."""
@@ -138,6 +151,15 @@ class Uncertainty:
         parts = self.curvature.split(vector)
         tabled = [parts[parameter.name].flatten() for parameter in self.tabled]
         return torch.cat(tabled) if tabled else vector[:0]
+
+
+def _mean_around(variance: Tensor) -> Tensor:
+    """Of a field [..., z, y, x], the mean over the cells around each; else as it is."""
+    if variance.ndim < 3:
+        return variance
+    cells = variance.reshape(-1, 1, *variance.shape[-3:])
+    around = avg_pool3d(cells, AROUND, 1, AROUND // 2, count_include_pad=False)
+    return around.view(variance.shape)
 
 
 def curvature_of(run: Reconstruction) -> Curvature:

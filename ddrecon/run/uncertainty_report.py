@@ -122,11 +122,23 @@ def _how(record: Mapping[str, Any]) -> list[str]:
         paragraph(
             f"A deviation from {count} samples is itself off by about {error:.0f} %."
             " Told is the part of a cell's variance that pictures took away from what smoothing"
-            " alone leaves open."
+            " alone leaves open, in the mean of the cells around."
         ),
         paragraph(
             "All this is about the optimum that was found, for pictures that err by noise alone:"
             " what the model of light lacks is not in it."
         ),
-        table(["", ""], [(k, v) for k, v in record["noise"].items() if v is not None]),
+        table(["pictures", ""], _noise(record["noise"])),
     ]
+
+
+def _noise(noise: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What is known of how pictures err, and of what they tell."""
+    rows = [
+        ("deviation of a pixel, in radiance", f"{noise['deviation']:.3g}"),
+        ("known from", str(noise["from"])),
+        ("numbers in all pictures", str(noise["count"])),
+    ]
+    if noise["told"] is not None:
+        rows.append(("of these spent on telling the volume", f"{noise['told']:.0f}"))
+    return rows
