@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool3d
+from torch.nn.functional import avg_pool3d, pad
 
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
@@ -158,8 +158,12 @@ def _mean_around(variance: Tensor) -> Tensor:
     if variance.ndim < 3:
         return variance
     cells = variance.reshape(-1, 1, *variance.shape[-3:])
-    around = avg_pool3d(cells, AROUND, 1, AROUND // 2, count_include_pad=False)
-    return around.view(variance.shape)
+    # Beyond the box there are no cells: those that there are count alone.
+    sums, counts = (
+        avg_pool3d(pad(each, [AROUND // 2] * 6), AROUND, 1)
+        for each in (cells, torch.ones_like(cells))
+    )
+    return (sums / counts).view(variance.shape)
 
 
 def curvature_of(run: Reconstruction) -> Curvature:
