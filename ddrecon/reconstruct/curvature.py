@@ -92,8 +92,11 @@ class Curvature:
         parts = self.split(vector)
         return self.join({name: r.product(parts[name]) for name, r in self.roughness.items()})
 
-    def tangents(self, vector: Tensor) -> dict[str, Tensor]:
-        """J times `vector`: how the picture [3, h, w] of each view changes, by its name."""
+    def tangents(self, vector: Tensor, views: Sequence[View] | None = None) -> dict[str, Tensor]:
+        """J times `vector`: how the picture [3, h, w] of each view changes, by its name.
+
+        Those of the training views, or of other `views` of the same volume.
+        """
         changes, found = self.split(vector), dict[str, Tensor]()
         derivatives = self.scene.optimize.derivatives if self.scene.optimize else "all"
         with torch.no_grad(), forward_ad.dual_level():
@@ -103,7 +106,7 @@ class Curvature:
             }
             world = with_values(self.scene, duals)
             light_field = solve_light(world, self.new_memory())
-            for view in world.views:
+            for view in world.views if views is None else views:
                 picture = view_picture(light_field, world, view, derivatives)
                 tangent = forward_ad.unpack_dual(picture).tangent
                 found[view.name] = torch.zeros_like(picture) if tangent is None else tangent.clone()

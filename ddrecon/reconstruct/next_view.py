@@ -14,13 +14,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import View
 from ddrecon.variables.kinds import FIELDS
-from ddrecon.variables.values import with_values
 
 FEWEST = 5
 """Samples that there must be: four are independent of their mean, and without one of them three."""
@@ -84,21 +81,8 @@ class NextView:
 
     def _tangents(self, change: Tensor) -> Tensor:
         """How the pictures of all candidates change, one after another."""
-        curvature, found = self.curvature, list[Tensor]()
-        parts = curvature.split(change)
-        with torch.no_grad(), forward_ad.dual_level():
-            duals = {
-                name: forward_ad.make_dual(value, parts[name])
-                for name, value in curvature.values.items()
-            }
-            world = with_values(curvature.scene, duals)
-            light_field = solve_light(world, curvature.new_memory())
-            for view in self.views:
-                picture = forward_ad.unpack_dual(view_picture(light_field, world, view))
-                nothing = torch.zeros_like(picture.primal)
-                tangent = nothing if picture.tangent is None else picture.tangent
-                found.append(tangent.expand(3, -1, -1).reshape(-1).cpu())
-        return torch.cat(found)
+        found = self.curvature.tangents(change, self.views)
+        return torch.cat([found[v.name].expand(3, -1, -1).reshape(-1).cpu() for v in self.views])
 
 
 def find_gain(alike: Tensor, shown: Tensor) -> float:
