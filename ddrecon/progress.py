@@ -21,3 +21,9 @@ def bar_room() -> tuple[int | None, int | None]:
     except (OSError, ValueError, AttributeError):
         return None, None
     return (None if columns else 80), (None if rows else 24)
+
+
+def bar_settings(is_quiet: bool) -> dict[str, Any]:
+    """How every progress bar is shown: on stderr, with room, and not at all if `is_quiet`."""
+    columns, rows = bar_room()
+    return {"file": sys.stderr, "disable": is_quiet, "ncols": columns, "nrows": rows}

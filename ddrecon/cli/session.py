@@ -22,7 +22,7 @@ from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
 from ddrecon.memory import keep_freed_memory
-from ddrecon.progress import bar_room
+from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT
 from ddrecon.scene import Scene, View
@@ -81,16 +81,7 @@ class Session:
 
     def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
         """`items` with a progress bar on stderr, unless quiet."""
-        columns, rows = bar_room()
-        return tqdm(
-            items,
-            desc=what,
-            file=sys.stderr,
-            disable=self.is_quiet,
-            leave=self.is_verbose,
-            ncols=columns,
-            nrows=rows,
-        )
+        return tqdm(items, desc=what, leave=self.is_verbose, **bar_settings(self.is_quiet))
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
         """Prints `report` as JSON where that was asked for, else `lines`; the first rank alone."""

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError, UsageError
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
-from ddrecon.progress import bar_room
+from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
@@ -112,19 +112,12 @@ def drive_run(
     the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
-    columns, rows = bar_room()
     try:
         with (
             defer_interrupt() as asked,
             event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
             tqdm(
-                total=total,
-                initial=run.iteration,
-                desc="optimize",
-                file=sys.stderr,
-                disable=is_quiet,
-                ncols=columns,
-                nrows=rows,
+                total=total, initial=run.iteration, desc="optimize", **bar_settings(is_quiet)
             ) as bar,
         ):
             if not is_quiet:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -19,7 +18,7 @@ from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear
 from ddrecon.io.volumes.table import write_field
 from ddrecon.pictures.noise import Noise
-from ddrecon.progress import bar_room
+from ddrecon.progress import bar_settings
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.next_view import Candidate, NextView
 from ddrecon.reconstruct.picture_errors import PictureErrors
@@ -102,11 +101,8 @@ def drive_uncertainty(
     for name in ("volumes", CHECKPOINTS):
         (path / name).mkdir(exist_ok=True)
     described = _describe(run, seed, noise, tolerance) | {"candidates": candidates}
-    state: dict[str, Any] | None = None
-    if resume:
-        state, loaded = load_checkpoint(checkpoints, described)
-        os.replace(loaded, checkpoints / LAST)
-    else:
+    state = _take_up(checkpoints, described) if resume else None
+    if state is None:
         forget_checkpoints(checkpoints)
     errors = None if state is None else PictureErrors(**state["errors"])
     found = Uncertainty(run, seed, noise, tolerance, errors)
@@ -117,17 +113,10 @@ def drive_uncertainty(
         if ranking is not None:
             ranking.restore(state["ranking"])
         before = state["seconds"]
-    columns, rows = bar_room()
     with (
         defer_interrupt() as asked,
         tqdm(
-            total=samples,
-            initial=found.count,
-            desc="uncertainty",
-            file=sys.stderr,
-            disable=is_quiet,
-            ncols=columns,
-            nrows=rows,
+            total=samples, initial=found.count, desc="uncertainty", **bar_settings(is_quiet)
         ) as bar,
     ):
         while found.count < samples:
@@ -146,6 +135,13 @@ def drive_uncertainty(
                 raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
     seconds = before + perf_counter() - began
     return _finish(run, found, path, seconds, [] if ranking is None else ranking.rank())
+
+
+def _take_up(checkpoints: Path, described: dict[str, Any]) -> dict[str, Any]:
+    """The state of the last sample in `checkpoints`, if it is of a run as `described`."""
+    state, loaded = load_checkpoint(checkpoints, described)
+    os.replace(loaded, checkpoints / LAST)
+    return state
 
 
 def _describe(
