@@ -110,7 +110,7 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
-        compile_ahead(lambda: deepcopy(self)._iterate(start, {}))
+        compile_ahead(lambda: deepcopy(self)._iterate(start))
         if self.iteration == 0:
             self._settle_smoothing()
         stage = self.schedule.stage(self.iteration)
