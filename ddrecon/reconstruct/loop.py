@@ -110,7 +110,7 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
-        compile_ahead(lambda: deepcopy(self)._iterate(start, {}))
+        compile_ahead(lambda: deepcopy(self)._iterate(start))
         if self.iteration == 0:
             self._settle_smoothing()
         stage = self.schedule.stage(self.iteration)
@@ -118,13 +118,13 @@ class Reconstruction:
             self._enter_stage(stage)
         solutions = dict(self.memory.last)
         try:
-            return self._iterate(start, solutions)
+            return self._iterate(start)
         except (SolveError, NotFiniteError) as error:
             failure = explain_divergence(self.iteration + 1, self.parameters, error)
-            if self.before_step is None:
-                self.memory.last = solutions
-            else:
+            if self.before_step is not None:
                 self.restore(self.before_step)
+            # They solve that state, of which the step led astray.
+            self.memory.last = solutions
             raise failure from error.__cause__
         except RanksError:
             # The state is that before the iteration, even amid the step, when some have moved.
@@ -133,8 +133,8 @@ class Reconstruction:
             self.memory.last = solutions
             raise
 
-    def _iterate(self, start: float, solutions: dict[tuple[str, int], Tensor]) -> Row:
-        """One iteration, begun at `start` [s] with these last `solutions`."""
+    def _iterate(self, start: float) -> Row:
+        """One iteration, begun at `start` [s]."""
         # See: which views this iteration compares.
         views = self._views()
         # Differentiate: the objective and its derivative by every parameter.
@@ -147,7 +147,7 @@ class Reconstruction:
         numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         self.before_step = None
-        self.before_step = self.state() | {"solutions": solutions}
+        self.before_step = self.state() | {"solutions": {}}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
         self._step(gradients, compared)
