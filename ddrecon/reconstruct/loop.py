@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -20,6 +21,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
 from ddrecon.reconstruct import setup
+from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
@@ -108,6 +110,7 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
+        compile_ahead(lambda: deepcopy(self)._iterate(start))
         if self.iteration == 0:
             self._settle_smoothing()
         stage = self.schedule.stage(self.iteration)
