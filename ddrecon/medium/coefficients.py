@@ -6,6 +6,7 @@ cross sections are constant, rays need march through one field only, the density
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +16,7 @@ from ddrecon.display import Displayed
 from ddrecon.grid import Grid
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
 
@@ -177,25 +178,37 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
     g = _mean_cosine(type(volume.phase), *volume.phase.numbers)
     fraction = 0 * g.detach() if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
-    density = volume.density[None]
-
-    def coefficient(sigma: Tensor) -> Coefficient:
-        if sigma.shape[1:].numel() == 1:
-            return Coefficient(sigma, density)
-        return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * density)
-
-    extinction, peak = _extinction_and_peak(sigma_a, sigma_s, fraction)
+    find = _find_coefficients
+    if max(sigma_a[0].numel(), sigma_s[0].numel()) > 1:
+        # Of what varies from cell to cell nothing is kept that is made on the way.
+        find = functools.partial(recompute, find)
+    extinction, scattering, absorption, peak = find(sigma_a, sigma_s, fraction, volume.density)
     return Medium(
         volume.grid,
-        extinction=coefficient(extinction),
-        scattering=coefficient(sigma_s),
-        absorption=coefficient(sigma_a),
+        extinction=extinction,
+        scattering=scattering,
+        absorption=absorption,
         g=g,
         mean_cosine=_scaled_mean_cosine(g, fraction),
         forward_fraction=fraction,
         peak=peak,
         seen=seen,
     )
+
+
+def _find_coefficients(
+    sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor, density: Tensor
+) -> tuple[Coefficient, Coefficient, Coefficient, Tensor | None]:
+    """kappa_a + (1 - f) kappa_s, kappa_s and kappa_a, and what `Medium` has as `peak`."""
+    field = density[None]
+
+    def coefficient(sigma: Tensor) -> Coefficient:
+        if sigma.shape[1:].numel() == 1:
+            return Coefficient(sigma, field)
+        return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * field)
+
+    extinction, peak = _extinction_and_peak(sigma_a, sigma_s, fraction)
+    return coefficient(extinction), coefficient(sigma_s), coefficient(sigma_a), peak
 
 
 @remember
