@@ -9,6 +9,7 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
+from ddrecon.march.steps import greatest_depth
 from ddrecon.medium.coefficients import Medium, scale_medium
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
@@ -20,6 +21,13 @@ from ddrecon.settings import DiffusionSettings
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
+    samples = _count(scene.render.steps, "sample")
+    depth = f"{greatest_depth(scene.volume):.2g}"
+    return [*_light_in(scene), f"view rays: {samples} a cell of at most {depth} optical depths"]
+
+
+def _light_in(scene: Scene) -> list[str]:
+    """The terms of the light in the volume of `scene`."""
     settings = scene.diffusion
     medium = scale_medium(scene.volume, settings.angles)
     colors = medium.extinction.scale.shape[0]

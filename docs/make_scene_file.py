@@ -310,7 +310,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "How view rays are sampled.",
         {
             "samples_per_pixel": "Rays a pixel, over its area; one goes through its center.",
-            "steps_per_voxel": "Samples a cell along a ray.",
+            "steps_per_voxel": (
+                "Samples a cell along a ray. Left out: 2 where a cell is thicker than 0.75 optical"
+                " depths in the scene as its file has it, else 1."
+            ),
             "tolerance": (
                 "Pixels finer than half a cell are interpolated between rays, but where they may"
                 " change by more than this part of the image's root mean square. 0: every pixel "

@@ -54,7 +54,7 @@ def march(
         return nothing, 1 - nothing
     march_rays, march_lattice = _pick_engine(emission)
     channels = pack_channels(emission)
-    sampler = make_sampler(channels, emission.grid, sight.way, settings.steps_per_voxel)
+    sampler = make_sampler(channels, emission.grid, sight.way, settings.steps)
     if sight.lattice is None or sight.places is None:
         values = _spread(march_rays(emission, sampler, sight.rays, sight.crossing), sight)
     else:
