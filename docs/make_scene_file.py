@@ -342,8 +342,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "where there are none: without model `p1` or scheme `conservative`."
             ),
             "degree": (
-                "Degree to which such sweeps keep light's angles, along 18 directions for 1, 26 for "
-                "3, then 50 and 86. Left out, it is 3, or 1 where g is not sought and at most 0.32."
+                "Degree to which such sweeps keep light's angles, along 18 directions for 1, 26 "
+                "for 3, then 50 and 86. Left out, it is 3, or 1 where g is not sought and at most "
+                "0.32."
             ),
         },
     ),
