@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from torch import Tensor
+
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
@@ -57,6 +59,8 @@ def _round_terms(medium: Medium, scene: Scene) -> list[str]:
     if has_backward_peak(medium) and _has_beams(scene.lights):
         part = backward_fraction(medium).max().item()
         terms.append(f"beams in pairs: a backward peak turns {part:.3g} of scattering back")
+    elif medium.is_cellwise and _has_beams(scene.lights):
+        terms.append("no pairs of beams: the phase function differs from cell to cell")
     return terms
 
 
@@ -81,15 +85,22 @@ def _angle_term(medium: Medium) -> str:
 
 def _phase_term(phase: PhaseFunction) -> str:
     """Which phase function, and its mean cosine."""
-    cosines = ", ".join(f"{cosine:.3g}" for cosine in phase.moments(2)[:, 1].tolist())
-    return f"phase function {phase.NAME}, mean cosine {cosines}"
+    means = phase.moments(2)[:, 1]
+    if phase.cells is not None:
+        least, most = means.min().item(), means.max().item()
+        return f"phase function {phase.NAME}, mean cosine per cell, {least:.3g} to {most:.3g}"
+    return f"phase function {phase.NAME}, mean cosine {_listed(means)}"
 
 
 def _peak_term(medium: Medium) -> str:
     """What part of scattering counts as not scattered."""
-    fractions = medium.forward_fraction.flatten().tolist()
-    parts = ", ".join(f"{fraction:.3g}" for fraction in fractions)
+    fraction = medium.forward_fraction
+    parts = f"up to {fraction.max().item():.3g}" if medium.is_cellwise else _listed(fraction)
     return f"delta-Eddington scaling of the forward peak, {parts} of scattering"
+
+
+def _listed(numbers: Tensor) -> str:
+    return ", ".join(f"{number:.3g}" for number in numbers.flatten().tolist())
 
 
 def _method(settings: DiffusionSettings) -> str:
