@@ -78,7 +78,7 @@ def deviation(run: Reconstruction) -> float:
     nothing = torch.zeros_like(unit, dtype=torch.bool)
 
     def precondition(vector: Tensor) -> Tensor:
-        return posterior.prior.solve(vector, nothing, posterior.diagonal, CLOSE)
+        return posterior.prior.solve(vector, nothing, posterior.information.diagonal, CLOSE)
 
     solved = conjugate_gradients(posterior.product, precondition, unit, CLOSE, MOST)
     return math.sqrt(posterior.temperature * float(unit @ solved.value))
