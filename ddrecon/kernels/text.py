@@ -4,8 +4,8 @@
     scale.launch(count, {"x": x, "factor": 2.0}, {"out": out})
 
 What the text is given is declared as in C: pointers and numbers of type `F` (the kernel's own),
-`double`, `int`, `long`, `bool` or `half` (bfloat16); `F *fields[3]` are three pointers. It all goes into one record:
-a launch takes the same few microseconds, however much that is.
+`double`, `int`, `long`, `bool` or `half` (bfloat16); `F *fields[3]` are three pointers. It all goes
+into one record: a launch takes the same few microseconds, however much that is.
 """
 
 import re
