@@ -96,7 +96,7 @@ def view_cost(scene: Scene, view: View) -> float:
         length = float((crossing.far - crossing.near).sum()) / len(rays.direction)
     height, width = camera.size
     on_rays = height * width * scene.render.samples_per_pixel * length / min(grid.spacing)
-    return on_rays * scene.render.steps_per_voxel + CELL_COST * grid.cells
+    return on_rays * scene.render.steps + CELL_COST * grid.cells
 
 
 def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:
