@@ -51,18 +51,12 @@ def _sum_mass(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
     """What `sum_mass_to_cells` returns, of one field [1, z, y, x]."""
-    # From one slice to the next the beam goes `step` and drifts by `slope`, in rows and columns.
-    speed = direction / direction.new_tensor(grid.spacing)
-    slicing = Slicing.of(speed.tolist())
+    slicing, slope, step = frame_along(grid, direction)
     slices = slicing.lay(field)
-    slope = (
-        torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
-    )
-    step = grid.spacing[slicing.axis] / direction[slicing.axis].abs()
 
     # Shear: rho_k along each ray on slice k, and rho_(k + 1/2) midway to the next, where the field
     # is the mean of both slices.
-    shear = _Shear.of(slices, slope)
+    shear = Shear.of(slices, slope)
     on_slices = shear.to_rays(slices, 0.0)
     midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
 
@@ -79,8 +73,21 @@ def _sum_mass(
     return slicing.lift(shear.to_cells(passed, third_order)), step
 
 
+def frame_along(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
+    """The slices that a beam along `direction` crosses, and how it goes from one to the next.
+
+    It drifts by `slope` [2], in rows and columns, over a way of `step` [u].
+    """
+    speed = direction / direction.new_tensor(grid.spacing)
+    slicing = Slicing.of(speed.tolist())
+    slope = (
+        torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
+    )
+    return slicing, slope, grid.spacing[slicing.axis] / direction[slicing.axis].abs()
+
+
 @dataclass(frozen=True)
-class _Shear:
+class Shear:
     """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
 
     Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
@@ -93,14 +100,14 @@ class _Shear:
     first: tuple[int, int]
 
     @staticmethod
-    def of(slices: Tensor, slope: Tensor) -> _Shear:
+    def of(slices: Tensor, slope: Tensor) -> Shear:
         """The rays that meet `slices` [N, K, H, W]."""
         height, width = slices.shape[2:]
         rows, columns = (
             math.floor(abs(s) * (slices.shape[0] - 1) + 1e-9) + 1 for s in slope.tolist()
         )
         is_on = [s > 0 for s in slope.tolist()]
-        return _Shear(
+        return Shear(
             slope,
             (height, width),
             (height + rows, width + columns),
@@ -119,11 +126,11 @@ class _Shear:
         )
         return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
 
-    def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
+    def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
         places = self._places(values, 0.0, self.size, self.lattice, -1)
         rows, columns = (
-            Weights.at(place, size, has_third_order=True)
+            Weights.at(place, size, has_third_order=third_order is not None)
             for place, size in zip(places, self.lattice, strict=True)
         )
         return sample_lattice(values, rows, columns, third_order).unflatten(-1, self.size)
