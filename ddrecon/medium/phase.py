@@ -8,6 +8,7 @@ color as first axis, of size 1 where all colors share one phase function.
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -70,7 +71,7 @@ class PhaseFunction(ABC):
         """All numbers, in the order of the fields."""
         return tuple(getattr(self, field.name) for field in fields(self))
 
-    @property
+    @functools.cached_property
     def colors(self) -> int:
         """How many colors have a phase function of their own: 1 where all share one."""
         return len(self.moments(1))
