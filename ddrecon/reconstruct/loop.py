@@ -116,21 +116,17 @@ class Reconstruction:
         stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
-        solutions = dict(self.memory.last)
         try:
             return self._iterate(start)
         except (SolveError, NotFiniteError) as error:
             failure = explain_divergence(self.iteration + 1, self.parameters, error)
             if self.before_step is not None:
                 self.restore(self.before_step)
-            # They solve that state, of which the step led astray.
-            self.memory.last = solutions
             raise failure from error.__cause__
         except RanksError:
             # The state is that before the iteration, even amid the step, when some have moved.
             if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
                 self.restore(self.before_step)
-            self.memory.last = solutions
             raise
 
     def _iterate(self, start: float) -> Row:
@@ -147,7 +143,8 @@ class Reconstruction:
         numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         self.before_step = None
-        self.before_step = self.state() | {"solutions": {}}
+        # Not the solutions, where solves only begin.
+        self.before_step = {key: part for key, part in self.state().items() if key != "solutions"}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
         self._step(gradients, compared)
@@ -209,9 +206,11 @@ class Reconstruction:
         for parameter in self.parameters:
             curvature = state["parameters"][parameter.name]["curvature"]
             parameter.curvature = None if curvature is None else curvature.to(parameter.value)
-        self.memory.last = {
-            kind: field.to(self.scene.volume.density) for kind, field in state["solutions"].items()
-        }
+        if "solutions" in state:
+            self.memory.last = {
+                kind: field.to(self.scene.volume.density)
+                for kind, field in state["solutions"].items()
+            }
 
     def _settle_smoothing(self) -> None:
         """Finds the weight of density's total variation where the scene asks for that."""
