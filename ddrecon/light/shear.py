@@ -19,6 +19,8 @@ from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
+from ddrecon.slabs.exchange import gather_slabs
+from ddrecon.slabs.slab import Slab
 
 
 def sum_mass_to_cells(
@@ -37,6 +39,11 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
+    if isinstance(grid, Slab):
+        # Mass comes from the whole box: every rank sums it there.
+        whole = gather_slabs(field, grid)
+        entered, step = sum_mass_to_cells(whole, grid.whole, direction, bound)
+        return grid.cut(entered), step
     if is_fused(direction):
         from ddrecon.light.fused.sum_mass import sum_mass
 

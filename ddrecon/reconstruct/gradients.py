@@ -18,6 +18,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
 from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
+from ddrecon.slabs.slab import Slab
 from ddrecon.variables.kinds import VOLUME
 from ddrecon.variables.values import with_values
 
@@ -42,7 +43,8 @@ def differentiate(
 
     They are those by the leaves `values`, which stand in `scene` for the variables of their names.
     The views are shared out over ranks, which sum what reaches the light field; its way back is the
-    same on all of them.
+    same on all of them. Of a light field in slabs each rank has a part: it goes that part's way
+    back, and the derivatives by `values` are summed.
     """
     derivatives = scene.optimize.derivatives if scene.optimize else "all"
     # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
@@ -53,16 +55,24 @@ def differentiate(
     inputs = [*values.values(), *cut.leaves]
     sums: list[Tensor | None] = [None] * len(inputs)
     images, loss = list[Tensor](), scene.volume.density.new_zeros(())
-    for name in own_views(scene, names):
+    own, has_slabs = own_views(scene, names), isinstance(light_field.medium.grid, Slab)
+    for name in names if has_slabs else own:
         lit = with_values(scene, outside)
         view = lit.view(name)
         image = view_picture(light_field, lit, view, derivatives)
+        if name not in own:
+            # The loss is another rank's, which asks this one for its part of the derivative.
+            sums = _add(sums, torch.autograd.grad(0 * image.sum(), inputs, allow_unused=True))
+            continue
         view_loss = loss_of(view, image)
         if view_loss.requires_grad:
             sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))
         images.append(image.detach())
         loss = loss + view_loss.detach()
-    (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
+    if has_slabs:
+        (total,) = sum_found([loss], [loss])
+    else:
+        (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
     # What reached the leaves goes back through the light field, and so through the solve (E9).
     reached = [pair for pair in zip(cut.tensors, leaf_bars, strict=True) if pair[1] is not None]
@@ -72,6 +82,8 @@ def differentiate(
         through_light = torch.autograd.grad(product, inputs[: len(values)], allow_unused=True)
         # The derivative is the sum of both ways.
         direct = _add(direct, through_light)
+    if has_slabs:
+        direct = sum_found(direct, list(values.values()))
     gradients = {
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
