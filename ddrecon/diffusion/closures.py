@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -20,6 +20,7 @@ from ddrecon.grid import Grid
 from ddrecon.slabs.exchange import gather_own
 from ddrecon.slabs.slab import Slab, whole_of
 
+Shape = tuple[int, int, int]
 FLOOR = 3.3
 """Optical thickness across the box's shortest side that `smooth` gives empty space.
 
@@ -87,16 +88,20 @@ def _inverse_distance_in_slab(weight: Tensor, slab: Slab) -> Tensor:
     Averages and interpolation go axis by axis; that along the slab's axis is of the whole grid.
     """
     coarse, axis = coarse_grid(slab.whole), slab.axis
-    shape = [slab.sizes[slab.rank] if a == axis else n for a, n in enumerate(coarse.shape)]
-    layers = adaptive_avg_pool3d(slab.own(weight), shape)
+    own, whole = (_with_entry(coarse.shape, axis, n) for n in (slab.size, slab.whole.shape[axis]))
+    layers = adaptive_avg_pool3d(slab.own(weight), own)
     mean = adaptive_avg_pool3d(gather_own(layers, slab), coarse.shape)
     inverse = _inverse_distance(mean, slab.whole)
-    shape[axis] = slab.whole.shape[axis]
-    return _interpolate(slab.cut(_interpolate(inverse, shape)), slab.shape)
+    return _interpolate(slab.cut(_interpolate(inverse, whole)), slab.shape)
 
 
-def _interpolate(u: Tensor, shape: Sequence[int]) -> Tensor:
-    return interpolate(u[None], size=list(shape), mode="trilinear")[0]
+def _with_entry(shape: Shape, axis: int, cells: int) -> Shape:
+    z, y, x = (cells if a == axis else n for a, n in enumerate(shape))
+    return z, y, x
+
+
+def _interpolate(u: Tensor, shape: Shape) -> Tensor:
+    return interpolate(u[None], size=shape, mode="trilinear")[0]
 
 
 def coarse_grid(grid: Grid) -> Grid:

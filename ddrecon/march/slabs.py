@@ -130,7 +130,7 @@ def _of_mass(emission: Emission, sampler: Sampler) -> Sampler:
 def clip_to_slab(
     slab: Slab, rays: Rays, near: Tensor, far: Tensor, sampler: Sampler
 ) -> tuple[Tensor, Tensor]:
-    """Where `rays`, which run in the box from `near` to `far` [R], have nodes in `slab`'s own cells.
+    """Where `rays`, in the box from `near` to `far` [R], enter `slab`'s own cells and leave them.
 
     Between two planes of `sampler` a segment belongs to the slab where its middle is: rays enter
     and leave a slab at the node next to its face. Where they miss it both are the same.
@@ -148,7 +148,8 @@ def clip_to_slab(
             crossings.append(_next_node(slab, rays, (end - origin) / direction, sampler))
     low, high = crossings
     enter, leave = torch.where(is_upwards, low, high), torch.where(is_upwards, high, low)
-    return tuple(torch.minimum(torch.maximum(end, near), far) for end in (enter, leave))
+    near, far = (torch.minimum(torch.maximum(end, near), far) for end in (enter, leave))
+    return near, far
 
 
 def _next_node(slab: Slab, rays: Rays, distance: Tensor, sampler: Sampler) -> Tensor:

@@ -63,9 +63,7 @@ def join_parts(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
     most = max(sizes)
     missing = most - own.shape[axis]
     parts = gather_from_ranks(pad(own, (0, 0) * (-axis - 1) + (0, missing)))
-    return torch.cat(
-        [part.narrow(axis, 0, n) for part, n in zip(parts, sizes, strict=True)], axis
-    )
+    return torch.cat([part.narrow(axis, 0, n) for part, n in zip(parts, sizes, strict=True)], axis)
 
 
 class _AddHalo(torch.autograd.Function):
@@ -83,7 +81,7 @@ class _AddHalo(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, field_bar: Tensor) -> tuple[Tensor, None]:
         slab, axis = ctx.slab, ctx.slab.axis - 3
-        (below, above), size = slab.halo, slab.sizes[slab.rank]
+        (below, above), size = slab.halo, slab.size
         own_bar = slab.own(field_bar).clone()
         lent = swap_with_neighbors(
             field_bar.narrow(axis, 0, below) if below else None,

@@ -65,6 +65,11 @@ class Slab(Grid):
         return [end - begin for begin, end in zip(self.cuts, self.cuts[1:], strict=False)]
 
     @property
+    def size(self) -> int:
+        """How many layers of cells it has of its own."""
+        return self.sizes[self.rank]
+
+    @property
     def halo(self) -> tuple[int, int]:
         """How many layers of other ranks it has below and above its own."""
         return self.cuts[self.rank] - self.first, self.last - self.cuts[self.rank + 1]
@@ -89,7 +94,7 @@ class Slab(Grid):
 
     def own(self, field: Tensor) -> Tensor:
         """The part of `field` [..., z, y, x] of this slab that is its own (a view)."""
-        return field.narrow(self.axis - 3, self.halo[0], self.sizes[self.rank])
+        return field.narrow(self.axis - 3, self.halo[0], self.size)
 
 
 def plane(grid: Grid, axis: int, cell: int) -> float:

@@ -34,6 +34,7 @@ def multigrid(
             raise give_up("multigrid", solution.iterations, solution.residual)
         return solution
     system = ScaledSystem.of(operator, source)
+    matrix = system.matrix
     y, residual = system.start(guess)
     direction, square = torch.zeros_like(y), torch.ones_like(system.source_norm)
     tiny = torch.finfo(source.dtype).tiny
@@ -42,11 +43,11 @@ def multigrid(
         relative := float((by_color := system.relative_by_color(residual)).max())
     ) > tolerance and iteration < MAX_ITERATIONS:
         preconditioned = operator.once(Level.of).cycle(residual)
-        previous, square = square, system.matrix.inner(residual, preconditioned)
+        previous, square = square, matrix.inner(residual, preconditioned)
         direction.mul_(square / previous.clamp(min=tiny)).add_(preconditioned)
-        product = system.matrix.apply(direction)
+        product = matrix.apply(direction)
         # A color that is exact enough is left as it is, whatever the others need.
-        step = (by_color > tolerance) * square / system.matrix.inner(direction, product).clamp(min=tiny)
+        step = (by_color > tolerance) * square / matrix.inner(direction, product).clamp(min=tiny)
         y.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         iteration += 1

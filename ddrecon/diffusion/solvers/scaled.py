@@ -106,7 +106,9 @@ class ScaledSystem:
 
     def relative_by_color(self, residual: Tensor) -> Tensor:
         """The same of each color, `[C, 1, 1, 1]`."""
-        return self.matrix.norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)
+        return self.matrix.norm(residual) / self.source_norm.clamp(
+            min=torch.finfo(residual.dtype).tiny
+        )
 
     def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
         """The solution that y is."""
