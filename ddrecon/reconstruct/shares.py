@@ -53,12 +53,15 @@ def require_sharing(scene: Scene, names: Collection[str]) -> None:
         problems.append(
             "diffusion.transport_rounds: rounds need all cells; say 0 to do without them"
         )
-    problems += [
-        f"optimize.parameters.{name}: needs all cells; leave it out"
+    others = [
+        name
         for name in names
         if name.startswith("lights.")
         or (name.startswith("views.") and name.rpartition(".")[2] not in RESPONSE)
     ]
+    if others:
+        more = f" and {len(others) - 1} more need" if len(others) > 1 else ": needs"
+        problems.append(f"optimize.parameters.{others[0]}{more} all cells; leave them out")
     if problems:
         raise UsageError([f"--share cells: {problem}, or share views" for problem in problems])
 
