@@ -61,7 +61,7 @@ class LightField:
 
     @property
     def outgoing(self) -> Moments:
-        """What one more scattering makes of `diffuse`, per unit length and kappa_s (E3)."""
+        """What one more scattering makes of `diffuse` (E3), as `scatter_once_more` has it."""
         return scatter_once_more(self.medium, self.diffuse)
 
 
@@ -274,6 +274,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         diffuse,
         medium.seen,
         medium.peak,
+        medium.remaining if medium.is_cellwise else None,
     )
 
 

@@ -74,32 +74,39 @@ def uncertainty(
     """
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.pictures.noise import Noise
+    from ddrecon.ranks import is_first
     from ddrecon.reconstruct.next_view import FEWEST
     from ddrecon.reconstruct.posterior import TOLERANCE
     from ddrecon.run.uncertainty_folder import (
         drive_uncertainty,
         dtype_of,
+        follow_uncertainty,
         state_of,
         take_up,
         uncertainty_lines,
     )
 
-    require_one_process()
     if ring and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     state = state_of(run)
     session = replace(session, dtype=dtype_of(state))
     taken = take_up(session.build(session.read(run / "scene.yaml")), state, run)
+    asked: dict[str, Any] = {
+        "seed": session.seed,
+        "noise": None if read is None else Noise(read, 0.0),
+        "tolerance": tolerance or TOLERANCE,
+        "candidates": CANDIDATES if ring else 0,
+    }
+    if not is_first():
+        follow_uncertainty(taken, samples, **asked)
+        return
     with claim_folder(output, may_exist=overwrite or resume):
         record = drive_uncertainty(
             taken,
             output,
             samples,
-            seed=session.seed,
-            noise=None if read is None else Noise(read, 0.0),
-            tolerance=tolerance or TOLERANCE,
+            **asked,
             has_samples=has_samples,
-            candidates=CANDIDATES if ring else 0,
             resume=resume,
             is_quiet=session.is_quiet,
         )
@@ -107,11 +114,13 @@ def uncertainty(
 
 
 def require_one_process() -> None:
-    """Raises UsageError under torchrun: samples are drawn by one process."""
+    """Raises UsageError under torchrun, where a run ends with the first rank alone."""
     from ddrecon.ranks import rank_count
 
     if rank_count() > 1:
-        raise click.UsageError("uncertainty takes one process; run it without torchrun")
+        raise click.UsageError(
+            "--uncertainty takes one process; run `ddrecon uncertainty` by torchrun afterwards"
+        )
 
 
 def add_uncertainty(

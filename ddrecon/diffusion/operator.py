@@ -77,6 +77,13 @@ class Operator:
             self.prepared[prepare] = prepare(self)
         return self.prepared[prepare]
 
+    def of_color(self, color: int) -> Operator:
+        """The operator of one color: itself where all share it, else with nothing prepared."""
+        given = self.loss, *self.conductances
+        if all(len(tensor) == 1 for tensor in given):
+            return self
+        return Operator.of({}, *(t[color : color + 1] if len(t) > 1 else t for t in given))
+
     def transposed(self) -> Operator:
         """A^T, which is A."""
         return self

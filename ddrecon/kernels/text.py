@@ -17,6 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ddrecon.kernels.compiling import clear_in_rehearsal
 from ddrecon.kernels.launch import launch
 from ddrecon.kernels.native import number_type, program
 
@@ -117,6 +118,7 @@ class TextKernel:
             held.append(ready)
         for name, value in made.items():
             self.write(record, name, value)
+        clear_in_rehearsal(made.values())
         like = next(value for value in made.values() if isinstance(value, Tensor))
         return Bound(self, record, [held, made], like)
 

@@ -19,12 +19,17 @@ from ddrecon.numerics.remember import remember
 
 
 def scatter_once_more(medium: Medium, light: Moments) -> Moments:
-    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E3, E21)."""
+    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E3, E21).
+
+    Where the phase function differs from cell to cell it is p_l phi_k, per (1 - f) kappa_s.
+    """
     return light.weighted(_factors(medium))
 
 
 def _factors(medium: Medium) -> Tensor:
-    """(1 - f) p_l, by the degree l."""
+    """(1 - f) p_l, or p_l, by the degree l."""
+    if medium.is_cellwise:
+        return remaining_moments(medium)
     return _weigh(medium.forward_fraction, remaining_moments(medium))
 
 
@@ -40,7 +45,7 @@ def scatter_towards(
 
     With what the `turned` beams scatter (E21). As `Moments.positive_along` has it.
     """
-    if is_fused():
+    if is_fused() and not medium.is_cellwise:
         from ddrecon.light.fused.outgoing import scatter_fused
 
         more = recompute(_sum_turned, medium, rays, turned) if turned else None

@@ -24,6 +24,7 @@ from ddrecon.grid import Grid, array_order
 from ddrecon.light.lights import PointLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_volume
@@ -54,7 +55,7 @@ class PointBeam:
     least_square: float
 
     def scatter(
-        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase, peak: Tensor | None
+        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
         """The integral of `scattering` p / r^2 over each segment, `[N - 1, K or C, R]`, and 1.
 

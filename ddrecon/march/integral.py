@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.engine import current_engine
-from ddrecon.grid import Grid
 from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.march.emission import Emission, Sampled, pack_channels
@@ -24,6 +23,8 @@ from ddrecon.march.lattice import Lattice, interpolate_between, is_rough
 from ddrecon.march.samplers import make_sampler
 from ddrecon.march.sight import Sight
 from ddrecon.march.slices import Slices
+from ddrecon.medium.phase_cells import SeenNodes
+from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
@@ -54,9 +55,9 @@ def march(
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
         return nothing, 1 - nothing
-    of_rays, of_lattice = _pick_engine(emission.grid)
+    of_rays, of_lattice = _pick_engine(emission)
     channels = pack_channels(emission)
-    sampler = make_sampler(channels, emission.grid, sight.way, settings.steps_per_voxel)
+    sampler = make_sampler(channels, emission.grid, sight.way, settings.steps)
     if sight.lattice is None or sight.places is None:
         values = _spread(of_rays(emission, sampler, sight.rays, sight.crossing), sight)
     else:
@@ -69,13 +70,16 @@ def march(
     return scattered, 1 - opacity
 
 
-def _pick_engine(grid: Grid) -> tuple[Callable[..., Part], Callable[..., Tensor]]:
-    """How rays and lattices of rays are marched through `grid` by the engine in use."""
-    if isinstance(grid, Slab):
+def _pick_engine(emission: Emission) -> tuple[Callable[..., Part], Callable[..., Tensor]]:
+    """How rays and lattices of rays are marched by the engine in use.
+
+    Phase functions that differ from cell to cell have no fused kernels.
+    """
+    if isinstance(emission.grid, Slab):
         from ddrecon.march import slabs
 
         return slabs.march_rays, slabs.march_lattice
-    if current_engine() == "warp":
+    if current_engine() == "warp" and emission.seen.phase.cells is None:
         from ddrecon.march.fused import march as fused
 
         return fused.march_rays, fused.march_lattice
@@ -203,15 +207,20 @@ def integrate_segments(
     if front is not None:
         end = end + front
     begin = end - mass
-    # E3: the integral of tau kappa_s (L0 + g L1 . w), still without the scale of kappa_s.
-    emitted = nodes.integral(at_nodes.scattering * at_nodes.diffuse)
-    scattered = decayed_sum(emitted, begin, end, scale)
+    # E3: the integral of tau kappa_s (L0 + g L1 . w).
+    by = at_nodes.scattering if at_nodes.remaining is None else at_nodes.remaining
+    scattered = decayed_sum(nodes.integral(by * at_nodes.diffuse), begin, end, scale)
+    scattered = scattered * (emission.remaining or emission.scattering).scale.view(-1, 1)
     passed = torch.cat([begin[:1], end])
+    seen: SeenPhase | SeenNodes = emission.seen
+    if at_nodes.number is not None:
+        seen = SeenNodes(seen.phase, at_nodes.number, seen.degree)
     for beam, to_light in zip(emission.beams, at_nodes.masses, strict=True):
         # E13: the depth of the forward peak, from where the light enters to the camera.
         depth = None if at_nodes.peak is None else at_nodes.peak * (passed + to_light)
         # E2: the integral of tau kappa_s p E tau / (4 pi), where tau goes to the light as well.
-        weight, phase = beam.scatter(at_nodes.scattering, nodes, emission.seen, depth)
+        weight, phase = beam.scatter(at_nodes.scattering, nodes, seen, depth)
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
-        scattered = scattered + arriving * phase * (beam.irradiance.view(-1, 1) / (4 * math.pi))
-    return scattered * emission.scattering.scale.view(-1, 1), own[-1]
+        strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
+        scattered = scattered + arriving * phase * strength.view(-1, 1)
+    return scattered, own[-1]

@@ -15,7 +15,8 @@ from ddrecon.numerics.remember import is_any_nonzero, remember
 def remaining_moments(medium: Medium) -> Tensor:
     """p_l = (chi_l - f) / (1 - f) for l up to the medium's degree (E18), [L + 1, C or 1, 1, 1, 1].
 
-    chi_l are the moments of the phase function of `medium`, f the part of its forward peak.
+    chi_l are the moments of the phase function of `medium`, f the part of its forward peak. Of one
+    that differs from cell to cell they are [L + 1, C or 1, z, y, x].
     """
     phase = medium.seen.phase
     return _remaining(type(phase), medium.forward_fraction, medium.seen.degree, *phase.numbers)
@@ -39,8 +40,13 @@ def backward_fraction(medium: Medium) -> Tensor:
 
 
 def has_backward_peak(medium: Medium) -> bool:
-    """Whether a part of scattering counts as turned back: not by diffusion alone."""
-    return medium.seen.degree > P1_DEGREE and is_any_nonzero(backward_fraction(medium))
+    """Whether a part of scattering counts as turned back.
+
+    Not by diffusion alone, and not where the phase function differs from cell to cell.
+    """
+    if medium.seen.degree <= P1_DEGREE or medium.is_cellwise:
+        return False
+    return is_any_nonzero(backward_fraction(medium))
 
 
 def turned_phase(medium: Medium, turns: int) -> Tensor:
@@ -58,7 +64,8 @@ def turned_phase(medium: Medium, turns: int) -> Tensor:
 def _remaining(
     kind: type[PhaseFunction], fraction: Tensor, degree: int, *numbers: Tensor
 ) -> Tensor:
-    moments = kind(*numbers).moments(degree + 1).T[..., None, None, None]
+    moments = kind(*numbers).moments(degree + 1).transpose(0, 1)
+    moments = moments if moments.ndim == 5 else moments[..., None, None, None]
     return (moments - fraction) / (1 - fraction)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -21,6 +22,7 @@ from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
 from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct import setup
+from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
@@ -109,30 +111,27 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
+        compile_ahead(lambda: deepcopy(self)._iterate(start))
         if self.iteration == 0:
             self._settle_smoothing()
         stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
-        solutions = dict(self.memory.last)
         try:
-            return self._iterate(start, solutions)
+            return self._iterate(start)
         except (SolveError, NotFiniteError) as error:
             failure = explain_divergence(self.iteration + 1, self.parameters, error)
-            if self.before_step is None:
-                self.memory.last = solutions
-            else:
+            if self.before_step is not None:
                 self.restore(self.before_step)
             raise failure from error.__cause__
         except RanksError:
             # The state is that before the iteration, even amid the step, when some have moved.
             if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
                 self.restore(self.before_step)
-            self.memory.last = solutions
             raise
 
-    def _iterate(self, start: float, solutions: dict[tuple[str, int], Tensor]) -> Row:
-        """One iteration, begun at `start` [s] with these last `solutions`."""
+    def _iterate(self, start: float) -> Row:
+        """One iteration, begun at `start` [s]."""
         # See: which views this iteration compares.
         views = self._views()
         # Differentiate: the objective and its derivative by every parameter.
@@ -145,7 +144,8 @@ class Reconstruction:
         numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         self.before_step = None
-        self.before_step = self.state() | {"solutions": solutions}
+        # Not the solutions, where solves only begin.
+        self.before_step = {key: part for key, part in self.state().items() if key != "solutions"}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
         self._step(gradients, compared)
@@ -208,9 +208,11 @@ class Reconstruction:
         for parameter in self.parameters:
             curvature = state["parameters"][parameter.name]["curvature"]
             parameter.curvature = None if curvature is None else curvature.to(parameter.value)
-        self.memory.last = {
-            kind: field.to(self.scene.volume.density) for kind, field in state["solutions"].items()
-        }
+        if "solutions" in state:
+            self.memory.last = {
+                kind: field.to(self.scene.volume.density)
+                for kind, field in state["solutions"].items()
+            }
 
     def _settle_smoothing(self) -> None:
         """Finds the weight of density's total variation where the scene asks for that."""

@@ -55,8 +55,9 @@ class NextView:
 
     def add(self, change: Tensor) -> None:
         """Takes in a sample, [n] away from the optimum."""
-        fields = {name: p for name, p in self.curvature.split(change).items() if name in FIELDS}
-        parts = fields or self.curvature.split(change)
+        all_parts = self.curvature.split(change)
+        fields = {name: p for name, p in all_parts.items() if name in FIELDS and p.ndim >= 3}
+        parts = fields or all_parts
         self.changes.append(torch.cat([part.reshape(-1) for part in parts.values()]).cpu())
         self.pictures.append(self._tangents(change) / self.deviation)
 

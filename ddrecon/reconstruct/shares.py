@@ -5,7 +5,7 @@ Ranks share out the views of a scene, or its cells.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from weakref import WeakKeyDictionary
 
 import torch
@@ -73,10 +73,36 @@ def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
     """
     if rank_count() == 1:
         return list(names)
-    costs = {name: names.count(name) * _known_cost(scene, scene.view(name)) for name in names}
-    # As the first rank shares them out: another machine may round costs another way.
-    owners = dict(zip(costs, from_first(assign(list(costs.values()), rank_count())), strict=True))
+    owners = _owners(scene, {name: scene.view(name) for name in names}, names)
     return [name for name in names if owners[name] == own_rank()]
+
+
+def _owners(scene: Scene, views: Mapping[str, View], names: Sequence[str]) -> dict[str, int]:
+    """The rank that renders each of `views` of the volume of `scene`, as often as in `names`."""
+    costs = [names.count(name) * _known_cost(scene, view) for name, view in views.items()]
+    # As the first rank shares them out: another machine may round costs another way.
+    return dict(zip(views, from_first(assign(costs, rank_count())), strict=True))
+
+
+def share_pictures(
+    scene: Scene, views: Sequence[View], picture_of: Callable[[View], Tensor]
+) -> dict[str, Tensor]:
+    """The pictures [3, h, w] of `views` of the volume of `scene`, by name, on all ranks.
+
+    Each is what `picture_of` gives one of them.
+    """
+    if rank_count() == 1:
+        return {view.name: picture_of(view) for view in views}
+    names = [view.name for view in views]
+    owners = _owners(scene, dict(zip(names, views, strict=True)), names)
+    density = scene.volume.density
+    pictures = [
+        picture_of(view)
+        if owners[view.name] == own_rank()
+        else density.new_zeros(3, *view.camera.size)
+        for view in views
+    ]
+    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 _KNOWN: WeakKeyDictionary[View, tuple[Grid, RenderSettings, float]] = WeakKeyDictionary()
@@ -105,7 +131,7 @@ def view_cost(scene: Scene, view: View) -> float:
         length = float((crossing.far - crossing.near).sum()) / len(rays.direction)
     height, width = camera.size
     on_rays = height * width * scene.render.samples_per_pixel * length / min(grid.spacing)
-    return on_rays * scene.render.steps_per_voxel + CELL_COST * grid.cells
+    return on_rays * scene.render.steps + CELL_COST * grid.cells
 
 
 def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:

@@ -21,8 +21,7 @@ from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 from ddrecon.run.findings import Findings
 from ddrecon.scene import Scene, View
 from ddrecon.turntable import place_turntable, upright_axis
-from ddrecon.variables.kinds import FIELDS
-from ddrecon.variables.values import value_of
+from ddrecon.variables.values import fields_of
 
 FRAMES, FRAME = 24, 256
 """Pictures of the turntable, and pixels along their longer side, at most."""
@@ -33,8 +32,7 @@ ENLARGED = 2
 def volume_section(findings: Findings) -> str:
     """Every field that was found, and beside it what the scene file has in its place."""
     scene = findings.scene
-    named = {name: value_of(scene, name) for name in FIELDS}
-    named = {name: value for name, value in named.items() if value.ndim >= 3}
+    named = fields_of(scene)
     both = (*named.items(), *findings.given.items())
     whites = {name: max(find_white_value(v) for n, v in both if n == name) for name in named}
     z, y, x = scene.volume.grid.extent

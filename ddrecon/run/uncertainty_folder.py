@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from ddrecon.errors import FormatError, UsageError
+from ddrecon.errors import FormatError, RanksError, UsageError
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear
 from ddrecon.io.volumes.table import write_field
 from ddrecon.pictures.noise import Noise
 from ddrecon.progress import bar_settings
+from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.next_view import Candidate, NextView
 from ddrecon.reconstruct.picture_errors import PictureErrors
@@ -104,37 +105,75 @@ def drive_uncertainty(
     state = _take_up(checkpoints, described) if resume else None
     if state is None:
         forget_checkpoints(checkpoints)
+    before = 0.0 if state is None else state["seconds"]
+    found, ranking = _begin(run, from_first(state), seed, noise, tolerance, candidates)
+    try:
+        with (
+            defer_interrupt() as asked,
+            tqdm(
+                total=samples, initial=found.count, desc="uncertainty", **bar_settings(is_quiet)
+            ) as bar,
+        ):
+            while found.count < samples:
+                sample = found.step()
+                if has_samples:
+                    _write_sample(found, sample.change, path / SAMPLES / f"{found.count - 1:04d}")
+                kept = found.state()
+                if ranking is not None:
+                    ranking.add(sample.change)
+                    kept["ranking"] = ranking.state()
+                kept["seconds"] = before + perf_counter() - began
+                save_checkpoint(checkpoints, kept, described)
+                bar.set_postfix_str(f"{sample.products} products", refresh=False)
+                bar.update()
+                if is_any(bool(asked)):
+                    raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
+    except RanksError as error:
+        raise error.with_advice(f"{found.count} samples are kept: go on with --resume") from error
+    # What is left the first rank does by itself.
+    leave_ranks()
+    seconds = before + perf_counter() - began
+    return _finish(run, found, path, seconds, [] if ranking is None else ranking.rank())
+
+
+def follow_uncertainty(
+    run: Reconstruction,
+    samples: int,
+    *,
+    seed: int,
+    noise: Noise | None,
+    tolerance: float,
+    candidates: int,
+) -> None:
+    """Does this rank's part of what `drive_uncertainty` does on the first, which alone writes."""
+    found, ranking = _begin(run, from_first(None), seed, noise, tolerance, candidates)
+    with defer_interrupt() as asked:
+        while found.count < samples:
+            sample = found.step()
+            if ranking is not None:
+                ranking.add(sample.change)
+            if is_any(bool(asked)):
+                raise KeyboardInterrupt
+
+
+def _begin(
+    run: Reconstruction,
+    state: dict[str, Any] | None,
+    seed: int,
+    noise: Noise | None,
+    tolerance: float,
+    candidates: int,
+) -> tuple[Uncertainty, NextView | None]:
+    """The samples of `run` so far, as `state` has them, and what ranks `candidates` by them."""
     errors = None if state is None else PictureErrors(**state["errors"])
     found = Uncertainty(run, seed, noise, tolerance, errors)
-    before, ring = 0.0, place_turntable(run.train_level, run.train_level.views[0], candidates)
+    ring = place_turntable(run.train_level, run.train_level.views[0], candidates)
     ranking = NextView(found.curvature, ring, found.errors.deviation) if ring else None
     if state is not None:
         found.restore(state)
         if ranking is not None:
             ranking.restore(state["ranking"])
-        before = state["seconds"]
-    with (
-        defer_interrupt() as asked,
-        tqdm(
-            total=samples, initial=found.count, desc="uncertainty", **bar_settings(is_quiet)
-        ) as bar,
-    ):
-        while found.count < samples:
-            sample = found.step()
-            if has_samples:
-                _write_sample(found, sample.change, path / SAMPLES / f"{found.count - 1:04d}")
-            kept = found.state()
-            if ranking is not None:
-                ranking.add(sample.change)
-                kept["ranking"] = ranking.state()
-            kept["seconds"] = before + perf_counter() - began
-            save_checkpoint(checkpoints, kept, described)
-            bar.set_postfix_str(f"{sample.products} products", refresh=False)
-            bar.update()
-            if asked:
-                raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
-    seconds = before + perf_counter() - began
-    return _finish(run, found, path, seconds, [] if ranking is None else ranking.rank())
+    return found, ranking
 
 
 def _take_up(checkpoints: Path, described: dict[str, Any]) -> dict[str, Any]:

@@ -158,10 +158,11 @@ def forward_peak() -> Found:
     return run(scene, [make_camera((2.0, -1.5, 1.0))], "g", has_tangents=True)
 
 
-def cross_sections_per_cell() -> Found:
+def all_per_cell() -> Found:
     sigma_s = 5 + 5 * random_values(3, *SHAPES["z"], seed=5)
     scene = scene_of("z", g=0.3, sigma_s=sigma_s)
-    return run(scene, [make_camera((2.5, 0.4, 0.6), is_perspective=False)])
+    scene.volume.g = 0.5 * random_values(*SHAPES["z"], seed=6)
+    return run(scene, [make_camera((2.5, 0.4, 0.6), is_perspective=False)], "g")
 
 
 def point_light() -> Found:
@@ -203,7 +204,7 @@ CASES: dict[str, Callable[[], Found]] = {
     "light along y": partial(seen_from, "y", ACROSS, ALONG, ASKEW),
     "light along x": partial(seen_from, "x", ASKEW),
     "forward peak": forward_peak,
-    "cross sections per cell": cross_sections_per_cell,
+    "all per cell": all_per_cell,
     "point light": point_light,
     "environment": environment,
     "lattice": lattice,

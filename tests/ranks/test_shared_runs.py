@@ -59,7 +59,13 @@ def write_scene(folder: Path) -> None:
 
 def job(ranks: int, output: str, *options: str, **others: Any) -> dict[str, Any]:
     command = ["optimize", "scene.yaml", "-o", output, "--dtype", "float64", "--engine", "torch"]
-    return {"ranks": ranks, "arguments": [*command, "--iterations", "6", *options]} | others
+    return {"ranks": ranks, "arguments": [*command, "--iterations", "4", *options]} | others
+
+
+def sure(ranks: int, output: str, *options: str) -> dict[str, Any]:
+    command = ["uncertainty", "one", "-o", output, "--engine", "torch"]
+    roughly = ["--noise", "0.05", "--tolerance", "0.9", "--keep-samples"]
+    return {"ranks": ranks, "arguments": [*command, *roughly, *options]}
 
 
 RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density", "-o"]
@@ -80,6 +86,9 @@ JOBS = {
     "refused": job(2, "one"),
     "rendered": {"ranks": 3, "arguments": [*RENDER, "views"]},
     "alone": {"ranks": 1, "arguments": [*RENDER, "alone"]},
+    "sure": sure(1, "sure", "--samples", "3"),
+    "sure begun": sure(1, "doubts", "--samples", "2"),
+    "sure of three": sure(3, "doubts", "--samples", "3", "--resume"),
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
     "whole": job(1, "whole", *TALL, *KNOWN),
     "cells": job(2, "cells", *TALL, *KNOWN, *CELLS, "--preview-every", "4"),
@@ -214,6 +223,19 @@ def test_previews_and_pictures_are_of_all_slabs(runs: Runs) -> None:
     names = sorted(path.name for path in (runs.folder / "cells" / "previews").iterdir())
     assert "c.png" in names and "c_000004.png" in names
     assert (runs.folder / "cells" / "report.html").is_file()
+
+
+def test_ranks_draw_the_samples_of_one(runs: Runs) -> None:
+    """They go on where one has begun; the first of them alone writes."""
+    assert runs.codes["sure begun"] == [0]
+    assert runs.codes["sure of three"] == [0, 0, 0]
+    assert runs.text("sure of three", 0, "out") and not runs.text("sure of three", 1, "out")
+    one, other = (sorted((runs.folder / output).rglob("*.npz")) for output in ("sure", "doubts"))
+    assert [path.name for path in one] == [path.name for path in other]
+    assert "0002" in {path.parent.name for path in one}
+    for known, found in zip(one, other, strict=True):
+        for key, value in np.load(known).items():
+            np.testing.assert_allclose(np.load(found)[key], value, rtol=1e-5, atol=1e-7)
 
 
 def test_bench_measures_one_rank_and_all(runs: Runs) -> None:

@@ -83,7 +83,7 @@ def test_the_example_of_the_contract(read: Read, tmp_path: Path):
         AmbientSection((0.2, 0.3, 0.5)),
     )
     assert tree.views[0].image == tmp_path / "targets/front.exr" and tree.views[0].split == "train"
-    assert tree.diffusion.tolerance == 1e-4 and tree.render == RenderSettings()
+    assert tree.diffusion.tolerance == 1e-4 and tree.render == RenderSettings(steps_per_voxel=1)
     assert (
         tree.optimize
         == OptimizeSettings(
