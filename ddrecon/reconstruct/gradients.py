@@ -7,7 +7,7 @@ not grow with the number of views, and the adjoint (E9) is solved once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -51,11 +51,10 @@ def differentiate(
     light_field = cut.cut(solve_light(with_values(scene, values), memory))
     outside = {name: value for name, value in values.items() if name not in VOLUME}
     inputs = [*values.values(), *cut.leaves]
-    lit, own = with_values(scene, outside), own_views(scene, names)
-    has_slabs = isinstance(light_field.medium.grid, Slab)
-    images, loss, sums = _differentiate_views(
-        lit, names if has_slabs else own, own, light_field, inputs, loss_of
-    )
+    own, has_slabs = own_views(scene, names), isinstance(light_field.medium.grid, Slab)
+    # Views share what is made of values: so that each has a graph of its own, it is made anew.
+    worlds = ((with_values(scene, outside), name) for name in (names if has_slabs else own))
+    images, loss, sums = _differentiate_views(worlds, own, light_field, inputs, loss_of)
     if has_slabs:
         (total,) = sum_found([loss], [loss])
     else:
@@ -82,8 +81,7 @@ def differentiate(
 
 
 def _differentiate_views(
-    scene: Scene,
-    names: Sequence[str],
+    worlds: Iterable[tuple[Scene, str]],
     own: Sequence[str],
     light_field: LightField,
     inputs: Sequence[Tensor],
@@ -91,13 +89,13 @@ def _differentiate_views(
 ) -> tuple[list[Tensor], Tensor, list[Tensor | None]]:
     """The images of `own` views, the sum of their losses, and its derivatives by `inputs`.
 
-    Each view's derivative is added up at once; None is zero. Those called `names` are rendered: of
-    one that is another rank's, that rank asks this one for its part of the derivative.
+    `worlds` are scenes, and which of their views is rendered: of one that is another rank's, that
+    rank asks this one for its part of the derivative. Each view's is added up at once; None is zero.
     """
-    derivatives = scene.optimize.derivatives if scene.optimize else "all"
     sums: list[Tensor | None] = [None] * len(inputs)
-    images, loss = list[Tensor](), scene.volume.density.new_zeros(())
-    for name in names:
+    images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())
+    for scene, name in worlds:
+        derivatives = scene.optimize.derivatives if scene.optimize else "all"
         view = scene.view(name)
         image = view_picture(light_field, scene, view, derivatives)
         if name not in own:
