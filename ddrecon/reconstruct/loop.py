@@ -19,6 +19,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
+from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.brightness import lights_due, step_brightness
@@ -185,7 +186,8 @@ class Reconstruction:
             "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "stage": self.stage,
             "total": dict(vars(self.total)),
-            "solutions": dict(self.memory.last),
+            # Those of a slab are of no use to a run with other slabs.
+            "solutions": {} if cells_are_shared() else dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
             "schedule": self.schedule.state(),
@@ -241,7 +243,8 @@ class Reconstruction:
             parameter.curvature = None
             if parameter.name == "density" and self.support is not None:
                 parameter.restrict(self.support.on(grid))
-        self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
+        known = {} if cells_are_shared() else self.memory.last
+        self.memory.last = {kind: resample(field, grid) for kind, field in known.items()}
 
     def _views(self) -> list[View]:
         views, wanted = self.train_level.views, self.settings.views_per_iteration
