@@ -20,17 +20,16 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
 from ddrecon.reconstruct import setup
-from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
-from ddrecon.reconstruct.joint import moves_together, step_together
 from ddrecon.reconstruct.levels import factors, resample, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
 from ddrecon.reconstruct.schedule import Schedule
 from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
-from ddrecon.reconstruct.steps import solve_numbers, step_parameters
+from ddrecon.reconstruct.steps import share_out, solve_poses, solve_responses, step_parameters
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
@@ -80,7 +79,6 @@ class Reconstruction:
         self.parameters = setup.start_parameters(scene, self.settings)
         setup.choose_steps(self.parameters, self.train, self.loss in QUADRATIC)
         self.gauges = find_gauges(self.train, self.parameters)
-        self.moves_together = moves_together(self.parameters, self.loss)
         self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
         weights = {view.name: view.weight for view in self.train.views}
@@ -100,7 +98,7 @@ class Reconstruction:
 
     @property
     def is_done(self) -> bool:
-        """Whether all iterations have been made, or the run has ended by itself."""
+        """Whether all iterations have been made, or what ends the run by itself has come."""
         return self.schedule.is_over(self.iteration)
 
     def step(self) -> Row:
@@ -182,11 +180,6 @@ class Reconstruction:
             values = {parameter.name: parameter.value_on(grid) for parameter in self.parameters}
             return with_values(self.scene, values)
 
-    def curvature(self) -> Curvature:
-        """The second derivative of the objective of all training views, at this resolution."""
-        level, known = self.train_level, self.memory.last
-        return Curvature(level, self.parameters, self.targets, self.power, known)
-
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on to the same bits."""
         return {
@@ -225,7 +218,9 @@ class Reconstruction:
 
     def _smooth(self, smoothing: Smoothing) -> None:
         self.smoothing = smoothing
-        next(p for p in self.parameters if p.name == "density").tv = smoothing.weight
+        for parameter in self.parameters:
+            if parameter.name == "density":
+                parameter.tv = smoothing.weight
 
     def _enter_stage(self, stage: int) -> None:
         """Takes scenes, parameters and solutions to the resolution of `stage`."""
@@ -270,17 +265,21 @@ class Reconstruction:
             self.memory.tolerance_floor = {}
 
     def _step(self, gradients: dict[str, Tensor], compared: Comparison) -> None:
-        """Every parameter that is seen and due down its derivative, or all together."""
-        if self.moves_together and self.schedule.moves_together(self.iteration):
-            step_together(self.curvature(), self.targets, self.power, self.gauges)
-            return
-        names = {view.name for view in compared.views}
-        seen = [p for p in self.parameters if p.view is None or p.view in names]
+        """Every parameter against its derivative, but those of views not seen or not yet due.
+
+        What cameras do, and how bright lights are, goes part of the way to what fits best.
+        """
+        pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
-        now, rate_of = self.iteration, functools.partial(self.schedule.rate, self.iteration)
+        seen = [p for p in self.parameters if p.view is None or p.view in names]
+        rate_of = functools.partial(self.schedule.rate, self.iteration)
         solved = step_parameters(seen, gradients, rate_of)
-        at = self.train_level, gradients, values, compared, self.memory.last
-        solve_numbers(solved, *at, now)
+        solve_responses(solved, self.train_level, pictures, self.targets)
+        lights, level = lights_due(solved, self.iteration), self.train_level
+        step_brightness(lights, level, values, pictures, self.targets, self.memory.last)
+        if poses := [p for p in solved if p.key == "camera"]:
+            own = share_out(gradients, compared.views)
+            solve_poses(poses, level, own, values, self.targets, self.memory.last, pictures)
         for gauge in self.gauges:
             gauge.hold()
 
@@ -291,7 +290,10 @@ class Reconstruction:
         return iteration % TEST_EVERY == 0 or self.schedule.is_over(iteration)
 
     def _test_quality(self) -> tuple[float | None, float | None]:
-        """The mean PSNR [dB] and SSIM of the test views; None where it is not their turn."""
+        """The mean PSNR [dB] and SSIM of the test views.
+
+        None without any, or where it is not their turn.
+        """
         if not self._is_test_due or not self.test_level.views:
             return None, None
         return render_quality(self.test_level, self.parameters, self.test_targets, self.memory)

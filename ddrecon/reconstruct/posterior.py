@@ -85,7 +85,7 @@ class Posterior:
         right += self.curvature.adjoint(
             {name: scale * disturbed[name] - w * changes[name] for name, w in weights.items()}
         )
-        change, products, residual = self.minimize(prior, right)
+        change, products, residual = self._minimize(prior, right)
         return Sample(change, prior, products, residual)
 
     def data_noise(self, generator: torch.Generator) -> Tensor:
@@ -111,7 +111,7 @@ class Posterior:
         """H times `vector`, H being J^T W J + R + T K."""
         return self.curvature.data_product(vector) + self.prior.product(vector)
 
-    def minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
+    def _minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
         """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.
 
         And how many products that took, and what is left. Which cells are at a bound is guessed,

@@ -10,10 +10,8 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.ranks import sum_over_ranks
-from ddrecon.reconstruct.brightness import lights_due, step_brightness
-from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.poses import pose_curvature, step_pose, weigh_calibration
+from ddrecon.reconstruct.poses import calibration_prior, pose_curvature, step_pose
 from ddrecon.reconstruct.responses import step_responses
 from ddrecon.reconstruct.shares import take_from_owners
 from ddrecon.renderer import solve_light
@@ -38,29 +36,6 @@ def step_parameters(
         elif rate:
             parameter.step(gradients[parameter.name], rate)
     return solved
-
-
-def solve_numbers(
-    parameters: Sequence[Parameter],
-    scene: Scene,
-    gradients: Mapping[str, Tensor],
-    values: Mapping[str, Tensor],
-    compared: Comparison,
-    solutions: Mapping[tuple[str, int], Tensor],
-    iteration: int,
-) -> None:
-    """Takes `parameters` towards what fits the pictures of `scene` best, each as if alone.
-
-    `compared` has the pictures with the `values` of all parameters, and `gradients` are of their
-    mean loss; `solutions` are near to the light in them. Lights have a turn in some iterations.
-    """
-    pictures, targets = compared.pictures, compared.targets
-    solve_responses(parameters, scene, pictures, targets)
-    lights = lights_due(parameters, iteration)
-    step_brightness(lights, scene, values, pictures, targets, solutions)
-    if poses := [p for p in parameters if p.key == "camera"]:
-        own = share_out(gradients, compared.views)
-        solve_poses(poses, scene, own, values, targets, solutions, pictures)
 
 
 def solve_responses(
@@ -113,8 +88,8 @@ def solve_poses(
     grid = scene.volume.grid
     for pose in poses:
         assert pose.view is not None and pose.curvature is not None
-        held = weigh_calibration(pose, pose.curvature, scene.view(pose.view).camera, grid)
-        step_pose(pose, gradients[pose.name], pose.curvature, held)
+        prior = calibration_prior(scene.view(pose.view).camera, grid)
+        step_pose(pose, gradients[pose.name], pose.curvature, prior)
 
 
 def share_out(gradients: Mapping[str, Tensor], views: Sequence[View]) -> dict[str, Tensor]:

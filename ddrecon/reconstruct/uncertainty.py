@@ -10,8 +10,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d, pad
 
 from ddrecon.pictures.noise import Noise
-from ddrecon.reconstruct.joint import objective_gradient
+from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors
 from ddrecon.reconstruct.posterior import TOLERANCE, Posterior, Sample
@@ -37,8 +39,8 @@ class Uncertainty:
         errors: PictureErrors | None = None,
     ):
         self.parameters = run.parameters
-        self.curvature = run.curvature()
-        gradient = objective_gradient(self.curvature, run.targets, run.power)
+        self.curvature = curvature_of(run)
+        gradient = gradient_of(run, self.curvature)
         noises = _noises(run, noise)
         # What residuals said takes a solve to find: a run that goes on has it.
         if errors is None or errors.is_known:
@@ -162,6 +164,22 @@ def _mean_around(variance: Tensor) -> Tensor:
         for each in (cells, torch.ones_like(cells))
     )
     return (sums / counts).view(variance.shape)
+
+
+def curvature_of(run: Reconstruction) -> Curvature:
+    """The curvature of the objective of `run` where it is."""
+    level, memory = run.train_level, run.memory
+    return Curvature(level, run.parameters, run.targets, run.power, memory.last)
+
+
+def gradient_of(run: Reconstruction, curvature: Curvature) -> Tensor:
+    """The derivative of the objective of `run`, of all its training views, where it is."""
+    views = list(run.train_level.views)
+    compared = Comparison(views, run.targets)
+    names = [view.name for view in views]
+    values = {parameter.name: parameter.value for parameter in run.parameters}
+    objective = differentiate(run.train_level, names, values, compared, curvature.new_memory())
+    return curvature.join(add_penalties(objective, run.parameters, run.power)[1])
 
 
 def _noises(run: Reconstruction, noise: Noise | None) -> dict[str, Noise]:
