@@ -62,6 +62,7 @@ def one_of(default: Any, choices: Collection[Any]) -> Any:
 class RenderSettings:
     """How view rays are sampled.
 
+    `steps_per_voxel`: a scene file that leaves it out gets what its densest cell deserves.
     `tolerance`: pixels closer together than half a voxel are interpolated between rays that are
     half a voxel apart. A pixel that this may change by more than this part of the image's root mean
     square has rays of its own; with 0 every pixel has. `background`: ambient light and environment
@@ -69,9 +70,14 @@ class RenderSettings:
     """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
-    steps_per_voxel: int = bounded(1, minimum=1, maximum=8)
+    steps_per_voxel: int | None = optional(minimum=1, maximum=8)
     tolerance: float = bounded(0.05, minimum=0, maximum=1)
     background: bool = True
+
+    @property
+    def steps(self) -> int:
+        """Samples a cell along a ray: left out, one."""
+        return 1 if self.steps_per_voxel is None else self.steps_per_voxel
 
 
 @dataclass(frozen=True)
@@ -165,8 +171,11 @@ class ParameterSettings:
     learning rate `lr` (None: that of its kind).
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
-    always does). `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as
-    the whole brightness of the targets; `auto` finds the weight by leaving views out.
+    always does). For the part `even_until` of the iterations all its cells change alike, so that
+    numbers of the whole scene are found before it.
+
+    `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as the whole
+    brightness of the targets; `auto` finds the weight by leaving views out.
 
     `support`: where density may be above 0, by what pictures show, widened by `support_margin`
     pixels; None is anywhere.
@@ -179,6 +188,7 @@ class ParameterSettings:
     tv: Weight | None = optional(minimum=0)
     l1: float = bounded(0.0, minimum=0)
     field: bool | None = None
+    even_until: float = bounded(0.0, minimum=0, below=1)
     support: Support | None = optional(minimum=0, below=1)
     support_margin: float = bounded(2.0, minimum=0, maximum=1000)
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from torch import Tensor
+
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
+from ddrecon.march.steps import greatest_depth
 from ddrecon.medium.coefficients import Medium, scale_medium
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.remaining import backward_fraction, has_backward_peak, remaining_moments
@@ -18,6 +21,13 @@ from ddrecon.settings import DiffusionSettings
 
 def needed_terms(scene: Scene) -> list[str]:
     """One line per term that rendering `scene` computes, in the order it is computed."""
+    samples = _count(scene.render.steps, "sample")
+    depth = f"{greatest_depth(scene.volume):.2g}"
+    return [*_light_in(scene), f"view rays: {samples} a cell of at most {depth} optical depths"]
+
+
+def _light_in(scene: Scene) -> list[str]:
+    """The terms of the light in the volume of `scene`."""
     settings = scene.diffusion
     medium = scale_medium(scene.volume, settings.angles)
     colors = medium.extinction.scale.shape[0]
@@ -48,7 +58,8 @@ def _round_terms(medium: Medium, scene: Scene) -> list[str]:
         terms[0] += f"; each leaves up to {left:.2g} of what diffusion lacks"
     if has_backward_peak(medium) and _has_beams(scene.lights):
         part = backward_fraction(medium).max().item()
-        terms.append(f"beams in pairs: a backward peak turns {part:.3g} of scattering back")
+        most = "up to " if medium.is_cellwise else ""
+        terms.append(f"beams in pairs: a backward peak turns {most}{part:.3g} of scattering back")
     return terms
 
 
@@ -73,15 +84,22 @@ def _angle_term(medium: Medium) -> str:
 
 def _phase_term(phase: PhaseFunction) -> str:
     """Which phase function, and its mean cosine."""
-    cosines = ", ".join(f"{cosine:.3g}" for cosine in phase.moments(2)[:, 1].tolist())
-    return f"phase function {phase.NAME}, mean cosine {cosines}"
+    means = phase.moments(2)[:, 1]
+    if phase.cells is not None:
+        least, most = means.min().item(), means.max().item()
+        return f"phase function {phase.NAME}, mean cosine per cell, {least:.3g} to {most:.3g}"
+    return f"phase function {phase.NAME}, mean cosine {_listed(means)}"
 
 
 def _peak_term(medium: Medium) -> str:
     """What part of scattering counts as not scattered."""
-    fractions = medium.forward_fraction.flatten().tolist()
-    parts = ", ".join(f"{fraction:.3g}" for fraction in fractions)
+    fraction = medium.forward_fraction
+    parts = f"up to {fraction.max().item():.3g}" if medium.is_cellwise else _listed(fraction)
     return f"delta-Eddington scaling of the forward peak, {parts} of scattering"
+
+
+def _listed(numbers: Tensor) -> str:
+    return ", ".join(f"{number:.3g}" for number in numbers.flatten().tolist())
 
 
 def _method(settings: DiffusionSettings) -> str:

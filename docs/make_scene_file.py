@@ -79,7 +79,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "albedo": "Single-scattering albedo: the part of the extinction that scatters.",
             "g": (
                 "Mean cosine of the scattering angle (asymmetry parameter) of the "
-                "Henyey-Greenstein phase function; above 0 is forward. The short form of `phase`."
+                "Henyey-Greenstein phase function; above 0 is forward. The short form of `phase`. "
+                "A file gives it cell by cell."
             ),
             "phase": "How light is scattered by angle, in place of `g`; see below.",
         },
@@ -97,7 +98,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "volume.phase: {type: henyey_greenstein}",
         phase_schema.HenyeyGreensteinSection,
         "The usual phase function of one number; `g: 0.3` is short for it.",
-        {"g": "Mean cosine of the scattering angle; above 0 is forward."},
+        {"g": "Mean cosine of the scattering angle; above 0 is forward. A file has one a cell."},
     ),
     (
         "volume.phase: {type: two_lobe}",
@@ -105,7 +106,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "A mixture of two Henyey-Greenstein functions: haze and smoke, which scatter backward too.",
         {
             "g": "The mean cosine of each.",
-            "weight": "The part of the first.",
+            "weight": "The part of the first; a file has one a cell.",
         },
     ),
     (
@@ -309,7 +310,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "How view rays are sampled.",
         {
             "samples_per_pixel": "Rays a pixel, over its area; one goes through its center.",
-            "steps_per_voxel": "Samples a cell along a ray.",
+            "steps_per_voxel": (
+                "Samples a cell along a ray. Left out: 2 where a cell is thicker than 0.75 optical"
+                " depths in the scene as its file has it, else 1."
+            ),
             "tolerance": (
                 "Pixels finer than half a cell are interpolated between rays, but where they may"
                 " change by more than this part of the image's root mean square. 0: every pixel "
@@ -338,8 +342,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "where there are none: without model `p1` or scheme `conservative`."
             ),
             "degree": (
-                "Degree to which such sweeps keep light's angles, along 26 directions up to 3, "
-                "then 50 and 86. Left out, it is 3, or 1 where g is not sought and at most 0.32."
+                "Degree to which such sweeps keep light's angles, along 18 directions for 1, 26 "
+                "for 3, then 50 and 86. Left out, it is 3, or 1 where g is not sought and at most "
+                "0.32."
             ),
         },
     ),
@@ -399,6 +404,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "
                 "always does."
+            ),
+            "even_until": (
+                "Part of the iterations during which all cells of a field change alike, so that "
+                "numbers of the whole scene are found before it."
             ),
             "support": (
                 "For density: where it may be above 0. `masks`: nowhere that a view sees and its "

@@ -67,9 +67,8 @@ def exact_scene(scene: Scene) -> Scene:
 
     It is marched in finer steps, ray by ray.
     """
-    render = replace(
-        scene.render, steps_per_voxel=max(EXACT_STEPS, scene.render.steps_per_voxel), tolerance=0.0
-    )
+    steps = max(EXACT_STEPS, scene.render.steps)
+    render = replace(scene.render, steps_per_voxel=steps, tolerance=0.0)
     diffusion = replace(scene.diffusion, **EXACT)
     if diffusion.model == "flux_limited":
         diffusion = replace(diffusion, tolerance=EXACT_LIMITED)

@@ -47,10 +47,17 @@ THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
 
 That is 1.5 times faster than sleeping at once, without the stalls of endless spinning.
 """
-SHARED = ("optimize", "render", "bench")
+SHARED = ("optimize", "render", "uncertainty", "bench")
 """Commands whose work the ranks of torchrun share; others are the first rank's alone."""
 DTYPE = click.option(
     "--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
+)
+SHARE = click.option(
+    "--share",
+    type=click.Choice(["views", "cells"]),
+    default="views",
+    show_default=True,
+    help="What the processes of torchrun share out; cells where a volume is too large for one.",
 )
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 SCENE = click.argument("scene", type=click.Path(path_type=Path))
@@ -74,35 +81,10 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     """
 
     @functools.wraps(command)
-    def wrapped(
-        overrides: tuple[str, ...],
-        device: str,
-        engine: str | None,
-        threads: int | None,
-        seed: int,
-        quiet: bool,
-        verbose: bool,
-        debug: bool,
-        **others: Any,
-    ) -> None:
-        for name, value in THREADING.items():
-            os.environ.setdefault(name, value)
-        if "RANK" in os.environ:
-            # Where others cannot be reached, one line says so, and not a page of torch's.
-            os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
+    def wrapped(debug: bool, **options: Any) -> None:
+        _set_environment()
         try:
-            from ddrecon.cli.session import open_session, show_compilations
-            from ddrecon.ranks import alone, is_first, leave_ranks
-
-            dtype, as_json = others.pop("dtype", "float64"), others.pop("as_json", False)
-            common = overrides, device, engine, threads, seed, quiet, verbose
-            with show_warnings(), show_compilations(quiet):
-                session = open_session(*common, dtype, as_json)
-                is_shared = command.__name__ in SHARED
-                if is_shared or is_first():
-                    with nullcontext() if is_shared else alone():
-                        command(session=session, **others)
-            leave_ranks()
+            _run(command, **options)
         except DdreconError as error:
             from ddrecon.ranks import tell_failure
 
@@ -119,11 +101,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             tell_failure(error)
             if debug or not is_shortage(error):
                 raise
-            reason = str(error).partition("\n")[0] or "no more is given"
-            advice = (
-                "make volume.resolution or the images smaller; --resume takes up an interrupted run"
-            )
-            click.echo(f"out of memory: {reason}; {advice}", err=True)
+            click.echo(_shortage(error), err=True)
             sys.exit(2)
         except KeyboardInterrupt as error:
             _show(f"interrupted {error}".strip())
@@ -132,6 +110,50 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     for option in reversed(COMMON):
         wrapped = option(wrapped)
     return wrapped
+
+
+def _set_environment() -> None:
+    """Says how torch's threads wait, and keeps torch quiet about ranks; before it is loaded."""
+    for name, value in THREADING.items():
+        os.environ.setdefault(name, value)
+    if "RANK" in os.environ:
+        # Where others cannot be reached, one line says so, and not a page of torch's.
+        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "FATAL")
+
+
+def _run(
+    command: Callable[..., None],
+    overrides: tuple[str, ...],
+    device: str,
+    engine: str | None,
+    threads: int | None,
+    seed: int,
+    quiet: bool,
+    verbose: bool,
+    dtype: str = "float64",
+    as_json: bool = False,
+    share: str = "views",
+    **others: Any,
+) -> None:
+    """Runs `command` in a session; on the first rank alone where ranks do not share its work."""
+    from ddrecon.cli.session import open_session, show_compilations
+    from ddrecon.ranks import alone, is_first, leave_ranks
+
+    common = overrides, device, engine, threads, seed, quiet, verbose
+    with show_warnings(), show_compilations(quiet):
+        session = open_session(*common, dtype, as_json, share)
+        is_shared = command.__name__ in SHARED
+        if is_shared or is_first():
+            with nullcontext() if is_shared else alone():
+                command(session=session, **others)
+    leave_ranks()
+
+
+def _shortage(error: BaseException) -> str:
+    """The line that says what memory `error` found missing, and what helps."""
+    reason = str(error).partition("\n")[0] or "no more is given"
+    advice = "make volume.resolution or the images smaller; --resume takes up an interrupted run"
+    return f"out of memory: {reason}; {advice}"
 
 
 def require_folder_of(report: Path | None) -> None:

@@ -12,6 +12,7 @@ function's own jvp.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -109,7 +110,8 @@ class SolverWithMemory(Generic[AnyOperator]):
         record = SolveRecord(kind, solution.iterations, solution.residual, seconds)
         self.memory.records.append(record)
         if self.memory.is_warm:
-            self.memory.last[kind, self.round_index] = solution.value
+            # Without the graph that the solution is about to get.
+            self.memory.last[kind, self.round_index] = solution.value.detach()
 
 
 class ImplicitSolve(torch.autograd.Function):
@@ -126,7 +128,7 @@ class ImplicitSolve(torch.autograd.Function):
         source: Tensor,
         *tensors: Tensor,
     ) -> Tensor:
-        return solve("forward", assemble(prepared, *tensors), source).clone()
+        return solve("forward", assemble(prepared, *tensors), source)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -143,7 +145,7 @@ class ImplicitSolve(torch.autograd.Function):
         del prepared
         # E9: p_bar, the entries of A_bar = -lambda u^T that depend on p.
         tensor_bars = ctx.assemble({}, *tensors).cotangents(adjoint, u)
-        return None, None, None, adjoint.clone(), *tensor_bars
+        return None, None, None, adjoint, *tensor_bars
 
     @staticmethod
     def jvp(
@@ -178,7 +180,7 @@ class _Tangent(torch.autograd.Function):
         right: Tensor,
         *tensors: Tensor,
     ) -> Tensor:
-        return solve("tangent", assemble(prepared, *tensors), right).clone()
+        return solve("tangent", assemble(prepared, *tensors), right)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -193,6 +195,7 @@ def solve_diffusion(
     By `source` and by the operator. An operator of one color serves a source of several. What
     solvers prepare about the operator serves all its solves.
     """
+    assemble = functools.partial(Operator.of, ghosts=operator.ghosts)
     return ImplicitSolve.apply(
-        solve, Operator.of, operator.prepared, source, operator.loss, *operator.conductances
+        solve, assemble, operator.prepared, source, operator.loss, *operator.conductances
     )

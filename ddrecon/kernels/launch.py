@@ -7,7 +7,6 @@ Every kernel takes `first: int` before all else, and thread `wp.tid()` of a laun
 from __future__ import annotations
 
 import functools
-import logging
 import math
 import os
 import sys
@@ -20,17 +19,12 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from ddrecon import engine
+from ddrecon.kernels.compiling import is_rehearsed, load
 from ddrecon.kernels.spare import keep_freed_memory
 
 wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
-LOG = logging.getLogger(engine.LOG)
-COMPILED = 0.5
-"""A kernel that takes longer to load [s] was compiled; others come from Warp's cache."""
 QUICK = 1.5e-4
 """Handing a share to another thread takes about 50 microseconds; a launch, 20."""
-_compiled: list[float] = []
-"""How long each took to load [s]; a line says so of the first."""
 _seconds: dict[tuple[Any, int], float] = {}
 """What a launch of a kernel takes in one thread [s], by the digits of its items' number in base 2.
 
@@ -69,7 +63,9 @@ def launch(
         return
     threads = thread_count(like) if threads is None else threads
     device = _device(like.device)
-    _load(kernel, device.alias)
+    if is_rehearsed(kernel, device.alias):
+        return
+    load(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
     stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
 
@@ -154,17 +150,6 @@ def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -
 def _calls(kernel: Any, device: str) -> list[Any]:
     """Launches of `kernel` that nobody is making: given anew, they take a quarter of the time."""
     return []
-
-
-@functools.cache
-def _load(kernel: Any, device: str) -> None:
-    """Has `kernel` ready, compiled where Warp's cache has it not."""
-    start = perf_counter()
-    wp.load_module(kernel.module, device=device)
-    if (seconds := perf_counter() - start) > COMPILED:
-        if not _compiled:
-            LOG.info("compiling kernels, once: %.1f s for the first of them", seconds)
-        _compiled.append(seconds)
 
 
 @functools.cache

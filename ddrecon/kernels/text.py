@@ -4,8 +4,8 @@
     scale.launch(count, {"x": x, "factor": 2.0}, {"out": out})
 
 What the text is given is declared as in C: pointers and numbers of type `F` (the kernel's own),
-`double`, `int`, `long` or `bool`; `F *fields[3]` are three pointers. It all goes into one record:
-a launch takes the same few microseconds, however much that is.
+`double`, `int`, `long`, `bool` or `half` (bfloat16); `F *fields[3]` are three pointers. It all goes
+into one record: a launch takes the same few microseconds, however much that is.
 """
 
 import re
@@ -17,6 +17,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ddrecon.kernels.compiling import clear_in_rehearsal
 from ddrecon.kernels.launch import launch
 from ddrecon.kernels.native import number_type, program
 
@@ -25,6 +26,7 @@ _TYPES = {
     "int": ("int", wp.int32, torch.int32),
     "long": ("long long", wp.int64, torch.int64),
     "bool": ("bool", wp.bool, torch.bool),
+    "half": ("unsigned short", wp.uint16, torch.bfloat16),
 }
 BLOCK = """
 const int begin = item * length, end = begin + length < total ? begin + length : total;
@@ -117,6 +119,7 @@ class TextKernel:
             held.append(ready)
         for name, value in made.items():
             self.write(record, name, value)
+        clear_in_rehearsal(made.values())
         like = next(value for value in made.values() if isinstance(value, Tensor))
         return Bound(self, record, [held, made], like)
 

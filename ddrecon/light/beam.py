@@ -13,6 +13,7 @@ from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.shear import sum_mass_to_cells
 from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import recompute
 from ddrecon.numerics.nodes import Nodes
@@ -31,18 +32,20 @@ class Beam:
     irradiance: Tensor
 
     def scatter(
-        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase, peak: Tensor | None
+        self, scattering: Tensor, nodes: Nodes, seen: SeenPhase | SeenNodes, peak: Tensor | None
     ) -> tuple[Tensor, Tensor | float]:
         """The integral of `scattering` over each segment of view rays, and the phase function p.
 
         Their product is what E2 integrates, but for E tau / (4 pi). `scattering` [N, K, R]: kappa_s
         per unit of its scale, at the `nodes`. p is the same all along a ray: a factor [C, R]. With
-        a forward peak of depth `peak` [N, C, R] at the nodes (E13) it changes along the ray: then
-        the integral holds it, and the factor is 1.
+        a forward peak of depth `peak` [N, C, R] at the nodes (E13), or where it differs from cell
+        to cell, it changes along the ray: then the integral holds it, and the factor is 1.
         """
         cosine = self.cosine(nodes.direction)
-        if peak is None:
+        if peak is None and isinstance(seen, SeenPhase):
             return nodes.integral(scattering), seen.value(cosine)
+        if peak is None:
+            return nodes.integral(scattering * seen.value(cosine)), 1.0
         return nodes.integral(scattering * seen.along(peak, cosine)), 1.0
 
     def cosine(self, direction: Tensor) -> Tensor:

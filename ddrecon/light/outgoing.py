@@ -12,6 +12,7 @@ from ddrecon.cameras import Rays
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.phase_cells import turned_in_cells
 from ddrecon.medium.remaining import remaining_moments, turned_phase
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -19,12 +20,17 @@ from ddrecon.numerics.remember import remember
 
 
 def scatter_once_more(medium: Medium, light: Moments) -> Moments:
-    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E3, E21)."""
+    """(1 - f) p_l phi_k as moments, per unit length and kappa_s (E3, E21).
+
+    Where the phase function differs from cell to cell it is p_l phi_k, per (1 - f) kappa_s.
+    """
     return light.weighted(_factors(medium))
 
 
 def _factors(medium: Medium) -> Tensor:
-    """(1 - f) p_l, by the degree l."""
+    """(1 - f) p_l, or p_l, by the degree l."""
+    if medium.is_cellwise:
+        return remaining_moments(medium)
     return _weigh(medium.forward_fraction, remaining_moments(medium))
 
 
@@ -40,7 +46,7 @@ def scatter_towards(
 
     With what the `turned` beams scatter (E21). As `Moments.positive_along` has it.
     """
-    if is_fused():
+    if is_fused() and not medium.is_cellwise:
         from ddrecon.light.fused.outgoing import scatter_fused
 
         more = recompute(_sum_turned, medium, rays, turned) if turned else None
@@ -62,8 +68,14 @@ def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Ten
 
 
 def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor:
-    """What light of `beam` scatters `towards` a camera: its phase function is that of E21."""
+    """What light of `beam` scatters `towards` a camera: its phase function is that of E21.
+
+    It is per unit of what `scatter_once_more` is.
+    """
     z, y, x = (part * cosine for part, cosine in zip(beam.direction, towards, strict=True))
     cosine = torch.atleast_3d(z + y + x)
+    if medium.is_cellwise:
+        phase = turned_in_cells(medium, beam.turns, angle_of(cosine))
+        return beam.radiance * phase / (1 - medium.forward_fraction)
     phase = look_up(turned_phase(medium, beam.turns), angle_of(cosine))[..., 0]
     return beam.radiance * phase.to(cosine.dtype)

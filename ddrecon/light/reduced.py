@@ -73,7 +73,8 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
     directional = {
         i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
     }
-    if directional and is_fused(*(light.direction for light in directional.values())):
+    is_even = directional and not medium.is_cellwise
+    if is_even and is_fused(*(light.direction for light in directional.values())):
         from ddrecon.light.fused.beams import follow_beams
 
         found, moments = follow_beams(medium, list(directional.values()), degree > 0)

@@ -25,7 +25,8 @@ class Emission:
     Emission per unit length is kappa_s (diffuse + sum over `beams` of p E tau / (4 pi)), E2 and E3.
     `diffuse` [C, z, y, x] is the radiance that scatters into the camera's rays from all light but
     beams; `seen` is p. Point lights have E = I / r^2. `peak` is the medium's: what its forward peak
-    does to p (E13).
+    does to p (E13). `remaining`, where given, scatters diffuse light in place of kappa_s: where the
+    phase function differs from cell to cell, that is interpolated as the extinction is.
     """
 
     grid: Grid
@@ -35,6 +36,7 @@ class Emission:
     diffuse: Tensor
     seen: SeenPhase
     peak: Tensor | None
+    remaining: Coefficient | None = None
 
     @property
     def colors(self) -> int:
@@ -54,6 +56,8 @@ class Sampled:
     In cells each is `[channels, z, y, x]`, at nodes of rays `[N, channels, R]`. There is one mass
     for each beam. `scattering` is the tensor `extinction` itself where both coefficients have the
     same field. A `peak` that is the same everywhere is `[C, 1, 1, 1]`, and at nodes `[C, 1]`.
+    Where the phase function differs from cell to cell, `number` is that of its numbers which does,
+    and `remaining` is what scatters diffuse light; else both are None.
     """
 
     extinction: Tensor
@@ -61,6 +65,8 @@ class Sampled:
     masses: tuple[Tensor, ...]
     scattering: Tensor
     peak: Tensor | None
+    number: Tensor | None = None
+    remaining: Tensor | None = None
 
     @staticmethod
     def in_cells(emission: Emission) -> Sampled:
@@ -71,6 +77,8 @@ class Sampled:
             tuple(beam.mass for beam in emission.beams),
             emission.scattering.field,
             emission.peak,
+            emission.seen.phase.cells,
+            None if emission.remaining is None else emission.remaining.field,
         )
 
     def unpack(self, values: Tensor) -> Sampled:
@@ -82,7 +90,9 @@ class Sampled:
         peak = self.peak
         if peak is not None:
             peak = next(fields) if is_field(peak) else peak.view(-1, 1)
-        return Sampled(extinction, diffuse, masses, scattering, peak)
+        number = None if self.number is None else next(fields)
+        remaining = None if self.remaining is None else next(fields)
+        return Sampled(extinction, diffuse, masses, scattering, peak, number, remaining)
 
     def fields(self) -> list[Tensor]:
         """Those that differ, in the order in which they are channels of one interpolation."""
@@ -91,6 +101,10 @@ class Sampled:
             fields.append(self.scattering)
         if self.peak is not None and is_field(self.peak):
             fields.append(self.peak)
+        if self.number is not None:
+            fields.append(self.number)
+        if self.remaining is not None:
+            fields.append(self.remaining)
         return fields
 
     @property

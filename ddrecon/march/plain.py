@@ -9,6 +9,7 @@ third order, and it takes E13 from a table of polynomials.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -36,24 +37,31 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
     extinction = _interpolate(grid, emission.extinction.field, points)
     passed = pad(torch.cumulative_trapezoid(extinction, distance, dim=1), (0, 0, 1, 0))
     scale = emission.extinction.scale.view(-1, 1, 1)
-    # E3: the radiance (L0 + g L1 . w) that one more scattering turns towards the camera.
-    radiance = _interpolate(grid, emission.diffuse, points)
+    # E3: the radiance kappa_s (L0 + g L1 . w) that one more scattering turns towards the camera.
+    scattering = _interpolate(grid, emission.scattering.value, points)
+    by = emission.remaining or emission.scattering
+    emitted = _interpolate(grid, by.value, points) * _interpolate(grid, emission.diffuse, points)
+    seen, number = emission.seen, emission.seen.phase.cells
+    if number is not None:
+        # The number of the phase function that differs from cell to cell, as one of each node.
+        at_nodes = _interpolate(grid, number, points)
+        seen = replace(seen, phase=seen.phase.with_cells(at_nodes[..., None]))
     for beam in emission.beams:
-        # E2: p E tau / (4 pi), where tau is what lies between the light and the node.
+        # E2: kappa_s p E tau / (4 pi), where tau is what lies between the light and the node.
         travel, irradiance = _unattenuated(beam, points, rays.direction)
         cosine = -(travel * rays.direction).sum(-1)
         mass = _interpolate(grid, beam.mass, points)
         if emission.peak is None:
-            phase = emission.seen.value(cosine)
+            phase = seen.value(cosine[..., None])[..., 0]
         else:
             # E13: the forward peak spreads the light on its way to the node and to the camera.
             depth = _interpolate(grid, emission.peak, points) * (passed + mass)
-            phase = emission.seen.at(depth, cosine)
-        radiance = radiance + phase * irradiance / (4 * math.pi) * torch.exp(-scale * mass)
-    # E2 + E3: the integral of tau kappa_s times that, and tau of the whole way.
-    scattering = _interpolate(grid, emission.scattering.value, points)
+            phase = seen.at(depth, cosine)
+        arriving = irradiance / (4 * math.pi) * torch.exp(-scale * mass)
+        emitted = emitted + scattering * phase * arriving
+    # E2 + E3: the integral of tau times that, and tau of the whole way.
     tau = torch.exp(-scale * passed)
-    scattered = torch.trapezoid(tau * scattering * radiance, distance, dim=1)
+    scattered = torch.trapezoid(tau * emitted, distance, dim=1)
     return scattered, tau[:, -1].expand_as(scattered)
 
 

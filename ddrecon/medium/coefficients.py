@@ -6,6 +6,7 @@ cross sections are constant, rays need march through one field only, the density
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -15,9 +16,10 @@ from ddrecon.display import Displayed
 from ddrecon.grid import Grid
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.autodiff import is_varied
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
+from ddrecon.slabs.slab import Slab, own_slab
 
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
@@ -109,15 +111,17 @@ class Medium:
 
     f is `forward_fraction`, the forward peak's. `absorption` is kappa_a. `scattering` is all of
     kappa_s, by which beams scatter with the exact phase function `seen`, of mean cosine `g`.
-    `extinction` is kappa_a + (1 - f) kappa_s, and `mean_cosine` the g' of the scattering that
-    remains. These three are scalars, or [3, 1, 1, 1] where colors differ. `peak` is f kappa_s per
-    unit of the extinction's field: times a mass, it is the depth x of E13. It is [C, 1, 1, 1], or
-    [C, z, y, x] where cross sections vary, and None without a peak.
+    `remaining` is (1 - f) kappa_s, `extinction` kappa_a more, and `mean_cosine` the g' of what
+    remains. f, g and g' are scalars, [3, 1, 1, 1] where colors differ, or [C, z, y, x] where the
+    phase function does from cell to cell. `peak` is f kappa_s per unit of the extinction's field:
+    times a mass, it is the depth x of E13. It is [C, 1, 1, 1], or [C, z, y, x] where anything of it
+    varies, and None without a peak.
     """
 
     grid: Grid
     extinction: Coefficient
     scattering: Coefficient
+    remaining: Coefficient
     absorption: Coefficient
     g: Tensor
     mean_cosine: Tensor
@@ -128,7 +132,7 @@ class Medium:
     @property
     def remaining_scattering(self) -> Tensor:
         """(1 - f) kappa_s [1/u], `[C, z, y, x]`."""
-        return (1 - self.forward_fraction) * self.scattering.value
+        return self.remaining.value
 
     @property
     def transport_extinction(self) -> Tensor:
@@ -144,6 +148,11 @@ class Medium:
         return is_varied(self.g) or is_any_nonzero(self.g)
 
     @property
+    def is_cellwise(self) -> bool:
+        """Whether the phase function differs from cell to cell."""
+        return self.seen.phase.cells is not None
+
+    @property
     def degree(self) -> int:
         """The degree in angle to which light is known: 0 where its direction does not matter."""
         is_directed = self.is_anisotropic if self.seen.degree > P1_DEGREE else self.has_flux
@@ -153,6 +162,21 @@ class Medium:
     def is_anisotropic(self) -> bool:
         """Whether the phase function differs from that of isotropic scattering, or may come to."""
         return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
+
+
+def cut_volume(volume: Volume) -> Volume:
+    """The slab of `volume` that this rank has; `volume` itself where ranks do not share cells."""
+    slab = own_slab(volume.grid)
+    if not isinstance(slab, Slab):
+        return volume
+    density, sigma_a, sigma_s = (
+        slab.cut(field) if field.shape[-3:] == volume.grid.shape else field
+        for field in (volume.density, volume.sigma_a, volume.sigma_s)
+    )
+    phase = volume.phase
+    if phase.cells is not None:
+        phase = phase.with_cells(slab.cut(phase.cells))
+    return Volume(slab, density, sigma_a, sigma_s, phase)
 
 
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
@@ -175,27 +199,47 @@ def keep_medium(volume: Volume) -> Medium:
 
 def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
     g = _mean_cosine(type(volume.phase), *volume.phase.numbers)
-    fraction = 0 * g.detach() if fraction is None else fraction
+    fraction = g.new_zeros(()) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
-    density = volume.density[None]
-
-    def coefficient(sigma: Tensor) -> Coefficient:
-        if sigma.shape[1:].numel() == 1:
-            return Coefficient(sigma, density)
-        return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * density)
-
-    extinction, peak = _extinction_and_peak(sigma_a, sigma_s, fraction)
+    find = _find_coefficients
+    if max(sigma_a[0].numel(), sigma_s[0].numel()) > 1:
+        # Of what varies from cell to cell nothing is kept that is made on the way.
+        find = functools.partial(recompute, find)
+    extinction, scattering, remaining, absorption, peak = find(
+        sigma_a, sigma_s, fraction, volume.density
+    )
     return Medium(
         volume.grid,
-        extinction=coefficient(extinction),
-        scattering=coefficient(sigma_s),
-        absorption=coefficient(sigma_a),
+        extinction=extinction,
+        scattering=scattering,
+        remaining=remaining,
+        absorption=absorption,
         g=g,
         mean_cosine=_scaled_mean_cosine(g, fraction),
         forward_fraction=fraction,
         peak=peak,
         seen=seen,
     )
+
+
+def _find_coefficients(
+    sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor, density: Tensor
+) -> tuple[Coefficient, Coefficient, Coefficient, Coefficient, Tensor | None]:
+    """kappa_a + (1 - f) kappa_s, kappa_s, (1 - f) kappa_s, kappa_a, and `peak` of `Medium`."""
+    field = density[None]
+
+    def coefficient(sigma: Tensor) -> Coefficient:
+        if sigma.shape[1:].numel() == 1:
+            return Coefficient(sigma, field)
+        return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * field)
+
+    scaled, kept, peak = _scale_sections(sigma_a, sigma_s, fraction)
+    scattering = coefficient(sigma_s)
+    remaining = coefficient(kept)
+    if sigma_s[0].numel() > 1 and fraction.shape[1:].numel() == 1:
+        # One field for both, as cells share what remains of their scattering.
+        remaining = Coefficient((1 - fraction) * scattering.scale, scattering.field)
+    return coefficient(scaled), scattering, remaining, coefficient(sigma_a), peak
 
 
 @remember
@@ -219,25 +263,29 @@ def _scaled_mean_cosine(g: Tensor, fraction: Tensor) -> Tensor:
 
 
 def _for_cells(numbers: Tensor) -> Tensor:
-    """One number for each color, [1 or 3], as a scalar or `[3, 1, 1, 1]`."""
+    """One number for each color, [1 or 3], as a scalar or `[3, 1, 1, 1]`; of cells as they are."""
+    if numbers.ndim == 4:
+        return numbers + 0
     return numbers[0] + 0 if len(numbers) == 1 else numbers.view(-1, 1, 1, 1) + 0
 
 
-def _extinction_and_peak(
+def _scale_sections(
     sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor
-) -> tuple[Tensor, Tensor | None]:
-    """kappa_a + (1 - f) kappa_s per unit density, and what `Medium` has as `peak`."""
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Per unit density kappa_a + (1 - f) kappa_s and its scattering; and `Medium`'s `peak`."""
     has_peak = is_any_nonzero(fraction)
-    is_small = max(sigma_a[0].numel(), sigma_s[0].numel()) == 1
+    is_small = max(sigma_a[0].numel(), sigma_s[0].numel(), fraction.numel() // 3) == 1
     find = _remember_scaled if is_small else _find_scaled
     return find(sigma_a, sigma_s, fraction, has_peak)
 
 
 def _find_scaled(
     sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor, has_peak: bool
-) -> tuple[Tensor, Tensor | None]:
-    extinction = sigma_a + (1 - fraction) * sigma_s
-    return extinction, _peak_per_mass(extinction, fraction * sigma_s) if has_peak else None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    remaining = (1 - fraction) * sigma_s
+    extinction = sigma_a + remaining
+    peak = _peak_per_mass(extinction, fraction * sigma_s) if has_peak else None
+    return extinction, remaining, peak
 
 
 _remember_scaled = remember(_find_scaled)
@@ -257,7 +305,7 @@ def _peak_per_mass(extinction: Tensor, forward: Tensor) -> Tensor:
 def _broadcast(sigma: Tensor, g: Tensor) -> Tensor:
     """`sigma` as [C, z, y, x], with as many colors as `g` has."""
     sigma = sigma if sigma.ndim == 4 else along_colors(sigma)
-    return sigma if len(sigma) > 1 or g.ndim == 0 else sigma.expand(3, -1, -1, -1)
+    return sigma if len(sigma) > 1 or g.shape[:1] != (3,) else sigma.expand(3, -1, -1, -1)
 
 
 @remember

@@ -3,15 +3,17 @@
 They are normalized to 4 pi over the sphere, as in docs/theory.md E2. A phase function is known by
 its Legendre moments chi_l (E22), the mean of P_l(cosine) over scattered light: chi_0 = 1, and
 chi_1 is the mean cosine g. Its numbers may differ by color; what is computed from them has the
-color as first axis, of size 1 where all colors share one phase function.
+color as first axis, of size 1 where all colors share one phase function. One of its numbers may
+differ from cell to cell, [z, y, x] or [C, z, y, x]: then moments are followed by the cells' axes.
 """
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -33,17 +35,20 @@ class PhaseFunction(ABC):
     """What a scene file calls it."""
     VARIABLES: ClassVar[tuple[str, ...]] = ()
     """Those of its numbers that can be optimized."""
+    CELLWISE: ClassVar[str | None] = None
+    """That of its numbers which may differ from cell to cell."""
 
     @abstractmethod
     def value(self, cosine: Tensor) -> Tensor:
         """p >= 0, normalized to 4 pi, `[C, *cosine.shape]`.
 
-        `cosine`: between the directions of travel before and after scattering, in [-1, 1].
+        `cosine`: between the directions of travel before and after scattering, in [-1, 1]. A number
+        that differs from cell to cell broadcasts against it as it is.
         """
 
     @abstractmethod
     def moments(self, count: int) -> Tensor:
-        """chi_l for l < `count`, [C, count]."""
+        """chi_l for l < `count`, [C, count], or of cells [C, count, z, y, x]."""
 
     @abstractmethod
     def peak_tail(self, degree: int, count: int) -> Tensor:
@@ -70,10 +75,22 @@ class PhaseFunction(ABC):
         """All numbers, in the order of the fields."""
         return tuple(getattr(self, field.name) for field in fields(self))
 
-    @property
+    @functools.cached_property
     def colors(self) -> int:
         """How many colors have a phase function of their own: 1 where all share one."""
-        return len(self.moments(1))
+        cells = self.cells
+        return len(self.moments(1)) if cells is None else len(cells)
+
+    @property
+    def cells(self) -> Tensor | None:
+        """The number that differs from cell to cell, [C, z, y, x]; None where none does."""
+        number = None if self.CELLWISE is None else getattr(self, self.CELLWISE)
+        return None if number is None or number.ndim < 3 else _colored(number)
+
+    def with_cells(self, number: Tensor) -> Self:
+        """The same with another `number` in place of that which differs from cell to cell."""
+        assert self.CELLWISE is not None
+        return replace(self, **{self.CELLWISE: number})
 
     def forward_fraction(self, degree: int) -> Tensor:
         """f [C], the forward peak's part of scattering where light is known to `degree`."""
@@ -88,12 +105,13 @@ class PhaseFunction(ABC):
 class HenyeyGreenstein(PhaseFunction):
     """p(w) = (1 - g^2) / (1 + g^2 - 2 g w)^(3/2), chi_l = g^l.
 
-    `g`: mean cosine in (-1, 1), scalar or [3]. Source: Henyey and Greenstein 1941,
+    `g`: mean cosine in (-1, 1), scalar, [3] or of cells. Source: Henyey and Greenstein 1941,
     doi:10.1086/144246.
     """
 
     NAME = "henyey_greenstein"
     VARIABLES = ("g",)
+    CELLWISE = "g"
 
     g: Tensor
 
@@ -117,26 +135,31 @@ class HenyeyGreenstein(PhaseFunction):
 class TwoLobe(PhaseFunction):
     """`weight` of the first of two Henyey-Greenstein functions, and the rest of the second.
 
-    `g` [2]: their mean cosines; `weight`: in [0, 1], scalar or [3].
+    `g` [2]: their mean cosines; `weight`: in [0, 1], scalar, [3] or of cells.
     """
 
     NAME = "two_lobe"
     VARIABLES = ("g", "weight")
+    CELLWISE = "weight"
 
     g: Tensor
     weight: Tensor
 
     def value(self, cosine: Tensor) -> Tensor:
-        return self._mix([lobe.value(cosine) for lobe in self.lobes], cosine.ndim)
+        weight = _beside(self.weight, cosine)
+        first, second = (lobe.value(cosine) for lobe in self.lobes)
+        if self.cells is not None:
+            first, second = first[0], second[0]
+        return weight * first + (1 - weight) * second
 
     def moments(self, count: int) -> Tensor:
-        return self._mix([lobe.moments(count) for lobe in self.lobes], 1)
+        return self._mix([lobe.moments(count) for lobe in self.lobes])
 
     def peak_tail(self, degree: int, count: int) -> Tensor:
-        return self._mix([lobe.peak_tail(degree, count) for lobe in self.lobes], 1)
+        return self._mix([lobe.peak_tail(degree, count) for lobe in self.lobes])
 
     def backward_tail(self, degree: int, count: int) -> Tensor:
-        return self._mix([lobe.backward_tail(degree, count) for lobe in self.lobes], 1)
+        return self._mix([lobe.backward_tail(degree, count) for lobe in self.lobes])
 
     def length(self) -> int:
         return _length_of(self.g)
@@ -146,8 +169,13 @@ class TwoLobe(PhaseFunction):
         """Both functions."""
         return HenyeyGreenstein(self.g[0]), HenyeyGreenstein(self.g[1])
 
-    def _mix(self, parts: Sequence[Tensor], axes: int) -> Tensor:
-        weight = self.weight.reshape(-1, *[1] * axes)
+    def _mix(self, parts: Sequence[Tensor]) -> Tensor:
+        """Moments [1, count] of the two lobes as those of both."""
+        weight = self.cells
+        if weight is None:
+            weight = self.weight.reshape(-1, 1)
+        else:
+            weight, parts = weight[:, None], [part[..., None, None, None] for part in parts]
         return weight * parts[0] + (1 - weight) * parts[1]
 
 
@@ -235,13 +263,21 @@ def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
 
 
 def _beside(number: Tensor, cosine: Tensor) -> Tensor:
-    """`number`, scalar or [C], to broadcast against `[C, *cosine.shape]`."""
-    return number.reshape(-1, *[1] * cosine.ndim)
+    """`number`, scalar or [C], to broadcast against `[C, *cosine.shape]`; of cells as it is."""
+    return number if number.ndim > 2 else number.reshape(-1, *[1] * cosine.ndim)
+
+
+def _colored(number: Tensor) -> Tensor:
+    """A `number` of cells, [z, y, x] or [C, z, y, x], with colors."""
+    return number if number.ndim == 4 else number[None]
 
 
 def _powers(g: Tensor, first: int, count: int) -> Tensor:
-    """g^l for `count` degrees l from `first` on, [C, count]."""
+    """g^l for `count` degrees l from `first` on, [C, count] or [C, count, z, y, x]."""
     degree = torch.arange(first, first + count, dtype=g.dtype, device=g.device)
+    if g.ndim > 2:
+        powers: Tensor = _colored(g)[:, None] ** degree.view(-1, 1, 1, 1)
+        return powers
     return g.reshape(-1, 1) ** degree
 
 

@@ -48,6 +48,7 @@ class SeenPhase:
     def at(self, depth: Tensor, cosine: Tensor) -> Tensor:
         """S(x, w) of E13, [C, ...], summed term by term.
 
+        A number that differs from cell to cell is here [C or 1, N, R, 1], at the nodes of `depth`.
         `depth` x [C or 1, ...] >= 0: f times the optical depth of scattering from where the light
         enters, by the point where it turns, to where the view ray leaves; at 0 this is p.
         `cosine`: broadcast against one color of `depth`.
@@ -78,19 +79,22 @@ class SeenPhase:
         At even angles, with slopes by the angle (`numerics.angle_table`), in double precision.
         """
         kind, numbers = type(self.phase), self.phase.numbers
-        return _table(kind, self.degree, *numbers) if has_peak else _plain_table(kind, *numbers)
+        return peak_table(kind, self.degree, *numbers) if has_peak else _plain_table(kind, *numbers)
 
 
 def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
     """(2 l + 1) times the moments s_l of S at `depth` [C or 1, ..., 1], [C, ..., count] (E15)."""
     count = phase.length()
-    shape = (-1, *[1] * (depth.ndim - 2), count)
     chi = phase.moments(count).double()
     tail = phase.peak_tail(degree, count - degree - 1).double()
-    peak = torch.cat([tail[:, :1].expand(-1, degree + 1), tail], 1)
+    peak = torch.cat([tail[:, :1].expand_as(chi[:, : degree + 1]), tail], 1)
     # r_l, at most 1; without a peak it does not matter.
     spread = peak / torch.where(tail[:, :1] > 0, tail[:, :1], 1)
-    chi, peak, spread = (each.reshape(shape) for each in (chi, peak, spread))
+    if chi.ndim == 2:
+        shape = (-1, *[1] * (depth.ndim - 2), count)
+        chi, peak, spread = (each.reshape(shape) for each in (chi, peak, spread))
+    else:
+        chi, peak, spread = (each[..., 0].movedim(1, -1) for each in (chi, peak, spread))
     # exp(-x (1 - r)) phi(r x), which is exp(-x) phi(-r x) for r < 0.
     forward, size = spread.clamp(min=0), spread.abs()
     turned = torch.exp((forward - 1) * depth) * decay_mean(size * depth)
@@ -104,7 +108,8 @@ def _plain_table(kind: type[PhaseFunction], *numbers: Tensor) -> Tensor:
 
 
 @remember
-def _table(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+def peak_table(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+    """The polynomials of S, [C, steps + 1, 2, COEFFICIENTS], of the phase function of `numbers`."""
     depths, inverse = (each.to(numbers[0].device) for each in extrema())
     # At the depths of the fit, and from these to coefficients: [C, count, COEFFICIENTS].
     phase = kind(*(each.double() for each in numbers))

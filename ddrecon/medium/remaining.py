@@ -15,7 +15,8 @@ from ddrecon.numerics.remember import is_any_nonzero, remember
 def remaining_moments(medium: Medium) -> Tensor:
     """p_l = (chi_l - f) / (1 - f) for l up to the medium's degree (E18), [L + 1, C or 1, 1, 1, 1].
 
-    chi_l are the moments of the phase function of `medium`, f the part of its forward peak.
+    chi_l are the moments of the phase function of `medium`, f the part of its forward peak. Of one
+    that differs from cell to cell they are [L + 1, C or 1, z, y, x].
     """
     phase = medium.seen.phase
     return _remaining(type(phase), medium.forward_fraction, medium.seen.degree, *phase.numbers)
@@ -33,7 +34,10 @@ def unturned_moments(medium: Medium) -> Tensor:
 
 
 def backward_fraction(medium: Medium) -> Tensor:
-    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E20)."""
+    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E20).
+
+    It is [C or 1, z, y, x] where the phase function differs from cell to cell.
+    """
     phase = medium.seen.phase
     return _backward_fraction(type(phase), medium.seen.degree, *phase.numbers)
 
@@ -48,32 +52,37 @@ def turned_phase(medium: Medium, turns: int) -> Tensor:
 
     A table [C, steps + 1, 2, 1] for `look_up` over the angle from the way that light goes. Its
     moments are chi_l up to the degree of the medium, and chi_l r_l^turns beyond, where r_l are the
-    backward peak's.
+    backward peak's; less the forward peak's, which counts as not scattered.
     """
     phase = medium.seen.phase
-    return _turned_phase(type(phase), medium.seen.degree, turns, *phase.numbers)
+    return turned_table(type(phase), medium.seen.degree, turns, *phase.numbers)
 
 
 @remember
 def _remaining(
     kind: type[PhaseFunction], fraction: Tensor, degree: int, *numbers: Tensor
 ) -> Tensor:
-    moments = kind(*numbers).moments(degree + 1).T[..., None, None, None]
+    moments = kind(*numbers).moments(degree + 1).transpose(0, 1)
+    moments = moments if moments.ndim == 5 else moments[..., None, None, None]
     return (moments - fraction) / (1 - fraction)
 
 
 @remember
 def _backward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
-    return kind(*numbers).backward_fraction(degree).view(-1, 1, 1, 1) + 0
+    fraction = kind(*numbers).backward_fraction(degree)
+    return fraction + 0 if fraction.ndim == 4 else fraction.view(-1, 1, 1, 1) + 0
 
 
 @remember
-def _turned_phase(kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor) -> Tensor:
+def turned_table(kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor) -> Tensor:
+    """What `turned_phase` returns, of the phase function of `numbers`."""
     phase = kind(*numbers)
     count = phase.length()
     tail = phase.backward_tail(degree, count - degree - 1).double()
     spread = tail / torch.where(tail[:, :1] > 0, tail[:, :1], 1)
     spread = torch.cat([torch.ones_like(spread[:, :1]).expand(-1, degree + 1), spread], 1)
-    weights = series_weights(phase.moments(count).double() * spread**turns)
+    forward = phase.peak_tail(degree, count - degree - 1).double()
+    forward = torch.cat([forward[:, :1].expand(-1, degree + 1), forward], 1)
+    weights = series_weights((phase.moments(count).double() - forward) * spread**turns)
     curves = legendre_at_even_angles(STEPS, count)
     return torch.stack([weights @ rows.to(weights).T for rows in curves], -1)[..., None]

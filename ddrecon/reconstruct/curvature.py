@@ -2,24 +2,28 @@
 
 J is the derivative of all training pictures by all parameters, W how strongly each pixel counts, R
 what the regularizers add (E32). Nobody has the matrix: a product is one tangent and one adjoint,
-view by view, in one light field each. Its memory grows with the views by their pictures alone.
+view by view, in one light field each, shared out over ranks. Its memory grows with the views by
+their pictures alone.
 Parameters stand in one vector, entry by entry, in their own units and in their order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.light.lights import Light
 from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.roughness import Roughness
-from ddrecon.renderer import render_each, solve_light, view_picture
+from ddrecon.reconstruct.shares import share_pictures
+from ddrecon.renderer import solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import with_values
 
@@ -46,10 +50,14 @@ class Curvature:
         memory = self.new_memory()
         with torch.no_grad():
             world = with_values(scene, self.values)
-            images = render_each(world, world.views, memory)
+            light_field = solve_light(world, memory)
+            self.images = share_pictures(
+                scene,
+                scene.views,
+                lambda view: view_picture(light_field, world, world.view(view.name)),
+            )
         # Later solves of the same light begin where this one ended.
         self.solutions = {key: u for key, u in memory.last.items() if key[0] == "forward"}
-        self.images = {v.name: image for v, image in zip(scene.views, images, strict=True)}
         total = sum(view.weight for view in scene.views)
         self.weights = {
             view.name: view.weight / total * targets[view.name].weights_at(self.images[view.name])
@@ -92,25 +100,36 @@ class Curvature:
         parts = self.split(vector)
         return self.join({name: r.product(parts[name]) for name, r in self.roughness.items()})
 
-    def tangents(self, vector: Tensor, views: Sequence[View] | None = None) -> dict[str, Tensor]:
+    def tangents(
+        self,
+        vector: Tensor,
+        views: Sequence[View] | None = None,
+        lights: Sequence[Light] | None = None,
+    ) -> dict[str, Tensor]:
         """J times `vector`: how the picture [3, h, w] of each view changes, by its name.
 
-        Those of the training views, or of other `views` of the same volume.
+        Those of the training views, or of other `views` of the same volume; in the light of the
+        scene, or of other `lights`, which are known.
         """
-        changes, found = self.split(vector), dict[str, Tensor]()
+        changes = self.split(vector)
         derivatives = self.scene.optimize.derivatives if self.scene.optimize else "all"
         with torch.no_grad(), forward_ad.dual_level():
             duals = {
                 name: forward_ad.make_dual(value, changes[name])
                 for name, value in self.values.items()
+                if lights is None or not name.startswith("lights.")
             }
-            world = with_values(self.scene, duals)
+            lit = self.scene if lights is None else replace(self.scene, lights=list(lights))
+            world = with_values(lit, duals)
             light_field = solve_light(world, self.new_memory())
-            for view in world.views if views is None else views:
-                picture = view_picture(light_field, world, view, derivatives)
+
+            def change_of(view: View) -> Tensor:
+                seen = world.view(view.name) if views is None else view
+                picture = view_picture(light_field, world, seen, derivatives)
                 tangent = forward_ad.unpack_dual(picture).tangent
-                found[view.name] = torch.zeros_like(picture) if tangent is None else tangent.clone()
-        return found
+                return torch.zeros_like(picture) if tangent is None else tangent.clone()
+
+            return share_pictures(self.scene, views or self.scene.views, change_of)
 
     def adjoint(self, pictures: Mapping[str, Tensor]) -> Tensor:
         """J^T times `pictures` [3, h, w] of all views by name."""

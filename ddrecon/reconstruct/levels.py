@@ -43,7 +43,10 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
     sigma_a, sigma_s = (
         _resample_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s)
     )
-    coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, volume.phase)
+    phase = volume.phase
+    if phase.cells is not None:
+        phase = phase.with_cells(resample(phase.cells, grid))
+    coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, phase)
     starts = {
         name: resample(start, grid) if start.shape[-3:] == volume.grid.shape else start
         for name, start in scene.starts.items()

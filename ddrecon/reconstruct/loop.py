@@ -6,9 +6,9 @@ one iteration at a time, so that whoever drives it may log, preview, stop or sav
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -19,7 +19,9 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
+from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct import setup
+from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
@@ -108,30 +110,27 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
+        compile_ahead(lambda: deepcopy(self)._iterate(start))
         if self.iteration == 0:
             self._settle_smoothing()
         stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
-        solutions = dict(self.memory.last)
         try:
-            return self._iterate(start, solutions)
+            return self._iterate(start)
         except (SolveError, NotFiniteError) as error:
             failure = explain_divergence(self.iteration + 1, self.parameters, error)
-            if self.before_step is None:
-                self.memory.last = solutions
-            else:
+            if self.before_step is not None:
                 self.restore(self.before_step)
             raise failure from error.__cause__
         except RanksError:
             # The state is that before the iteration, even amid the step, when some have moved.
             if self.before_step and self.before_step["total"]["iteration"] == self.iteration:
                 self.restore(self.before_step)
-            self.memory.last = solutions
             raise
 
-    def _iterate(self, start: float, solutions: dict[tuple[str, int], Tensor]) -> Row:
-        """One iteration, begun at `start` [s] with these last `solutions`."""
+    def _iterate(self, start: float) -> Row:
+        """One iteration, begun at `start` [s]."""
         # See: which views this iteration compares.
         views = self._views()
         # Differentiate: the objective and its derivative by every parameter.
@@ -144,7 +143,8 @@ class Reconstruction:
         numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
         self.before_step = None
-        self.before_step = self.state() | {"solutions": solutions}
+        # Not the solutions, where solves only begin.
+        self.before_step = {key: part for key, part in self.state().items() if key != "solutions"}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
         self._step(gradients, compared)
@@ -186,7 +186,8 @@ class Reconstruction:
             "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "stage": self.stage,
             "total": dict(vars(self.total)),
-            "solutions": dict(self.memory.last),
+            # Those of a slab are of no use to a run with other slabs.
+            "solutions": {} if cells_are_shared() else dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
             "schedule": self.schedule.state(),
@@ -206,9 +207,11 @@ class Reconstruction:
         for parameter in self.parameters:
             curvature = state["parameters"][parameter.name]["curvature"]
             parameter.curvature = None if curvature is None else curvature.to(parameter.value)
-        self.memory.last = {
-            kind: field.to(self.scene.volume.density) for kind, field in state["solutions"].items()
-        }
+        if "solutions" in state:
+            self.memory.last = {
+                kind: field.to(self.scene.volume.density)
+                for kind, field in state["solutions"].items()
+            }
 
     def _settle_smoothing(self) -> None:
         """Finds the weight of density's total variation where the scene asks for that."""
@@ -240,7 +243,8 @@ class Reconstruction:
             parameter.curvature = None
             if parameter.name == "density" and self.support is not None:
                 parameter.restrict(self.support.on(grid))
-        self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
+        known = {} if cells_are_shared() else self.memory.last
+        self.memory.last = {kind: resample(field, grid) for kind, field in known.items()}
 
     def _views(self) -> list[View]:
         views, wanted = self.train_level.views, self.settings.views_per_iteration
@@ -272,8 +276,7 @@ class Reconstruction:
         pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
         seen = [p for p in self.parameters if p.view is None or p.view in names]
-        rate_of = functools.partial(self.schedule.rate, self.iteration)
-        solved = step_parameters(seen, gradients, rate_of)
+        solved = step_parameters(seen, gradients, self.schedule, self.iteration)
         solve_responses(solved, self.train_level, pictures, self.targets)
         lights, level = lights_due(solved, self.iteration), self.train_level
         step_brightness(lights, level, values, pictures, self.targets, self.memory.last)

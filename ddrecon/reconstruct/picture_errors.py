@@ -12,6 +12,7 @@ from torch import Tensor
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.information import Information
 from ddrecon.reconstruct.posterior import Posterior
 
 LEAST_LEFT = 0.1
@@ -38,32 +39,47 @@ class PictureErrors:
         return {**vars(self), "from": "the scene" if self.is_known else "residuals"}
 
 
+def know_errors(
+    curvature: Curvature, targets: Mapping[str, Target], noises: Mapping[str, Noise]
+) -> PictureErrors | None:
+    """How much the pictures `targets` of the views of `curvature` err, if all have `noises`.
+
+    The weights of `curvature` are then those of this noise.
+    """
+    if not all(name in noises for name in curvature.weights):
+        return None
+    squares = {name: noises[name].deviation(targets[name].image) ** 2 for name in noises}
+    count = _count_all(curvature, targets)
+    temperature = _sum_weighted(curvature, squares) / count
+    # Each pixel counts by its own noise, all together as the objective has them.
+    for name, weight in curvature.weights.items():
+        is_seen = (weight > 0).to(weight)
+        curvature.weights[name] = is_seen * temperature / squares[name]
+    return PictureErrors(temperature, _root_mean(squares, curvature), count, None, True)
+
+
 def find_errors(
     curvature: Curvature,
     targets: Mapping[str, Target],
-    noises: Mapping[str, Noise],
     gradient: Tensor,
     seed: int,
+    information: Information,
 ) -> PictureErrors:
-    """How much the pictures `targets` of the views of `curvature` err.
+    """How much they err by what is left at the optimum, less what they told.
 
-    By their `noises` where all have one; the weights of `curvature` are then those of this noise.
-    Otherwise by what is left at the optimum, less what the pictures told.
+    `information` is that of `curvature`.
     """
-    count = sum(_count(w, targets[name].image) for name, w in curvature.weights.items())
-    if all(name in noises for name in curvature.weights):
-        squares = {name: noises[name].deviation(targets[name].image) ** 2 for name in noises}
-        temperature = _sum_weighted(curvature, squares) / count
-        # Each pixel counts by its own noise, all together as the objective has them.
-        for name, weight in curvature.weights.items():
-            is_seen = (weight > 0).to(weight)
-            curvature.weights[name] = is_seen * temperature / squares[name]
-        return PictureErrors(temperature, _root_mean(squares, curvature), count, None, True)
     squares = {name: (curvature.images[name] - targets[name].image) ** 2 for name in targets}
-    misfit = _sum_weighted(curvature, squares)
-    told = Posterior(curvature, gradient, misfit / count, seed).count_told()
+    misfit, count = _sum_weighted(curvature, squares), _count_all(curvature, targets)
+    posterior = Posterior(curvature, gradient, misfit / count, seed, information=information)
+    told = posterior.count_told()
     temperature = misfit / max(count - told, LEAST_LEFT * count)
     return PictureErrors(temperature, _root_mean(squares, curvature), count, told, False)
+
+
+def _count_all(curvature: Curvature, targets: Mapping[str, Target]) -> int:
+    """How many independent numbers all pictures have."""
+    return sum(_count(w, targets[name].image) for name, w in curvature.weights.items())
 
 
 def _count(weight: Tensor, target: Tensor) -> int:

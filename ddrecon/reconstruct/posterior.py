@@ -14,19 +14,26 @@ from torch import Tensor
 
 from ddrecon.numerics.conjugate_gradients import Solved, conjugate_gradients
 from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.information import Information
 from ddrecon.reconstruct.limits import find_bounds, find_gauge, find_kept
-from ddrecon.reconstruct.prior import PRECONDITION, Prior, normal_like
+from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like
 
-TOLERANCE = 0.2
-"""How small a sample's residual is to be, of what it was for a draw from the prior."""
+TOLERANCE = 0.5
+"""How small a sample's residual is to be, of a right side's usual size."""
+TOLD = 0.4
+"""And that of the change by which told numbers are counted: they err by its square."""
 MOST = 40
 """Products with J^T W J that a sample may take."""
 ROUNDS = 10
 """Times that cells are let go of or held at a bound."""
-CUT = 1e-3
-"""A step of which less than this part is cut at bounds counts as whole."""
-PROBES = 3
-"""Random pictures that the diagonal of J^T W J is found by."""
+INNER = 6
+"""Steps of each solve that conjugate gradients are preconditioned with,"""
+PRECONDITION = 0.1
+"""or fewer, where so small a part of the residual is left."""
+PROBED = -1
+"""The number of random vectors that belong to no sample, but to information."""
+BEGIN = 0.25
+"""The part of the way from a draw of the prior to what pictures roughly leave of it (E50)."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,8 @@ class Posterior:
     """The posterior about the values of `curvature`, of pictures that err by `temperature`.
 
     `gradient` [n] is the objective's: it presses entries at a bound against it. Entries stay where
-    `is_kept` [n]; changes have no part in the orthonormal `gauge` [n, k].
+    `is_kept` [n]; changes have no part in the orthonormal `gauge` [n, k]. `information` is what
+    `curvature` is about, where that was found before.
     """
 
     def __init__(
@@ -58,6 +66,7 @@ class Posterior:
         temperature: float,
         seed: int,
         tolerance: float = TOLERANCE,
+        information: Information | None = None,
     ):
         self.curvature, self.temperature = curvature, temperature
         self.seed, self.tolerance, self.most = seed, tolerance, MOST
@@ -69,28 +78,25 @@ class Posterior:
         # The optimum is one: what is left of a derivative elsewhere belongs to the optimizer.
         self.gradient = torch.where(at_bound, gradient, 0)
         self.gauge = find_gauge(curvature)
-        self.diagonal = self._diagonal()
+        self.information = information or Information(curvature, generator_of(seed, PROBED))
 
     def sample(self, number: int) -> Sample:
         """The sample of this `number`, the same whenever it is asked for."""
-        generator = self._generator(number)
+        generator = generator_of(self.seed, number)
         scale = self.temperature**0.5
         noise, level = (scale * part for part in self.prior.root_noise(generator))
-        even = self.prior.without_levels(self._solve_prior(noise), self.is_kept)
-        prior = self._within(even)
-        right = noise + level - self.gradient - self.prior.product(prior)
-        # What is lacking at the draw from the prior: both parts of the data in one adjoint.
-        changes, disturbed = self.curvature.tangents(prior), self._disturbances(generator)
+        prior = self._within(self.prior.without_levels(self._solve_prior(noise), self.is_kept))
+        right = noise + level - self.gradient
+        begin = self._begin(prior, right)
+        # What is lacking there: both parts of the data in one adjoint.
+        changes, disturbed = self.curvature.tangents(begin), self._disturbances(generator)
         weights = self.curvature.weights
-        right += self.curvature.adjoint(
+        lacking = right - self.prior.product(begin)
+        lacking += self.curvature.adjoint(
             {name: scale * disturbed[name] - w * changes[name] for name, w in weights.items()}
         )
-        change, products, residual = self._minimize(prior, right)
+        change, products, residual = self._minimize(begin, lacking)
         return Sample(change, prior, products, residual)
-
-    def data_noise(self, generator: torch.Generator) -> Tensor:
-        """A random vector whose covariance is J^T W J."""
-        return self.curvature.adjoint(self._disturbances(generator))
 
     def _disturbances(self, generator: torch.Generator) -> dict[str, Tensor]:
         """W^(1/2) times white noise, by the name of a view."""
@@ -101,15 +107,28 @@ class Posterior:
     def count_told(self) -> float:
         """How many numbers the pictures tell: an estimate of the trace of H^-1 J^T W J.
 
-        By one random vector, without bounds.
+        By one random vector of the covariance J^T W J, without bounds.
         """
-        noise = self.data_noise(self._generator(-2))
-        change = self._correct(noise, self.is_kept, self.most).value
+        noise = self.information.probe
+        change = self._correct(noise, self.is_kept, self.most, TOLD).value
         return float(noise @ change)
 
     def product(self, vector: Tensor) -> Tensor:
         """H times `vector`, H being J^T W J + R + T K."""
         return self.curvature.data_product(vector) + self.prior.product(vector)
+
+    def _begin(self, prior: Tensor, right: Tensor) -> Tensor:
+        """Where a sample begins: from the draw `prior` on towards what pictures leave of it (E50).
+
+        `right` is what it came of.
+        """
+        is_fixed = self.is_kept | self._is_held(prior, right)
+        left = self._precondition(right, is_fixed)
+        return self._within(prior + BEGIN * (left - prior))
+
+    def _is_held(self, change: Tensor, residual: Tensor) -> Tensor:
+        """Which entries are at a bound that `residual` presses them against."""
+        return (change <= self.low) & (residual < 0) | (change >= self.high) & (residual > 0)
 
     def _minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
         """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.
@@ -118,45 +137,57 @@ class Posterior:
         the others are solved for, and the guess is mended (active sets: Bertsekas 1982,
         doi:10.1137/0320018).
         """
-        products, first, left = 1, 0.0, 1.0
+        products, left = 1, 1.0
         for _ in range(ROUNDS):
-            is_held = (change <= self.low) & (residual < 0) | (change >= self.high) & (residual > 0)
-            is_fixed = self.is_kept | is_held
-            size = self._size(residual, is_fixed)
-            first = first or size
-            left = size / first if first else 0.0
+            is_fixed = self.is_kept | self._is_held(change, residual)
+            left = self._size(residual, is_fixed)
             if left <= self.tolerance or products >= self.most:
                 break
             solved = self._correct(residual, is_fixed, self.most - products, self.tolerance / left)
             products, residual = products + solved.products, solved.lacking
             wanted = change + solved.value
             change = self._within(wanted)
-            # Where hardly anything was cut at a bound, no product is spent on it.
+            # What was cut at bounds counts roughly first: where that does, no product is spent.
             cut = change - wanted
-            if float(cut.norm()) > CUT * float(solved.value.norm()):
-                residual = residual - self.product(cut)
-                products += 1
+            rough = residual - self._rough_product(cut)
+            left = self._size(rough, self.is_kept | self._is_held(change, rough))
+            if left <= self.tolerance:
+                break
+            residual, products = residual - self.product(cut), products + 1
         return change, products, left
 
     def _correct(
         self, right: Tensor, is_fixed: Tensor, most: int, tolerance: float = TOLERANCE
     ) -> Solved:
         """The change of all that is not fixed that H takes to `right`."""
-
-        def precondition(vector: Tensor) -> Tensor:
-            free = self._without_gauge(vector.masked_fill(is_fixed, 0))
-            ready = self._precondition(free, is_fixed)
-            return self._without_gauge(ready.masked_fill(is_fixed, 0))
-
-        return conjugate_gradients(self.product, precondition, right, tolerance, most)
+        return conjugate_gradients(
+            self.product, lambda part: self._precondition(part, is_fixed), right, tolerance, most
+        )
 
     def _precondition(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
-        """About H^-1 `vector`: what pictures say counts by its diagonal alone."""
-        return self.prior.solve(vector, is_fixed, self.diagonal, PRECONDITION)
+        """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E49).
+
+        That again is solved by conjugate gradients, to which it counts by its diagonal alone.
+        """
+
+        def precondition(part: Tensor) -> Tensor:
+            return self.prior.solve(part, is_fixed, self.information.diagonal, DIAGONAL)
+
+        free = self._without_gauge(vector.masked_fill(is_fixed, 0))
+        ready = conjugate_gradients(
+            self._rough_product, precondition, free, PRECONDITION, INNER
+        ).value
+        return self._without_gauge(ready.masked_fill(is_fixed, 0))
+
+    def _rough_product(self, vector: Tensor) -> Tensor:
+        """About H times `vector`: J^T W J by its `information`."""
+        return self.information.product(vector) + self.prior.product(vector)
 
     def _size(self, residual: Tensor, is_fixed: Tensor) -> float:
-        free = self._without_gauge(residual.masked_fill(is_fixed, 0))
-        return max(float(free @ self._precondition(free, is_fixed)), 0.0) ** 0.5
+        """How large `residual` is, about 1 being what a right side is on average."""
+        square = float(residual @ self._precondition(residual, is_fixed))
+        free = int((~is_fixed).sum())
+        return (max(square, 0.0) / (self.temperature * max(free, 1))) ** 0.5
 
     def _solve_prior(self, right: Tensor) -> Tensor:
         """The draw from the prior whose disturbance is `right`."""
@@ -171,17 +202,7 @@ class Posterior:
             return vector
         return vector - self.gauge @ (self.gauge.T @ vector)
 
-    def _diagonal(self) -> Tensor:
-        """About the diagonal of J^T W J: the mean square of J^T W^(1/2) of random signs."""
-        generator, total = self._generator(-1), torch.zeros_like(self.low)
-        for _ in range(PROBES):
-            signs = {
-                name: w.sqrt() * normal_like(self.curvature.images[name], generator).sign()
-                for name, w in self.curvature.weights.items()
-            }
-            total += self.curvature.adjoint(signs).square() / PROBES
-        return total
 
-    def _generator(self, number: int) -> torch.Generator:
-        """What draws the numbers of a sample; below 0 those of other random vectors."""
-        return torch.Generator().manual_seed((self.seed % 2**31) * 1_000_003 + number + 2)
+def generator_of(seed: int, number: int) -> torch.Generator:
+    """What draws the numbers of sample `number` >= 0, or those `PROBED`."""
+    return torch.Generator().manual_seed((seed % 2**31) * 1_000_003 + number + 2)

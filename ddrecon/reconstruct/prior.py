@@ -22,7 +22,7 @@ WIDE = 10.0
 STEPS = 100.0
 SOLVE = 1e-4
 """Relative residual of a draw from the prior."""
-PRECONDITION = 1e-2
+DIAGONAL = 1e-2
 """And of the solves that conjugate gradients are preconditioned with."""
 
 

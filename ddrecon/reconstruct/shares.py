@@ -1,18 +1,23 @@
-"""Which rank renders which view, and how each learns what the others have found of theirs."""
+"""Which rank does what, and how each learns what the others have found.
+
+Ranks share out the views of a scene, or its cells.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
 from ddrecon.ranks import (
     assign,
+    cells_are_shared,
     from_first,
     is_any,
     is_first,
@@ -24,11 +29,41 @@ from ddrecon.ranks import (
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
+from ddrecon.variables.values import RESPONSE
 
 CELL_COST = 0.5
 """What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
 COARSE = 16
 """A view's rays are counted as if it had about so many pixels along its shorter side."""
+
+
+def require_sharing(scene: Scene, names: Collection[str]) -> None:
+    """Raises UsageError where ranks are to share cells, and cannot in `scene`.
+
+    `names` are the variables that are optimized.
+    """
+    if not cells_are_shared():
+        return
+    settings, problems = scene.diffusion, list[str]()
+    if settings.model == "flux_limited":
+        problems.append("diffusion.model: flux_limited light needs all cells; say p1")
+    if settings.scheme == "printed":
+        problems.append("diffusion.scheme: the printed scheme needs all cells; say conservative")
+    if settings.rounds:
+        problems.append(
+            "diffusion.transport_rounds: rounds need all cells; say 0 to do without them"
+        )
+    others = [
+        name
+        for name in names
+        if name.startswith("lights.")
+        or (name.startswith("views.") and name.rpartition(".")[2] not in RESPONSE)
+    ]
+    if others:
+        more = f" and {len(others) - 1} more need" if len(others) > 1 else ": needs"
+        problems.append(f"optimize.parameters.{others[0]}{more} all cells; leave them out")
+    if problems:
+        raise UsageError([f"--share cells: {problem}, or share views" for problem in problems])
 
 
 def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
@@ -38,10 +73,36 @@ def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
     """
     if rank_count() == 1:
         return list(names)
-    costs = {name: names.count(name) * _known_cost(scene, scene.view(name)) for name in names}
-    # As the first rank shares them out: another machine may round costs another way.
-    owners = dict(zip(costs, from_first(assign(list(costs.values()), rank_count())), strict=True))
+    owners = _owners(scene, {name: scene.view(name) for name in names}, names)
     return [name for name in names if owners[name] == own_rank()]
+
+
+def _owners(scene: Scene, views: Mapping[str, View], names: Sequence[str]) -> dict[str, int]:
+    """The rank that renders each of `views` of the volume of `scene`, as often as in `names`."""
+    costs = [names.count(name) * _known_cost(scene, view) for name, view in views.items()]
+    # As the first rank shares them out: another machine may round costs another way.
+    return dict(zip(views, from_first(assign(costs, rank_count())), strict=True))
+
+
+def share_pictures(
+    scene: Scene, views: Sequence[View], picture_of: Callable[[View], Tensor]
+) -> dict[str, Tensor]:
+    """The pictures [3, h, w] of `views` of the volume of `scene`, by name, on all ranks.
+
+    Each is what `picture_of` gives one of them.
+    """
+    if rank_count() == 1:
+        return {view.name: picture_of(view) for view in views}
+    names = [view.name for view in views]
+    owners = _owners(scene, dict(zip(names, views, strict=True)), names)
+    density = scene.volume.density
+    pictures = [
+        picture_of(view)
+        if owners[view.name] == own_rank()
+        else density.new_zeros(3, *view.camera.size)
+        for view in views
+    ]
+    return dict(zip(names, sum_over_ranks(pictures), strict=True))
 
 
 _KNOWN: WeakKeyDictionary[View, tuple[Grid, RenderSettings, float]] = WeakKeyDictionary()
@@ -70,7 +131,7 @@ def view_cost(scene: Scene, view: View) -> float:
         length = float((crossing.far - crossing.near).sum()) / len(rays.direction)
     height, width = camera.size
     on_rays = height * width * scene.render.samples_per_pixel * length / min(grid.spacing)
-    return on_rays * scene.render.steps_per_voxel + CELL_COST * grid.cells
+    return on_rays * scene.render.steps + CELL_COST * grid.cells
 
 
 def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:

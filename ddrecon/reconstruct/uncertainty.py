@@ -7,20 +7,18 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool3d, pad
 
+from ddrecon.numerics.around import mean_around
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.gradients import differentiate
+from ddrecon.reconstruct.information import Information
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors
-from ddrecon.reconstruct.posterior import TOLERANCE, Posterior, Sample
+from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors, know_errors
+from ddrecon.reconstruct.posterior import PROBED, TOLERANCE, Posterior, Sample, generator_of
 from ddrecon.variables.values import component_names
-
-AROUND = 5
-"""Cells along each axis over which variances are averaged where they are compared."""
 
 
 class Uncertainty:
@@ -41,13 +39,16 @@ class Uncertainty:
         self.parameters = run.parameters
         self.curvature = curvature_of(run)
         gradient = gradient_of(run, self.curvature)
-        noises = _noises(run, noise)
+        known = know_errors(self.curvature, run.targets, _noises(run, noise))
+        information = Information(self.curvature, generator_of(seed, PROBED))
         # What residuals said takes a solve to find: a run that goes on has it.
-        if errors is None or errors.is_known:
-            errors = find_errors(self.curvature, run.targets, noises, gradient, seed)
-        self.errors = errors
+        self.errors = (
+            known or errors or find_errors(self.curvature, run.targets, gradient, seed, information)
+        )
         temperature = self.errors.temperature
-        self.posterior = Posterior(self.curvature, gradient, temperature, seed, tolerance)
+        self.posterior = Posterior(
+            self.curvature, gradient, temperature, seed, tolerance, information
+        )
         nothing = torch.zeros(self.curvature.size, dtype=torch.float64)
         self.count, self.products, self.residual = 0, 0, 0.0
         self.sums = {key: nothing.clone() for key in ("post", "post2", "prior", "prior2")}
@@ -84,7 +85,10 @@ class Uncertainty:
         In fields, of the mean variance of the cells around: of one alone, few samples say little.
         """
         before, after = (
-            {name: _mean_around(part) for name, part in self.curvature.split(variance).items()}
+            {
+                name: mean_around(part) if part.ndim >= 3 else part
+                for name, part in self.curvature.split(variance).items()
+            }
             for variance in (self._variance("prior"), self._variance("post"))
         )
         tiny = torch.finfo(torch.float64).tiny
@@ -151,19 +155,6 @@ class Uncertainty:
         parts = self.curvature.split(vector)
         tabled = [parts[parameter.name].flatten() for parameter in self.tabled]
         return torch.cat(tabled) if tabled else vector[:0]
-
-
-def _mean_around(variance: Tensor) -> Tensor:
-    """Of a field [..., z, y, x], the mean over the cells around each; else as it is."""
-    if variance.ndim < 3:
-        return variance
-    cells = variance.reshape(-1, 1, *variance.shape[-3:])
-    # Beyond the box there are no cells: those that there are count alone.
-    sums, counts = (
-        avg_pool3d(pad(each, [AROUND // 2] * 6), AROUND, 1)
-        for each in (cells, torch.ones_like(cells))
-    )
-    return (sums / counts).view(variance.shape)
 
 
 def curvature_of(run: Reconstruction) -> Curvature:

@@ -26,6 +26,7 @@ from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
 from ddrecon.reference.mitsuba_lights import mitsuba_lights
 from ddrecon.reference.mitsuba_phase import mitsuba_phase
+from ddrecon.reference.mitsuba_volume import grid_volume, place
 from ddrecon.scene import Scene, View
 
 LONGEST = 1024
@@ -50,7 +51,8 @@ def mitsuba_scene(scene: Scene, views: Sequence[View], depth: int = -1) -> dict[
 
     With 2 light scatters once; -1 is `LONGEST`. The cameras are `sensor_0`, `sensor_1`, ... Raises
     SceneError for what Mitsuba cannot show: several environment maps, a phase function that differs
-    by color, pixels that are not square, and views of whose rays only some start inside the volume.
+    by color or a g that does so by cell, pixels that are not square, and views of whose rays only
+    some start inside the volume.
     """
     return {
         "type": "scene",
@@ -89,10 +91,10 @@ def _medium(volume: Volume) -> dict[str, Any]:
         field, scale = sigma_t * volume.density, 1.0
     return {
         "type": "heterogeneous",
-        "sigma_t": _grid_volume(field, volume.grid),
+        "sigma_t": grid_volume(field, volume.grid),
         "scale": scale,
         "albedo": _albedo(volume),
-        "phase": mitsuba_phase(volume.phase),
+        "phase": mitsuba_phase(volume.phase, volume.grid),
     }
 
 
@@ -129,37 +131,18 @@ def _albedo(volume: Volume) -> Any:
         extinction > 0, scattering / torch.where(extinction > 0, extinction, 1), 0
     ).clamp(max=1)
     if albedo[0].numel() > 1:
-        return _grid_volume(albedo, volume.grid)
+        return grid_volume(albedo, volume.grid)
     return albedo.item() if albedo.numel() == 1 else tuple(albedo.flatten().tolist())
-
-
-def _grid_volume(values: Tensor, grid: Grid) -> dict[str, Any]:
-    """`values` [C, z, y, x] on the box of `grid`."""
-    array = np.ascontiguousarray(values.permute(1, 2, 3, 0).float().numpy())
-    lower, upper = (np.array(corner) for corner in grid.bounds_xyz)
-    return {
-        "type": "gridvolume",
-        "grid": array,
-        "raw": True,
-        "to_world": _place(lower, upper - lower),
-    }
 
 
 def _box(grid: Grid) -> dict[str, Any]:
     """The box, whose faces do nothing but hold the medium; Mitsuba's cube runs from -1 to 1."""
     return {
         "type": "cube",
-        "to_world": _place(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2),
+        "to_world": place(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2),
         "bsdf": {"type": "null"},
         "interior": {"type": "ref", "id": MEDIUM},
     }
-
-
-def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The transform [4, 4] that scales by `scale` [3] and then shifts by `origin` [3]."""
-    matrix = np.diag([*scale, 1.0])
-    matrix[:3, 3] = origin
-    return matrix
 
 
 def _sensor(view: View, grid: Grid) -> dict[str, Any]:

@@ -35,12 +35,14 @@ def describe_result(
     same as tensors, its cameras as reconstructed. Nothing is left to optimize.
     """
     described = {key: value for key, value in describe(scene_file).items() if key != "optimize"}
-    # The rounds that were run, which a scene file that leaves them out chooses by what it seeks.
+    # The rounds and samples of the run, which a scene file that leaves them out chooses by what it
+    # seeks and by how dense it starts.
     chosen = {
         "transport_rounds": scene.diffusion.transport_rounds,
         "degree": scene.diffusion.degree,
     }
     described["diffusion"] |= {key: value for key, value in chosen.items() if value is not None}
+    described["render"]["steps_per_voxel"] = scene.render.steps
     # The volume, in its box: a reconstructed pair of cross sections replaces either pair.
     low, high = scene.volume.grid.bounds_xyz
     box = {

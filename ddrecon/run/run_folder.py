@@ -22,14 +22,14 @@ from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.diagnoses import LateMeans, diagnose
 from ddrecon.run.findings import Findings, given_fields, solve
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import compared_by, render_views
+from ddrecon.run.quality import compared_by, render_run, render_views
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import CROSS_SECTIONS, FIELDS, VOLUME
-from ddrecon.variables.values import value_of, variable_names
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, FIELDS, PHASE, VOLUME
+from ddrecon.variables.values import fields_of, value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
 """Where a run folder keeps its checkpoints."""
@@ -107,8 +107,7 @@ class RunFolder:
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
-        scene = run.current_scene()
-        images, _ = render_views(run, scene, solve(scene))
+        scene, _, images, _ = render_run(run)
         self._pictures(scene, images, f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
@@ -143,8 +142,9 @@ class RunFolder:
         if name not in FIELDS and value.ndim == 3:
             return self._write_map(name, value)
         array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
-        file, box = Path("volumes", f"{name}.npz"), np.array(scene.volume.grid.bounds_xyz)
-        write_field(self.path / file, name, array.float().cpu().numpy(), box)
+        called = name.removeprefix(PHASE)
+        file, box = Path("volumes", f"{called}.npz"), np.array(scene.volume.grid.bounds_xyz)
+        write_field(self.path / file, called, array.float().cpu().numpy(), box)
         return {"file": str(file)}
 
     def _parameters(self, scene: Scene, stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,8 +154,8 @@ class RunFolder:
         """
         parameters: dict[str, Any] = {}
         for name in variable_names(scene):
-            is_number = name in VOLUME and name not in FIELDS
-            if (is_number or name in CROSS_SECTIONS) and (value := value_of(scene, name)).ndim < 2:
+            is_told = name in VOLUME and name not in ("density", *EXTINCTION_AND_ALBEDO)
+            if is_told and (value := value_of(scene, name)).ndim < 2:
                 parameters[name] = value.tolist()
         for name in variable_names(scene):
             if name.startswith("lights."):
@@ -181,9 +181,8 @@ class RunFolder:
     def _pictures(self, scene: Scene, images: dict[str, Tensor], mark: str) -> None:
         """Writes pictures of views and fields."""
         folder = self.path / "previews"
-        for name in FIELDS:
-            if (value := value_of(scene, name)).ndim >= 3:
-                write_preview(folder / f"{name}.slices{mark}.png", slices(value))
+        for name, value in fields_of(scene).items():
+            write_preview(folder / f"{name}.slices{mark}.png", slices(value))
         for view in scene.views:
             if view.image is not None:
                 shown = comparison(view.image, images[view.name])

@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 
 from ddrecon.light.lights import Light
+from ddrecon.march.steps import choose_steps
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
 from ddrecon.scene_file.build_starts import (
@@ -61,6 +62,9 @@ def build_scene(
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
     diffusion = choose_rounds(tree, volume.phase)
-    scene = Scene(volume, lights, views, tree.render, diffusion, optimize, path=scene_file.path)
+    render = tree.render
+    if render.steps_per_voxel is None:
+        render = replace(render, steps_per_voxel=choose_steps(volume))
+    scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
     support = build_support(scene_file, volume.density)
     return replace(scene, starts=build_starts(scene_file, scene), support=support)

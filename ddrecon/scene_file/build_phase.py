@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,20 +28,30 @@ from ddrecon.scene_file.phase_schema import (
     TableSection,
     TwoLobeSection,
 )
+from ddrecon.settings import FieldFile
 
 FAR_OFF = 0.01
 """A table whose mean over the sphere is further from 1 is not normalized, and the user is told."""
 
 
-def build_phase(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> PhaseFunction:
+def build_phase(
+    scene_file: SceneFile, cells: Tensor | None, dtype: torch.dtype, device: torch.device
+) -> PhaseFunction:
     """The phase function of the scene in `dtype` on `device`.
 
-    Raises SceneError, FormatError, or MissingExtraError for droplets without miepython.
+    `cells`: that of its numbers which a file gives cell by cell, [z, y, x] or [C, z, y, x]. Raises
+    SceneError, FormatError, or MissingExtraError for droplets without miepython.
     """
-    section, tensor = (
+    section, number = (
         scene_file.tree.volume.phase,
         partial(torch.tensor, dtype=dtype, device=device),
     )
+
+    def tensor(value: Any) -> Tensor:
+        if cells is not None and isinstance(value, FieldFile):
+            return cells.to(device, dtype)
+        return number(value)
+
     match section:
         case None:
             return HenyeyGreenstein(tensor(scene_file.tree.volume.g))

@@ -17,7 +17,7 @@ from ddrecon.scene_file.files import read_referenced, require
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import Kind, kind_of
+from ddrecon.variables.kinds import PHASE, kind_of
 from ddrecon.variables.values import component_names, value_of, variable_names
 
 
@@ -75,7 +75,7 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     elif settings.init is not None:
         value = _fill(scene_file, f"{key}.init", name, settings.init, value)
     if kind.is_cellwise:
-        value = _spread(scene_file, key, kind, settings, value, scene.volume.grid.shape)
+        value = _spread(scene_file, key, settings, value, scene.volume.grid.shape)
     if not bool(((value >= kind.low) & (value <= kind.high)).all()):
         raise scene_file.refused(
             f"{key}.init", f"must be at least {kind.low:g} and at most {kind.high:g} everywhere"
@@ -87,7 +87,7 @@ def _read_cells(
     scene_file: SceneFile, key: str, name: str, init: FieldFile, value: Tensor
 ) -> Tensor:
     """The file's values per cell, [C, z, y, x] or, where there are no colors, [z, y, x]."""
-    read = partial(read_field, name=init.name or name)
+    read = partial(read_field, name=init.name or name.removeprefix(PHASE))
     field = torch.from_numpy(read_referenced(scene_file, key, init.file, read).values).to(value)
     has_colors = field.ndim == 4
     if kind_of(name).is_color:
@@ -144,26 +144,23 @@ def _fill(
 def _spread(
     scene_file: SceneFile,
     key: str,
-    kind: Kind,
     settings: ParameterSettings,
     value: Tensor,
     shape: tuple[int, int, int],
 ) -> Tensor:
     """`value` as a field of `shape`, or as one number (a color), as the scene asks for."""
-    leading = 1 if kind.is_color else 0
-    is_field = value.ndim == leading + 3
+    is_field = value.ndim >= 3
     if settings.field is None or settings.field == is_field:
-        if is_field and tuple(value.shape[leading:]) != shape:
+        if is_field and tuple(value.shape[-3:]) != shape:
             raise scene_file.refused(
                 f"{key}.init.file",
-                f"has {list(value.shape[leading:])} cells [z, y, x],"
-                f" but the volume has {list(shape)}",
+                f"has {list(value.shape[-3:])} cells [z, y, x], but the volume has {list(shape)}",
             )
         return value
     if settings.field:
         return value.view(*value.shape, 1, 1, 1).expand(*value.shape, *shape).clone()
-    single = value.flatten(leading).amin(-1)
-    if not torch.equal(single, value.flatten(leading).amax(-1)):
+    single = value.flatten(-3).amin(-1)
+    if not torch.equal(single, value.flatten(-3).amax(-1)):
         raise scene_file.refused(
             key,
             "differs from cell to cell where it starts;"

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,19 +20,23 @@ from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import PhaseFunction
-from ddrecon.memory import Needs, shortage
+from ddrecon.memory import Needs, make_room
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, TwoLobeSection
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.rounds import choose_rounds
+from ddrecon.scene_file.schema import VolumeSection
 from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import FIELDS
+from ddrecon.variables.kinds import FIELDS, KINDS, PHASE, kind_of
 from ddrecon.variables.values import cross_sections
 
 Fields = Mapping[str, Field]
+_BY_ANGLE = "g", "phase.weight"
+"""Quantities that belong to the phase function."""
 
 
 def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> Volume:
@@ -42,8 +47,9 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     section = scene_file.tree.volume
     fields = _read_fields(scene_file)
     grid = _agree_on_grid(scene_file, fields)
-    phase = build_phase(scene_file, dtype, device)
-    if too_much := shortage(_needs(scene_file, fields, grid, phase, dtype), device):
+    cells = next((_channels_first(fields[name]) for name in _BY_ANGLE if name in fields), None)
+    phase = build_phase(scene_file, cells, dtype, device)
+    if too_much := make_room(_needs(scene_file, fields, grid, phase, dtype), device):
         raise scene_file.refused("volume.resolution", too_much)
 
     def quantity(name: str) -> Tensor:
@@ -76,10 +82,8 @@ def _needs(
     """
     tree, section = scene_file.tree, scene_file.tree.volume
     given = [
-        fields[name].values.ndim == 4
-        if name in fields
-        else isinstance(getattr(section, name), tuple)
-        for name in FIELDS
+        fields[name].values.ndim == 4 if name in fields else isinstance(value, tuple)
+        for name, (_, value) in _quantities(section).items()
     ]
     colors = 3 if any(given) else 1
     optimized = tree.optimize.parameters if tree.optimize else {}
@@ -104,55 +108,75 @@ def _varied(name: str, settings: ParameterSettings, fields: Fields, colors: int)
     """How many numbers a cell the parameter `name` has."""
     if name == "density":
         return 1
+    per_cell = colors if kind_of(name).is_color else 1
     is_field = (
         name in fields or isinstance(settings.init, FieldFile)
         if settings.field is None
         else settings.field
     )
-    return colors if name in FIELDS and is_field else 0
+    return per_cell if name in FIELDS and is_field else 0
 
 
 def _read_fields(scene_file: SceneFile) -> Fields:
     problems, fields = Problems(), {}
-    for name in FIELDS:
-        value = getattr(scene_file.tree.volume, name)
+    for name, (key, value) in _quantities(scene_file.tree.volume).items():
         if isinstance(value, FieldFile):
+            called = value.name or name.removeprefix(PHASE)
             with problems.collecting():
                 fields[name] = read_referenced(
                     scene_file,
-                    f"volume.{name}.file",
+                    f"{key}.file",
                     value.file,
-                    partial(_read_quantity, name=name, called=value.name or name),
+                    partial(_read_quantity, name=name, called=called),
                 )
     problems.raise_any()
     return fields
 
 
+def _quantities(section: VolumeSection) -> dict[str, tuple[str, Any]]:
+    """The key and the value of each quantity that a file may give cell by cell, by variable."""
+    names = [name for name in FIELDS if hasattr(section, name)]
+    found = {name: (f"volume.{name}", getattr(section, name)) for name in names}
+    if isinstance(section.phase, HenyeyGreensteinSection):
+        found["g"] = "volume.phase.g", section.phase.g
+    elif isinstance(section.phase, TwoLobeSection):
+        found["phase.weight"] = "volume.phase.weight", section.phase.weight
+    return found
+
+
 def _read_quantity(path: Path, name: str, called: str) -> Field:
     """The quantity `name`, which the file has as `called`."""
     field = read_field(path, called)
-    if name == "density" and field.values.ndim != 3:
+    kind = KINDS[name]
+    if not kind.is_color and field.values.ndim != 3:
         raise FormatError(
             path,
-            f"density has shape {list(field.values.shape)}; expected [z, y, x]:"
+            f"{called} has shape {list(field.values.shape)}; expected [z, y, x]:"
             " colors belong to the cross sections",
         )
-    if name == "albedo" and (highest := field.values.max()) > 1:
-        z, y, x = np.argwhere(field.values > 1)[0, :3]
-        raise FormatError(
-            path,
-            f"albedo is above 1 at cell (x, y, z) = ({x}, {y}, {z}) (the highest is {highest:g})",
-        )
+    for bound, is_beyond, side in (
+        (kind.low, field.values < np.float32(kind.low), "below"),
+        (kind.high, field.values > np.float32(kind.high), "above"),
+    ):
+        if is_beyond.any():
+            z, y, x = np.argwhere(is_beyond)[0, :3]
+            worst = field.values.min() if side == "below" else field.values.max()
+            raise FormatError(
+                path,
+                f"{called} is {side} {bound:g} at cell (x, y, z) = ({x}, {y}, {z}) "
+                f"(the {'lowest' if side == 'below' else 'highest'} is {worst:g})",
+            )
     return field
 
 
 def _agree_on_grid(scene_file: SceneFile, fields: Fields) -> Grid:
     section, problems = scene_file.tree.volume, Problems()
+    keys = {name: key for name, (key, _) in _quantities(section).items()}
     sizes: dict[str, tuple[int, int, int]] = {
-        f"volume.{name}.file": field.resolution for name, field in fields.items()
+        f"{keys[name]}.file": field.resolution for name, field in fields.items()
     }
     boxes = {
-        f"volume.{name}.file": _corners(field.bounds)
+        f"{keys[name]}.file": _corners(field.bounds)
         for name, field in fields.items()
         if field.bounds is not None
     }

@@ -12,7 +12,9 @@ from typing import ClassVar
 
 from ddrecon.scene_file.camera_schema import Pair
 from ddrecon.scene_file.light_schema import Color
-from ddrecon.settings import Problem, limited
+from ddrecon.settings import FieldFile, Problem, limited
+
+Quantity = Color | FieldFile
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class HenyeyGreensteinSection:
 
     type: ClassVar[str] = "henyey_greenstein"
 
-    g: Color = limited(above=-1, below=1)
+    g: Quantity = limited(above=-1, below=1)
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class TwoLobeSection:
     type: ClassVar[str] = "two_lobe"
 
     g: Pair = limited(above=-1, below=1)
-    weight: Color = limited(minimum=0, maximum=1)
+    weight: Quantity = limited(minimum=0, maximum=1)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import ClassVar
 from ddrecon.grid import Triple
 from ddrecon.scene_file.camera_schema import CameraSection, Size
 from ddrecon.scene_file.light_schema import Color, LightSection
-from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, PhaseSection
+from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, PhaseSection, Quantity
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
@@ -49,7 +49,6 @@ class Constant:
 
 
 Density = float | FieldFile
-Quantity = Color | FieldFile
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ class VolumeSection:
     sigma_s: Quantity | None = optional(minimum=0)
     sigma_t: Quantity | None = optional(minimum=0)
     albedo: Quantity | None = optional(minimum=0, maximum=1)
-    g: float = bounded(0.0, above=-1, below=1)
+    g: Density = bounded(0.0, above=-1, below=1)
     phase: PhaseSection | None = None
 
     def problems(self) -> Iterator[Problem]:

@@ -67,6 +67,7 @@ _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True
 _MEAN_COSINE = Kind(
     fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
+_LOBE_WEIGHT = Kind(fixed_rate(0.05), low=0, high=1, is_color=True, is_cellwise=True)
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, is_fitted=True)
 
 KINDS: Mapping[str, Kind] = {
@@ -75,9 +76,9 @@ KINDS: Mapping[str, Kind] = {
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
-    "g": _MEAN_COSINE,
+    "g": replace(_MEAN_COSINE, is_cellwise=True),
     "phase.g": replace(_MEAN_COSINE, is_color=True),
-    "phase.weight": Kind(fixed_rate(0.05), low=0, high=1, is_color=True),
+    "phase.weight": _LOBE_WEIGHT,
     "phase.alpha": Kind(fixed_rate(0.05), low=0, is_color=True),
     "phase.coefficients": Kind(fixed_rate(0.02), low=-1, high=1),
     "lights.N.irradiance": _BRIGHTNESS,

@@ -20,7 +20,7 @@ from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, VOLUME, kind_of
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, FIELDS, PHASE, VOLUME, kind_of
 
 RESPONSE = {"exposure": 1.0, "offset": 0.0}
 """What a camera does to radiance, and what it is where a view has none (E28)."""
@@ -37,11 +37,21 @@ def variable_names(scene: Scene) -> list[str]:
     return [*_volume_names(scene.volume), *lights, *views]
 
 
+def fields_of(scene: Scene) -> dict[str, Tensor]:
+    """The variables of `scene` that differ from cell to cell, by name.
+
+    Each is [z, y, x], or [C, z, y, x] where colors may differ.
+    """
+    names = [name for name in FIELDS if name in _volume_names(scene.volume)]
+    values = {name: value_of(scene, name) for name in names}
+    return {name: value for name, value in values.items() if value.ndim >= 3}
+
+
 def value_of(scene: Scene, name: str) -> Tensor:
     """The value of the variable `name`; raises KeyError for a name that is none.
 
-    `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; `g` and a light's numbers as
-    that light holds them; a camera's twist is the change of its pose, [6] and zero: see
+    `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; numbers of phase functions
+    and of lights as these hold them; a camera's twist is the change of its pose, [6] and zero: see
     `ddrecon.cameras.twist`. Its focal length [] is in widths of its image; exposure and offset are
     [1] or [3].
     """

@@ -23,7 +23,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
         seen.append((given[0], size, *given[1:]))
 
     monkeypatch.setattr(launching, "_call", note)
-    monkeypatch.setattr(launching, "_load", lambda kernel, device: None)
+    monkeypatch.setattr(launching, "load", lambda kernel, device: None)
     return seen
 
 

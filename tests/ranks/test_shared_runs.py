@@ -59,10 +59,23 @@ def write_scene(folder: Path) -> None:
 
 def job(ranks: int, output: str, *options: str, **others: Any) -> dict[str, Any]:
     command = ["optimize", "scene.yaml", "-o", output, "--dtype", "float64", "--engine", "torch"]
-    return {"ranks": ranks, "arguments": [*command, "--iterations", "6", *options]} | others
+    return {"ranks": ranks, "arguments": [*command, "--iterations", "4", *options]} | others
+
+
+def sure(ranks: int, output: str, *options: str) -> dict[str, Any]:
+    command = ["uncertainty", "one", "-o", output, "--engine", "torch"]
+    roughly = ["--noise", "0.05", "--tolerance", "0.9", "--keep-samples"]
+    return {"ranks": ranks, "arguments": [*command, *roughly, *options]}
 
 
 RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density", "-o"]
+TALL = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch", "-D", "diffusion.warm_start=false"
+KNOWN = (
+    "-D",
+    "optimize.parameters={density: {init: 0.4, tv: 1e-3}, sigma_s: {field: true}, g: {}, "
+    "views.*.exposure: {}}",
+)
+CELLS = "--share", "cells"
 JOBS = {
     "one": job(1, "one"),
     "four": job(4, "four"),
@@ -73,7 +86,17 @@ JOBS = {
     "refused": job(2, "one"),
     "rendered": {"ranks": 3, "arguments": [*RENDER, "views"]},
     "alone": {"ranks": 1, "arguments": [*RENDER, "alone"]},
+    "sure": sure(1, "sure", "--samples", "3"),
+    "sure begun": sure(1, "doubts", "--samples", "2"),
+    "sure of three": sure(3, "doubts", "--samples", "3", "--resume"),
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
+    "whole": job(1, "whole", *TALL, *KNOWN),
+    "cells": job(2, "cells", *TALL, *KNOWN, *CELLS, "--preview-every", "4"),
+    "cells killed": job(3, "torn", *TALL, *KNOWN, *CELLS, failing=[2, 4, "killed"]),
+    "cells resumed": job(2, "torn", *TALL, *KNOWN, *CELLS, "--resume"),
+    "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.transport_rounds=1"),
+    "tall": {"ranks": 1, "arguments": [*RENDER, "tall", *TALL]},
+    "tall cells": {"ranks": 2, "arguments": [*RENDER, "tall cells", *TALL, *CELLS]},
     "measured": {"ranks": 2, "arguments": ["bench", "scene.yaml", "--json", "bench.json"]},
 }
 
@@ -127,10 +150,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     return Runs(folder)
 
 
-@pytest.mark.parametrize("output", ["four", "broken"])
-def test_ranks_find_what_one_finds(runs: Runs, output: str) -> None:
-    np.testing.assert_allclose(runs.log(output), runs.log("one"), rtol=1e-7)
-    expected, found = runs.found("one"), runs.found(output)
+@pytest.mark.parametrize(
+    ("output", "alone"), [("four", "one"), ("broken", "one"), ("cells", "whole"), ("torn", "whole")]
+)
+def test_ranks_find_what_one_finds(runs: Runs, output: str, alone: str) -> None:
+    np.testing.assert_allclose(runs.log(output), runs.log(alone), rtol=1e-7)
+    expected, found = runs.found(alone), runs.found(output)
     assert expected.keys() == found.keys()
     assert "views.c.exposure" in found and "views.d.camera" in found
     for name, value in expected.items():
@@ -175,6 +200,42 @@ def test_ranks_render_what_one_renders(runs: Runs) -> None:
     for name in arrays:
         one, other = (np.load(runs.folder / output / name) for output in ("alone", "views"))
         np.testing.assert_array_equal(one, other)
+
+
+def test_ranks_render_in_slabs_what_one_renders(runs: Runs) -> None:
+    assert runs.codes["tall"] == [0] and runs.codes["tall cells"] == [0, 0]
+    arrays = sorted(path.name for path in (runs.folder / "tall").glob("*.npy"))
+    assert len(arrays) == 2 * len(VIEWS | TESTS)
+    for name in arrays:
+        one, other = (np.load(runs.folder / output / name) for output in ("tall", "tall cells"))
+        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-5 * abs(one).max())
+
+
+def test_what_slabs_cannot_do_is_refused(runs: Runs) -> None:
+    assert runs.codes["cells refused"][0] == 2
+    lines = runs.text("cells refused", 0, "err").splitlines()
+    assert len(lines) == 2 and all(line.startswith("--share cells: ") for line in lines)
+    assert "diffusion.transport_rounds" in lines[0] and "views.a.camera and 2 more" in lines[1]
+    assert not (runs.folder / "none").exists()
+
+
+def test_previews_and_pictures_are_of_all_slabs(runs: Runs) -> None:
+    names = sorted(path.name for path in (runs.folder / "cells" / "previews").iterdir())
+    assert "c.png" in names and "c_000004.png" in names
+    assert (runs.folder / "cells" / "report.html").is_file()
+
+
+def test_ranks_draw_the_samples_of_one(runs: Runs) -> None:
+    """They go on where one has begun; the first of them alone writes."""
+    assert runs.codes["sure begun"] == [0]
+    assert runs.codes["sure of three"] == [0, 0, 0]
+    assert runs.text("sure of three", 0, "out") and not runs.text("sure of three", 1, "out")
+    one, other = (sorted((runs.folder / output).rglob("*.npz")) for output in ("sure", "doubts"))
+    assert [path.name for path in one] == [path.name for path in other]
+    assert "0002" in {path.parent.name for path in one}
+    for known, found in zip(one, other, strict=True):
+        for key, value in np.load(known).items():
+            np.testing.assert_allclose(np.load(found)[key], value, rtol=1e-5, atol=1e-7)
 
 
 def test_bench_measures_one_rank_and_all(runs: Runs) -> None:

@@ -13,7 +13,7 @@ from ddrecon.losses import Target
 from ddrecon.numerics.conjugate_gradients import conjugate_gradients
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.posterior import Posterior
+from ddrecon.reconstruct.posterior import Posterior, generator_of
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
 
@@ -99,10 +99,10 @@ def test_within_bounds_a_sample_is_the_least_of_its_quadratic(
     posterior.gradient = pressed
     posterior.most = 400
     matrix = exact(curvature, posterior, jacobian)
-    generator = posterior._generator(0)
+    generator = generator_of(3, 0)
     scale = TEMPERATURE**0.5
     right = scale * sum(posterior.prior.root_noise(generator))
-    right += scale * posterior.data_noise(generator)
+    right += scale * curvature.adjoint(posterior._disturbances(generator))
     change = posterior.sample(0).change
     slope = matrix @ change - right + pressed
     size = float((right - pressed).abs().max())

@@ -83,7 +83,7 @@ def test_the_example_of_the_contract(read: Read, tmp_path: Path):
         AmbientSection((0.2, 0.3, 0.5)),
     )
     assert tree.views[0].image == tmp_path / "targets/front.exr" and tree.views[0].split == "train"
-    assert tree.diffusion.tolerance == 1e-4 and tree.render == RenderSettings()
+    assert tree.diffusion.tolerance == 1e-4 and tree.render == RenderSettings(steps_per_voxel=1)
     assert (
         tree.optimize
         == OptimizeSettings(
@@ -162,8 +162,14 @@ ONE_FAULT = [
     ("volume.g=-1", "volume.g: must be above -1"),
     ("volume.g=.nan", "volume.g: expected a finite number"),
     ("volume.g=1e400", "volume.g: expected a finite number"),
-    ("volume.g='0.3'", "volume.g: expected a number, found '0.3'"),
-    ("volume.g=", "volume.g: expected a number, found nothing"),
+    (
+        "volume.g='0.3'",
+        "volume.g: expected a number, {constant: number} or {file: path}, found '0.3'",
+    ),
+    (
+        "volume.g=",
+        "volume.g: expected a number, {constant: number} or {file: path}, found nothing",
+    ),
     ("volume.density=-1", "volume.density: must be at least 0"),
     (
         "volume.density=[1, 2, 3]",

@@ -46,6 +46,9 @@ def close_medium(medium: Medium, closure: Closure) -> Tensor:
 def _extinction_terms(medium: Medium) -> tuple[Tensor, ...]:
     """Scales and fields of which kappa_tr is made: one of each where coefficients share a field."""
     absorption, scattering = medium.absorption, medium.scattering
+    if medium.is_cellwise:
+        field = (1 - medium.g) * scattering.field
+        return absorption.scale, absorption.field, scattering.scale, field
     scale = (1 - medium.g) * scattering.scale
     if absorption.field is scattering.field:
         return absorption.scale + scale, absorption.field

@@ -7,21 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.remember import remember
-
 FLUX = "flux_z", "flux_y", "flux_x"
 """What kernels call Q1 along z, y, x."""
-
-
-def remaining_scale(medium: Medium) -> Tensor:
-    """(1 - f) kappa_s per unit of the field of kappa_s, `[C, 1, 1, 1]`."""
-    return _remaining_scale(medium.forward_fraction, medium.scattering.scale)
-
-
-@remember
-def _remaining_scale(fraction: Tensor, scale: Tensor) -> Tensor:
-    return (1 - fraction) * scale
 
 
 def per_color(scale: Tensor, colors: int) -> Tensor:

@@ -14,7 +14,6 @@ from ddrecon.diffusion.fused.colors import (
     empty_bars,
     name_flux,
     per_color,
-    remaining_scale,
     sum_colors,
     total,
 )
@@ -35,7 +34,7 @@ def find_flux(
     medium: Medium, diffusion: Tensor, flux: Vector | None, outside: Tensor, mean: Tensor
 ) -> Vector:
     """L1 of L0 = `mean` (E5, E6); `flux` is Q1."""
-    scale, field = remaining_scale(medium), medium.scattering.field
+    scale, field = medium.remaining.scale, medium.remaining.field
     z, y, x = _Flux.apply(medium.grid, diffusion, scale, field, outside, mean, *(flux or ()))
     return z, y, x
 

@@ -17,7 +17,6 @@ from ddrecon.diffusion.fused.colors import (
     empty_bars,
     name_flux,
     per_color,
-    remaining_scale,
     sum_colors,
 )
 from ddrecon.diffusion.fused.faces import FACES
@@ -88,7 +87,7 @@ _GIVEN = " ".join(_TENSORS) + " "
 
 def spread_flux(medium: Medium, diffusion: Tensor, flux: Vector) -> Tensor:
     """- div(D kappa_s `flux`) [C, z, y, x]."""
-    scale, field = remaining_scale(medium), medium.scattering.field
+    scale, field = medium.remaining.scale, medium.remaining.field
     spread: Tensor = _Spread.apply(medium.grid, diffusion, scale, field, *flux)
     return spread
 

@@ -14,7 +14,6 @@ from ddrecon.diffusion.fused.colors import (
     empty_bars,
     name_flux,
     per_color,
-    remaining_scale,
     sum_colors,
     total,
 )
@@ -40,12 +39,12 @@ def assemble_system(
     """Conductances along z, y, x, loss and right side of E7; `source` holds Q0 and Q1."""
     system: tuple[Tensor, ...] = _System.apply(
         medium.grid,
-        medium.absorption.field is medium.scattering.field,
+        medium.absorption.field is medium.remaining.field,
         diffusion,
         medium.absorption.scale,
         medium.absorption.field,
-        remaining_scale(medium),
-        medium.scattering.field,
+        medium.remaining.scale,
+        medium.remaining.field,
         outside,
         source.mean,
         *(source.flux or ()),

@@ -92,14 +92,13 @@ def radiance_along(
     mass = _step_integral(medium.extinction, course)
     scattering_mass = (
         mass
-        if medium.scattering.field is medium.extinction.field
-        else _step_integral(medium.scattering, course)
+        if medium.remaining.field is medium.extinction.field
+        else _step_integral(medium.remaining, course)
     )
     depth = mass * _scale(medium.extinction)
     # what scatters along the step and reaches its end, and the part of I that is lost on it
     line, lost = decayed_line(scatters, course.before(scatters, is_repeated=True), depth)
-    scattering_scale = (1 - medium.forward_fraction.view(1, -1, 1, 1)) * _scale(medium.scattering)
-    source = line * (scattering_mass * scattering_scale)
+    source = line * (scattering_mass * _scale(medium.remaining))
     if inflow is None:
         return course.lift(follow(1 - lost, source, course))
     # Light from outside is there without a medium. The rest, I - inflow, is zero where rays enter

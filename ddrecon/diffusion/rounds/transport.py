@@ -95,7 +95,7 @@ def _blend(
 
     That is what is now `diffuse`, plus its gain, and theta times what was `swept` of higher degree.
     """
-    if is_fused():
+    if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.blend import blend_fused
 
         length = _share_length(medium, degree)
@@ -137,7 +137,7 @@ def _gain(
     And theta p_1 (L1' - L1), by how much the flux that scatters changes (E17).
     """
     cosine = remaining_moments(medium)[1]
-    if is_fused():
+    if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
         length = _share_length(medium, degree)

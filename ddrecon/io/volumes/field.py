@@ -39,6 +39,8 @@ Fields = Mapping[str, np.ndarray]
 """Values of several fields of the same cells, by name."""
 NO_FIELDS: Fields = MappingProxyType({})
 """None of them."""
+SIGNED = ("g",)
+"""What fields are called that may be negative."""
 
 
 def name_from_file(path: Path) -> list[str]:
@@ -70,7 +72,11 @@ def check_field(path: Path, name: str, values: np.ndarray, bounds: np.ndarray | 
             "expected [z, y, x] or [z, y, x, 3], at least one cell",
         )
     values = as_float32(values)
-    for legal, what in ((np.isfinite(values), "NaN or infinite"), (values >= 0, "negative")):
+    is_signed = name in SIGNED
+    for legal, what in (
+        (np.isfinite(values), "NaN or infinite"),
+        ((values >= 0) | is_signed, "negative"),
+    ):
         if not legal.all():
             z, y, x = np.argwhere(~legal)[0, :3]
             count = np.count_nonzero(~legal)

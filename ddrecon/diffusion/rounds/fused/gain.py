@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.fused.colors import remaining_scale
 from ddrecon.diffusion.rounds.fused.share import (
     SHARE,
     SHARE_SLOPE,
@@ -132,14 +131,14 @@ def gain_fused(
     None (E12); the third theta `cosine` times the change of the flux of `light` (E17). `length`: of
     the mean step [u], by which theta is (E14).
     """
-    numbers = numbers_by_color(medium, length, [remaining_scale(medium), cosine])
+    numbers = numbers_by_color(medium, length, [medium.remaining.scale, cosine])
     numbers = numbers.expand(-1, len(swept.mean))
-    shares_field = medium.scattering.field is medium.extinction.field
+    shares_field = medium.remaining.field is medium.extinction.field
     source, mean, *flux = _Gain.apply(
         medium.grid,
         numbers,
         medium.extinction.field,
-        None if shares_field else medium.scattering.field,
+        None if shares_field else medium.remaining.field,
         imbalance,
         swept.mean,
         diffuse.mean,

@@ -35,7 +35,7 @@ def sweep_fused(
     thread does a cell of a slice, not rows of directions; None: on a GPU.
     """
     colors = len(medium.extinction.value) if light is None else len(light.mean)
-    shares_field = medium.scattering.field is medium.extinction.field
+    shares_field = medium.remaining.field is medium.extinction.field
     mean, *rest, _ = _Sweep.apply(
         source.mean.is_cuda if by_cells is None else by_cells,
         torch.is_grad_enabled(),
@@ -43,13 +43,12 @@ def sweep_fused(
         directions,
         _scales(
             medium.extinction.scale,
-            medium.scattering.scale,
-            medium.forward_fraction,
+            medium.remaining.scale,
             inflow,
             colors,
         ),
         medium.extinction.field,
-        None if shares_field else medium.scattering.field,
+        None if shares_field else medium.remaining.field,
         _spread_factors(factors, colors),
         *((None,) * PARTS if light is None else parts_of(light, colors)),
         *parts_of(source, colors),
@@ -59,12 +58,10 @@ def sweep_fused(
 
 
 @remember
-def _scales(
-    extinction: Tensor, scattering: Tensor, fraction: Tensor, inflow: Tensor | None, colors: int
-) -> Tensor:
+def _scales(extinction: Tensor, scattering: Tensor, inflow: Tensor | None, colors: int) -> Tensor:
     """Of extinction, of scattering that remains, and the inflow of each of `colors`, [3, C]."""
     entering = torch.zeros_like(extinction) if inflow is None else inflow
-    each = extinction, (1 - fraction) * scattering, entering
+    each = extinction, scattering, entering
     return torch.stack([one.reshape(-1).expand(colors) for one in each])
 
 

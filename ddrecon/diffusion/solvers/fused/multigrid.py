@@ -28,6 +28,8 @@ START, CHOOSE, DIRECT, ADVANCE = range(4)
 VECTORS = 6
 MOST_AHEAD = 16
 """So many iterations are launched at most before the residual is looked at."""
+ALONE = 1 << 19
+"""Colors of so many cells are solved one after another: as fast, in a third of the memory."""
 _counts: dict[torch.Size, deque[int]] = defaultdict(lambda: deque([3], maxlen=6))
 """How many iterations solves of a shape took: how many to launch ahead. No result depends on it."""
 
@@ -39,21 +41,55 @@ def solve(
 
     Its residual may be above `tolerance` then.
     """
+    made = source.new_empty(source.shape)
+    if source[0].numel() < ALONE:
+        return _solve_checked(operator, source, guess, tolerance, most, made)
+    guess = None if guess is None or guess.shape != source.shape else guess
+    found = [
+        _solve_checked(
+            operator.of_color(color),
+            source[color : color + 1],
+            None if guess is None else guess[color : color + 1],
+            tolerance,
+            most,
+            made[color : color + 1],
+        )
+        for color in range(len(source))
+    ]
+    # max() would pass over what is not a number.
+    worst = float(torch.tensor([part.residual for part in found], dtype=torch.float64).max())
+    return Solution(made, max(part.iterations for part in found), worst)
+
+
+def _solve_checked(
+    operator: Operator,
+    source: Tensor,
+    guess: Tensor | None,
+    tolerance: float,
+    most: int,
+    made: Tensor,
+) -> Solution:
+    """The solution, written to `made`, by a hierarchy that coarsens the axes it should."""
     hierarchy = operator.once(Hierarchy.of)
-    solution, strengths = _solve(hierarchy, source, guess, tolerance, most)
+    solution, strengths = _solve(hierarchy, source, guess, tolerance, most, made)
     while not hierarchy.is_checked:
         found = hierarchy.checked(operator, strengths)
         operator.prepared[Hierarchy.of] = found
         if found is not hierarchy:
-            solution, strengths = _solve(found, source, guess, tolerance, most)
+            solution, strengths = _solve(found, source, guess, tolerance, most, made)
         hierarchy = found
     return solution
 
 
 def _solve(
-    hierarchy: Hierarchy, source: Tensor, guess: Tensor | None, tolerance: float, most: int
+    hierarchy: Hierarchy,
+    source: Tensor,
+    guess: Tensor | None,
+    tolerance: float,
+    most: int,
+    made: Tensor,
 ) -> tuple[Solution, list[float]]:
-    """The solution, and the strengths of a hierarchy that is not checked yet."""
+    """The solution in `made`, and the strengths of a hierarchy that is not checked yet."""
     run, counts = _Run(hierarchy, source, guess, tolerance), _counts[source.shape]
     launched = min(max(counts), most)
     run.iterate(0, launched)
@@ -64,7 +100,7 @@ def _solve(
         launched = more
         verdict, strengths = run.verdict(launched)
     counts.append(verdict.iterations)
-    return Solution(run.value(), verdict.iterations, verdict.residual), strengths
+    return Solution(run.value(made), verdict.iterations, verdict.residual), strengths
 
 
 @dataclass(frozen=True)
@@ -147,13 +183,13 @@ class _Run:
         count = max(found[begin : begin + size])
         return _Verdict(int(count), worst), found[len(self.sums) :]
 
-    def value(self) -> Tensor:
-        """The solution u = S y; nothing else can be asked for after it."""
+    def value(self, made: Tensor) -> Tensor:
+        """`made`, the solution u = S y; nothing else can be asked for after it."""
         # The last act: what it was computed in is free again.
         y = self.vectors[self.places[0] :][: self.source.numel()].view_as(self.source)
-        value = y * self.hierarchy.scale
+        torch.mul(y, self.hierarchy.scale, out=made)
         give_back(self.vectors, self.coarser, self.scratch)
-        return value
+        return made
 
     def _cycle(self, leg: int, iteration: int) -> None:
         parts, threads = self.shares, self.threads

@@ -1,0 +1,87 @@
+"""Kernels are compiled once, then come from Warp's cache; those of a computation side by side.
+
+Which ones a computation needs is known once it has come to each. So it is rehearsed: launches tell
+what they would launch and do nothing, and what kernels would make is zero.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from time import perf_counter
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from ddrecon import engine
+
+LOG = logging.getLogger(engine.LOG)
+COMPILED = 0.5
+"""A kernel that takes longer to load [s] was compiled; others come from Warp's cache."""
+_compiled: list[float] = []
+"""How long each took to load [s]; a line says so of the first."""
+_rehearsed: dict[tuple[Any, str], None] | None = None
+"""Kernels that a rehearsal came to, with their devices; None while there is none."""
+
+
+def compile_rehearsed(computation: Callable[[], object]) -> None:
+    """Has the kernels of `computation` ready, where this process has loaded none yet.
+
+    They are compiled in as many threads as torch has. `computation` is called in rehearsal, so it
+    is to work on what nobody else reads.
+    """
+    if load.cache_info().currsize:
+        return
+    # Whatever goes wrong in a rehearsal goes wrong again in earnest, or came of the zeros.
+    with _rehearsal() as kernels, contextlib.suppress(Exception):
+        computation()
+    if not kernels:
+        return
+    # The first one compiles what all have in common. Adjoints, which come last, take longest.
+    first, *others = kernels
+    load(*first)
+    with ThreadPoolExecutor(torch.get_num_threads(), "compiling") as pool:
+        for loading in [pool.submit(load, *each) for each in reversed(others)]:
+            loading.result()
+
+
+@contextlib.contextmanager
+def _rehearsal() -> Iterator[dict[tuple[Any, str], None]]:
+    """Kernels that a rehearsal comes to, and their devices, in that order."""
+    global _rehearsed
+    _rehearsed = {}
+    try:
+        yield _rehearsed
+    finally:
+        _rehearsed = None
+
+
+def is_rehearsed(kernel: Any, device: str) -> bool:
+    """Whether this is a rehearsal, which then knows of `kernel`."""
+    if _rehearsed is not None:
+        _rehearsed[kernel, device] = None
+    return _rehearsed is not None
+
+
+def clear_in_rehearsal(arrays: Iterable[Any]) -> None:
+    """Makes those `arrays` zero that kernels would write, where this is a rehearsal."""
+    if _rehearsed is not None:
+        for array in arrays:
+            if isinstance(array, Tensor):
+                array.zero_()
+
+
+@functools.cache
+def load(kernel: Any, device: str) -> None:
+    """Has `kernel` ready, compiled where Warp's cache has it not; a line says so of the first."""
+    start = perf_counter()
+    wp.load_module(kernel.module, device=device)
+    if (seconds := perf_counter() - start) > COMPILED:
+        if not _compiled:
+            LOG.info("compiling kernels, once: %.1f s for the first of them", seconds)
+        _compiled.append(seconds)

@@ -1,0 +1,84 @@
+"""A rehearsal comes to every kernel that is launched in earnest, and leaves nothing behind."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("warp")
+
+from ddrecon.engine import use_engine
+from ddrecon.kernels import compiling
+from ddrecon.kernels import launch as launching
+from ddrecon.kernels.text import TextKernel
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.scene_file.build import load_scene
+
+BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
+SMALL = ["volume.resolution=[10,12,8]", "volume.g=0.3"]
+
+
+class Loads(list[object]):
+    """Kernels made ready; `unload` has the process forget those it had."""
+
+    def unload(self) -> None:
+        compiling.load.cache_clear()
+        self.clear()
+
+
+@pytest.fixture
+def loads(monkeypatch: pytest.MonkeyPatch) -> Iterator[Loads]:
+    """Which kernels are made ready while it lasts."""
+    seen = Loads()
+    real = compiling.wp.load_module
+    monkeypatch.setattr(
+        compiling.wp, "load_module", lambda module, **of: (seen.append(module), real(module, **of))
+    )
+    seen.unload()
+    yield seen
+    compiling.load.cache_clear()
+
+
+def first_iteration() -> torch.Tensor:
+    run = Reconstruction(load_scene(BALL, overrides=SMALL))
+    run.step()
+    return run.parameters[0].value.detach()
+
+
+@pytest.mark.slow
+def test_an_iteration_needs_no_other_kernels(loads: Loads, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_engine("warp")
+    ahead = first_iteration()
+    # All were made ready by the rehearsal, each once; now as an iteration comes to them.
+    side_by_side = list(loads)
+    loads.unload()
+    monkeypatch.setattr("ddrecon.reconstruct.loop.compile_ahead", lambda _: None)
+    assert torch.equal(first_iteration(), ahead)
+    assert len(side_by_side) == len(set(side_by_side))
+    assert set(side_by_side) == set(loads)
+
+
+def test_kernels_do_nothing_in_a_rehearsal(loads: Loads, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("launched")
+
+    monkeypatch.setattr(launching, "_call", fail)
+    monkeypatch.setattr(compiling.wp, "load_module", lambda module, **_: loads.append(module))
+    kernels = [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out") for k in range(3)]
+    found = []
+
+    def computation() -> None:
+        for kernel in kernels:
+            found.append(torch.ones(4, dtype=torch.float64))
+            kernel.launch(4, {}, {"out": found[-1]})
+        raise ValueError("zeros may lead astray")
+
+    compiling.compile_rehearsed(computation)
+    assert not torch.stack(found).any()
+    assert {kernel.module for kernel in kernels} == set(loads)
+    # Where a process has kernels, nothing is rehearsed.
+    compiling.compile_rehearsed(lambda: found.append("again"))
+    assert "again" not in found
+    with pytest.raises(AssertionError, match="launched"):
+        kernels[0].launch(4, {}, {"out": found[0]})

@@ -1,0 +1,152 @@
+"""Phase functions that differ from cell to cell, by what they must do whatever the cells hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from media import make_camera, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import use_engine
+from ddrecon.medium.coefficients import scale_medium
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
+from ddrecon.medium.phase_cells import SeenNodes
+from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.numerics.angle_table import angle_of
+from ddrecon.renderer import render, solve_light
+from ddrecon.scene import Scene
+from ddrecon.validate.balance import balance_of
+
+SHAPE = (5, 4, 6)
+LOBES = torch.tensor([0.8, -0.4], dtype=torch.float64)
+FIELDS: dict[str, PhaseFunction] = {
+    "g": HenyeyGreenstein(1.7 * random_values(*SHAPE, seed=3) - 0.8),
+    "weight": TwoLobe(LOBES, random_values(*SHAPE, seed=4)),
+    "weight by color": TwoLobe(LOBES, random_values(3, *SHAPE, seed=5)),
+}
+each_field = pytest.mark.parametrize("phase", FIELDS.values(), ids=FIELDS.keys())
+
+
+def scene_of(phase: PhaseFunction, **changes: Any) -> Scene:
+    """Cross sections are given cell by cell, as coefficients are where a phase function is."""
+    sigma_s = torch.tensor([8.0, 6.0, 4.0], dtype=torch.float64).view(3, 1, 1, 1)
+    given = {"sigma_s": sigma_s.expand(3, *SHAPE), "ambient": (0.3,)} | changes
+    scene = make_scene(random_values(*SHAPE), **given)
+    scene.volume.phase = phase
+    return scene
+
+
+@pytest.mark.parametrize("rounds", [0, 2])
+@pytest.mark.parametrize(
+    "phase, is_looked_up",
+    [
+        (HenyeyGreenstein(torch.tensor(0.7, dtype=torch.float64)), True),
+        (HenyeyGreenstein(torch.tensor(0.0, dtype=torch.float64)), False),
+        (HenyeyGreenstein(torch.tensor(-0.5, dtype=torch.float64)), False),
+        (TwoLobe(LOBES, torch.tensor(0.3, dtype=torch.float64)), False),
+        (TwoLobe(LOBES.abs(), torch.tensor(0.3, dtype=torch.float64)), True),
+    ],
+    ids=["forward", "isotropic", "backward", "two lobes", "two forward lobes"],
+)
+def test_the_same_in_every_cell_is_one_number(
+    phase: PhaseFunction, is_looked_up: bool, rounds: int
+):
+    """To rounding, or as closely as functions are looked up by their number."""
+    number = phase.g if isinstance(phase, HenyeyGreenstein) else phase.weight
+    cells = phase.with_cells(number.expand(SHAPE))
+    # along an axis: on their way across the grid pairs of cells are interpolated otherwise
+    changes = {"transport_rounds": rounds, "travel": (0.0, -1.0, 0.0)}
+    one, other = (render(scene_of(each, **changes)) for each in (phase, cells))
+    has_pairs = rounds > 0 and float(phase.backward_fraction(3).max()) > 0
+    tolerance = 1e-5 if is_looked_up or has_pairs else 1e-11
+    torch.testing.assert_close(other, one, rtol=tolerance, atol=0)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+@pytest.mark.parametrize("numbers", [[0.013, 0.333, 0.777, 0.949], [-0.5, 0.0, -1e-9, 0.5]])
+def test_between_the_numbers_of_its_table_e13_is_that_of_the_number(
+    degree: int, numbers: list[float]
+):
+    """To a hundred-thousandth of its forward peak, and exactly without one."""
+    depth, cosine = 20 * random_values(7, 1, 9), 2 * random_values(9, seed=1) - 1
+    for g in torch.tensor(numbers, dtype=torch.float64):
+        number = g.expand(7, 1, 9)
+        found = SeenNodes(HenyeyGreenstein(g), number, degree).along(depth, cosine)
+        expected = SeenPhase(HenyeyGreenstein(g), degree).along(depth, cosine)
+        peak = float(HenyeyGreenstein(g).value(torch.ones(1, dtype=torch.float64)).max())
+        assert float((found - expected).abs().max()) < (1e-5 if g > 0 else 2e-4) * max(peak, 1)
+
+
+def test_of_two_lobes_a_table_in_the_weight_is_close():
+    depth, cosine = 20 * random_values(7, 1, 9), 2 * random_values(9, seed=1) - 1
+    angle = angle_of(cosine).expand(7, -1)
+    for weight in torch.tensor([0.0, 0.03, 0.41, 1.0], dtype=torch.float64):
+        for lobes in (LOBES, LOBES.abs()):
+            phase = TwoLobe(lobes, weight)
+            found = SeenNodes(phase, weight.expand(7, 1, 9), 3).at_angles(depth, angle)
+            torch.testing.assert_close(
+                found, SeenPhase(phase, 3).along(depth, cosine), rtol=1e-4, atol=1e-6
+            )
+
+
+@each_field
+@pytest.mark.parametrize("rounds", [0, 2])
+def test_a_white_furnace_stays_white(phase: PhaseFunction, rounds: int):
+    changes = {"sigma_a": (0.0, 0.0, 0.0), "directional": None, "ambient": (0.7,)}
+    image = render(scene_of(phase, transport_rounds=rounds, **changes))
+    torch.testing.assert_close(image, torch.full_like(image, 0.7), rtol=1e-10, atol=0)
+
+
+@each_field
+def test_what_is_absorbed_and_leaks_is_what_came_in(phase: PhaseFunction):
+    scene = scene_of(phase)
+    light = solve_light(scene, SolveMemory()).diffuse
+    assert balance_of(scene, light.mean).energy < 1e-12
+
+
+def test_scattering_once_is_linear_in_the_weight():
+    """Where neither lobe has a forward peak."""
+    lobes = -LOBES.abs()
+
+    def image(weight: Tensor) -> Tensor:
+        return render(scene_of(TwoLobe(lobes, weight), model="none"))
+
+    one, other = random_values(2, *SHAPE, seed=6)
+    middle = image(0.25 * one + 0.75 * other)
+    torch.testing.assert_close(middle, 0.25 * image(one) + 0.75 * image(other))
+
+
+@each_field
+def test_cells_without_scattering_have_no_phase_function(phase: PhaseFunction):
+    """Their number changes moments of nothing, and its derivative is zero and finite."""
+    density = random_values(*SHAPE)
+    density[:, :, 3:] = 0
+    number = phase.cells.clone().requires_grad_()
+    scene = scene_of(phase.with_cells(number), transport_rounds=1)
+    scene.volume.density = density
+    medium = scale_medium(scene.volume, 3)
+    assert bool(torch.isfinite(medium.peak).all())
+    (bar,) = torch.autograd.grad(render(scene).sum(), number)
+    assert bool(torch.isfinite(bar).all()) and bool((bar[..., 5] == 0).all())
+
+
+@pytest.mark.slow
+@each_field
+@pytest.mark.parametrize("rounds", [0, 2])
+def test_both_engines_agree(phase: PhaseFunction, rounds: int):
+    pytest.importorskip("warp")
+
+    def pictures(engine: str) -> tuple[Tensor, ...]:
+        use_engine(engine)
+        number = phase.cells.clone().requires_grad_()
+        scene = scene_of(
+            phase.with_cells(number), transport_rounds=rounds, camera=make_camera(size=(3, 3))
+        )
+        image = render(scene)
+        return image.detach(), *torch.autograd.grad(image.square().sum(), number)
+
+    for fused, plain in zip(pictures("warp"), pictures("torch"), strict=True):
+        torch.testing.assert_close(fused, plain, rtol=1e-9, atol=1e-12)
