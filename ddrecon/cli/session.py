@@ -21,7 +21,7 @@ from tqdm import tqdm
 from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
-from ddrecon.memory import keep_freed_memory
+from ddrecon.kernels.spare import keep_freed_memory
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import cells_are_shared, is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT

@@ -152,11 +152,11 @@ class Shear:
         )
         return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
 
-    def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
+    def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
         places = self._places(values, 0.0, self.size, self.lattice, -1)
         rows, columns = (
-            Weights.at(place, size, has_third_order=True)
+            Weights.at(place, size, has_third_order=third_order is not None)
             for place, size in zip(places, self.lattice, strict=True)
         )
         return sample_lattice(values, rows, columns, third_order).unflatten(-1, self.size)

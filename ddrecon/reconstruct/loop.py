@@ -6,7 +6,6 @@ one iteration at a time, so that whoever drives it may log, preview, stop or sav
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from copy import deepcopy
@@ -277,8 +276,7 @@ class Reconstruction:
         pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
         seen = [p for p in self.parameters if p.view is None or p.view in names]
-        rate_of = functools.partial(self.schedule.rate, self.iteration)
-        solved = step_parameters(seen, gradients, rate_of)
+        solved = step_parameters(seen, gradients, self.schedule, self.iteration)
         solve_responses(solved, self.train_level, pictures, self.targets)
         lights, level = lights_due(solved, self.iteration), self.train_level
         step_brightness(lights, level, values, pictures, self.targets, self.memory.last)
