@@ -44,6 +44,7 @@ from ddrecon.slabs.ghosts import Ghosts
 from ddrecon.slabs.slab import Slab, own_slab
 from ddrecon.variables.values import value_of, with_values
 
+DIRECTION = "lights.0.direction"
 RANKS, TELLS = 3, 1
 """How many there are, and which one's errors are told: it has neighbors on both sides."""
 SHAPES = {"z": (21, 4, 5), "y": (5, 22, 4), "x": (4, 5, 23)}
@@ -155,7 +156,7 @@ def seen_from(axis: str, *eyes: tuple[float, float, float], **settings: Any) -> 
 
 def forward_peak() -> Found:
     scene = scene_of("y", g=0.4, travel=(1.0, 3.0, 0.5))
-    return run(scene, [make_camera((2.0, -1.5, 1.0))], "g", has_tangents=True)
+    return run(scene, [make_camera((2.0, -1.5, 1.0))], "g", DIRECTION, has_tangents=True)
 
 
 def all_per_cell() -> Found:
