@@ -26,7 +26,7 @@ FIELDS, NUMBERS = (
         f"optimize.parameters.{name}={{init: {start}, lr: 0.2{more}}}"
         for name, start in STARTS.items()
     ]
-    for more in (", field: true, tv: 1e-4", "")
+    for more in (", field: true, even_until: 0.3, tv: 1e-4", "")
 )
 TRUE = [
     *(f"volume.{name}={{file: ../../data/shapes/cloud.npz}}" for name in STARTS),

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
+from ddrecon.kernels.spare import LARGEST, give_freed_memory
 from ddrecon.march.integral import CHUNK_NODES
 
-GIVEN_BACK = 2**25
-"""Arrays of more bytes leave the process when they are done with; smaller ones stay with glibc."""
-KEPT = 2**30
-"""So many bytes of smaller ones may lie unused at the end of glibc's heap."""
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Numbers of these options in glibc's malloc.h."""
+SMALL = 2**24
+"""Bytes of arrays that are small beside what else the process holds."""
 SHORTAGES = (
     "not enough memory",
     "out of memory",
@@ -69,30 +64,30 @@ class Arrays:
 
 
 RENDER = Arrays(
-    cell={"once": 17, "color": 21, "flux": 3, "rounds": 16, "moments": 4, "limited": 7},
+    cell={"once": 19, "color": 7, "flux": 3, "rounds": 9, "moments": 3, "limited": 7},
     node={"once": 6, "color": 2},
     pixel=12,  # what rays meet, renders
 )
 OPTIMIZE = Arrays(
     cell={
-        "once": 50,
-        "varied": 15,
-        "color": 7,
-        "flux": 13,
-        "rounds": 34,
-        "moments": 8,
-        "limited": 32,
+        "once": 14,
+        "varied": 11,
+        "color": 11,
+        "flux": 8,
+        "rounds": 20,
+        "moments": 4,
+        "limited": 29,
     },
     node={"color": 12, "varied": 4},
     pixel=18,  # targets, those of a coarser level, what rays meet, renders
 )
-"""Fitted to what `benchmarks/memory.py` measures, but for `moments`: the arrays that are kept."""
+"""Fitted to arrays that `benchmarks/memory.py --count` finds alive, but for nodes and pixels."""
 
 
-def memory_of(needs: Needs) -> int:
+def memory_of(needs: Needs, is_short: bool = False) -> int:
     """Bytes that rendering all views takes at its peak, without torch itself.
 
-    With derivatives where something is optimized.
+    With derivatives where something is optimized. `is_short`: where freed memory is given back.
     """
     arrays = RENDER if needs.varied is None else OPTIMIZE
     counts = {
@@ -106,33 +101,41 @@ def memory_of(needs: Needs) -> int:
     }
     in_cells = needs.cells * sum(number * counts[name] for name, number in arrays.cell.items())
     at_nodes = CHUNK_NODES * sum(number * counts[name] for name, number in arrays.node.items())
-    held = (in_cells + at_nodes) * _overhead(needs)
+    held = (in_cells + at_nodes) * _overhead(needs, is_short)
     return int(needs.size * (held + arrays.pixel * needs.pixels))
 
 
-def _overhead(needs: Needs) -> float:
+def _overhead(needs: Needs, is_short: bool) -> float:
     """How many times as much as is alive the process holds.
 
     Where arrays stay with the allocator it holds up to twice as much, for others of the same size.
     """
-    if needs.varied is None or needs.size * needs.cells > GIVEN_BACK:
-        return 1.1
-    return 1.9 if needs.size * needs.colors * needs.cells <= GIVEN_BACK else 1.5
+    largest = needs.size * needs.colors * needs.cells
+    is_small = largest <= SMALL
+    if is_short:
+        return 1.3 if is_small else 1.15
+    if needs.varied is None or largest > LARGEST:
+        return 1.2
+    return 1.9 if is_small else 1.55
 
 
-def shortage(needs: Needs, device: torch.device) -> str | None:
+def make_room(needs: Needs, device: torch.device) -> str | None:
     """What to say of a scene with such `needs` that does not fit into the free memory of `device`.
 
-    None where it does.
+    None where it does. Where it barely does, freed memory is given back from now on.
     """
-    needed, free = memory_of(needs), free_memory(device)
-    if free is None or needed <= free:
+    free = free_memory(device)
+    if free is None or memory_of(needs) <= free:
+        return None
+    is_short = device.type == "cpu"
+    if is_short and memory_of(needs, is_short) <= free:
+        give_freed_memory()
         return None
     place = "this machine" if device.type == "cpu" else "the GPU"
     fits = [words for words, other in _smaller(needs, free) if memory_of(other) <= free]
     return (
-        f"takes about {gibibytes(needed)}, but {place} has {gibibytes(free)} free; "
-        f"this would fit: {', or '.join(fits) or 'nothing'}"
+        f"takes about {gibibytes(memory_of(needs, is_short))}, but {place} has {gibibytes(free)} "
+        f"free; this would fit: {', or '.join(fits) or 'nothing'}"
     )
 
 
@@ -218,17 +221,6 @@ def _left(root: Path, path: str, limit: str, usage: str, cached: str) -> Iterato
             pass
         if folder == root:
             return
-
-
-def keep_freed_memory() -> None:
-    """Has glibc, where that is in use, keep the memory of smaller arrays that are done with.
-
-    The system would clear each page anew, which takes up to a tenth of an iteration.
-    """
-    change = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if change is not None:
-        change(_MMAP_THRESHOLD, GIVEN_BACK)
-        change(_TRIM_THRESHOLD, KEPT)
 
 
 def is_shortage(error: BaseException) -> bool:

@@ -405,6 +405,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Whether it differs from cell to cell; unless given, as its start does. Density "
                 "always does."
             ),
+            "even_until": (
+                "Part of the iterations during which all cells of a field change alike, so that "
+                "numbers of the whole scene are found before it."
+            ),
             "support": (
                 "For density: where it may be above 0. `masks`: nowhere that a view sees and its "
                 "mask, or alpha, says is empty; a number: nor where it displays no more than that "

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.shear import Shear, frame_along
+from ddrecon.light.shear import Shear, cross_grid
 from ddrecon.numerics.decay import decay_mean
 
 MOST = 1e30
@@ -26,9 +26,9 @@ def turn_in_cells(
     `extinction` and `turned`, b kappa_s, are [C, z, y, x] [1/u]; `direction` [3]: unit, array
     order, the way that F goes.
     """
-    slicing, slope, step = frame_along(grid, direction)
+    slicing, slope, step = cross_grid(grid, direction)
     fields = [slicing.lay(field) for field in (extinction, turned)]
-    shear = Shear.of(fields[0], slope)
+    shear = Shear.of(fields[0].shape[0], fields[0].shape[2:], slope)
     depth, back = (shear.to_rays(field, 0.0) * step for field in fields)
     is_there = depth > 0
     beta = torch.where(is_there, back / torch.where(is_there, depth, 1), 0)

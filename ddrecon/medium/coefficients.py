@@ -19,6 +19,7 @@ from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
+from ddrecon.slabs.slab import Slab, own_slab
 
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
@@ -161,6 +162,21 @@ class Medium:
     def is_anisotropic(self) -> bool:
         """Whether the phase function differs from that of isotropic scattering, or may come to."""
         return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
+
+
+def cut_volume(volume: Volume) -> Volume:
+    """The slab of `volume` that this rank has; `volume` itself where ranks do not share cells."""
+    slab = own_slab(volume.grid)
+    if not isinstance(slab, Slab):
+        return volume
+    density, sigma_a, sigma_s = (
+        slab.cut(field) if field.shape[-3:] == volume.grid.shape else field
+        for field in (volume.density, volume.sigma_a, volume.sigma_s)
+    )
+    phase = volume.phase
+    if phase.cells is not None:
+        phase = phase.with_cells(slab.cut(phase.cells))
+    return Volume(slab, density, sigma_a, sigma_s, phase)
 
 
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:

@@ -24,6 +24,12 @@ EPSILON = 1e-15
 
 That of a mean over pixels with respect to one cell is far smaller than the customary 1e-8.
 """
+HALVED = 1 << 20
+"""Fields of so many numbers keep their moments in half the bits, where they are in float32.
+
+They are the largest part of an iteration's memory. Rounding, to 1 in 256, is far below what a
+derivative changes from one iteration to the next (docs/benchmarks.md).
+"""
 
 
 class Parameter:
@@ -31,8 +37,9 @@ class Parameter:
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
-    is Adam (Kingma and Ba 2015, arXiv:1412.6980). `rate` is one number or one for each entry.
-    `view` is the name of the view that it belongs to, None for what all views see. One that
+    is Adam (Kingma and Ba 2015, arXiv:1412.6980). While a field `is_even`, all its cells change
+    alike; that ends after the part `even_until` of a run. `rate` is one number or one for each
+    entry. `view` is the name of the view that it belongs to, None for what all views see. One that
     `is_fitted` is solved for instead; `curvature` is the second derivative of the loss by it.
     """
 
@@ -55,13 +62,15 @@ class Parameter:
         self.view = owner.removeprefix("views.") if owner.startswith("views.") else None
         self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
+        self.even_until = settings.even_until if self.is_field else 0.0
+        self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
         self.steps = 0
-        self.moments = (torch.zeros_like(value), torch.zeros_like(value))
+        self.moments = self._kept(torch.zeros_like(value), torch.zeros_like(value))
 
     def penalty(self) -> Tensor:
         """What its regularizers add to the loss, in units of the targets' mean square.
@@ -91,12 +100,21 @@ class Parameter:
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
         before = self.value.detach()
+        if self.is_even:
+            gradient = gradient.mean((-3, -2, -1), keepdim=True).expand_as(gradient).contiguous()
         value, self.moments = self._step(before, gradient, rate * self.rate)
         if self.is_direction:
             value.mul_(before.norm() / value.norm())
         if self.support is not None:
             value.mul_(self.support)
         self.value = value.requires_grad_()
+
+    def _kept(self, *moments: Tensor) -> tuple[Tensor, Tensor]:
+        """`moments` in the type that they are kept in."""
+        is_long = self.is_field and self.value.numel() >= HALVED
+        is_halved = is_long and self.value.dtype is torch.float32
+        first, second = (one.to(torch.bfloat16 if is_halved else self.value) for one in moments)
+        return first, second
 
     def _step(
         self, before: Tensor, gradient: Tensor, rate: float | Tensor
@@ -109,13 +127,13 @@ class Parameter:
             return step_adam(
                 before, gradient, self.moments, BETAS, self.steps, rate, EPSILON, bounds
             )
-        first, second = self.moments
+        first, second = (moment.to(before) for moment in self.moments)
         weights = [1 - beta ** float(self.steps) for beta in BETAS]
         first = first.lerp(gradient, 1 - BETAS[0])
         second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
         size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
         value = before - first / size * (rate / weights[0])
-        return value.clamp_(self.low, self.high), (first, second)
+        return value.clamp_(self.low, self.high), self._kept(first, second)
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""
@@ -132,15 +150,19 @@ class Parameter:
         if not self.is_field:
             return
         self.value = self.value_on(grid).requires_grad_()
-        first, second = (resample(moment, grid) for moment in self.moments)
-        self.moments = first * volume_ratio, second * volume_ratio**2
+        first, second = (resample(moment.to(self.value), grid) for moment in self.moments)
+        self.moments = self._kept(first * volume_ratio, second * volume_ratio**2)
+
+    def forget(self) -> None:
+        """Has its optimizer begin anew where the value is."""
+        self.steps = 0
+        self.moments = self._kept(torch.zeros_like(self.value), torch.zeros_like(self.value))
 
     def restrict(self, support: Tensor) -> None:
         """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
         self.support = support.to(self.value.dtype)
         self.value = (self.value.detach() * self.support).requires_grad_()
-        first, second = self.moments
-        self.moments = first * self.support, second * self.support
+        self.moments = self._kept(*(moment * self.support for moment in self.moments))
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it; further steps make new tensors."""
@@ -150,12 +172,12 @@ class Parameter:
             "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
             "moments": list(self.moments),
             "curvature": self.curvature,
+            "is_even": self.is_even,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
         self.value = state["value"].to(self.value).clone().requires_grad_()
-        self.steps = int(state["steps"])
-        first, second = (moment.to(self.value) for moment in state["moments"])
-        self.moments = first, second
+        self.steps, self.is_even = int(state["steps"]), state["is_even"]
+        self.moments = self._kept(*(moment.to(self.value) for moment in state["moments"]))

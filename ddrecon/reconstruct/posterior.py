@@ -20,7 +20,7 @@ from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like
 
 TOLERANCE = 0.5
 """How small a sample's residual is to be, of a right side's usual size."""
-TOLD = 0.3
+TOLD = 0.4
 """And that of the change by which told numbers are counted: they err by its square."""
 MOST = 40
 """Products with J^T W J that a sample may take."""
@@ -30,8 +30,8 @@ INNER = 6
 """Steps of each solve that conjugate gradients are preconditioned with,"""
 PRECONDITION = 0.1
 """or fewer, where so small a part of the residual is left."""
-PROBED, COUNTED = -1, -2
-"""The numbers of random vectors that belong to no sample: of information, and of told numbers."""
+PROBED = -1
+"""The number of random vectors that belong to no sample, but to information."""
 BEGIN = 0.25
 """The part of the way from a draw of the prior to what pictures roughly leave of it (E50)."""
 
@@ -98,10 +98,6 @@ class Posterior:
         change, products, residual = self._minimize(begin, lacking)
         return Sample(change, prior, products, residual)
 
-    def data_noise(self, generator: torch.Generator) -> Tensor:
-        """A random vector whose covariance is J^T W J."""
-        return self.curvature.adjoint(self._disturbances(generator))
-
     def _disturbances(self, generator: torch.Generator) -> dict[str, Tensor]:
         """W^(1/2) times white noise, by the name of a view."""
         images = self.curvature.images
@@ -111,9 +107,9 @@ class Posterior:
     def count_told(self) -> float:
         """How many numbers the pictures tell: an estimate of the trace of H^-1 J^T W J.
 
-        By one random vector, without bounds.
+        By one random vector of the covariance J^T W J, without bounds.
         """
-        noise = self.data_noise(generator_of(self.seed, COUNTED))
+        noise = self.information.probe
         change = self._correct(noise, self.is_kept, self.most, TOLD).value
         return float(noise @ change)
 
@@ -208,5 +204,5 @@ class Posterior:
 
 
 def generator_of(seed: int, number: int) -> torch.Generator:
-    """What draws the numbers of sample `number` >= 0, or those of `PROBED` and `COUNTED`."""
+    """What draws the numbers of sample `number` >= 0, or those `PROBED`."""
     return torch.Generator().manual_seed((seed % 2**31) * 1_000_003 + number + 2)

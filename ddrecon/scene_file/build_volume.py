@@ -20,7 +20,7 @@ from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import PhaseFunction
-from ddrecon.memory import Needs, shortage
+from ddrecon.memory import Needs, make_room
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
@@ -49,7 +49,7 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     grid = _agree_on_grid(scene_file, fields)
     cells = next((_channels_first(fields[name]) for name in _BY_ANGLE if name in fields), None)
     phase = build_phase(scene_file, cells, dtype, device)
-    if too_much := shortage(_needs(scene_file, fields, grid, phase, dtype), device):
+    if too_much := make_room(_needs(scene_file, fields, grid, phase, dtype), device):
         raise scene_file.refused("volume.resolution", too_much)
 
     def quantity(name: str) -> Tensor:

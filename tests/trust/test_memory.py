@@ -70,6 +70,18 @@ def test_what_is_said_to_fit_fits(
         assert run(*large, *words).exit_code == 0
 
 
+def test_what_barely_fits_gives_freed_memory_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    needs, cpu = Needs((96, 96, 96), 3, 4, 0, varied=7), torch.device("cpu")
+    free, calls = memory_of(needs), list[str]()
+    monkeypatch.setattr(memory, "free_memory", lambda _: free)
+    monkeypatch.setattr(memory, "give_freed_memory", lambda: calls.append("given"))
+    assert memory.make_room(needs, cpu) is None and not calls
+    free = memory_of(needs, is_short=True)
+    assert memory.make_room(needs, cpu) is None and calls == ["given"]
+    free -= 1
+    assert "this would fit" in (memory.make_room(needs, cpu) or "") and calls == ["given"]
+
+
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -92,7 +104,7 @@ def test_the_prediction_is_the_estimate(
     bounds = torch.tensor([[-0.5, -0.3, -0.3], [0.5, 0.3, 0.3]]).numpy()
     write_field(Path("density.npz"), "density", torch.rand(3, 4, 16).numpy(), bounds)
     predicted: list[Needs] = []
-    monkeypatch.setattr(build_volume, "shortage", lambda needs, _: predicted.append(needs))
+    monkeypatch.setattr(build_volume, "make_room", lambda needs, _: predicted.append(needs))
     scene = load_scene("scene.yaml", overrides=overrides)
     assert memory_of(predicted[0]) == memory_estimate(scene) > 0
 
