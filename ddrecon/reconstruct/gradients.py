@@ -90,7 +90,7 @@ def _differentiate_views(
     """The images of `own` views, the sum of their losses, and its derivatives by `inputs`.
 
     `worlds` are scenes, and which of their views is rendered: of one that is another rank's, that
-    rank asks this one for its part of the derivative. Each view's is added up at once; None is zero.
+    rank asks this one for its part of the derivative. Each view's is added up at once; None is 0.
     """
     sums: list[Tensor | None] = [None] * len(inputs)
     images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())
