@@ -19,16 +19,15 @@ from torch import Tensor
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.levels import resample, scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.next_view import Candidate, NextView
+from ddrecon.reconstruct.next_view import CANDIDATES, Candidate, NextView, shots_around
 from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import NoiseSettings
-from ddrecon.turntable import place_turntable
 
 ROOT = Path(__file__).parents[1]
-SEEN, CANDIDATES = 3, 12
+SEEN = 3
 
 
 def photograph(scene: Scene, truth: Tensor, views: list[View], noise: float) -> list[View]:
@@ -86,7 +85,7 @@ def main() -> None:
     run = reconstruct(scene, seen)
     print(f"{SEEN} pictures: L1 {error_of(run, truth):.4f}", flush=True)
     found = Uncertainty(run, run.seed, tolerance=arguments.tolerance)
-    ring = place_turntable(scene, seen[0], CANDIDATES)
+    ring = shots_around(replace(scene, views=seen), "ring")
     ranking = NextView(found.curvature, ring, found.errors.deviation)
     for _ in range(arguments.samples):
         ranking.add(found.step().change)
@@ -94,10 +93,10 @@ def main() -> None:
     print("| camera | gain, at least | error of it | L1 with its picture |\n|---|---|---|---|")
     errors = []
     for candidate in ranked:
-        taken = photograph(scene, truth, [candidate.view], arguments.noise)
+        taken = photograph(scene, truth, [candidate.shot.view], arguments.noise)
         errors.append(error_of(reconstruct(scene, [*seen, *taken]), truth))
         gains = f"{100 * candidate.gain:.1f} % | {100 * candidate.error:.1f} %"
-        print(f"| {candidate.view.name} | {gains} | {errors[-1]:.4f} |", flush=True)
+        print(f"| {candidate.shot.view.name} | {gains} | {errors[-1]:.4f} |", flush=True)
     orders = torch.stack([rank_of([-c.gain for c in ranked]), rank_of(errors)])
     agree = float(torch.corrcoef(orders)[0, 1])
     print(f"rank correlation {agree:.2f}; median L1 {sorted(errors)[CANDIDATES // 2]:.4f}")

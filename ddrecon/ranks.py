@@ -36,12 +36,14 @@ T = TypeVar("T")
 class _Group:
     """This process's place among `count` ranks, and where they leave each other notes, `store`.
 
-    `bytes` were handed to exchanges so far, which took `seconds`.
+    `has_slabs`: they share out the cells of a scene, not its views. `bytes` were handed to
+    exchanges so far, which took `seconds`.
     """
 
     rank: int
     count: int
     store: Any
+    has_slabs: bool = False
     bytes: int = 0
     seconds: float = 0.0
 
@@ -50,10 +52,11 @@ _group: _Group | None = None
 """Of this process, once it has joined others."""
 
 
-def join_ranks(has_gpu: bool) -> None:
+def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
     """Meets the other ranks where torchrun has started several; nothing happens elsewhere.
 
-    With `has_gpu`, sums of tensors on a GPU go by NCCL; all else goes by gloo. Raises RanksError
+    With `has_gpu`, exchanges of tensors on a GPU go by NCCL; all else goes by gloo. With
+    `has_slabs`, ranks share out the cells of a scene instead of its views. Raises RanksError
     where the others cannot be reached, UsageError for an environment that torchrun does not make.
     """
     global _group
@@ -92,7 +95,7 @@ def join_ranks(has_gpu: bool) -> None:
             f"rank {rank} of {count} cannot connect to the others ({_reason(error)}); "
             "GLOO_SOCKET_IFNAME and NCCL_SOCKET_IFNAME name the network to use"
         ) from error
-    _group = _Group(rank, count, store)
+    _group = _Group(rank, count, store, has_slabs)
 
 
 def _meet(store: Any, rank: int, count: int, wait: timedelta) -> None:
@@ -127,6 +130,11 @@ def own_rank() -> int:
     return 0 if _group is None else _group.rank
 
 
+def cells_are_shared() -> bool:
+    """Whether ranks share out the cells of a scene, instead of its views."""
+    return _group is not None and _group.has_slabs
+
+
 def is_first() -> bool:
     """Whether this is the rank that writes and prints."""
     return own_rank() == 0
@@ -148,19 +156,6 @@ def exchanged() -> tuple[int, float]:
     return (0, 0.0) if _group is None else (_group.bytes, _group.seconds)
 
 
-def assign(costs: Sequence[float], ranks: int) -> list[int]:
-    """The rank that does each of some jobs with these `costs`, so that all end at about one time.
-
-    The longest jobs are given out first, each to the rank with the least to do (Graham 1969,
-    doi:10.1137/0117039): no rank has more than 4/3 of what it must have.
-    """
-    owners, loads = [0] * len(costs), [0.0] * ranks
-    for job in sorted(range(len(costs)), key=lambda job: -costs[job]):
-        owners[job] = min(range(ranks), key=lambda rank: loads[rank])
-        loads[owners[job]] += costs[job]
-    return owners
-
-
 def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     """The sums over ranks of each of `tensors`, of one device: the same bits on all of them.
 
@@ -171,10 +166,41 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     flat = torch.cat([tensor.detach().flatten() for tensor in tensors])
     with _exchange(flat.nbytes):
         torch.distributed.all_reduce(flat)
-        if flat.is_cuda:
-            torch.cuda.synchronize(flat.device)
+        _wait_for_gpu(flat)
     parts = flat.split([tensor.numel() for tensor in tensors])
     return [part.view(like.shape).to(like.dtype) for part, like in zip(parts, tensors, strict=True)]
+
+
+def gather_from_ranks(part: Tensor) -> list[Tensor]:
+    """The `part` that each rank has, by rank; all are of one shape."""
+    assert _group is not None
+    part = part.contiguous()
+    parts = [torch.empty_like(part) for _ in range(_group.count)]
+    with _exchange(part.nbytes):
+        torch.distributed.all_gather(parts, part)
+        _wait_for_gpu(part)
+    return parts
+
+
+def swap_with_neighbors(
+    before: Tensor | None, after: Tensor | None
+) -> tuple[Tensor | None, Tensor | None]:
+    """What the ranks before and after this one hand to it, who get `before` and `after`.
+
+    That is of the shape of what they get; the first rank has none before it, the last none after.
+    """
+    assert _group is not None
+    dist, got, jobs = torch.distributed, list[Tensor | None](), list[Any]()
+    for other, tensor in ((_group.rank - 1, before), (_group.rank + 1, after)):
+        got.append(None)
+        if tensor is not None:
+            own, others = tensor.detach().contiguous(), tensor.new_empty(tensor.shape)
+            got[-1] = others
+            jobs += [dist.P2POp(dist.isend, own, other), dist.P2POp(dist.irecv, others, other)]
+    with _exchange(sum(tensor.nbytes for tensor in got if tensor is not None)):
+        for job in dist.batch_isend_irecv(jobs):
+            job.wait()
+    return got[0], got[1]
 
 
 def sum_numbers(numbers: Sequence[float]) -> list[float]:
@@ -205,6 +231,12 @@ def from_first(value: T) -> T:
         torch.distributed.broadcast(content, 0)
     copy: T = torch.load(BytesIO(content.numpy().tobytes()), map_location="cpu", weights_only=True)
     return copy
+
+
+def _wait_for_gpu(tensor: Tensor) -> None:
+    """Waits for what a GPU does with `tensor`, so that what fails there fails here."""
+    if tensor.is_cuda:
+        torch.cuda.synchronize(tensor.device)
 
 
 @contextmanager

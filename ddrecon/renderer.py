@@ -37,6 +37,7 @@ from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
+from ddrecon.medium.cut import cut_volume
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, require_plain_autograd
 from ddrecon.numerics.remember import is_any_nonzero
@@ -104,9 +105,10 @@ def solve_light(scene: Scene, memory: SolveMemory) -> LightField:
 
     Reduced light alone where nothing scatters twice.
     """
-    medium = scale_medium(scene.volume, scene.diffusion.angles)
+    volume = cut_volume(scene.volume)
+    medium = scale_medium(volume, scene.diffusion.angles)
     if not multiply_scatters(medium, scene.diffusion):
-        return follow_unscattered_light(keep_medium(scene.volume), scene.lights)
+        return follow_unscattered_light(keep_medium(volume), scene.lights)
     # Q0 and Q1: beams and skies, not yet scattered; the skies' mean enters through the faces (E6).
     lights = decompose_lights(scene.lights)
     reduced = reduced_light(medium, lights, medium.degree, has_backward_peak(medium))
@@ -230,7 +232,7 @@ def view_components(light_field: LightField, scene: Scene, camera: Camera) -> Co
     radiance are those of the medium itself, and the difference, light scattered forward once or
     more, belongs to `multiple`.
     """
-    once = follow_unscattered_light(keep_medium(scene.volume), scene.lights)
+    once = follow_unscattered_light(keep_medium(cut_volume(scene.volume)), scene.lights)
     image = view_image(light_field, scene, camera)
     single = view_image(once, _without_background(scene), camera)
     reduced = view_image(once, scene, camera) - single

@@ -157,7 +157,9 @@ Iterations = int | str
 """How many iterations a run has, or `auto`: it ends by itself."""
 AUTO = "auto"
 Support = float | str | FieldFile
-"""Where medium may be: `masks`, the displayed value above which a pixel shows some, or a field."""
+"""Where medium may be: `masks`, the displayed value above which a pixel shows some, `auto` for a
+value that follows from the picture's noise, or a field.
+"""
 MASKS = "masks"
 
 
@@ -169,8 +171,11 @@ class ParameterSettings:
     learning rate `lr` (None: that of its kind).
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
-    always does). `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as
-    the whole brightness of the targets; `auto` finds the weight by leaving views out.
+    always does). For the part `even_until` of the iterations all its cells change alike, so that
+    numbers of the whole scene are found before it.
+
+    `tv` weighs its total variation and `l1` its mean; 1 would weigh them as much as the whole
+    brightness of the targets; `auto` finds the weight by leaving views out.
 
     `support`: where density may be above 0, by what pictures show, widened by `support_margin`
     pixels; None is anywhere.
@@ -183,6 +188,7 @@ class ParameterSettings:
     tv: Weight | None = optional(minimum=0)
     l1: float = bounded(0.0, minimum=0)
     field: bool | None = None
+    even_until: float = bounded(0.0, minimum=0, below=1)
     support: Support | None = optional(minimum=0, below=1)
     support_margin: float = bounded(2.0, minimum=0, maximum=1000)
 

@@ -58,9 +58,8 @@ def _round_terms(medium: Medium, scene: Scene) -> list[str]:
         terms[0] += f"; each leaves up to {left:.2g} of what diffusion lacks"
     if has_backward_peak(medium) and _has_beams(scene.lights):
         part = backward_fraction(medium).max().item()
-        terms.append(f"beams in pairs: a backward peak turns {part:.3g} of scattering back")
-    elif medium.is_cellwise and _has_beams(scene.lights):
-        terms.append("no pairs of beams: the phase function differs from cell to cell")
+        most = "up to " if medium.is_cellwise else ""
+        terms.append(f"beams in pairs: a backward peak turns {most}{part:.3g} of scattering back")
     return terms
 
 

@@ -151,8 +151,10 @@ def scattering_light(
     """A medium and what scatters in it from what is varied."""
     grid = Grid(tuple(field.shape[1:]), (0, 0, 0), (1.0, 1.5, 1.0))
     g = scale.new_tensor(0.3)
-    scattering, absorption = scale * albedo, scale * (1 - albedo)
-    coefficients = (Coefficient(s, field) for s in (scale, scattering, absorption))
+    extinction, scattering, absorption = (
+        Coefficient(s, field) for s in (scale, scale * albedo, scale * (1 - albedo))
+    )
+    coefficients = extinction, scattering, scattering, absorption
     seen = SeenPhase(HenyeyGreenstein(g), 1)
     return Medium(grid, *coefficients, g, g, scale.new_tensor(0.0), None, seen), source
 

@@ -52,6 +52,13 @@ SHARED = ("optimize", "render", "uncertainty", "bench")
 DTYPE = click.option(
     "--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True
 )
+SHARE = click.option(
+    "--share",
+    type=click.Choice(["views", "cells"]),
+    default="views",
+    show_default=True,
+    help="What the processes of torchrun share out; cells where a volume is too large for one.",
+)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 SCENE = click.argument("scene", type=click.Path(path_type=Path))
 OUTPUT = click.option(
@@ -125,6 +132,7 @@ def _run(
     verbose: bool,
     dtype: str = "float64",
     as_json: bool = False,
+    share: str = "views",
     **others: Any,
 ) -> None:
     """Runs `command` in a session; on the first rank alone where ranks do not share its work."""
@@ -133,7 +141,7 @@ def _run(
 
     common = overrides, device, engine, threads, seed, quiet, verbose
     with show_warnings(), show_compilations(quiet):
-        session = open_session(*common, dtype, as_json)
+        session = open_session(*common, dtype, as_json, share)
         is_shared = command.__name__ in SHARED
         if is_shared or is_first():
             with nullcontext() if is_shared else alone():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ddrecon.cli.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, SCENE, in_session
+from ddrecon.cli.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, SCENE, SHARE, in_session
 from ddrecon.cli.watch import SAVE_EVERY, watched
 from ddrecon.errors import DataWarning
 
@@ -77,6 +77,7 @@ def check(session: Session, scene: Path) -> None:
     help="N views around the volume instead, and ring.png of them.",
 )
 @click.option("--mp4", "has_mp4", is_flag=True, help="With --ring, also write ring.mp4.")
+@SHARE
 @DTYPE
 @AS_JSON
 @in_session
@@ -97,6 +98,7 @@ def render(
     from ddrecon.io.files.json_file import write_json
     from ddrecon.io.images.movies import require_mp4
     from ddrecon.ranks import is_first
+    from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.render_folder import (
         remove_targets,
         render_gradient_to_folder,
@@ -111,6 +113,7 @@ def render(
     if has_mp4:
         require_mp4()
     loaded = session.with_lights(lights).load(scene)
+    require_sharing(loaded, ())
     views = session.pick_views(loaded, names)
     if lights or count is not None:
         loaded = remove_targets(loaded, views, count)
@@ -159,6 +162,7 @@ def render(
     is_flag=True,
     help="Then also say how sure the result is, as ddrecon uncertainty does.",
 )
+@SHARE
 @DTYPE
 @AS_JSON
 @in_session
@@ -177,6 +181,7 @@ def optimize(
     """Reconstruct what SCENE asks for from its views' images."""
     from ddrecon.cli.uncertainty import add_uncertainty, require_one_process
     from ddrecon.ranks import is_first
+    from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
     from ddrecon.scene_file.doubts import find_doubts
@@ -189,10 +194,11 @@ def optimize(
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
+    require_sharing(built, built.optimize.parameters if built.optimize else ())
     for doubt in find_doubts(built):
         warnings.warn(doubt, DataWarning, 2)
     if not is_first():
-        follow_run(built, scene_file, resume=resume)
+        follow_run(built, scene_file, resume=resume, preview_every=preview_every)
         return
     with (
         open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (

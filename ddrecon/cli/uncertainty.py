@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ddrecon.reconstruct.loop import Reconstruction
 
 SAMPLES = 16
-CANDIDATES = 12
 
 
 @click.command()
@@ -44,15 +43,14 @@ CANDIDATES = 12
 @click.option(
     "--tolerance",
     type=click.FloatRange(min=0, max=1, min_open=True),
-    help="Relative residual of a sample.",
+    help="What a sample may lack. Left out: 0.5, and 0.03 where single numbers are optimized.",
 )
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
 @click.option(
     "--next-view",
-    "ring",
-    type=click.Choice(["ring"]),
-    help=f"Rank {CANDIDATES} cameras, turned around the volume from the first: which picture would "
-    "tell most?",
+    type=click.Choice(["ring", "lights"]),
+    help="Which picture would tell most? Rank twelve by the first camera: turned around the volume "
+    "(ring), or in directional lights that are (lights).",
 )
 @click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
 @AS_JSON
@@ -66,7 +64,7 @@ def uncertainty(
     read: float | None,
     tolerance: float | None,
     has_samples: bool,
-    ring: str | None,
+    next_view: str | None,
     resume: bool,
 ) -> None:
     """Say how sure RUN is, the folder of a finished run: which cells its pictures tell, and which
@@ -76,8 +74,8 @@ def uncertainty(
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.next_view import FEWEST
-    from ddrecon.reconstruct.posterior import TOLERANCE
     from ddrecon.run.uncertainty_folder import (
+        Request,
         drive_uncertainty,
         dtype_of,
         follow_uncertainty,
@@ -86,26 +84,22 @@ def uncertainty(
         uncertainty_lines,
     )
 
-    if ring and samples < FEWEST:
+    if next_view and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
     state = state_of(run)
     session = replace(session, dtype=dtype_of(state))
     taken = take_up(session.build(session.read(run / "scene.yaml")), state, run)
-    asked: dict[str, Any] = {
-        "seed": session.seed,
-        "noise": None if read is None else Noise(read, 0.0),
-        "tolerance": tolerance or TOLERANCE,
-        "candidates": CANDIDATES if ring else 0,
-    }
+    noise = None if read is None else Noise(read, 0.0)
+    request = Request(session.seed, noise, tolerance, next_view)
     if not is_first():
-        follow_uncertainty(taken, samples, **asked)
+        follow_uncertainty(taken, samples, request)
         return
     with claim_folder(output, may_exist=overwrite or resume):
         record = drive_uncertainty(
             taken,
             output,
             samples,
-            **asked,
+            request,
             has_samples=has_samples,
             resume=resume,
             is_quiet=session.is_quiet,
@@ -127,8 +121,7 @@ def add_uncertainty(
     run: Reconstruction, folder: Path, is_quiet: bool
 ) -> tuple[dict[str, Any], list[str]]:
     """How sure `run` is, told in `uncertainty` within its `folder`: the record, and its lines."""
-    from ddrecon.reconstruct.posterior import TOLERANCE
-    from ddrecon.run.uncertainty_folder import drive_uncertainty, uncertainty_lines
+    from ddrecon.run.uncertainty_folder import Request, drive_uncertainty, uncertainty_lines
 
     path = folder / "uncertainty"
     path.mkdir(exist_ok=True)
@@ -136,9 +129,7 @@ def add_uncertainty(
         run,
         path,
         SAMPLES,
-        seed=run.seed,
-        noise=None,
-        tolerance=TOLERANCE,
+        Request(run.seed),
         has_samples=False,
         resume=False,
         is_quiet=is_quiet,

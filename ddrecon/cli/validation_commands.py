@@ -20,6 +20,7 @@ from ddrecon.cli.command import (
     OVERWRITE,
     REPORT,
     SCENE,
+    SHARE,
     in_session,
     require_folder_of,
 )
@@ -139,6 +140,7 @@ def reference(
 )
 @OVERWRITE
 @REPORT
+@SHARE
 @in_session
 def bench(
     session: Session,
@@ -205,8 +207,10 @@ def _bench_shared(session: Session, path: Path, report: Path | None) -> None:
     from ddrecon.bench.shared import describe_shared, measure_shared, shared_lines
     from ddrecon.io.files.json_file import write_json
     from ddrecon.ranks import is_first
+    from ddrecon.reconstruct.shares import require_sharing
 
     scene = replace(session, dtype=torch.float32).load(path)
+    require_sharing(scene, scene.optimize.parameters if scene.optimize else ())
     measured = measure_shared(scene, session.progress)
     if is_first():
         click.echo("\n".join(shared_lines(scene, measured)))

@@ -17,7 +17,10 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
+from ddrecon.slabs.exchange import gather_own
+from ddrecon.slabs.slab import Slab, whole_of
 
+Shape = tuple[int, int, int]
 FLOOR = 3.3
 """Optical thickness across the box's shortest side that `smooth` gives empty space.
 
@@ -43,7 +46,7 @@ def smooth(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Te
 
 def least_extinction(grid: Grid, floor: float) -> float:
     """kappa_tr [1/u] that `smooth` gives empty space."""
-    return floor / min(grid.extent)
+    return floor / min(whole_of(grid).extent)
 
 
 def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) -> Tensor:
@@ -66,10 +69,39 @@ def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
     It is computed on a coarse grid and interpolated. Outside a sphere this is
     1 / (distance to its center), exactly: Newton's shell theorem.
     """
+    if isinstance(grid, Slab):
+        return _inverse_distance_in_slab(weight, grid)
     coarse = coarse_grid(grid)
-    mass = adaptive_avg_pool3d(weight, coarse.shape) + haze(grid)
-    inverse = potential(mass, coarse) / mass.sum((1, 2, 3), keepdim=True)
-    return interpolate(inverse[None], size=grid.shape, mode="trilinear")[0]
+    mean = adaptive_avg_pool3d(weight, coarse.shape)
+    return _interpolate(_inverse_distance(mean, grid), grid.shape)
+
+
+def _inverse_distance(mean: Tensor, grid: Grid) -> Tensor:
+    """The mean of 1 / distance [1/u] on the coarse grid, from the `mean` weight of its cells."""
+    mass = mean + haze(grid)
+    return potential(mass, coarse_grid(grid)) / mass.sum((1, 2, 3), keepdim=True)
+
+
+def _inverse_distance_in_slab(weight: Tensor, slab: Slab) -> Tensor:
+    """`inverse_distance` to all ranks' weight together, in one's `slab`.
+
+    Averages and interpolation go axis by axis; that along the slab's axis is of the whole grid.
+    """
+    coarse, axis = coarse_grid(slab.whole), slab.axis
+    own, whole = (_with_entry(coarse.shape, axis, n) for n in (slab.size, slab.whole.shape[axis]))
+    layers = adaptive_avg_pool3d(slab.own(weight), own)
+    mean = adaptive_avg_pool3d(gather_own(layers, slab), coarse.shape)
+    inverse = _inverse_distance(mean, slab.whole)
+    return _interpolate(slab.cut(_interpolate(inverse, whole)), slab.shape)
+
+
+def _with_entry(shape: Shape, axis: int, cells: int) -> Shape:
+    z, y, x = (cells if a == axis else n for a, n in enumerate(shape))
+    return z, y, x
+
+
+def _interpolate(u: Tensor, shape: Shape) -> Tensor:
+    return interpolate(u[None], size=shape, mode="trilinear")[0]
 
 
 def coarse_grid(grid: Grid) -> Grid:

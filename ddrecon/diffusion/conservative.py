@@ -25,6 +25,9 @@ from ddrecon.diffusion.operator import (
 from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import is_fused, recompute
+from ddrecon.slabs.exchange import add_halo
+from ddrecon.slabs.ghosts import Ghosts
+from ddrecon.slabs.slab import Slab
 
 
 @dataclass(frozen=True)
@@ -105,8 +108,32 @@ class DiffusionProblem:
 
 def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operator]) -> Moments:
     """L0 and, where `problem` has flux, L1."""
-    mean = solve_diffusion(solve, *problem.system)
+    grid = problem.medium.grid
+    if isinstance(grid, Slab):
+        mean = _solve_in_slabs(solve, *problem.system, grid)
+    else:
+        mean = solve_diffusion(solve, *problem.system)
     return Moments(mean, problem.flux(mean))
+
+
+def _solve_in_slabs(
+    solve: SolverWithMemory[Operator], operator: Operator, right: Tensor, slab: Slab
+) -> Tensor:
+    """L0 in this rank's `slab`, by a solve in all ranks' own cells together.
+
+    `operator` and `right` are made in the slab with its halo, whose outermost faces are not those
+    of the box: no rank's own cells have them.
+    """
+    ghosts = Ghosts.of(slab)
+    first, last = (halo - layers for halo, layers in zip(slab.halo, ghosts.layers, strict=True))
+
+    def inner(u: Tensor) -> Tensor:
+        return u.narrow(ghosts.axis, first, u.shape[ghosts.axis] - first - last)
+
+    z, y, x = map(inner, operator.conductances)
+    shared = Operator((z, y, x), inner(operator.loss), ghosts=ghosts)
+    solution = solve_diffusion(solve, shared, ghosts.without(inner(right)))
+    return add_halo(ghosts.own(solution), slab)
 
 
 def _diffusion(medium: Medium, closure: Callable[[Tensor], Tensor]) -> Tensor:

@@ -12,6 +12,7 @@ function's own jvp.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -194,6 +195,7 @@ def solve_diffusion(
     By `source` and by the operator. An operator of one color serves a source of several. What
     solvers prepare about the operator serves all its solves.
     """
+    assemble = functools.partial(Operator.of, ghosts=operator.ghosts)
     return ImplicitSolve.apply(
-        solve, Operator.of, operator.prepared, source, operator.loss, *operator.conductances
+        solve, assemble, operator.prepared, source, operator.loss, *operator.conductances
     )

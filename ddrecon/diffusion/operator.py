@@ -22,6 +22,7 @@ from torch import Tensor
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import keep, run_plainly
+from ddrecon.slabs.ghosts import Ghosts
 
 Prepared = TypeVar("Prepared")
 AXES = (1, 2, 3)
@@ -35,7 +36,8 @@ class Operator:
     `conductances`: c [1/u] on the interior faces along z, y, x, each one entry shorter than a cell
     array along its axis; `loss` [1/u]: `[C, z, y, x]`, >= 0 and somewhere > 0. Conductances that
     all colors share may be given once. `prepared`: what solvers have computed from these numbers;
-    to be handed on with them only.
+    to be handed on with them only. With `ghosts`, its cells are a rank's own and those of its
+    neighbors beside them; rows and columns of all ranks' own cells are one matrix.
     """
 
     conductances: tuple[Tensor, Tensor, Tensor]
@@ -43,14 +45,18 @@ class Operator:
     prepared: dict[Callable[[Operator], Any], Any] = field(
         default_factory=dict, repr=False, compare=False
     )
+    ghosts: Ghosts | None = None
 
     @staticmethod
     def of(
-        prepared: dict[Callable[[Operator], Any], Any], loss: Tensor, *conductances: Tensor
+        prepared: dict[Callable[[Operator], Any], Any],
+        loss: Tensor,
+        *conductances: Tensor,
+        ghosts: Ghosts | None = None,
     ) -> Operator:
         """The operator of `loss` and three conductances, in the order of its derivatives."""
         z, y, x = conductances
-        return Operator((z, y, x), loss, prepared)
+        return Operator((z, y, x), loss, prepared, ghosts)
 
     @cached_property
     def diagonal(self) -> Tensor:
@@ -84,6 +90,9 @@ class Operator:
 
     def cotangents(self, adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
         """loss_bar = -lambda u and c_bar = -(G lambda)(G u) of each axis (E9)."""
+        if self.ghosts is not None:
+            # Each rank has the rows of its own cells: so a face that two have is counted once.
+            adjoint = self.ghosts.without(adjoint)
         if current_engine() == "warp":
             from ddrecon.diffusion.fused.cotangents import find_cotangents  # imports Warp
 

@@ -12,6 +12,7 @@ from ddrecon.cameras import Rays
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.light.pairs import TurnedBeam
 from ddrecon.medium.coefficients import Medium
+from ddrecon.medium.phase_cells import turned_in_cells
 from ddrecon.medium.remaining import remaining_moments, turned_phase
 from ddrecon.numerics.angle_table import angle_of, look_up
 from ddrecon.numerics.autodiff import is_fused, recompute
@@ -67,8 +68,14 @@ def _sum_turned(medium: Medium, rays: Rays, turned: Sequence[TurnedBeam]) -> Ten
 
 
 def _scatter_turned(medium: Medium, beam: TurnedBeam, towards: Vector) -> Tensor:
-    """What light of `beam` scatters `towards` a camera: its phase function is that of E21."""
+    """What light of `beam` scatters `towards` a camera: its phase function is that of E21.
+
+    It is per unit of what `scatter_once_more` is.
+    """
     z, y, x = (part * cosine for part, cosine in zip(beam.direction, towards, strict=True))
     cosine = torch.atleast_3d(z + y + x)
+    if medium.is_cellwise:
+        phase = turned_in_cells(medium, beam.turns, angle_of(cosine))
+        return beam.radiance * phase / (1 - medium.forward_fraction)
     phase = look_up(turned_phase(medium, beam.turns), angle_of(cosine))[..., 0]
     return beam.radiance * phase.to(cosine.dtype)

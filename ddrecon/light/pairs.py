@@ -11,7 +11,7 @@ depth that is left, T - t:
     F = (exp(-lambda t) - r^2 exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
     G = r (exp(-lambda t) - exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
 
-Where albedo varies from cell to cell, beta is that of the cell.
+Where albedo varies from cell to cell, beta is that of the cell; where b does, see `turning.py`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from ddrecon.light.beam import Beam
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.light.turning import turn_in_cells
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import backward_fraction, unturned_moments
 from ddrecon.numerics.autodiff import recompute
@@ -84,12 +85,17 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
     extinction = medium.extinction
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
-    (entered, step), (behind, _) = (
+    ways = (direction,) if medium.is_cellwise else (direction, -direction)
+    (entered, step), *behind = (
         recompute(sum_mass_to_cells, extinction.field, medium.grid, way, extinction.mass_bound)
-        for way in (direction, -direction)
+        for way in ways
     )
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
-    shares = recompute(_pair, medium, entered, behind, step, backward_fraction(medium))
+    turned = backward_fraction(medium)
+    if medium.is_cellwise:
+        shares = recompute(_pair_in_cells, medium, entered, step, turned, direction)
+    else:
+        shares = recompute(_pair, medium, entered, behind[0][0], step, turned)
     received, along, against = (irradiance / (4 * math.pi) * share for share in shares)
     return beam, Pair(direction, received, along, against)
 
@@ -112,6 +118,16 @@ def _pair(
     again = 1 / (1 - reflected**2 * torch.exp(-2 * rate * total))
     tau = extinction.mean_transmittance(entered, step)
     return tau, (forth - reflected**2 * back) * again, reflected * (forth - back) * again
+
+
+def _pair_in_cells(
+    medium: Medium, entered: Tensor, step: Tensor, turned: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `_pair`, where the part that is `turned` differs from cell to cell (E40)."""
+    extinction, back = medium.extinction.value, turned * medium.scattering.value
+    forth, against = turn_in_cells(extinction, back, medium.grid, direction)
+    tau = medium.extinction.mean_transmittance(entered, step)
+    return tau, tau * forth, tau * against
 
 
 def _turned_part(medium: Medium, turned: Tensor) -> Tensor:

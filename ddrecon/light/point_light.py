@@ -29,6 +29,8 @@ from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_fused, recompute
 from ddrecon.numerics.interpolation import sample_volume
 from ddrecon.numerics.nodes import Nodes
+from ddrecon.slabs.exchange import gather_slabs
+from ddrecon.slabs.slab import whole_of
 
 NORM_ORDER = 8
 """Order of the norm that gives a ray's path through a cell: nearly the largest component, without
@@ -110,8 +112,12 @@ def follow_point_light(medium: Medium, light: PointLight, degree: int) -> tuple[
     # Mass from the light to where the ray enters the cell, and from there to the center.
     entries = centers - 0.5 * step[..., None] * direction
     entered = _mass_to(
-        extinction.field, grid, position, entries.flatten(0, 2), (distance - 0.5 * step).flatten()
-    )
+        gather_slabs(extinction.field, grid),
+        whole_of(grid),
+        position,
+        entries.flatten(0, 2),
+        (distance - 0.5 * step).flatten(),
+    ).unflatten(1, grid.shape)
     mass = entered + 0.5 * step * extinction.field
 
     received = irradiance / (4 * math.pi) / square * extinction.mean_transmittance(entered, step)
@@ -132,7 +138,7 @@ def _bounded_square(offset: Tensor, least: float) -> Tensor:
 def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance: Tensor) -> Tensor:
     """The integral of `field` [K, z, y, x] from `position` to `ends` [P, 3]; 0 outside the box.
 
-    `distance` [P]: how far `ends` are from `position`. Returns `[K, z, y, x]`.
+    `distance` [P]: how far `ends` are from `position`. Returns `[K, P]`.
     """
     pairs = math.ceil(math.hypot(*grid.extent) / (2 * min(grid.spacing)))
     fraction = _gauss_pairs(pairs).to(field)[:, None]
@@ -150,11 +156,10 @@ def _mass_to(field: Tensor, grid: Grid, position: Tensor, ends: Tensor, distance
 
         inside = _part_inside(grid, position, ends)
         begins = ends - inside[:, None] * (ends - position)
-        total = integrate_ways(field, grid, begins, ends, inside * distance, fraction)
-        return total.unflatten(1, grid.shape)
+        return integrate_ways(field, grid, begins, ends, inside * distance, fraction)
     count = max(1, CHUNK_SAMPLES // (2 * pairs))
     chunks = zip(ends.split(count), distance.split(count), strict=True)
-    return torch.cat([recompute(integrate, *chunk) for chunk in chunks], 1).unflatten(1, grid.shape)
+    return torch.cat([recompute(integrate, *chunk) for chunk in chunks], 1)
 
 
 def _gauss_pairs(count: int) -> Tensor:

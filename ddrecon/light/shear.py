@@ -8,6 +8,7 @@ back. What is interpolated is the field and its integral, never an exponential o
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,7 @@ from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
+from ddrecon.slabs.slab import Slab
 
 
 def sum_mass_to_cells(
@@ -37,13 +39,19 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
-    if is_fused(direction):
+    if isinstance(grid, Slab):
+        from ddrecon.light import shear_slabs
+
+        sum_one: Callable[..., tuple[Tensor, Tensor]] = shear_slabs.sum_mass
+    elif is_fused(direction):
         from ddrecon.light.fused.sum_mass import sum_mass
 
         return sum_mass(field, grid, direction, bound)
+    else:
+        sum_one = _sum_mass
     if field.shape[0] == 1:
-        return _sum_mass(field, grid, direction, bound)
-    each = [recompute(_sum_mass, one, grid, direction, bound) for one in field.split(1)]
+        return sum_one(field, grid, direction, bound)
+    each = [recompute(sum_one, one, grid, direction, bound) for one in field.split(1)]
     return torch.cat([entered for entered, _ in each]), each[0][1]
 
 
@@ -51,61 +59,86 @@ def _sum_mass(
     field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
 ) -> tuple[Tensor, Tensor]:
     """What `sum_mass_to_cells` returns, of one field [1, z, y, x]."""
-    # From one slice to the next the beam goes `step` and drifts by `slope`, in rows and columns.
-    speed = direction / direction.new_tensor(grid.spacing)
-    slicing = Slicing.of(speed.tolist())
+    slicing, slope, step = cross_grid(grid, direction)
     slices = slicing.lay(field)
-    slope = (
-        torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
-    )
-    step = grid.spacing[slicing.axis] / direction[slicing.axis].abs()
-
-    # Shear: rho_k along each ray on slice k, and rho_(k + 1/2) midway to the next, where the field
-    # is the mean of both slices.
-    shear = _Shear.of(slices, slope)
-    on_slices = shear.to_rays(slices, 0.0)
-    midway = shear.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
-
-    # Trapezoids over half steps are more than those over whole ones by
-    # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
-    bends = midway - 0.5 * (on_slices[1:] + on_slices[:-1])
-    refinement = running_sum(torch.cat([torch.zeros_like(on_slices[:1]), bends])) * (0.5 * step)
-
-    # The mass of all slices passed: step sum over j < k of rho_j.
+    shear = Shear.of(slices.shape[0], slices.shape[2:], slope)
+    on_slices, bends = shear.look(slices)
     third_order = ThirdOrder(0, 1, bound)
-    passed = (running_sum(on_slices) - on_slices) * step + third_order.bounded(refinement)
-
+    passed = mass_passed(on_slices, bends, step, third_order)
     # Shear back, from rays to cells.
     return slicing.lift(shear.to_cells(passed, third_order)), step
 
 
+def cross_grid(grid: Grid, direction: Tensor) -> tuple[Slicing, Tensor, Tensor]:
+    """How a beam along `direction` goes through `grid`: in which slices, and from one to the next.
+
+    There it goes a `step` [u] and drifts by `slope` [2], in rows and columns.
+    """
+    speed = direction / direction.new_tensor(grid.spacing)
+    slicing = Slicing.of(speed.tolist())
+    slope = (
+        torch.stack([speed[other] for other in across(slicing.axis)]) / speed[slicing.axis].abs()
+    )
+    return slicing, slope, grid.spacing[slicing.axis] / direction[slicing.axis].abs()
+
+
+def mass_passed(
+    on_slices: Tensor,
+    bends: Tensor,
+    step: Tensor,
+    third_order: ThirdOrder,
+    before: Tensor | None = None,
+) -> Tensor:
+    """The mass [N, K, *lattice] on rays up to each slice, from what `Shear.look` has found.
+
+    `before` [2, K, *lattice] are sums of both over what lies before the first slice.
+    """
+    # Trapezoids over half steps are more than those over whole ones by
+    # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
+    bent = running_sum(torch.cat([torch.zeros_like(on_slices[:1]), bends]))
+    # The mass of all slices passed: step sum over j < k of rho_j.
+    passed = running_sum(on_slices) - on_slices
+    if before is not None:
+        passed, bent = passed + before[0], bent + before[1]
+    return passed * step + third_order.bounded(bent * (0.5 * step))
+
+
 @dataclass(frozen=True)
-class _Shear:
+class Shear:
     """Rays along a beam, as many as a `lattice` has points, and where they meet slices of `size`.
 
     Ray r meets slice k at cell r - `first` + k `slope`, in rows as in columns; with this lattice
-    there is a ray for every cell.
+    there is a ray for every cell. Slices are counted from number `begin` on.
     """
 
     slope: Tensor
     size: tuple[int, int]
     lattice: tuple[int, int]
     first: tuple[int, int]
+    begin: int = 0
 
     @staticmethod
-    def of(slices: Tensor, slope: Tensor) -> _Shear:
-        """The rays that meet `slices` [N, K, H, W]."""
-        height, width = slices.shape[2:]
-        rows, columns = (
-            math.floor(abs(s) * (slices.shape[0] - 1) + 1e-9) + 1 for s in slope.tolist()
-        )
+    def of(slices: int, size: Sequence[int], slope: Tensor) -> Shear:
+        """The rays that meet so many `slices` of `size` (height, width)."""
+        height, width = size
+        rows, columns = (math.floor(abs(s) * (slices - 1) + 1e-9) + 1 for s in slope.tolist())
         is_on = [s > 0 for s in slope.tolist()]
-        return _Shear(
+        return Shear(
             slope,
             (height, width),
             (height + rows, width + columns),
             (rows * is_on[0], columns * is_on[1]),
         )
+
+    def look(self, slices: Tensor) -> tuple[Tensor, Tensor]:
+        """The field on rays: rho_k on `slices` [N, K, H, W], and how much it bends between two.
+
+        That is rho_(k + 1/2), midway, where the field is the mean of both slices, less the mean of
+        rho_k and rho_(k + 1).
+        """
+        on_slices = self.to_rays(slices, 0.0)
+        midway = self.to_rays(0.5 * (slices[1:] + slices[:-1]), 0.5)
+        return on_slices, midway - 0.5 * (on_slices[1:] + on_slices[:-1])
 
     def to_rays(self, slices: Tensor, shift: float) -> Tensor:
         """`slices` [N, K, H, W], the first of which is number `shift`, where rays meet them.
@@ -119,11 +152,11 @@ class _Shear:
         )
         return sample_lattice(slices, rows, columns).unflatten(-1, self.lattice)
 
-    def to_cells(self, values: Tensor, third_order: ThirdOrder) -> Tensor:
+    def to_cells(self, values: Tensor, third_order: ThirdOrder | None = None) -> Tensor:
         """`values` [N, K, *lattice] on the rays, at the centers of the slices' cells."""
         places = self._places(values, 0.0, self.size, self.lattice, -1)
         rows, columns = (
-            Weights.at(place, size, has_third_order=True)
+            Weights.at(place, size, has_third_order=third_order is not None)
             for place, size in zip(places, self.lattice, strict=True)
         )
         return sample_lattice(values, rows, columns, third_order).unflatten(-1, self.size)
@@ -135,7 +168,9 @@ class _Shear:
 
         `sign` is 1 for rays among cells, -1 for cells among rays.
         """
-        index = torch.arange(like.shape[0], dtype=like.dtype, device=like.device) + shift
+        index = torch.arange(like.shape[0], dtype=like.dtype, device=like.device) + (
+            self.begin + shift
+        )
         lines = []
         for slope, first, count, size in zip(self.slope, self.first, points, cells, strict=True):
             drift = sign * (index * slope - first)

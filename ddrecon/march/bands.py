@@ -49,7 +49,7 @@ class Bands:
     def planes(self) -> Tensor:
         """Planes [N] across the axis [u]: through all centers of cells, and both faces."""
         grid, axis, like = self.grid, self.axis, self.channels.fields[0]
-        return _planes(grid, axis, self.is_reversed, self.steps, like.dtype, like.device)
+        return planes_across(grid, axis, self.is_reversed, self.steps, like.dtype, like.device)
 
     @functools.cached_property
     def slices(self) -> Slices:
@@ -146,7 +146,7 @@ def _order(count: int, is_reversed: bool, device: torch.device) -> Tensor:
 
 
 @remember
-def _planes(
+def planes_across(
     grid: Grid,
     axis: int,
     is_reversed: bool,
@@ -154,6 +154,7 @@ def _planes(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
+    """The planes across `axis` of `grid` [u]: through all centers of cells, and both faces."""
     # In cells: 0, 0.5, 1.5, ...
     count = grid.shape[axis]
     place = torch.arange(count + 2, dtype=dtype, device=device) - 0.5

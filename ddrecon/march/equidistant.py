@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import torch
 from torch import Tensor
@@ -29,6 +30,12 @@ class Equidistant:
         like = channels.fields[0]
         self.lower, self.extent = like.new_tensor(grid.lower), like.new_tensor(grid.extent)
         self.nodes = steps * math.ceil(longest / min(grid.spacing)) + 1
+
+    def of(self, channels: Channels) -> Equidistant:
+        """The same steps through other `channels`."""
+        other = copy(self)
+        other.channels = channels
+        return other
 
     def parts(self, rays: Rays, count: int) -> list[tuple[Tensor, Equidistant]]:
         """All of `rays`, `count` at a time, in large volumes more: indices, and what they meet."""

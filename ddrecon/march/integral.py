@@ -30,6 +30,7 @@ from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.numerics.running_sum import running_sum
 from ddrecon.settings import RenderSettings
+from ddrecon.slabs.slab import Slab, whole_of
 
 CHUNK_NODES = 1 << 18
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and
@@ -37,6 +38,8 @@ memory does not grow with pixels.
 """
 Part = tuple[Tensor, Tensor]
 """Some rays, by their indices [P], and radiance and opacity [2 C, P] along them."""
+Integrate = Callable[[Tensor, Nodes, Tensor], Tensor]
+"""What is found along rays, [*, R], from values at their nodes and the rays' numbers [R]."""
 
 
 def march(
@@ -52,17 +55,17 @@ def march(
     if sight.way is None:
         nothing = emission.diffuse.new_zeros(emission.colors, len(sight.rays.direction))
         return nothing, 1 - nothing
-    march_rays, march_lattice = _pick_engine(emission)
+    of_rays, of_lattice = _pick_engine(emission)
     channels = pack_channels(emission)
     sampler = make_sampler(channels, emission.grid, sight.way, settings.steps)
     if sight.lattice is None or sight.places is None:
-        values = _spread(march_rays(emission, sampler, sight.rays, sight.crossing), sight)
+        values = _spread(of_rays(emission, sampler, sight.rays, sight.crossing), sight)
     else:
-        of_lattice = march_lattice(emission, sampler, sight.lattice)
-        values, is_rough = _interpolate(of_lattice, sight, sight.places, settings, behind)
+        between = of_lattice(emission, sampler, sight.lattice)
+        values, is_rough = _interpolate(between, sight, sight.places, settings, behind)
         rough = sight.crossing.select(is_rough.nonzero()[:, 0])
         if len(rough.hit):
-            values = values.index_copy(1, *march_rays(emission, sampler, sight.rays, rough))
+            values = values.index_copy(1, *of_rays(emission, sampler, sight.rays, rough))
     scattered, opacity = values.split(emission.colors)
     return scattered, 1 - opacity
 
@@ -72,11 +75,15 @@ def _pick_engine(emission: Emission) -> tuple[Callable[..., Part], Callable[...,
 
     Phase functions that differ from cell to cell have no fused kernels.
     """
+    if isinstance(emission.grid, Slab):
+        from ddrecon.march import slabs
+
+        return slabs.march_rays, slabs.march_lattice
     if current_engine() == "warp" and emission.seen.phase.cells is None:
         from ddrecon.march.fused import march as fused
 
         return fused.march_rays, fused.march_lattice
-    return _march_rays, _march_lattice
+    return march_rays, march_lattice
 
 
 def _interpolate(
@@ -118,10 +125,14 @@ def _spread(part: Part, sight: Sight) -> Tensor:
     return along.new_zeros(len(along), len(sight.rays.direction)).index_copy(1, index, along)
 
 
-def _march_rays(
-    emission: Emission, sampler: Bands | Equidistant, rays: Rays, crossing: Crossing
+def march_rays(
+    emission: Emission,
+    sampler: Bands | Equidistant,
+    rays: Rays,
+    crossing: Crossing,
+    integrate: Integrate | None = None,
 ) -> Part:
-    """Those of `rays` that are in `crossing`, in some order."""
+    """Those of `rays` that are in `crossing`, in some order, by `integrate` or as E1 to E3 say."""
     hitting = rays.select(crossing.hit)
 
     def run(chunk: Tensor, part: Slices | Equidistant) -> Tensor:
@@ -129,24 +140,40 @@ def _march_rays(
         values, distance = part.sample(
             chosen.origin, chosen.direction, crossing.near[chunk], crossing.far[chunk]
         )
-        return _integrate(emission, values, Nodes(chosen.origin, chosen.direction, distance))
+        nodes = Nodes(chosen.origin, chosen.direction, distance)
+        return integrate(values, nodes, chunk) if integrate else _integrate(emission, values, nodes)
 
     parts = sampler.parts(hitting, max(1, CHUNK_NODES // sampler.nodes))
     values = torch.cat([recompute(run, *part) for part in parts], 1)
     return crossing.hit[torch.cat([chunk for chunk, _ in parts])], values
 
 
-def _march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
-    """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
+def march_lattice(
+    emission: Emission,
+    bands: Bands,
+    lattice: Lattice,
+    intersect: Callable[[Rays], tuple[Tensor, Tensor]] | None = None,
+    integrate: Integrate | None = None,
+) -> Tensor:
+    """Radiance and opacity [2 C, r, c] along the rays of `lattice`.
+
+    By `integrate`, or as E1 to E3 say, where `intersect` says, or within the box.
+    """
     grid, columns = emission.grid, bands.slices.lattice_columns(lattice)
+    box = whole_of(grid)
 
     def run(chunk: Tensor, part: Slices) -> Tensor:
         rows = lattice.rows[chunk]
-        rays = lattice.rays(rows, 2 * math.hypot(*grid.extent))
-        near, far = intersect_box(grid, rays)
+        rays = lattice.rays(rows, 2 * math.hypot(*box.extent))
+        near, far = intersect(rays) if intersect else intersect_box(box, rays)
         values, distance = part.sample_rows(lattice, rows, columns, rays)
         inside = torch.minimum(torch.maximum(distance, near), torch.maximum(near, far))
-        return _integrate(emission, values, Nodes(rays.origin, rays.direction, inside))
+        nodes = Nodes(rays.origin, rays.direction, inside)
+        if integrate is None:
+            return _integrate(emission, values, nodes)
+        width = lattice.shape[1]
+        index = width * chunk[:, None] + torch.arange(width, device=chunk.device)
+        return integrate(values, nodes, index.flatten())
 
     parts = bands.lattice_parts(lattice, max(1, CHUNK_NODES // (bands.nodes * lattice.shape[1])))
     return torch.cat([recompute(run, *part) for part in parts], 1).unflatten(1, lattice.shape)
@@ -154,17 +181,37 @@ def _march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor
 
 def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> Tensor:
     """Scattered radiance and opacity [2 C, R] from `values` [N, channels, R] at the `nodes`."""
+    scattered, passed = integrate_segments(emission, values, nodes)
+    # E1: what comes from the volume, and 1 - tau of what is behind it.
+    return torch.cat([scattered, opacity_of(emission, passed)])
+
+
+def opacity_of(emission: Emission, mass: Tensor) -> Tensor:
+    """1 - tau [C, R] of rays that pass `mass` [K, R]."""
+    scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
+    return -torch.expm1(-scale * mass)
+
+
+def integrate_segments(
+    emission: Emission, values: Tensor, nodes: Nodes, front: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Scattered radiance [C, R] from `values` [N, channels, R] at the `nodes`, and mass [K, R].
+
+    `front` [K, R] is the mass between the camera and the first node, 0 if left out.
+    """
     at_nodes = Sampled.in_cells(emission).unpack(values)
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
     mass = nodes.integral(at_nodes.extinction)
-    end = running_sum(mass)
+    own = end = running_sum(mass)
+    if front is not None:
+        end = end + front
     begin = end - mass
     # E3: the integral of tau kappa_s (L0 + g L1 . w).
     by = at_nodes.scattering if at_nodes.remaining is None else at_nodes.remaining
     scattered = decayed_sum(nodes.integral(by * at_nodes.diffuse), begin, end, scale)
     scattered = scattered * (emission.remaining or emission.scattering).scale.view(-1, 1)
-    passed = torch.cat([torch.zeros_like(end[:1]), end])
+    passed = torch.cat([begin[:1], end])
     seen: SeenPhase | SeenNodes = emission.seen
     if at_nodes.number is not None:
         seen = SeenNodes(seen.phase, at_nodes.number, seen.degree)
@@ -176,6 +223,4 @@ def _integrate(emission: Emission, values: Tensor, nodes: Nodes) -> Tensor:
         arriving = decayed_sum(weight, begin + to_light[:-1], end + to_light[1:], scale)
         strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
         scattered = scattered + arriving * phase * strength.view(-1, 1)
-    # E1: what comes from the volume, and 1 - tau of what is behind it.
-    opacity = -torch.expm1(-scale * end[-1])
-    return torch.cat([scattered, opacity])
+    return scattered, own[-1]

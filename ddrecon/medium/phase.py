@@ -9,6 +9,7 @@ differ from cell to cell, [z, y, x] or [C, z, y, x]: then moments are followed b
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -74,7 +75,7 @@ class PhaseFunction(ABC):
         """All numbers, in the order of the fields."""
         return tuple(getattr(self, field.name) for field in fields(self))
 
-    @property
+    @functools.cached_property
     def colors(self) -> int:
         """How many colors have a phase function of their own: 1 where all share one."""
         cells = self.cells

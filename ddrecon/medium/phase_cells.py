@@ -2,25 +2,28 @@
 
 The number that differs is interpolated to the nodes of rays, as density is. Without a forward peak
 the phase function is evaluated there. With one, S of E13 is looked up by that number and by the
-angle: its polynomials are kept at even steps of the number (docs/theory.md E39).
+angle: its polynomials are kept at even steps of the number, the rungs (docs/theory.md E39).
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
+from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_peak import peak_table
+from ddrecon.medium.remaining import turned_table
 from ddrecon.numerics.angle_table import angle_of, look_up_between
 from ddrecon.numerics.chebyshev import evaluate_positive
 from ddrecon.numerics.remember import remember
 
 STEEP_STEP, STEEP_STEPS = 0.05, 54
-"""Of artanh g, up to g = 0.991: in it a peak, 2 / (1 - g)^2 high, is cubic to 4e-6."""
+"""Of artanh g, so many from 0 on, to 0.991: a peak, 2 / (1 - g)^2 high, is cubic in it to 4e-6."""
 EVEN_STEPS = 16
 """Of a weight between 0 and 1."""
 
@@ -53,43 +56,76 @@ class SeenNodes:
         plain = self.value(angle.cos().to(self.number))
         if depth is None:
             return plain
-        rungs = _rungs(isinstance(self.phase, HenyeyGreenstein), self.number.device)
-        others = (one for one in fields(self.phase) if one.name != self.phase.CELLWISE)
-        numbers = (getattr(self.phase, one.name) for one in others)
-        table = _tables(type(self.phase), self.degree, rungs, *numbers).to(self.number)
-        place, angle = torch.broadcast_tensors(self._place(), angle)
+        kind = type(self.phase)
+        table = _peak_tables(kind, self.degree, *_rungs_and_others(self.phase, 0)).to(self.number)
+        place, angle = torch.broadcast_tensors(_place(kind, self.number.clamp(min=0), 0), angle)
         coefficients = look_up_between(table, place, angle.double())
         seen = evaluate_positive(coefficients.movedim(-1, 0), depth)
-        is_steep = isinstance(self.phase, HenyeyGreenstein)
-        return torch.where(self.number > 0, seen, plain) if is_steep else seen
+        return torch.where(self.number > 0, seen, plain) if kind is HenyeyGreenstein else seen
 
-    def _place(self) -> Tensor:
-        """Between which of these numbers is that of each node, [N, C, R]."""
-        if not isinstance(self.phase, HenyeyGreenstein):
-            return self.number * EVEN_STEPS
-        return torch.atanh(self.number.clamp(min=0)) / STEEP_STEP
+
+def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
+    """What `turned_phase` is of each cell, [C, z, y, x] at `angle` [z, y, x] (E21)."""
+    phase, kind = medium.seen.phase, type(medium.seen.phase)
+    assert phase.cells is not None
+    backward = STEEP_STEPS
+    table = _turned_tables(kind, medium.seen.degree, turns, *_rungs_and_others(phase, backward))
+    place, angle = torch.broadcast_tensors(_place(kind, phase.cells, backward), angle)
+    return look_up_between(table.to(phase.cells), place, angle.double())[..., 0]
+
+
+def _rungs_and_others(phase: PhaseFunction, backward: int) -> list[Tensor]:
+    """The numbers at which tables are kept, [n], and the other numbers of `phase`.
+
+    Of g so many of them are `backward`.
+    """
+    others = [one.name for one in fields(phase) if one.name != phase.CELLWISE]
+    numbers = [getattr(phase, name) for name in others]
+    device = phase.numbers[0].device
+    return [_rungs(type(phase), backward, device), *numbers]
+
+
+def _place(kind: type[PhaseFunction], number: Tensor, backward: int) -> Tensor:
+    """Between which of the rungs `number` is, counted from the first."""
+    if kind is not HenyeyGreenstein:
+        return number * EVEN_STEPS
+    return torch.atanh(number) / STEEP_STEP + backward
 
 
 @functools.cache
 @torch.inference_mode(False)
-def _rungs(is_steep: bool, device: torch.device) -> Tensor:
-    """The numbers at which polynomials are kept, [n]."""
-    steps = torch.arange((STEEP_STEPS if is_steep else EVEN_STEPS) + 1, dtype=torch.float64)
-    numbers = torch.tanh(STEEP_STEP * steps) if is_steep else steps / EVEN_STEPS
-    return numbers.to(device)
+def _rungs(kind: type[PhaseFunction], backward: int, device: torch.device) -> Tensor:
+    """The numbers at which tables are kept, [n]: even steps of artanh g, or of a weight."""
+    if kind is HenyeyGreenstein:
+        steps = torch.arange(-backward, STEEP_STEPS + 1, dtype=torch.float64, device=device)
+        return torch.tanh(STEEP_STEP * steps)
+    return torch.arange(EVEN_STEPS + 1, dtype=torch.float64, device=device) / EVEN_STEPS
 
 
 @remember
-def _tables(kind: type[PhaseFunction], degree: int, rungs: Tensor, *numbers: Tensor) -> Tensor:
-    """Polynomials at all `rungs`, and their slopes from rung to rung, [n, 2, steps + 1, 2, K].
+def _peak_tables(kind: type[PhaseFunction], degree: int, rungs: Tensor, *others: Tensor) -> Tensor:
+    """Polynomials of S at all `rungs`, and their slopes, [n, 2, steps + 1, 2, K].
 
-    `numbers` are the others of the phase function, in front of the one that has the rungs.
+    `others` are the numbers of the phase function in front of the one that has the rungs.
     """
     # one after the other: weak peaks have short series
-    tables = torch.cat([peak_table(kind, degree, *numbers, rung) for rung in rungs])
-    wide = _extended(_extended(tables))
+    return _with_slopes([peak_table(kind, degree, *others, rung) for rung in rungs])
+
+
+@remember
+def _turned_tables(
+    kind: type[PhaseFunction], degree: int, turns: int, rungs: Tensor, *others: Tensor
+) -> Tensor:
+    """How turned light scatters towards a camera at all `rungs`, as `_peak_tables`."""
+    return _with_slopes([turned_table(kind, degree, turns, *others, rung) for rung in rungs])
+
+
+def _with_slopes(tables: Sequence[Tensor]) -> Tensor:
+    """Tables [1, steps + 1, 2, K] of all rungs, and their slopes from one to the next."""
+    values = torch.cat(list(tables))
+    wide = _extended(_extended(values))
     near, far = wide[3:-1] - wide[1:-3], wide[4:] - wide[:-4]
-    return torch.stack([tables, (8 * near - far) / 12], 1)
+    return torch.stack([values, (8 * near - far) / 12], 1)
 
 
 def _extended(tables: Tensor) -> Tensor:

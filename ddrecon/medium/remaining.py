@@ -34,19 +34,17 @@ def unturned_moments(medium: Medium) -> Tensor:
 
 
 def backward_fraction(medium: Medium) -> Tensor:
-    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E20)."""
+    """b, the part of scattering that counts as turned back [C or 1, 1, 1, 1] (E20).
+
+    It is [C or 1, z, y, x] where the phase function differs from cell to cell.
+    """
     phase = medium.seen.phase
     return _backward_fraction(type(phase), medium.seen.degree, *phase.numbers)
 
 
 def has_backward_peak(medium: Medium) -> bool:
-    """Whether a part of scattering counts as turned back.
-
-    Not by diffusion alone, and not where the phase function differs from cell to cell.
-    """
-    if medium.seen.degree <= P1_DEGREE or medium.is_cellwise:
-        return False
-    return is_any_nonzero(backward_fraction(medium))
+    """Whether a part of scattering counts as turned back: not by diffusion alone."""
+    return medium.seen.degree > P1_DEGREE and is_any_nonzero(backward_fraction(medium))
 
 
 def turned_phase(medium: Medium, turns: int) -> Tensor:
@@ -54,10 +52,10 @@ def turned_phase(medium: Medium, turns: int) -> Tensor:
 
     A table [C, steps + 1, 2, 1] for `look_up` over the angle from the way that light goes. Its
     moments are chi_l up to the degree of the medium, and chi_l r_l^turns beyond, where r_l are the
-    backward peak's.
+    backward peak's; less the forward peak's, which counts as not scattered.
     """
     phase = medium.seen.phase
-    return _turned_phase(type(phase), medium.seen.degree, turns, *phase.numbers)
+    return turned_table(type(phase), medium.seen.degree, turns, *phase.numbers)
 
 
 @remember
@@ -71,16 +69,20 @@ def _remaining(
 
 @remember
 def _backward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
-    return kind(*numbers).backward_fraction(degree).view(-1, 1, 1, 1) + 0
+    fraction = kind(*numbers).backward_fraction(degree)
+    return fraction + 0 if fraction.ndim == 4 else fraction.view(-1, 1, 1, 1) + 0
 
 
 @remember
-def _turned_phase(kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor) -> Tensor:
+def turned_table(kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor) -> Tensor:
+    """What `turned_phase` returns, of the phase function of `numbers`."""
     phase = kind(*numbers)
     count = phase.length()
     tail = phase.backward_tail(degree, count - degree - 1).double()
     spread = tail / torch.where(tail[:, :1] > 0, tail[:, :1], 1)
     spread = torch.cat([torch.ones_like(spread[:, :1]).expand(-1, degree + 1), spread], 1)
-    weights = series_weights(phase.moments(count).double() * spread**turns)
+    forward = phase.peak_tail(degree, count - degree - 1).double()
+    forward = torch.cat([forward[:, :1].expand(-1, degree + 1), forward], 1)
+    weights = series_weights((phase.moments(count).double() - forward) * spread**turns)
     curves = legendre_at_even_angles(STEPS, count)
     return torch.stack([weights @ rows.to(weights).T for rows in curves], -1)[..., None]

@@ -10,12 +10,14 @@ Parameters stand in one vector, entry by entry, in their own units and in their 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.light.lights import Light
 from ddrecon.losses import Target
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.parameters import Parameter
@@ -98,10 +100,16 @@ class Curvature:
         parts = self.split(vector)
         return self.join({name: r.product(parts[name]) for name, r in self.roughness.items()})
 
-    def tangents(self, vector: Tensor, views: Sequence[View] | None = None) -> dict[str, Tensor]:
+    def tangents(
+        self,
+        vector: Tensor,
+        views: Sequence[View] | None = None,
+        lights: Sequence[Light] | None = None,
+    ) -> dict[str, Tensor]:
         """J times `vector`: how the picture [3, h, w] of each view changes, by its name.
 
-        Those of the training views, or of other `views` of the same volume.
+        Those of the training views, or of other `views` of the same volume; in the light of the
+        scene, or of other `lights`, which are known.
         """
         changes = self.split(vector)
         derivatives = self.scene.optimize.derivatives if self.scene.optimize else "all"
@@ -109,8 +117,10 @@ class Curvature:
             duals = {
                 name: forward_ad.make_dual(value, changes[name])
                 for name, value in self.values.items()
+                if lights is None or not name.startswith("lights.")
             }
-            world = with_values(self.scene, duals)
+            lit = self.scene if lights is None else replace(self.scene, lights=list(lights))
+            world = with_values(lit, duals)
             light_field = solve_light(world, self.new_memory())
 
             def change_of(view: View) -> Tensor:

@@ -7,7 +7,7 @@ not grow with the number of views, and the adjoint (E9) is solved once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
+from ddrecon.slabs.slab import Slab
 from ddrecon.variables.kinds import VOLUME
 from ddrecon.variables.values import with_values
 
@@ -42,18 +43,22 @@ def differentiate(
 
     They are those by the leaves `values`, which stand in `scene` for the variables of their names.
     The views are shared out over ranks, which sum what reaches the light field; its way back is the
-    same on all of them.
+    same on all of them. Of a light field in slabs each rank has a part: it goes that part's way
+    back, and the derivatives by `values` are summed.
     """
     # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
     cut = _Cut()
     light_field = cut.cut(solve_light(with_values(scene, values), memory))
     outside = {name: value for name, value in values.items() if name not in VOLUME}
     inputs = [*values.values(), *cut.leaves]
-    lit = with_values(scene, outside)
-    images, loss, sums = _differentiate_views(
-        lit, own_views(scene, names), light_field, inputs, loss_of
-    )
-    (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
+    own, has_slabs = own_views(scene, names), isinstance(light_field.medium.grid, Slab)
+    # Views share what is made of values: so that each has a graph of its own, it is made anew.
+    worlds = ((with_values(scene, outside), name) for name in (names if has_slabs else own))
+    images, loss, sums = _differentiate_views(worlds, own, light_field, inputs, loss_of)
+    if has_slabs:
+        (total,) = sum_found([loss], [loss])
+    else:
+        (total, *sums) = sum_found([loss, *sums], [loss, *inputs])
     direct, leaf_bars = sums[: len(values)], sums[len(values) :]
     # What reached the leaves goes back through the light field, and so through the solve (E9).
     reached = [pair for pair in zip(cut.tensors, leaf_bars, strict=True) if pair[1] is not None]
@@ -66,6 +71,8 @@ def differentiate(
         through_light = torch.autograd.grad(product, list(values.values()), allow_unused=True)
         # The derivative is the sum of both ways.
         direct = _add(direct, through_light)
+    if has_slabs:
+        direct = sum_found(direct, list(values.values()))
     gradients = {
         name: torch.zeros_like(values[name]) if bar is None else bar
         for name, bar in zip(values, direct, strict=True)
@@ -74,22 +81,26 @@ def differentiate(
 
 
 def _differentiate_views(
-    scene: Scene,
-    names: Sequence[str],
+    worlds: Iterable[tuple[Scene, str]],
+    own: Sequence[str],
     light_field: LightField,
     inputs: Sequence[Tensor],
     loss_of: Callable[[View, Tensor], Tensor],
 ) -> tuple[list[Tensor], Tensor, list[Tensor | None]]:
-    """The images of views, the sum of their losses, and its derivatives by `inputs`.
+    """The images of `own` views, the sum of their losses, and its derivatives by `inputs`.
 
-    Each view's derivative is added up at once; None is zero.
+    `worlds` are scenes, and which of their views is rendered: of one that is another rank's, it
+    asks this one for its part of the derivative. Each view's is added up at once; None is zero.
     """
-    derivatives = scene.optimize.derivatives if scene.optimize else "all"
     sums: list[Tensor | None] = [None] * len(inputs)
-    images, loss = list[Tensor](), scene.volume.density.new_zeros(())
-    for name in names:
+    images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())
+    for scene, name in worlds:
+        derivatives = scene.optimize.derivatives if scene.optimize else "all"
         view = scene.view(name)
         image = view_picture(light_field, scene, view, derivatives)
+        if name not in own:
+            sums = _add(sums, torch.autograd.grad(0 * image.sum(), inputs, allow_unused=True))
+            continue
         view_loss = loss_of(view, image)
         if view_loss.requires_grad:
             sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))

@@ -22,12 +22,14 @@ AXES = (-3, -2, -1)
 class Information:
     """About J^T W J of `curvature`: its `diagonal` [n], and of each field a spectrum.
 
-    `generator` draws the random pictures.
+    `generator` draws the random pictures. `probe` [n] is what one of them gives, a random vector
+    whose covariance is J^T W J.
     """
 
     def __init__(self, curvature: Curvature, generator: torch.Generator):
         self.curvature = curvature
-        probes = [curvature.split(self._probe(generator)) for _ in range(PROBES)]
+        found = [self._probe(generator) for _ in range(PROBES)]
+        probes, self.probe = [curvature.split(each) for each in found], found[0]
         squares = {
             name: torch.stack([probe[name].square() for probe in probes]).mean(0)
             for name in curvature.values
@@ -52,7 +54,7 @@ class Information:
         return self.curvature.join(parts)
 
     def _probe(self, generator: torch.Generator) -> Tensor:
-        """J^T W^(1/2) times random signs, whose covariance is J^T W J."""
+        """J^T W^(1/2) times random signs."""
         images = self.curvature.images
         signs = {
             name: weight.sqrt() * normal_like(images[name], generator).sign()

@@ -6,7 +6,6 @@ one iteration at a time, so that whoever drives it may log, preview, stop or sav
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from copy import deepcopy
@@ -20,13 +19,14 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
+from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
-from ddrecon.reconstruct.levels import factors, resample, scene_at_level
+from ddrecon.reconstruct.levels import factors, resample_solutions, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
 from ddrecon.reconstruct.schedule import Schedule
@@ -187,7 +187,7 @@ class Reconstruction:
             "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "stage": self.stage,
             "total": dict(vars(self.total)),
-            "solutions": dict(self.memory.last),
+            "solutions": {} if cells_are_shared() else dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
             "schedule": self.schedule.state(),
@@ -243,7 +243,7 @@ class Reconstruction:
             parameter.curvature = None
             if parameter.name == "density" and self.support is not None:
                 parameter.restrict(self.support.on(grid))
-        self.memory.last = {kind: resample(field, grid) for kind, field in self.memory.last.items()}
+        self.memory.last = resample_solutions(self.memory.last, grid)
 
     def _views(self) -> list[View]:
         views, wanted = self.train_level.views, self.settings.views_per_iteration
@@ -275,8 +275,7 @@ class Reconstruction:
         pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
         seen = [p for p in self.parameters if p.view is None or p.view in names]
-        rate_of = functools.partial(self.schedule.rate, self.iteration)
-        solved = step_parameters(seen, gradients, rate_of)
+        solved = step_parameters(seen, gradients, self.schedule, self.iteration)
         solve_responses(solved, self.train_level, pictures, self.targets)
         lights, level = lights_due(solved, self.iteration), self.train_level
         step_brightness(lights, level, values, pictures, self.targets, self.memory.last)

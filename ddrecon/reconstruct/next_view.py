@@ -8,6 +8,7 @@ triples of different samples, which have no such bias, and a bound made of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,41 +16,74 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ddrecon.errors import UsageError
+from ddrecon.light.lights import DirectionalLight, Light
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.scene import View
+from ddrecon.scene import Scene, View
+from ddrecon.turntable import place_turntable, turn_lights
 from ddrecon.variables.kinds import FIELDS
 
+CANDIDATES = 12
+"""Pictures that are ranked."""
 FEWEST = 5
 """Samples that there must be: four are independent of their mean, and without one of them three."""
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A `view` whose picture takes at least the part `gain` of the variance; `error` is of that."""
+class Shot:
+    """A picture that may be taken, by the camera of `view` and in `lights`, else in the scene's."""
 
     view: View
+    lights: Sequence[Light] | None = None
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A `shot` whose picture takes at least the part `gain` of the variance; `error` is of that."""
+
+    shot: Shot
     gain: float
     error: float
 
     def described(self) -> dict[str, Any]:
-        """As plain values; the camera as a scene file has it."""
-        matrix = [*self.view.camera.pose.tolist(), [0, 0, 0, 1]]
+        """As plain values; the camera as a scene file has it, and the ways other light travels."""
+        view, lights = self.shot.view, self.shot.lights or ()
+        directions = [
+            light.direction.tolist() for light in lights if isinstance(light, DirectionalLight)
+        ]
         return {
-            "name": self.view.name,
+            "name": view.name,
             "gain": self.gain,
             "error": self.error,
-            "matrix": matrix,
+            "matrix": [*view.camera.pose.tolist(), [0, 0, 0, 1]],
+            "light_directions": directions,
         }
 
 
+def shots_around(scene: Scene, kind: str) -> list[Shot]:
+    """Pictures to rank, around the volume of `scene`, by the first of its cameras.
+
+    `ring`: it is turned; `lights`: the directional lights are. Raises UsageError without such.
+    """
+    first = scene.views[0]
+    if kind == "ring":
+        return [Shot(view) for view in place_turntable(scene, first, CANDIDATES)]
+    if not any(isinstance(light, DirectionalLight) for light in scene.lights):
+        raise UsageError("--next-view lights turns directional lights; the scene has none")
+    return [
+        Shot(View(f"light_{index:03d}", first.camera), lights)
+        for index, lights in enumerate(turn_lights(scene, CANDIDATES))
+    ]
+
+
 class NextView:
-    """Ranks `views` that were not taken, by samples of the posterior about `curvature`.
+    """Ranks `shots` that were not taken, by samples of the posterior about `curvature`.
 
     Their pictures would err by `deviation` [radiance] at each pixel.
     """
 
-    def __init__(self, curvature: Curvature, views: Sequence[View], deviation: float):
-        self.curvature, self.views, self.deviation = curvature, list(views), deviation
+    def __init__(self, curvature: Curvature, shots: Sequence[Shot], deviation: float):
+        self.curvature, self.shots, self.deviation = curvature, list(shots), deviation
         self.changes: list[Tensor] = []
         self.pictures: list[Tensor] = []
 
@@ -65,11 +99,11 @@ class NextView:
         """The candidates, best first."""
         alike = find_products(torch.stack(self.changes))
         pictures = torch.stack(self.pictures)
-        sizes = [3 * view.camera.size[0] * view.camera.size[1] for view in self.views]
+        sizes = [3 * math.prod(shot.view.camera.size) for shot in self.shots]
         found = []
-        for view, shown in zip(self.views, pictures.split(sizes, dim=1), strict=True):
+        for shot, shown in zip(self.shots, pictures.split(sizes, dim=1), strict=True):
             pair = alike, find_products(shown)
-            found.append(Candidate(view, find_gain(*pair), find_error(*pair)))
+            found.append(Candidate(shot, find_gain(*pair), find_error(*pair)))
         return sorted(found, key=lambda candidate: -candidate.gain)
 
     def state(self) -> dict[str, Any]:
@@ -82,8 +116,14 @@ class NextView:
 
     def _tangents(self, change: Tensor) -> Tensor:
         """How the pictures of all candidates change, one after another."""
-        found = self.curvature.tangents(change, self.views)
-        return torch.cat([found[v.name].expand(3, -1, -1).reshape(-1).cpu() for v in self.views])
+        # Those in the light of the scene share one light field, others have one each.
+        plain = [shot.view for shot in self.shots if shot.lights is None]
+        found = self.curvature.tangents(change, plain) if plain else {}
+        for shot in self.shots:
+            if shot.lights is not None:
+                found |= self.curvature.tangents(change, [shot.view], shot.lights)
+        names = [shot.view.name for shot in self.shots]
+        return torch.cat([found[name].expand(3, -1, -1).reshape(-1).cpu() for name in names])
 
 
 def find_gain(alike: Tensor, shown: Tensor) -> float:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
+from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct.divergence import NotFiniteError, require_finite
 from ddrecon.reconstruct.gradients import Differentiated
 from ddrecon.reconstruct.parameters import Parameter
@@ -180,8 +181,10 @@ def render_quality(
     with torch.no_grad():
         values = {p.name: p.value for p in parameters if p.name in known}
         rendered = with_values(scene, values)
-        views = [rendered.view(name) for name in own]
+        views = [rendered.view(name) for name in (names if cells_are_shared() else own)]
         for view, image in zip(views, render_each(rendered, views, memory), strict=True):
+            if view.name not in own:
+                continue
             target = targets[view.name]
             fitted, _ = fit_held_out(image, view, target, parameters)
             rows[0].append(target.psnr_of(fitted))

@@ -33,8 +33,9 @@ class Parameter:
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
-    is Adam (Kingma and Ba 2015, arXiv:1412.6980). `rate` is one number or one for each entry.
-    `view` is the name of the view that it belongs to, None for what all views see. One that
+    is Adam (Kingma and Ba 2015, arXiv:1412.6980). While a field `is_even`, all its cells change
+    alike; that ends after the part `even_until` of a run. `rate` is one number or one for each
+    entry. `view` is the name of the view that it belongs to, None for what all views see. One that
     `is_fitted` is solved for instead; `curvature` is the second derivative of the loss by it.
     """
 
@@ -57,6 +58,8 @@ class Parameter:
         self.view = owner.removeprefix("views.") if owner.startswith("views.") else None
         self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
+        self.even_until = settings.even_until if self.is_field else 0.0
+        self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
         self.l1 = settings.l1
@@ -93,6 +96,8 @@ class Parameter:
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
         before = self.value.detach()
+        if self.is_even:
+            gradient = gradient.mean((-3, -2, -1), keepdim=True).expand_as(gradient).contiguous()
         value, self.moments = self._step(before, gradient, rate * self.rate)
         if self.is_direction:
             value.mul_(before.norm() / value.norm())
@@ -137,6 +142,11 @@ class Parameter:
         first, second = (resample(moment, grid) for moment in self.moments)
         self.moments = first * volume_ratio, second * volume_ratio**2
 
+    def forget(self) -> None:
+        """Has its optimizer begin anew where the value is."""
+        self.steps = 0
+        self.moments = torch.zeros_like(self.value), torch.zeros_like(self.value)
+
     def restrict(self, support: Tensor) -> None:
         """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
         self.support = support.to(self.value.dtype)
@@ -152,6 +162,7 @@ class Parameter:
             "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
             "moments": list(self.moments),
             "curvature": self.curvature,
+            "is_even": self.is_even,
         }
 
     def backup(self) -> dict[str, Any]:
@@ -168,6 +179,6 @@ class Parameter:
         """Takes up a `state`, whatever its resolution."""
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
         self.value = state["value"].to(self.value).clone().requires_grad_()
-        self.steps = int(state["steps"])
+        self.steps, self.is_even = int(state["steps"]), state["is_even"]
         first, second = (moment.to(self.value) for moment in state["moments"])
         self.moments = first, second

@@ -1,4 +1,7 @@
-"""Which rank renders which view, and how each learns what the others have found of theirs."""
+"""Which rank does what, and how each learns what the others have found.
+
+Ranks share out the views of a scene, or its cells.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,11 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import cast_rays
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
 from ddrecon.ranks import (
-    assign,
+    cells_are_shared,
     from_first,
     is_any,
     is_first,
@@ -24,11 +28,41 @@ from ddrecon.ranks import (
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
+from ddrecon.variables.values import RESPONSE
 
 CELL_COST = 0.5
 """What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
 COARSE = 16
 """A view's rays are counted as if it had about so many pixels along its shorter side."""
+
+
+def require_sharing(scene: Scene, names: Collection[str]) -> None:
+    """Raises UsageError where ranks are to share cells, and cannot in `scene`.
+
+    `names` are the variables that are optimized.
+    """
+    if not cells_are_shared():
+        return
+    settings, problems = scene.diffusion, list[str]()
+    if settings.model == "flux_limited":
+        problems.append("diffusion.model: flux_limited light needs all cells; say p1")
+    if settings.scheme == "printed":
+        problems.append("diffusion.scheme: the printed scheme needs all cells; say conservative")
+    if settings.rounds:
+        problems.append(
+            "diffusion.transport_rounds: rounds need all cells; say 0 to do without them"
+        )
+    others = [
+        name
+        for name in names
+        if name.startswith("lights.")
+        or (name.startswith("views.") and name.rpartition(".")[2] not in RESPONSE)
+    ]
+    if others:
+        more = f" and {len(others) - 1} more need" if len(others) > 1 else ": needs"
+        problems.append(f"optimize.parameters.{others[0]}{more} all cells; leave them out")
+    if problems:
+        raise UsageError([f"--share cells: {problem}, or share views" for problem in problems])
 
 
 def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
@@ -68,6 +102,19 @@ def share_pictures(
         for view in views
     ]
     return dict(zip(names, sum_over_ranks(pictures), strict=True))
+
+
+def assign(costs: Sequence[float], ranks: int) -> list[int]:
+    """The rank that does each of some jobs with these `costs`, so that all end at about one time.
+
+    The longest jobs are given out first, each to the rank with the least to do (Graham 1969,
+    doi:10.1137/0117039): no rank has more than 4/3 of what it must have.
+    """
+    owners, loads = [0] * len(costs), [0.0] * ranks
+    for job in sorted(range(len(costs)), key=lambda job: -costs[job]):
+        owners[job] = min(range(ranks), key=lambda rank: loads[rank])
+        loads[owners[job]] += costs[job]
+    return owners
 
 
 _KNOWN: WeakKeyDictionary[View, tuple[Grid, RenderSettings, float]] = WeakKeyDictionary()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.poses import calibration_prior, pose_curvature, step_pose
 from ddrecon.reconstruct.responses import step_responses
+from ddrecon.reconstruct.schedule import Schedule
 from ddrecon.reconstruct.shares import take_from_owners
 from ddrecon.renderer import solve_light
 from ddrecon.scene import Scene, View
@@ -22,20 +23,34 @@ from ddrecon.variables.values import RESPONSE, with_values
 def step_parameters(
     parameters: Sequence[Parameter],
     gradients: Mapping[str, Tensor],
-    rate_of: Callable[[float], float],
+    schedule: Schedule,
+    iteration: int,
 ) -> list[Parameter]:
     """Moves those of `parameters` that are due along their `gradients`; returns those to be solved.
 
-    `rate_of` is the part of its learning rate that counts now, by the `release` of a parameter.
+    `schedule` says which are due in `iteration`, and how much of its learning rate counts.
     """
+    _let_go(parameters, schedule, iteration)
     solved = []
     for parameter in parameters:
-        rate = rate_of(parameter.release)
+        rate = schedule.rate(iteration, parameter.release)
         if rate and parameter.is_fitted:
             solved.append(parameter)
         elif rate:
             parameter.step(gradients[parameter.name], rate)
     return solved
+
+
+def _let_go(parameters: Sequence[Parameter], schedule: Schedule, iteration: int) -> None:
+    """Ends the evenness of those fields among `parameters` whose time for it is over.
+
+    All optimizers then begin anew: with derivatives as large as before they would hardly move.
+    """
+    due = [p for p in parameters if p.is_even and schedule.has_passed(iteration, p.even_until)]
+    for parameter in due:
+        parameter.is_even = False
+    for parameter in parameters if due else ():
+        parameter.forget()
 
 
 def solve_responses(

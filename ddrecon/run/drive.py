@@ -16,7 +16,7 @@ from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError,
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_settings
-from ddrecon.ranks import from_first, is_any, leave_ranks
+from ddrecon.ranks import cells_are_shared, from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -24,7 +24,8 @@ from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
-from ddrecon.run.quality import describe_loss, loss_text
+from ddrecon.run.quality import describe_loss, loss_text, render_run
+from ddrecon.run.report_volume import turntable_images
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import dump_scene
@@ -85,16 +86,26 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
     return loaded
 
 
-def follow_run(scene: Scene, scene_file: SceneFile, *, resume: bool) -> None:
-    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes."""
+def follow_run(
+    scene: Scene, scene_file: SceneFile, *, resume: bool, preview_every: int | None
+) -> None:
+    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes.
+
+    Where ranks share cells, that is also a part of the pictures that the first one writes.
+    """
     run = _begin(scene, scene_file)
     if resume:
         run.restore(from_first(run.state()))
     with defer_interrupt() as asked:
         while not run.is_done:
             run.step()
+            if cells_are_shared() and preview_every and run.iteration % preview_every == 0:
+                render_run(run)
             if is_any(bool(asked)):
                 raise KeyboardInterrupt
+    if cells_are_shared():
+        scene, light_field, *_ = render_run(run)
+        turntable_images(scene, light_field)
 
 
 def drive_run(
@@ -144,8 +155,9 @@ def drive_run(
             f"the state after {run.iteration} iterations is kept in {folder.checkpoints / LAST}: "
             "go on from it with --resume"
         ) from error
-    # What is left the first rank does by itself.
-    leave_ranks()
+    if not cells_are_shared():
+        # What is left the first rank does by itself.
+        leave_ranks()
     return folder.finish(run)
 
 

@@ -21,9 +21,9 @@ from ddrecon.errors import FormatError, UsageError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import page_text, section, side_by_side
 from ddrecon.run.checkpoint import LAST, read_state
-from ddrecon.run.findings import Findings, given_fields, solve
+from ddrecon.run.findings import Findings, given_fields
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import render_views
+from ddrecon.run.quality import render_run
 from ddrecon.run.report import curves
 from ddrecon.run.report_views import view_section
 from ddrecon.run.report_volume import volume_section
@@ -105,9 +105,7 @@ class LiveRun:
         run.restore(state)
         self.iterations = run.settings.iterations
         with torch.no_grad():
-            scene = run.current_scene()
-            light_field = solve(scene)
-            images, quality = render_views(run, scene, light_field)
+            scene, light_field, images, quality = render_run(run)
         given = given_fields(run.scene)
         findings = Findings(scene, given, light_field, images, quality, [], {}, {}, "")
         volume = section("Volume", volume_section(findings))

@@ -14,6 +14,7 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.responses import fit_held_out
 from ddrecon.reconstruct.setup import choose_loss, targets_of
 from ddrecon.renderer import LightField, view_picture
+from ddrecon.run.findings import solve
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings
 
@@ -42,6 +43,15 @@ def render_views(
             **{f"fitted_{key}": value.tolist() for key, value in fitted.items()},
         }
     return pictures, quality
+
+
+def render_run(
+    run: Reconstruction,
+) -> tuple[Scene, LightField, dict[str, Tensor], dict[str, dict[str, Any]]]:
+    """The scene that `run` has found, the light in it, and what `render_views` makes of both."""
+    scene = run.current_scene()
+    light_field = solve(scene)
+    return scene, light_field, *render_views(run, scene, light_field)
 
 
 def compared_by(run: Reconstruction) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
-from ddrecon.ranks import is_first, own_rank, rank_count, sum_numbers
+from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_numbers
 from ddrecon.renderer import LightField, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
 from ddrecon.run.shared_views import bring, render_in_turns
@@ -89,7 +89,7 @@ def render_gradient_to_folder(
         start, images = perf_counter(), dict[tuple[str, str], Tensor]()
         light_field = solve_light(world, memory)
         seconds["light"] = perf_counter() - start
-        own = views[own_rank() :: rank_count()]
+        own = views if cells_are_shared() else views[own_rank() :: rank_count()]
         for view in progress([world.view(view.name) for view in own], "render"):
             begun = perf_counter()
             images |= {
@@ -103,7 +103,8 @@ def render_gradient_to_folder(
         rendered = render_tangent(scene, parameter, images_of)
     found = {name: image for (_, name), (image, _) in rendered.items()}
     derived = {_derived(*key): derivative for key, (_, derivative) in rendered.items()}
-    taken = dict(zip(taken, sum_numbers(list(taken.values())), strict=True))
+    if not cells_are_shared():
+        taken = dict(zip(taken, sum_numbers(list(taken.values())), strict=True))
     for view in views:
         names = _names(view, has_components)
         images = bring(view, found, names)

@@ -14,12 +14,12 @@ from ddrecon.io.images.movies import SECONDS, encode_frames
 from ddrecon.io.images.table import png_of
 from ddrecon.io.images.webp import moving_webp_of
 from ddrecon.reconstruct.smoothing import smoothing_text
-from ddrecon.renderer import view_image
+from ddrecon.renderer import LightField, view_image
 from ddrecon.report.page import movie, paragraph, picture, side_by_side
 from ddrecon.report.pictures import find_white, pixels, projections, slices
 from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 from ddrecon.run.findings import Findings
-from ddrecon.scene import View
+from ddrecon.scene import Scene, View
 from ddrecon.turntable import place_turntable, upright_axis
 from ddrecon.variables.values import fields_of
 
@@ -77,19 +77,25 @@ def _stills(fields: dict[str, Tensor]) -> str:
 
 def turntable(findings: Findings) -> str:
     """A movie of FRAMES pictures once around the volume, from the first view."""
-    first = findings.scene.views[0]
-    view = View(first.name, _enlarge(first.camera))
-    with torch.no_grad():
-        images = [
-            pixels(view_image(findings.light_field, findings.scene, each.camera))
-            for each in place_turntable(findings.scene, view, FRAMES)
-        ]
+    images = [pixels(image) for image in turntable_images(findings.scene, findings.light_field)]
     white = max(map(find_white, images))
+    first = findings.scene.views[0].name
     caption = (
-        f"Once around the upright axis, from {first.name}; radiance {white:.3g} is white. "
+        f"Once around the upright axis, from {first}; radiance {white:.3g} is white. "
         "Larger: ddrecon render RUN --ring 60"
     )
     return movie(moving_webp_of(encode_frames(images, white), SECONDS), caption)
+
+
+def turntable_images(scene: Scene, light_field: LightField) -> list[Tensor]:
+    """The images [3, h, w] of that movie."""
+    first = scene.views[0]
+    view = View(first.name, _enlarge(first.camera))
+    with torch.no_grad():
+        return [
+            view_image(light_field, scene, each.camera)
+            for each in place_turntable(scene, view, FRAMES)
+        ]
 
 
 def _enlarge(camera: Camera) -> Camera:

@@ -22,7 +22,7 @@ from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
 from ddrecon.run.diagnoses import LateMeans, diagnose
 from ddrecon.run.findings import Findings, given_fields, solve
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import compared_by, render_views
+from ddrecon.run.quality import compared_by, render_run, render_views
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
@@ -107,8 +107,7 @@ class RunFolder:
 
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
-        scene = run.current_scene()
-        images, _ = render_views(run, scene, solve(scene))
+        scene, _, images, _ = render_run(run)
         self._pictures(scene, images, f"_{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:

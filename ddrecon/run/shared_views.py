@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.progress import Progress
-from ddrecon.ranks import own_rank, rank_count, sum_over_ranks
+from ddrecon.ranks import cells_are_shared, own_rank, rank_count, sum_over_ranks
 from ddrecon.scene import View
 
 Images = Mapping[str, Tensor]
@@ -24,8 +24,14 @@ def render_in_turns(
 ) -> Iterator[tuple[View, Images, float]]:
     """Each of `views`, its images as `images_of` gives them, and the seconds that they took.
 
-    `names_of` says what these are called. With several ranks the seconds are those of a turn.
+    `names_of` says what these are called. With several ranks the seconds are those of a turn; where
+    they share out cells, all render each view together.
     """
+    if cells_are_shared():
+        for view in progress(views, "render"):
+            start = perf_counter()
+            yield view, images_of(view), perf_counter() - start
+        return
     ranks = rank_count()
     for begin in progress(range(0, len(views), ranks), "render"):
         turn, start = views[begin : begin + ranks], perf_counter()
@@ -38,7 +44,7 @@ def render_in_turns(
 
 def bring(view: View, images: Images, names: Sequence[str]) -> Images:
     """The images of `view` called `names`, from the rank that has them as `images`."""
-    if rank_count() == 1:
+    if rank_count() == 1 or cells_are_shared():
         return images
     nothing = view.camera.pose.new_zeros(3, *view.camera.size)
     stack = torch.stack([images.get(name, nothing) for name in names])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -21,8 +22,9 @@ from ddrecon.pictures.noise import Noise
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.next_view import Candidate, NextView
+from ddrecon.reconstruct.next_view import Candidate, NextView, shots_around
 from ddrecon.reconstruct.picture_errors import PictureErrors
+from ddrecon.reconstruct.posterior import Sample
 from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.run.checkpoint import (
     LAST,
@@ -36,7 +38,6 @@ from ddrecon.run.drive import defer_interrupt
 from ddrecon.run.run_folder import CHECKPOINTS
 from ddrecon.run.uncertainty_report import write_uncertainty_report
 from ddrecon.scene import Scene
-from ddrecon.turntable import place_turntable
 
 RECORD = "uncertainty.json"
 """What tells a folder of this kind."""
@@ -79,101 +80,105 @@ def take_up(scene: Scene, state: dict[str, Any], folder: Path) -> Reconstruction
     return run
 
 
+@dataclass(frozen=True)
+class Request:
+    """What samples depend on: `noise` of all pictures, if their scene is not to say, and so on.
+
+    `next_view` is the kind of pictures to rank (`shots_around`), if any.
+    """
+
+    seed: int
+    noise: Noise | None = None
+    tolerance: float | None = None
+    next_view: str | None = None
+
+
 def drive_uncertainty(
     run: Reconstruction,
     path: Path,
     samples: int,
+    request: Request,
     *,
-    seed: int,
-    noise: Noise | None,
-    tolerance: float,
     has_samples: bool,
-    candidates: int = 0,
     resume: bool,
     is_quiet: bool,
 ) -> dict[str, Any]:
     """What `uncertainty.json` says of `run`, after `samples` in all, its folder being `path`.
 
     Each sample is saved when it is drawn: `resume` goes on after the last. `has_samples` keeps them
-    as volumes. An interrupt takes effect after a sample. So many `candidates` for the next picture,
-    around the volume, are ranked.
+    as volumes. An interrupt takes effect after a sample.
     """
     began, checkpoints = perf_counter(), path / CHECKPOINTS
     for name in ("volumes", CHECKPOINTS):
         (path / name).mkdir(exist_ok=True)
-    described = _describe(run, seed, noise, tolerance) | {"candidates": candidates}
+    described = _describe(run, request)
     state = _take_up(checkpoints, described) if resume else None
     if state is None:
         forget_checkpoints(checkpoints)
-    before = 0.0 if state is None else state["seconds"]
-    found, ranking = _begin(run, from_first(state), seed, noise, tolerance, candidates)
+    began -= 0.0 if state is None else state["seconds"]
+    found, ranking = _begin(run, from_first(state), request)
+
+    def keep(sample: Sample) -> None:
+        if has_samples:
+            _write_sample(found, sample.change, path / SAMPLES / f"{found.count - 1:04d}")
+        kept = found.state() | {"seconds": perf_counter() - began}
+        if ranking is not None:
+            kept["ranking"] = ranking.state()
+        save_checkpoint(checkpoints, kept, described)
+
     try:
-        with (
-            defer_interrupt() as asked,
-            tqdm(
-                total=samples, initial=found.count, desc="uncertainty", **bar_settings(is_quiet)
-            ) as bar,
-        ):
-            while found.count < samples:
-                sample = found.step()
-                if has_samples:
-                    _write_sample(found, sample.change, path / SAMPLES / f"{found.count - 1:04d}")
-                kept = found.state()
-                if ranking is not None:
-                    ranking.add(sample.change)
-                    kept["ranking"] = ranking.state()
-                kept["seconds"] = before + perf_counter() - began
-                save_checkpoint(checkpoints, kept, described)
-                bar.set_postfix_str(f"{sample.products} products", refresh=False)
-                bar.update()
-                if is_any(bool(asked)):
-                    raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
+        _draw(found, ranking, samples, keep, is_quiet)
     except RanksError as error:
         raise error.with_advice(f"{found.count} samples are kept: go on with --resume") from error
     # What is left the first rank does by itself.
     leave_ranks()
-    seconds = before + perf_counter() - began
-    return _finish(run, found, path, seconds, [] if ranking is None else ranking.rank())
+    ranked = [] if ranking is None else ranking.rank()
+    return _finish(run, found, path, perf_counter() - began, ranked)
 
 
-def follow_uncertainty(
-    run: Reconstruction,
-    samples: int,
-    *,
-    seed: int,
-    noise: Noise | None,
-    tolerance: float,
-    candidates: int,
-) -> None:
+def follow_uncertainty(run: Reconstruction, samples: int, request: Request) -> None:
     """Does this rank's part of what `drive_uncertainty` does on the first, which alone writes."""
-    found, ranking = _begin(run, from_first(None), seed, noise, tolerance, candidates)
-    with defer_interrupt() as asked:
-        while found.count < samples:
-            sample = found.step()
-            if ranking is not None:
-                ranking.add(sample.change)
-            if is_any(bool(asked)):
-                raise KeyboardInterrupt
+    found, ranking = _begin(run, from_first(None), request)
+    _draw(found, ranking, samples, lambda sample: None, is_quiet=True)
 
 
 def _begin(
-    run: Reconstruction,
-    state: dict[str, Any] | None,
-    seed: int,
-    noise: Noise | None,
-    tolerance: float,
-    candidates: int,
+    run: Reconstruction, state: dict[str, Any] | None, request: Request
 ) -> tuple[Uncertainty, NextView | None]:
-    """The samples of `run` so far, as `state` has them, and what ranks `candidates` by them."""
+    """The samples of `run` so far, as `state` has them, and what ranks pictures by them."""
     errors = None if state is None else PictureErrors(**state["errors"])
-    found = Uncertainty(run, seed, noise, tolerance, errors)
-    ring = place_turntable(run.train_level, run.train_level.views[0], candidates)
-    ranking = NextView(found.curvature, ring, found.errors.deviation) if ring else None
+    kind, ranking = request.next_view, None
+    # Before anything takes long: there may be nothing to rank.
+    shots = [] if kind is None else shots_around(run.train_level, kind)
+    found = Uncertainty(run, request.seed, request.noise, request.tolerance, errors)
+    if shots:
+        ranking = NextView(found.curvature, shots, found.errors.deviation)
     if state is not None:
         found.restore(state)
         if ranking is not None:
             ranking.restore(state["ranking"])
     return found, ranking
+
+
+def _draw(
+    found: Uncertainty,
+    ranking: NextView | None,
+    samples: int,
+    keep: Callable[[Sample], None],
+    is_quiet: bool,
+) -> None:
+    """Draws what `found` lacks of so many `samples`, and keeps each."""
+    bar = tqdm(total=samples, initial=found.count, desc="uncertainty", **bar_settings(is_quiet))
+    with defer_interrupt() as asked, bar:
+        while found.count < samples:
+            sample = found.step()
+            if ranking is not None:
+                ranking.add(sample.change)
+            keep(sample)
+            bar.set_postfix_str(f"{sample.products} products", refresh=False)
+            bar.update()
+            if is_any(bool(asked)):
+                raise KeyboardInterrupt(f"after {found.count} samples; go on with --resume")
 
 
 def _take_up(checkpoints: Path, described: dict[str, Any]) -> dict[str, Any]:
@@ -183,18 +188,11 @@ def _take_up(checkpoints: Path, described: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def _describe(
-    run: Reconstruction, seed: int, noise: Noise | None, tolerance: float
-) -> dict[str, Any]:
+def _describe(run: Reconstruction, request: Request) -> dict[str, Any]:
     """What samples depend on, in plain values, so that only those of the same run are added up."""
     sums = {p.name: float(p.value.detach().double().abs().sum()) for p in run.parameters}
-    return {
-        "iteration": run.iteration,
-        "values": sums,
-        "seed": seed,
-        "noise": None if noise is None else vars(noise),
-        "tolerance": tolerance,
-    }
+    noise = None if request.noise is None else vars(request.noise)
+    return {"iteration": run.iteration, "values": sums} | vars(request) | {"noise": noise}
 
 
 def _finish(

@@ -31,7 +31,7 @@ from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.rounds import choose_rounds
 from ddrecon.scene_file.schema import VolumeSection
 from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import FIELDS, KINDS, PHASE
+from ddrecon.variables.kinds import FIELDS, KINDS, PHASE, kind_of
 from ddrecon.variables.values import cross_sections
 
 Fields = Mapping[str, Field]
@@ -108,12 +108,13 @@ def _varied(name: str, settings: ParameterSettings, fields: Fields, colors: int)
     """How many numbers a cell the parameter `name` has."""
     if name == "density":
         return 1
+    per_cell = colors if kind_of(name).is_color else 1
     is_field = (
         name in fields or isinstance(settings.init, FieldFile)
         if settings.field is None
         else settings.field
     )
-    return colors if name in FIELDS and is_field else 0
+    return per_cell if name in FIELDS and is_field else 0
 
 
 def _read_fields(scene_file: SceneFile) -> Fields:

@@ -41,3 +41,15 @@ def test_cameras_around_the_volume_are_ranked(finished: None, succeed: Run, run:
     assert ranked("parts") == views
     few = run("uncertainty", "run", "-o", "few", "--samples", "4", *RANK)
     assert few.exit_code == 2 and "--next-view takes at least 5 samples" in few.stderr
+
+
+def test_lights_around_the_volume_are_ranked(finished: None, succeed: Run) -> None:
+    lit = [*RANK[:-1], "lights"]
+    succeed("uncertainty", "run", "-o", "lit", "--samples", "5", *lit)
+    views = {view["name"]: view for view in ranked("lit")}
+    assert len(views) == 12 and all(0 <= view["gain"] <= 1 for view in views.values())
+    # All travel as far down as the first, which is the scene's, and none twice the same way.
+    ways = [view["light_directions"][0] for _, view in sorted(views.items())]
+    assert {round(way[1] - ways[0][1], 5) for way in ways} == {0}
+    assert len({(round(way[0], 4), round(way[2], 4)) for way in ways}) == 12
+    assert "light_000" in Path("lit/report.html").read_text()

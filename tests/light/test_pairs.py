@@ -19,6 +19,40 @@ from ddrecon.validate.balance import balance_of
 IRRADIANCE = 3.0
 
 
+def test_energy_is_kept_where_the_backward_peak_differs_from_cell_to_cell() -> None:
+    """What F and G lose in a cell is what scatters there and is absorbed, and the rest leaves."""
+    torch.manual_seed(1)
+    density, g = torch.rand(2, 9, 1, 1, dtype=torch.float64)
+    density[4] = 0
+    scene = make_scene(
+        density,
+        grid=Grid((9, 1, 1), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+        sigma_a=(0.5,),
+        sigma_s=(6.0,),
+        directional=(IRRADIANCE,),
+        travel=(0.0, 0.0, 2.0),
+    )
+    scene.volume.g = 0.6 - 1.5 * g
+    medium = scale_medium(scene.volume, 3)
+    _, pair = follow_pair(medium, scene.lights[0])
+    # what a cell takes, kappa_t of both less what it turns, and what it hands on to its neighbors
+    turned = backward_fraction(medium) * medium.scattering.value
+    beams = 4 * math.pi / 9 * (pair.along + pair.against)
+    taken = ((medium.extinction.value - turned) * beams).flatten()
+    # a slab of layers, each by its own closed form, added up from the far end
+    passed, reflected = 1.0, 0.0
+    beta = (turned / medium.extinction.value).nan_to_num().flatten()
+    depth = medium.extinction.value.flatten() / 9
+    for k in reversed(range(9)):
+        rate = math.sqrt(1 - float(beta[k]) ** 2)
+        back, through = float(beta[k]) / (1 + rate), math.exp(-rate * float(depth[k]))
+        norm = 1 / (1 - (back * through) ** 2)
+        lets, turns = (1 - back**2) * through * norm, back * (1 - through**2) * norm
+        again = 1 / (1 - turns * reflected)
+        passed, reflected = lets * again * passed, turns + lets**2 * reflected * again
+    assert float(taken.sum()) == pytest.approx(IRRADIANCE * (1 - passed - reflected), rel=1e-12)
+
+
 @pytest.mark.parametrize("g", [-0.8, -0.4])
 def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
     """E20's beams leave with F at the far end and G at the near one; the rest is the source of E4,

@@ -69,6 +69,13 @@ def sure(ranks: int, output: str, *options: str) -> dict[str, Any]:
 
 
 RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density", "-o"]
+TALL = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch", "-D", "diffusion.warm_start=false"
+KNOWN = (
+    "-D",
+    "optimize.parameters={density: {init: 0.4, tv: 1e-3}, sigma_s: {field: true}, g: {}, "
+    "views.*.exposure: {}}",
+)
+CELLS = "--share", "cells"
 JOBS = {
     "one": job(1, "one"),
     "four": job(4, "four"),
@@ -83,6 +90,13 @@ JOBS = {
     "sure begun": sure(1, "doubts", "--samples", "2"),
     "sure of three": sure(3, "doubts", "--samples", "3", "--resume"),
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
+    "whole": job(1, "whole", *TALL, *KNOWN),
+    "cells": job(2, "cells", *TALL, *KNOWN, *CELLS, "--preview-every", "4"),
+    "cells killed": job(3, "torn", *TALL, *KNOWN, *CELLS, failing=[2, 4, "killed"]),
+    "cells resumed": job(2, "torn", *TALL, *KNOWN, *CELLS, "--resume"),
+    "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.transport_rounds=1"),
+    "tall": {"ranks": 1, "arguments": [*RENDER, "tall", *TALL]},
+    "tall cells": {"ranks": 2, "arguments": [*RENDER, "tall cells", *TALL, *CELLS]},
     "measured": {"ranks": 2, "arguments": ["bench", "scene.yaml", "--json", "bench.json"]},
 }
 
@@ -98,9 +112,14 @@ class Runs:
         return (self.folder / f"{list(JOBS).index(name)}.{rank}.{end}").read_text()
 
     def log(self, output: str) -> np.ndarray:
-        """The log in the folder `output`, without the times."""
+        """The log in the folder `output`, without the times.
+
+        And without the steps of solves: one that was cut off has begun nearer to its end.
+        """
         with (self.folder / output / "loss.csv").open() as stream:
-            rows = [row | {"seconds": "0"} for row in csv.DictReader(stream)]
+            rows = [
+                row | {"seconds": "0", "forward_iterations": "0"} for row in csv.DictReader(stream)
+            ]
         return np.array([[float(cell or 0) for cell in row.values()] for row in rows])
 
     def found(self, output: str) -> dict[str, np.ndarray]:
@@ -136,10 +155,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     return Runs(folder)
 
 
-@pytest.mark.parametrize("output", ["four", "broken"])
-def test_ranks_find_what_one_finds(runs: Runs, output: str) -> None:
-    np.testing.assert_allclose(runs.log(output), runs.log("one"), rtol=1e-7)
-    expected, found = runs.found("one"), runs.found(output)
+@pytest.mark.parametrize(
+    ("output", "alone"), [("four", "one"), ("broken", "one"), ("cells", "whole"), ("torn", "whole")]
+)
+def test_ranks_find_what_one_finds(runs: Runs, output: str, alone: str) -> None:
+    np.testing.assert_allclose(runs.log(output), runs.log(alone), rtol=1e-7)
+    expected, found = runs.found(alone), runs.found(output)
     assert expected.keys() == found.keys()
     assert "views.c.exposure" in found and "views.d.camera" in found
     for name, value in expected.items():
@@ -184,6 +205,29 @@ def test_ranks_render_what_one_renders(runs: Runs) -> None:
     for name in arrays:
         one, other = (np.load(runs.folder / output / name) for output in ("alone", "views"))
         np.testing.assert_array_equal(one, other)
+
+
+def test_ranks_render_in_slabs_what_one_renders(runs: Runs) -> None:
+    assert runs.codes["tall"] == [0] and runs.codes["tall cells"] == [0, 0]
+    arrays = sorted(path.name for path in (runs.folder / "tall").glob("*.npy"))
+    assert len(arrays) == 2 * len(VIEWS | TESTS)
+    for name in arrays:
+        one, other = (np.load(runs.folder / output / name) for output in ("tall", "tall cells"))
+        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-5 * abs(one).max())
+
+
+def test_what_slabs_cannot_do_is_refused(runs: Runs) -> None:
+    assert runs.codes["cells refused"][0] == 2
+    lines = runs.text("cells refused", 0, "err").splitlines()
+    assert len(lines) == 2 and all(line.startswith("--share cells: ") for line in lines)
+    assert "diffusion.transport_rounds" in lines[0] and "views.a.camera and 2 more" in lines[1]
+    assert not (runs.folder / "none").exists()
+
+
+def test_previews_and_pictures_are_of_all_slabs(runs: Runs) -> None:
+    names = sorted(path.name for path in (runs.folder / "cells" / "previews").iterdir())
+    assert "c.png" in names and "c_000004.png" in names
+    assert (runs.folder / "cells" / "report.html").is_file()
 
 
 def test_ranks_draw_the_samples_of_one(runs: Runs) -> None:

@@ -76,6 +76,23 @@ def test_a_product_is_that_with_the_matrix_of_differences() -> None:
     torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6 * float(wanted.abs().max()))
 
 
+def test_pictures_change_in_other_light_as_they_are_bright_in_it() -> None:
+    scene = small_scene(torch.float64, rounds=0)
+    curvature = curvature_of(scene)
+    # What lights of the scene do counts for nothing where others are lit.
+    vector = random_values(curvature.size)
+    dark = curvature.split(vector.clone())
+    dark["lights.0.irradiance"].zero_()
+    plain = curvature.tangents(curvature.join(dark), scene.views)
+    ambient, sun = scene.lights[1], scene.lights[0]
+    bright = [
+        replace(sun, irradiance=2 * sun.irradiance),
+        replace(ambient, radiance=2 * ambient.radiance),
+    ]
+    for name, change in curvature.tangents(vector, scene.views, bright).items():
+        torch.testing.assert_close(change, 2 * plain[name])
+
+
 @pytest.mark.parametrize("loss", LOSSES)
 def test_weights_are_the_second_derivative_of_the_loss_or_of_a_parabola_above_it(
     loss: str,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from media import make_scene, random_values
 
-from ddrecon.reconstruct.next_view import find_error, find_gain, find_products
+from ddrecon.errors import UsageError
+from ddrecon.reconstruct.next_view import find_error, find_gain, find_products, shots_around
 
 SIZE, PIXELS = 40, 60
 
@@ -74,3 +76,9 @@ def test_the_error_is_how_much_gains_of_other_samples_differ() -> None:
 def test_a_picture_of_nothing_gains_nothing() -> None:
     root, picture = problem()
     assert find_gain(*drawn(root, 0 * picture, 8, 0)) == 0
+
+
+def test_lights_that_cannot_be_turned_are_refused() -> None:
+    dark = make_scene(random_values(3, 3, 3), directional=None, ambient=(1.0,))
+    with pytest.raises(UsageError, match="turns directional lights"):
+        shots_around(dark, "lights")

@@ -102,7 +102,7 @@ def test_within_bounds_a_sample_is_the_least_of_its_quadratic(
     generator = generator_of(3, 0)
     scale = TEMPERATURE**0.5
     right = scale * sum(posterior.prior.root_noise(generator))
-    right += scale * posterior.data_noise(generator)
+    right += scale * curvature.adjoint(posterior._disturbances(generator))
     change = posterior.sample(0).change
     slope = matrix @ change - right + pressed
     size = float((right - pressed).abs().max())

@@ -182,6 +182,17 @@ def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time() -> None:
         assert phase["weight"] == pytest.approx(1 - float(weight[color]))
 
 
+def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused() -> None:
+    scene, weight = make_scene(random_values(*SHAPE)), random_values(*SHAPE, seed=1)
+    scene.volume.phase = TwoLobe(weight.new_tensor([0.6, -0.3]), weight)
+    phase = described(scene)["medium"]["phase"]
+    np.testing.assert_allclose(phase["weight"]["grid"][..., 0], 1 - weight, rtol=1e-6)
+    assert (phase["first"]["g"], phase["second"]["g"]) == (0.6, -0.3)
+    scene.volume.g = weight
+    with pytest.raises(SceneError, match=r"volume.g: differs from cell to cell.*two_lobe"):
+        described(scene)
+
+
 def test_a_table_of_values_goes_from_backward_to_forward() -> None:
     scene = make_scene(random_values(*SHAPE))
     scene.volume.phase = Draine(*scene.volume.density.new_tensor([0.5, 1.0]))

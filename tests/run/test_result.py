@@ -57,6 +57,7 @@ VARIED = [
         [],
     ),
     ("lights.1.radiance: {}, lights.1.scale: {}, lights.1.rotation: {}", []),
+    ("g: {init: 0.5, field: true}", ["g"]),
     ("views.front.camera: {}", []),
 ]
 

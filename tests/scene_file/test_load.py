@@ -162,8 +162,14 @@ ONE_FAULT = [
     ("volume.g=-1", "volume.g: must be above -1"),
     ("volume.g=.nan", "volume.g: expected a finite number"),
     ("volume.g=1e400", "volume.g: expected a finite number"),
-    ("volume.g='0.3'", "volume.g: expected a number, found '0.3'"),
-    ("volume.g=", "volume.g: expected a number, found nothing"),
+    (
+        "volume.g='0.3'",
+        "volume.g: expected a number, {constant: number} or {file: path}, found '0.3'",
+    ),
+    (
+        "volume.g=",
+        "volume.g: expected a number, {constant: number} or {file: path}, found nothing",
+    ),
     ("volume.density=-1", "volume.density: must be at least 0"),
     (
         "volume.density=[1, 2, 3]",

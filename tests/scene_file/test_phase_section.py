@@ -12,7 +12,7 @@ import torch
 import yaml
 from example_scene import SCENE, changed
 
-from ddrecon.errors import DataWarning, SceneError
+from ddrecon.errors import DataWarning, FormatError, SceneError
 from ddrecon.medium.phase import Draine, HenyeyGreenstein, Rayleigh, TwoLobe
 from ddrecon.medium.phase_series import Legendre, Tabulated
 from ddrecon.scene_file.build import build_scene, load_scene
@@ -146,3 +146,81 @@ def test_droplets_scatter_as_one_sphere_does_and_forward(write: Callable[[str], 
 def test_a_missing_file_is_the_scene_s_mistake(write: Callable[[str], Path]) -> None:
     with pytest.raises(SceneError, match=r"volume\.phase\.file"):
         load_scene(write(scene_with(type="table", file="nowhere.csv")))
+
+
+CELLS = (6, 5, 4)
+"""In x, y, z."""
+
+
+def write_cells(path: Path, **fields: float) -> None:
+    """Fields of one number, but for the first cell, which has half of it."""
+    arrays = {name: np.full(CELLS[::-1], value, np.float32) for name, value in fields.items()}
+    for array in arrays.values():
+        array[0, 0, 0] /= 2
+    bounds = np.array([[0, 0, 0], CELLS], np.float32)
+    np.savez(path, bounds=bounds, **arrays)  # type: ignore[arg-type]
+
+
+def cells_scene(**volume: Any) -> str:
+    sizes = {"bounds": {"min": [0, 0, 0], "max": list(CELLS)}, "resolution": list(CELLS)}
+    fixed = {"density": 0.1, "sigma_t": 5, "albedo": 0.9}
+    return changed(volume=sizes | fixed | volume, optimize=None)
+
+
+@pytest.mark.parametrize(
+    "volume",
+    [
+        {"g": {"file": "cells.npz"}},
+        {"phase": {"type": "henyey_greenstein", "g": {"file": "cells.npz"}}},
+        {"phase": {"type": "two_lobe", "g": [0.8, -0.3], "weight": {"file": "cells.npz"}}},
+        {"g": {"file": "cells.npz", "name": "weight"}},
+    ],
+    ids=["short", "long", "weight", "another name"],
+)
+def test_a_number_of_each_cell_comes_from_a_file_and_is_written_back(
+    volume: dict[str, Any], write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    write_cells(tmp_path / "cells.npz", g=0.6, weight=0.6)
+    scene_file = read_scene(write(cells_scene(**volume)))
+    cells = build_scene(scene_file).volume.phase.cells
+    assert cells is not None and cells.shape == (1, *CELLS[::-1])
+    assert float(cells[0, 0, 0, 0]) == pytest.approx(0.3)
+    assert bool((cells.flatten()[1:] - 0.6).abs().max() < 1e-6)
+    dump_scene(scene_file, tmp_path / "again.yaml")
+    again = load_scene(tmp_path / "again.yaml").volume.phase.cells
+    assert again is not None and torch.equal(again, cells)
+
+
+def test_g_of_a_cell_may_be_negative_and_a_weight_not(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    write_cells(tmp_path / "cells.npz", g=-0.6, weight=-0.6, steep=0.995, much=1.5)
+    phase = load_scene(write(cells_scene(g={"file": "cells.npz"}))).volume.phase
+    assert float(phase.moments(2)[0, 1].min()) == pytest.approx(-0.6)
+    lobes = {"type": "two_lobe", "g": [0.8, -0.3]}
+    for volume, told in (
+        ({"phase": lobes | {"weight": {"file": "cells.npz"}}}, "weight is negative"),
+        ({"phase": lobes | {"weight": {"file": "cells.npz", "name": "much"}}}, "much is above 1"),
+        ({"g": {"file": "cells.npz", "name": "steep"}}, "steep is above 0.99"),
+    ):
+        with pytest.raises(FormatError, match=told):
+            load_scene(write(cells_scene(**volume)))
+
+
+def test_cells_of_another_grid_are_refused_at_their_key(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    write_cells(tmp_path / "cells.npz", weight=0.6)
+    phase = {"type": "two_lobe", "g": [0.8, -0.3], "weight": {"file": "cells.npz"}}
+    with pytest.raises(SceneError, match=r"volume\.phase\.weight\.file: has 6 x 5 x 4 cells"):
+        load_scene(write(cells_scene(phase=phase, resolution=[6, 5, 5])))
+
+
+def test_a_number_of_each_cell_is_optimized_from_one(write: Callable[[str], Path]) -> None:
+    parameters = {"phase.weight": {"init": 0.4, "field": True}, "phase.g": {}}
+    phase = {"type": "two_lobe", "g": [0.8, -0.3], "weight": 0.7}
+    text = changed(volume=VOLUME | {"phase": phase}, optimize={"parameters": parameters})
+    scene = load_scene(write(text))
+    weight = scene.starts["phase.weight"]
+    assert weight.shape == scene.volume.grid.shape and bool((weight == 0.4).all())
+    assert scene.starts["phase.g"].tolist() == pytest.approx([0.8, -0.3])

@@ -126,7 +126,10 @@ def test_a_start_from_a_file(
             "{lights.0.direction: {init: 3}}",
             "optimize.parameters.lights.0.direction.init: expected a list of 3 numbers",
         ),
-        ("{g: {field: true}}", "optimize.parameters.g.field: it is not a field, so it has none"),
+        (
+            "{lights.0.irradiance: {field: true}}",
+            "optimize.parameters.lights.0.irradiance.field: it is not a field, so it has none",
+        ),
         (
             "{lights.1.radiance: {tv: 1}}",
             "optimize.parameters.lights.1.radiance.tv: it is not a field, so it has none",

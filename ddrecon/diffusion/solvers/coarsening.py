@@ -71,7 +71,10 @@ def coarsen(operator: Operator, axis: int) -> tuple[Coarsening, Operator]:
     coarse = [_sum_of_pairs(c, axis) for c in operator.conductances]
     coarse[axis - 1] = _stiffened(1 / resistance, way, operator)
     z, y, x = coarse
-    return way, Operator((z, y, x), _sum_of_pairs(operator.loss, axis))
+    ghosts = operator.ghosts
+    if ghosts is not None and ghosts.axis == axis:
+        ghosts = ghosts.halved()
+    return way, Operator((z, y, x), _sum_of_pairs(operator.loss, axis), ghosts=ghosts)
 
 
 def _stiffened(along: Tensor, way: Coarsening, operator: Operator) -> Tensor:

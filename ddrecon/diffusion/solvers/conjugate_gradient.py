@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up, inner
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up
 
 MAX_ITERATIONS = 20_000
 CHECK_EVERY = 4
@@ -24,17 +24,18 @@ def conjugate_gradient(
     Raises SolveError when it is not reached.
     """
     system = ScaledSystem.of(operator, source)
+    matrix = system.matrix
     y, residual = system.start(guess)
-    direction, square = residual.clone(), inner(residual, residual)
+    direction, square = residual.clone(), matrix.inner(residual, residual)
     tiny = torch.finfo(source.dtype).tiny
     for iteration in range(MAX_ITERATIONS + 1):
         if iteration % CHECK_EVERY == 0 and not (relative := system.relative(residual)) > tolerance:
             break
-        product = system.matrix.apply(direction)
-        step = square / inner(direction, product).clamp(min=tiny)
+        product = matrix.apply(direction)
+        step = square / matrix.inner(direction, product).clamp(min=tiny)
         y.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
-        previous, square = square, inner(residual, residual)
+        previous, square = square, matrix.inner(residual, residual)
         direction.mul_(square / previous.clamp(min=tiny)).add_(residual)
     if not relative <= tolerance:
         raise give_up("conjugate_gradient", iteration, relative)

@@ -17,6 +17,8 @@ from torch import Tensor
 from ddrecon.diffusion.operator import AXES, Operator, lower_cells, upper_cells
 from ddrecon.diffusion.solvers.coarsening import Coarsening, coarsen
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
+from ddrecon.ranks import sum_over_ranks
+from ddrecon.slabs.ghosts import Ghosts
 
 FEW_CELLS = 128
 """So many cells are solved directly."""
@@ -71,6 +73,8 @@ class Coarsest:
 class Level:
     """A grid: its matrix, and the way to the next coarser one, axis by axis.
 
+    Of a grid in slabs the next coarser one is gathered on every rank.
+
     `taken` [C, z, y, x]: S times what a cell exchanges with its neighbors, the sum of its
     conductances. Corrections from the coarser grid are multiplied by it: by 1/S where nothing is
     lost, by nearly nothing where light is absorbed before it gets to the next cell. Else they would
@@ -80,7 +84,7 @@ class Level:
     matrix: ScaledMatrix
     taken: Tensor
     ways: tuple[Coarsening, ...]
-    coarser: Level | Coarsest
+    coarser: Level | Coarsest | Gathered
 
     @staticmethod
     def of(operator: Operator) -> Level:
@@ -90,10 +94,7 @@ class Level:
         for axis in _strong_axes(matrix):
             way, operator = coarsen(operator, axis)
             ways.append(way)
-        has_few = operator.loss[0].numel() <= FEW_CELLS
-        return Level(
-            matrix, taken, tuple(ways), Coarsest.of(operator) if has_few else Level.of(operator)
-        )
+        return Level(matrix, taken, tuple(ways), _coarser(operator))
 
     def cycle(self, source: Tensor) -> Tensor:
         """Roughly y with S A S y = `source` [C, z, y, x].
@@ -119,15 +120,47 @@ class Level:
         return self.cycle(self.matrix.scale * residual).mul_(self.matrix.scale)
 
 
+@dataclass(frozen=True)
+class Gathered:
+    """A `whole` grid that every rank has, beneath one in slabs with `ghosts`."""
+
+    ghosts: Ghosts
+    whole: Level | Coarsest
+
+    @staticmethod
+    def of(operator: Operator, ghosts: Ghosts) -> Gathered:
+        """The grid of all cells of `operator`, which has those of one rank, and all coarser."""
+        z, y, x = (
+            ghosts.gather(ghosts.own_faces(faces, axis), without_last=axis == ghosts.axis)
+            for axis, faces in zip(AXES, operator.conductances, strict=True)
+        )
+        whole = _coarser(Operator((z, y, x), ghosts.gather(ghosts.own(operator.loss))))
+        assert not isinstance(whole, Gathered)
+        return Gathered(ghosts, whole)
+
+    def correction(self, residual: Tensor) -> Tensor:
+        """Roughly A^-1 `residual` of this rank's cells, by one cycle of all."""
+        whole = self.ghosts.gather(self.ghosts.own(residual))
+        return self.ghosts.cut(self.whole.correction(whole))
+
+
+def _coarser(operator: Operator) -> Level | Coarsest | Gathered:
+    """The grid of `operator`, coarsened from a finer one, and all coarser ones."""
+    if operator.ghosts is not None:
+        return Gathered.of(operator, operator.ghosts)
+    has_few = operator.loss[0].numel() <= FEW_CELLS
+    return Coarsest.of(operator) if has_few else Level.of(operator)
+
+
 def _strong_axes(matrix: ScaledMatrix) -> list[int]:
     """The axes to coarsen, all that have more than one cell and are not weak."""
     sizes = matrix.scale.shape
     axes = [axis for axis in AXES if sizes[axis] > 1]
-    strengths = (
-        torch.stack([matrix.conductances[axis - 1].mean() for axis in axes]).tolist()
-        if axes
-        else []
-    )
+    means = [matrix.conductances[axis - 1].mean() for axis in axes]
+    if matrix.ghosts is not None:
+        # All ranks coarsen the same axes.
+        means = sum_over_ranks(means)
+    strengths = torch.stack(means).tolist() if axes else []
     return [
         axis
         for axis, strength in zip(axes, strengths, strict=True)

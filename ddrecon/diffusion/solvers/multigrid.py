@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
-from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up, inner
+from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up
 from ddrecon.engine import current_engine
 
 MAX_ITERATIONS = 2_000
@@ -26,7 +26,7 @@ def multigrid(
     Raises SolveError when it is not reached.
     """
     # Fused, a thread does slices. On a GPU it does a cell, by torch's operations.
-    if current_engine() == "warp" and not source.is_cuda:
+    if current_engine() == "warp" and not source.is_cuda and operator.ghosts is None:
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)
@@ -34,6 +34,7 @@ def multigrid(
             raise give_up("multigrid", solution.iterations, solution.residual)
         return solution
     system = ScaledSystem.of(operator, source)
+    matrix = system.matrix
     y, residual = system.start(guess)
     direction, square = torch.zeros_like(y), torch.ones_like(system.source_norm)
     tiny = torch.finfo(source.dtype).tiny
@@ -42,11 +43,11 @@ def multigrid(
         relative := float((by_color := system.relative_by_color(residual)).max())
     ) > tolerance and iteration < MAX_ITERATIONS:
         preconditioned = operator.once(Level.of).cycle(residual)
-        previous, square = square, inner(residual, preconditioned)
+        previous, square = square, matrix.inner(residual, preconditioned)
         direction.mul_(square / previous.clamp(min=tiny)).add_(preconditioned)
-        product = system.matrix.apply(direction)
+        product = matrix.apply(direction)
         # A color that is exact enough is left as it is, whatever the others need.
-        step = (by_color > tolerance) * square / inner(direction, product).clamp(min=tiny)
+        step = (by_color > tolerance) * square / matrix.inner(direction, product).clamp(min=tiny)
         y.addcmul_(step, direction)
         residual.addcmul_(step, product, value=-1)
         iteration += 1

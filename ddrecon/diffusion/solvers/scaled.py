@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.operator import AXES, Operator, lower_cells, subtract_neighbors, upper_cells
 from ddrecon.errors import SolveError
+from ddrecon.slabs.ghosts import Ghosts
 
 
 @dataclass(frozen=True)
@@ -25,32 +26,47 @@ class Solution:
 
 @dataclass(frozen=True)
 class ScaledMatrix:
-    """S A S, whose diagonal is 1; `scale` is S, `conductances` those of S A S."""
+    """S A S, whose diagonal is 1; `scale` is S, `conductances` those of S A S.
+
+    With `ghosts`, so have all arrays, and each product ends with an exchange of them.
+    """
 
     scale: Tensor
     conductances: tuple[Tensor, ...]
+    ghosts: Ghosts | None = None
 
     @staticmethod
     def of(operator: Operator) -> ScaledMatrix:
         """The scaled form of `operator`."""
-        scale = operator.diagonal.rsqrt()
+        scale = fill(operator.ghosts, operator.diagonal.rsqrt())
         scaled = tuple(
             c * lower_cells(scale, axis) * upper_cells(scale, axis)
             for axis, c in zip(AXES, operator.conductances, strict=True)
         )
-        return ScaledMatrix(scale, scaled)
+        return ScaledMatrix(scale, scaled, operator.ghosts)
 
     def apply(self, y: Tensor) -> Tensor:
         """S A S y."""
-        return subtract_neighbors(y.clone(), y, self.conductances)
+        return self._subtract_neighbors(y.clone(), y)
 
     def residual(self, y: Tensor, source: Tensor) -> Tensor:
         """`source` - S A S y."""
-        return subtract_neighbors(source - y, y, self.conductances, times=-1.0)
+        return self._subtract_neighbors(source - y, y, times=-1.0)
 
     def relaxed(self, y: Tensor, source: Tensor, step: float) -> Tensor:
         """y + `step` (`source` - S A S y)."""
-        return subtract_neighbors(torch.lerp(y, source, step), y, self.conductances, times=-step)
+        return self._subtract_neighbors(torch.lerp(y, source, step), y, times=-step)
+
+    def inner(self, a: Tensor, b: Tensor) -> Tensor:
+        """Inner product per color, `[C, 1, 1, 1]`."""
+        return inner(a, b) if self.ghosts is None else self.ghosts.inner(a, b)
+
+    def norm(self, a: Tensor) -> Tensor:
+        """Euclidean norm per color, `[C, 1, 1, 1]`."""
+        return self.inner(a, a).sqrt()
+
+    def _subtract_neighbors(self, result: Tensor, y: Tensor, times: float = 1.0) -> Tensor:
+        return fill(self.ghosts, subtract_neighbors(result, y, self.conductances, times))
 
 
 @dataclass(frozen=True)
@@ -65,8 +81,8 @@ class ScaledSystem:
     def of(operator: Operator, source: Tensor) -> ScaledSystem:
         """The scaled form of `operator` u = `source`."""
         matrix = operator.once(ScaledMatrix.of)
-        scaled = matrix.scale * source
-        return ScaledSystem(matrix, scaled, norm(scaled))
+        scaled = fill(matrix.ghosts, matrix.scale * source)
+        return ScaledSystem(matrix, scaled, matrix.norm(scaled))
 
     def start(self, guess: Tensor | None) -> tuple[Tensor, Tensor]:
         """The first iterate, from a guess of u, and its residual.
@@ -78,7 +94,7 @@ class ScaledSystem:
             return nothing, self.source.clone()
         y = guess / self.matrix.scale
         residual = self.matrix.residual(y, self.source)
-        helps = norm(residual) < self.source_norm
+        helps = self.matrix.norm(residual) < self.source_norm
         return torch.where(helps, y, nothing), torch.where(helps, residual, self.source)
 
     def relative(self, residual: Tensor) -> float:
@@ -90,11 +106,18 @@ class ScaledSystem:
 
     def relative_by_color(self, residual: Tensor) -> Tensor:
         """The same of each color, `[C, 1, 1, 1]`."""
-        return norm(residual) / self.source_norm.clamp(min=torch.finfo(residual.dtype).tiny)
+        return self.matrix.norm(residual) / self.source_norm.clamp(
+            min=torch.finfo(residual.dtype).tiny
+        )
 
     def solution(self, y: Tensor, iterations: int, residual: float) -> Solution:
         """The solution that y is."""
         return Solution(self.matrix.scale * y, iterations, residual)
+
+
+def fill(ghosts: Ghosts | None, u: Tensor) -> Tensor:
+    """`u`, whose `ghosts` are now what their owners have: `u` itself where there are none."""
+    return u if ghosts is None else ghosts.fill(u)
 
 
 def give_up(name: str, iterations: int, residual: float) -> SolveError:

@@ -19,7 +19,7 @@ from ddrecon.diffusion.rounds.fused.swept import Parts, Swept
 from ddrecon.kernels.spare import borrow, give_back
 from ddrecon.kernels.text import TextKernel
 
-MOST_OF_FEW, MOST = 8, 16
+MOST_OF_FEW, MOST = 9, 16
 """Directions at most that go through the cells together: of few moments, and of many.
 
 More read many moments less often; fewer leave more of a cache to each.

@@ -12,6 +12,7 @@ Where a step meets no medium, nothing returns to what scatters.
 
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.rows import (
+    BEGINNINGS,
     DECAYED,
     DIRECTION,
     ENDS,
@@ -25,24 +26,23 @@ from ddrecon.diffusion.rounds.fused.rows import (
 # Cells whose steps begin at this one. What begins beyond a face of the box took q at the face: then
 # there may be two for each slice, row and column.
 _TARGETS = """
-struct Target { int s, t, shift; F part; bool is_real; };
+struct Target { const F* lines; int shift; F part; bool is_real; };
 Target targets[16];
 int target_count = 0;
 for (int i = 0; i < point_count; ++i) {
     const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
     for (int a = 0; a <= (dk && s == 0); ++a)
         for (int b = 0; b <= (dr && t == 0); ++b) {
-            const int to_s = a ? s : s + dk, to_t = b ? t : t + dr;
-            if (to_s < depth && to_t < height)
-                targets[target_count++] = {to_s, to_t, shift, part[i], !a && !b};
+            const F* lines = back_lines[2 * (a ? 0 : dk) + (b ? 0 : dr)];
+            if (lines) targets[target_count++] = {lines + own_back_line, shift, part[i], !a && !b};
         }
 }
 """
 _RETURN_ROWS = (
     """
-enum { NEAR, LIGHT };
+enum { NEAR, LIGHT, LINES };
 enum { RETURNING, FAR, MASS, SCATTERED };
-const long long stride = 2LL * most * pitch, places = (slab + 1LL) * height;
+const long long stride = (long long)LINES * most * pitch, places = (slab + 1LL) * height;
 const int kinds = SHARES_FIELD ? 3 : 4;
 const long long back_stride = (long long)kinds * most * pitch;
 const F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
@@ -62,7 +62,7 @@ for (int t = height - 1; t >= 0; --t) {
     const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
     auto line = [&](int slice, int turn, int which, int j) -> const F* {
         const long long place = (slice - slice_from + 1LL) * height + turn;
-        return own_lines + place * stride + (2 * (before + j) + which) * (long long)pitch;
+        return own_lines + place * stride + (LINES * (before + j) + which) * (long long)pitch;
     };
     auto back = [&](int slice, int turn, int which, int j) -> F* {
         const int place = (height - 1 - turn + 2LL * slice) % (height + 2);
@@ -90,28 +90,39 @@ for (int t = height - 1; t >= 0; --t) {
     F* __restrict inflow_bar = scratch_row(own + 4);
     if (VARIES_NUMBERS)
         for (int c = 0; c < width; ++c) scale_bar[c] = strength_bar[c] = inflow_bar[c] = F(0);
+    // Where light went on to, in this slice or the next one, in this row or the next one.
+    auto kind = [&](auto* lines, int which) { return lines + which * (long long)pitch; };
+    F* back_lines[4];
+    for (int i = 0; i < 4; ++i) {
+        const int to_s = s + i / 2, to_t = t + i % 2;
+        back_lines[i] = to_s < depth && to_t < height ? back(to_s, to_t, RETURNING, 0) : nullptr;
+    }"""
+    + BEGINNINGS
+    + """
     for (int j = 0; j < members; ++j) {"""
     + DIRECTION
     + UPSTREAM
+    + "const long long own_back_line = kinds * j * (long long)pitch;"
     + _TARGETS
     + """
         F* __restrict bar = bar_of(j);
-        F *__restrict returning_row = back(s, t, RETURNING, j), *__restrict far_row
-            = back(s, t, FAR, j);
-        F *__restrict mass_row = back(s, t, MASS, j), *__restrict scattered_row
-            = back(s, t, SHARES_FIELD ? MASS : SCATTERED, j);
-        const F* near_row = line(s, t, NEAR, j);
+        F* own_lines_back = back_lines[0] + own_back_line;
+        F *__restrict returning_row = kind(own_lines_back, RETURNING);
+        F *__restrict far_row = kind(own_lines_back, FAR);
+        F *__restrict mass_row = kind(own_lines_back, MASS);
+        F *__restrict scattered_row = kind(own_lines_back, SHARES_FIELD ? MASS : SCATTERED);
+        const F* near_row = near_lines[0] + own_line;
         for (int which = 0; which < kinds; ++which) {
-            F* own = back(s, t, which, j);
+            F* own = kind(own_lines_back, which);
             own[-1] = own[width] = F(0);
         }
         // What returns from the cells to which light went on, but for those of this row.
         const F *back_from[4];
-        for (int i = 0; i < 4; ++i) {
-            const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
-            const bool is_inside = s + dk < depth && t + dr < height && (dk || dr);
-            back_from[i]
-                = (is_inside ? back(s + dk, t + dr, RETURNING, j) : empty_row) + shift;
+        for (int i = 0; i < used; ++i) {
+            const int place = 2 * point[3 * i] + point[3 * i + 1];
+            const bool is_inside = place && back_lines[place];
+            back_from[i] = (is_inside ? back_lines[place] + own_back_line : empty_row)
+                + point[3 * i + 2] * x_way;
         }
         auto pass = [&](auto points, auto along, auto empty, int from, int to) {
             constexpr bool is_empty = decltype(empty)::value;
@@ -174,15 +185,15 @@ for (int t = height - 1; t >= 0; --t) {
         }
         for (int i = 0; i < target_count; ++i) {
             const Target target = targets[i];
-            const F* far = back(target.s, target.t, FAR, j) + target.shift;
+            const F* far = kind(target.lines, FAR) + target.shift;
+            const F* mass = kind(target.lines, MASS) + target.shift;
+            const F* scattered_from
+                = kind(target.lines, SHARES_FIELD ? MASS : SCATTERED) + target.shift;
             INDEPENDENT
             for (int c = 0; c < width; ++c) bar[c] += target.part * far[c];
             const int edge = target.shift > 0 ? 0 : width - 1;
             if (target.shift) bar[edge] += target.part * far[edge - target.shift];
             if (!target.is_real) continue;
-            const F* mass = back(target.s, target.t, MASS, j) + target.shift;
-            const F* scattered_from
-                = back(target.s, target.t, SHARES_FIELD ? MASS : SCATTERED, j) + target.shift;
             INDEPENDENT
             for (int c = 0; c < width; ++c) {
                 e_bar_row[c] += target.part * mass[c];

@@ -84,22 +84,36 @@ const F *to_weighted_light = to_sums + half, *to_weighted_sums = to_weighted_lig
 DIRECTION = """
 const int* point = points + 16 * (begin + j) + 3;
 const int point_count = point[-3], x_way = point[-2], is_along = point[-1];
+const int used = point_count == 1 && !is_along ? 1 : 4;
 const F half_step = parts[5 * (begin + j)];
 const F part[4] = {parts[5 * (begin + j) + 1], parts[5 * (begin + j) + 2],
                    parts[5 * (begin + j) + 3], parts[5 * (begin + j) + 4]};
 """
-# Lines of earlier slices and rows. Beyond the faces of the box are neither medium nor I; q is
+# Lines where steps to a row may begin, of the group's first direction: in this slice or the one
+# before, in this row or the one before. Beyond the faces of the box are neither medium nor I; q is
 # repeated there.
+BEGINNINGS = """
+const F *near_lines[4], *light_lines[4];
+long long e_back[4];
+for (int i = 0; i < 4; ++i) {
+    const int dk = i / 2, dr = i % 2;
+    const bool is_inside = s >= dk && t >= dr;
+    near_lines[i] = line(s >= dk ? s - dk : 0, t >= dr ? t - dr : 0, NEAR, 0);
+    light_lines[i] = is_inside ? line(s - dk, t - dr, LIGHT, 0) : nullptr;
+    e_back[i] = dk * way * sheet + dr * y_way * pitch;
+}
+"""
+# Those of a direction.
 UPSTREAM = """
 const F *near_from[4], *light_from[4], *e_from[4], *sc_from[4];
-for (int i = 0; i < 4; ++i) {
-    const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
-    const bool is_inside = s >= dk && t >= dr;
-    near_from[i] = line(s >= dk ? s - dk : 0, t >= dr ? t - dr : 0, NEAR, j) - shift;
-    light_from[i] = (is_inside ? line(s - dk, t - dr, LIGHT, j) : empty_row) - shift;
-    const long long back = dk * way * sheet + dr * y_way * pitch + shift;
-    e_from[i] = e - back;
-    sc_from[i] = sc - back;
+const long long own_line = LINES * j * (long long)pitch;
+#pragma clang loop vectorize(disable) unroll(disable)
+for (int i = 0; i < used; ++i) {
+    const int place = 2 * point[3 * i] + point[3 * i + 1], shift = point[3 * i + 2] * x_way;
+    near_from[i] = near_lines[place] + own_line - shift;
+    light_from[i] = (light_lines[place] ? light_lines[place] + own_line : empty_row) - shift;
+    e_from[i] = e - e_back[place] - shift;
+    sc_from[i] = sc - e_back[place] - shift;
 }
 """
 # The two ends of a step.
@@ -134,8 +148,8 @@ const F scattered = half_step * (scattering_depth_bar * strength);
 """
 FOLLOW_ROWS = (
     """
-enum { NEAR, LIGHT };
-const long long stride = 2LL * most * pitch;
+enum { NEAR, LIGHT, LINES };
+const long long stride = LINES * most * pitch;
 const long long places = KEEPS ? (slab + 1LL) * height : height + 2;
 F* own_lines = lines + lane * (places * stride + MARGIN) + MARGIN;
 const int slice_before = KEEPS && slice_from > 0 ? slice_from - 1 : slice_from;
@@ -152,7 +166,7 @@ for (int t = 0; t < height; ++t) {
         const long long place = KEEPS
             ? (slice - slice_from + 1LL) * height + turn
             : (turn + 2LL * (depth - slice)) % (height + 2);
-        return own_lines + place * stride + (2 * (before + j) + which) * (long long)pitch;
+        return own_lines + place * stride + (LINES * (before + j) + which) * (long long)pitch;
     };
     auto near_of = [&](int j) -> F* { return line(s, t, NEAR, j); };
     auto light_of = [&](int j) -> F* { return line(s, t, LIGHT, j); };
@@ -165,7 +179,9 @@ for (int t = 0; t < height; ++t) {
     };
     to_directions(to_light, read, near_of, near_begin, near_end);
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
-    F* __restrict carried = scratch_row(3 * POINTERS);
+    F* __restrict carried = scratch_row(3 * POINTERS);"""
+    + BEGINNINGS
+    + """
     for (int j = 0; j < members; ++j) {"""
     + DIRECTION
     + """

@@ -10,6 +10,7 @@ import functools
 
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.rows import (
+    BEGINNINGS,
     DECAYED,
     DIRECTION,
     ENDS,
@@ -38,11 +39,10 @@ auto read_change = [&](long long at, int k, F* __restrict row, int from, int to)
 """
 _CHANGES_UPSTREAM = """
 const F *d_near_from[4], *d_light_from[4], *d_e_from[4], *d_sc_from[4];
-for (int i = 0; i < 4; ++i) {
-    const int dk = point[3 * i], dr = point[3 * i + 1], shift = point[3 * i + 2] * x_way;
-    const bool is_inside = s >= dk && t >= dr;
-    d_near_from[i] = line(s >= dk ? s - dk : 0, t >= dr ? t - dr : 0, D_NEAR, j) - shift;
-    d_light_from[i] = (is_inside ? line(s - dk, t - dr, D_LIGHT, j) : empty_row) - shift;
+for (int i = 0; i < used; ++i) {
+    const F* light_line = light_lines[2 * point[3 * i] + point[3 * i + 1]];
+    d_near_from[i] = near_from[i] + (D_NEAR - NEAR) * (long long)pitch;
+    d_light_from[i] = light_from[i] + (light_line ? D_LIGHT - LIGHT : 0) * (long long)pitch;
     d_e_from[i] = e_from[i] + (d_e_cells - e_cells);
     d_sc_from[i] = sc_from[i] + (d_sc_cells - sc_cells);
 }
@@ -108,7 +108,9 @@ for (int t = 0; t < height; ++t) {
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
     const F *__restrict d_e = d_e_cells + row, *__restrict d_sc = d_sc_cells + row;
     F *__restrict carried = scratch_row(3 * POINTERS);
-    F *__restrict d_carried = scratch_row(3 * POINTERS + 1);
+    F *__restrict d_carried = scratch_row(3 * POINTERS + 1);"""
+    + BEGINNINGS
+    + """
     for (int j = 0; j < members; ++j) {"""
     + DIRECTION
     + """

@@ -1,0 +1,151 @@
+"""What ranks exchange of fields in slabs, differentiable: E52.
+
+The objective is a sum over ranks. So every adjoint is the transpose of the exchange as a whole:
+what one rank has lent to others is added up by those others' cotangents.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ddrecon.grid import Grid
+from ddrecon.numerics.autodiff import differentiate_once
+from ddrecon.ranks import (
+    gather_from_ranks,
+    own_rank,
+    rank_count,
+    sum_over_ranks,
+    swap_with_neighbors,
+)
+from ddrecon.slabs.slab import Slab
+
+
+def add_halo(own: Tensor, slab: Slab) -> Tensor:
+    """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them (E52)."""
+    field: Tensor = _AddHalo.apply(own, slab)
+    return field
+
+
+def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
+    """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part (E52).
+
+    `field` itself where `grid` is the whole.
+    """
+    if not isinstance(grid, Slab):
+        return field
+    return gather_own(grid.own(field), grid)
+
+
+def gather_own(own: Tensor, slab: Slab) -> Tensor:
+    """The same from the `own` layers of a slab, of any shape across its axis."""
+    field: Tensor = _Gather.apply(own, slab.axis - 3, slab.sizes, slab.rank)
+    return field
+
+
+def gather_parts(part: Tensor) -> Tensor:
+    """What each rank has as `part`, any shape, one after the other along a new first axis (E52)."""
+    parts: Tensor = _Gather.apply(part[None], -part.ndim - 1, [1] * rank_count(), own_rank())
+    return parts
+
+
+def sum_slabs(part: Tensor) -> Tensor:
+    """The sum over ranks of `part`, any shape, differentiable (E52)."""
+    total: Tensor = _Sum.apply(part)
+    return total
+
+
+def join_parts(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
+    """All ranks' `own` parts one after the other along `axis` < 0, of `sizes`; no derivatives."""
+    most = max(sizes)
+    missing = most - own.shape[axis]
+    parts = gather_from_ranks(pad(own, (0, 0) * (-axis - 1) + (0, missing)))
+    return torch.cat([part.narrow(axis, 0, n) for part, n in zip(parts, sizes, strict=True)], axis)
+
+
+class _AddHalo(torch.autograd.Function):
+    """Neighbors' layers beside own ones; backwards, what these were lent for is added to them."""
+
+    @staticmethod
+    def forward(own: Tensor, slab: Slab) -> Tensor:
+        return _with_halo(own, slab)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Slab], output: Tensor) -> None:
+        ctx.slab = inputs[1]
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, field_bar: Tensor) -> tuple[Tensor, None]:
+        slab, axis = ctx.slab, ctx.slab.axis - 3
+        (below, above), size = slab.halo, slab.size
+        own_bar = slab.own(field_bar).clone()
+        lent = swap_with_neighbors(
+            field_bar.narrow(axis, 0, below) if below else None,
+            field_bar.narrow(axis, below + size, above) if above else None,
+        )
+        if lent[0] is not None:
+            own_bar.narrow(axis, 0, below).add_(lent[0])
+        if lent[1] is not None:
+            own_bar.narrow(axis, size - above, above).add_(lent[1])
+        return own_bar, None
+
+    @staticmethod
+    def jvp(ctx: Any, d_own: Tensor, _: None) -> Tensor:
+        return _with_halo(d_own, ctx.slab)
+
+
+def _with_halo(own: Tensor, slab: Slab) -> Tensor:
+    axis, (below, above) = slab.axis - 3, slab.halo
+    got = swap_with_neighbors(
+        own.narrow(axis, 0, below) if below else None,
+        own.narrow(axis, own.shape[axis] - above, above) if above else None,
+    )
+    return torch.cat([part for part in (got[0], own, got[1]) if part is not None], axis)
+
+
+class _Gather(torch.autograd.Function):
+    """All ranks' parts; backwards, the sum of what ranks make of one's own."""
+
+    @staticmethod
+    def forward(own: Tensor, axis: int, sizes: list[int], rank: int) -> Tensor:
+        return join_parts(own, axis, sizes)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _, ctx.axis, ctx.sizes, ctx.rank = inputs
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, whole_bar: Tensor) -> tuple[Tensor | None, ...]:
+        begin, size = sum(ctx.sizes[: ctx.rank]), ctx.sizes[ctx.rank]
+        own_bar = sum_over_ranks([whole_bar])[0].narrow(ctx.axis, begin, size)
+        return own_bar, None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, d_own: Tensor, *_: None) -> Tensor:
+        return join_parts(d_own, ctx.axis, ctx.sizes)
+
+
+class _Sum(torch.autograd.Function):
+    """The sum over ranks, which is its own transpose."""
+
+    @staticmethod
+    def forward(part: Tensor) -> Tensor:
+        return sum_over_ranks([part])[0]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, total_bar: Tensor) -> Tensor:
+        return sum_over_ranks([total_bar])[0]
+
+    @staticmethod
+    def jvp(ctx: Any, d_part: Tensor) -> Tensor:
+        return sum_over_ranks([d_part])[0]
