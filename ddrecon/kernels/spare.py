@@ -14,6 +14,7 @@ import functools
 import os
 import sys
 import threading
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,13 +53,25 @@ def give_freed_memory() -> None:
     _choose(GIVEN_BACK, GIVEN_BACK)
 
 
+def trim_freed_memory() -> None:
+    """Gives the system back what lies unused between tensors: once, for little time."""
+    if (trim := _c_function("malloc_trim")) is not None:
+        trim(0)
+
+
 def _choose(largest: int, most_free: int) -> None:
-    if sys.platform != "linux" or any(name in os.environ for name in _OWN_CHOICES):
-        return
-    # Other libraries than GNU's have no such choice, or decide for themselves.
-    choose = getattr(ctypes.CDLL(None), "mallopt", None)
+    choose = _c_function("mallopt")
     if choose is not None and choose(_MMAP_THRESHOLD, largest):
         choose(_TRIM_THRESHOLD, most_free)
+
+
+@functools.cache
+def _c_function(name: str) -> Any:
+    """The C library's function of this `name`; None where it has none, or the user chose."""
+    if sys.platform != "linux" or any(one in os.environ for one in _OWN_CHOICES):
+        return None
+    # Other libraries than GNU's have no such choice, or decide for themselves.
+    return getattr(ctypes.CDLL(None), name, None)
 
 
 def borrow(count: int, like: Tensor) -> Tensor:

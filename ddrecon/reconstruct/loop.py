@@ -145,6 +145,7 @@ class Reconstruction:
         self.before_step = None
         # Not the solutions, where solves only begin.
         self.before_step = {key: part for key, part in self.state().items() if key != "solutions"}
+        self.before_step["parameters"] = {p.name: p.backup() for p in self.parameters}
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
         self._step(gradients, compared)

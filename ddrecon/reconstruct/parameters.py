@@ -24,6 +24,8 @@ EPSILON = 1e-15
 
 That of a mean over pixels with respect to one cell is far smaller than the customary 1e-8.
 """
+HALVED = 1 << 20
+"""Of fields of so many numbers, what a run goes back to has moments in half the bits."""
 
 
 class Parameter:
@@ -162,6 +164,16 @@ class Parameter:
             "curvature": self.curvature,
             "is_even": self.is_even,
         }
+
+    def backup(self) -> dict[str, Any]:
+        """Its state, but that moments of a large field are rounded to 1 in 256 (bfloat16).
+
+        It is gone back to only where a step led astray.
+        """
+        state = self.state()
+        if self.value.numel() >= HALVED and self.value.dtype is torch.float32:
+            state["moments"] = [moment.bfloat16() for moment in self.moments]
+        return state
 
     def restore(self, state: dict[str, Any]) -> None:
         """Takes up a `state`, whatever its resolution."""

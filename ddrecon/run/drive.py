@@ -123,38 +123,39 @@ def drive_run(
     the checkpoints written so far.
     """
     total = None if run.schedule.is_auto else run.schedule.planned
-    try:
-        with (
-            defer_interrupt() as asked,
-            event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
-            tqdm(
-                total=total, initial=run.iteration, desc="optimize", **bar_settings(is_quiet)
-            ) as bar,
-        ):
-            if not is_quiet:
-                tqdm.write(loss_text(describe_loss(run.settings, run.train)), file=sys.stderr)
-            while not run.is_done:
-                folder.save_in_time(run)
-                row = run.step()
-                folder.log.add(row)
-                folder.late.note(run)
-                if events is not None:
-                    events.log(row)
-                bar.set_postfix_str(progress_text(run.total, row), refresh=False)
-                bar.update()
-                if preview_every and row.iteration % preview_every == 0:
-                    folder.preview(run)
-                if is_any(bool(asked)):
-                    folder.save(run)
-                    raise KeyboardInterrupt(
-                        f"after {run.iteration} iterations; go on with --resume"
-                    )
-    except (DivergenceError, RanksError) as error:
-        folder.save(run)
-        raise error.with_advice(
-            f"the state after {run.iteration} iterations is kept in {folder.checkpoints / LAST}: "
-            "go on from it with --resume"
-        ) from error
+    # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
+    with defer_interrupt() as asked:
+        try:
+            with (
+                event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
+                tqdm(
+                    total=total, initial=run.iteration, desc="optimize", **bar_settings(is_quiet)
+                ) as bar,
+            ):
+                if not is_quiet:
+                    tqdm.write(loss_text(describe_loss(run.settings, run.train)), file=sys.stderr)
+                while not run.is_done:
+                    folder.save_in_time(run)
+                    row = run.step()
+                    folder.log.add(row)
+                    folder.late.note(run)
+                    if events is not None:
+                        events.log(row)
+                    bar.set_postfix_str(progress_text(run.total, row), refresh=False)
+                    bar.update()
+                    if preview_every and row.iteration % preview_every == 0:
+                        folder.preview(run)
+                    if is_any(bool(asked)):
+                        folder.save(run)
+                        raise KeyboardInterrupt(
+                            f"after {run.iteration} iterations; go on with --resume"
+                        )
+        except (DivergenceError, RanksError) as error:
+            folder.save(run)
+            raise error.with_advice(
+                f"the state after {run.iteration} iterations is kept in "
+                f"{folder.checkpoints / LAST}: go on from it with --resume"
+            ) from error
     if not cells_are_shared():
         # What is left the first rank does by itself.
         leave_ranks()

@@ -7,12 +7,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from media import box_grid, random_values
 
 from ddrecon.errors import FormatError, SceneError, SolveError, UsageError
 from ddrecon.io.volumes.table import read_field
+from ddrecon.reconstruct import parameters
 from ddrecon.reconstruct.loop import Reconstruction, optimize
+from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run.checkpoint import load_checkpoint, save_checkpoint
 from ddrecon.scene import Scene
+from ddrecon.settings import ParameterSettings
 
 TRUTH = Path(__file__).parents[2] / "data" / "ball" / "density.npz"
 
@@ -157,3 +161,17 @@ def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
         )
     with pytest.raises(SceneError, match="missing section"):
         Reconstruction(replace(ball_scene, optimize=None))
+
+
+def test_a_backup_is_the_state_with_rounded_moments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parameters, "HALVED", 1)
+    grid, start = box_grid((3, 4, 5)), random_values(3, 4, 5, dtype=torch.float32)
+    one, other = (Parameter("density", ParameterSettings(), 0.1, start, grid) for _ in range(2))
+    one.step(random_values(3, 4, 5, seed=1, dtype=torch.float32) - 0.5, 1.0)
+    backup = one.backup()
+    assert all(moment.dtype is torch.bfloat16 for moment in backup["moments"])
+    other.restore(backup)
+    assert torch.equal(other.value, one.value) and other.steps == one.steps
+    for found, known in zip(other.moments, one.moments, strict=True):
+        # To nearest: of eight bits, half of the last.
+        torch.testing.assert_close(found, known, rtol=2**-8, atol=0)

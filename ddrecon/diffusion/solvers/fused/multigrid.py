@@ -21,7 +21,7 @@ from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, tabl
 from ddrecon.diffusion.solvers.fused.stages import margin
 from ddrecon.diffusion.solvers.fused.sums import ROWS
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.kernels.spare import borrow, give_back
+from ddrecon.kernels.spare import borrow, give_back, trim_freed_memory
 
 DOWN, COARSER, UP = range(3)
 START, CHOOSE, DIRECT, ADVANCE = range(4)
@@ -30,6 +30,8 @@ MOST_AHEAD = 16
 """So many iterations are launched at most before the residual is looked at."""
 ALONE = 1 << 19
 """Colors of so many cells are solved one after another: as fast, in a third of the memory."""
+TRIMMED = 1 << 26
+"""Before solves of so many bytes, at a peak, the system gets unused memory back."""
 _counts: dict[torch.Size, deque[int]] = defaultdict(lambda: deque([3], maxlen=6))
 """How many iterations solves of a shape took: how many to launch ahead. No result depends on it."""
 
@@ -44,6 +46,8 @@ def solve(
     made = source.new_empty(source.shape)
     if source[0].numel() < ALONE:
         return _solve_checked(operator, source, guess, tolerance, most, made)
+    if source.nbytes >= TRIMMED:
+        trim_freed_memory()
     guess = None if guess is None or guess.shape != source.shape else guess
     found = [
         _solve_checked(
