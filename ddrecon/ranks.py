@@ -192,10 +192,10 @@ def swap_with_neighbors(
     assert _group is not None
     dist, got, jobs = torch.distributed, list[Tensor | None](), list[Any]()
     for other, tensor in ((_group.rank - 1, before), (_group.rank + 1, after)):
-        others = None if tensor is None else tensor.new_empty(tensor.shape)
-        got.append(others)
-        if tensor is not None and others is not None:
-            own = tensor.detach().contiguous()
+        got.append(None)
+        if tensor is not None:
+            own, others = tensor.detach().contiguous(), tensor.new_empty(tensor.shape)
+            got[-1] = others
             jobs += [dist.P2POp(dist.isend, own, other), dist.P2POp(dist.irecv, others, other)]
     with _exchange(sum(tensor.nbytes for tensor in got if tensor is not None)):
         for job in dist.batch_isend_irecv(jobs):

@@ -157,7 +157,9 @@ Iterations = int | str
 """How many iterations a run has, or `auto`: it ends by itself."""
 AUTO = "auto"
 Support = float | str | FieldFile
-"""Where medium may be: `masks`, the displayed value above which a pixel shows some, or a field."""
+"""Where medium may be: `masks`, the displayed value above which a pixel shows some, `auto` for a
+value that follows from the picture's noise, or a field.
+"""
 MASKS = "masks"
 
 

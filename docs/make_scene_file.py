@@ -27,7 +27,7 @@ KIND_NAMES = {
     settings.Start: "number, list or {file: ...}",
     settings.Weight: "number or `auto`",
     settings.Iterations: "whole number or `auto`",
-    settings.Support: "`masks`, number or {file: ...}",
+    settings.Support: "`masks`, `auto`, number or {file: ...}",
     schema.Triple: "[x, y, z]",
     schema.Count: "[nx, ny, nz]",
     camera_schema.Size: "[width, height]",
@@ -412,7 +412,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "support": (
                 "For density: where it may be above 0. `masks`: nowhere that a view sees and its "
                 "mask, or alpha, says is empty; a number: nor where it displays no more than that "
-                "(sRGB, 0 to 1); or a field that is above 0 there. Left out: anywhere."
+                "(sRGB, 0 to 1); `auto`: nor where it is as dark as its darkest tenth, within "
+                "noise; or a field that is above 0 there. Left out: anywhere."
             ),
             "support_margin": "Pixels by which what a view shows is widened for that.",
         },

@@ -8,7 +8,7 @@ learn their exposures as differences between its sides.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -78,7 +78,9 @@ def fit_held_out(
     """The `picture` [3, h, w] of a test `view` with the response that fits its own `target` best.
 
     And what that is, by key: of exposure and offset those that are `parameters` of training views,
-    for these say nothing of the camera of a test view. Nothing changes where there are none.
+    for these say nothing of the camera of a test view. Nothing changes where there are none. Least
+    squares count errors in the dark more than PSNR does where pictures are displayed, and may do
+    harm to a picture that is far off: then the exposure alone is found, or none.
     """
     sizes = {
         parameter.key: len(parameter.value)
@@ -92,9 +94,21 @@ def fit_held_out(
         for key, default in RESPONSE.items()
     )
     response = Response(exposure, offset, "exposure" in sizes, "offset" in sizes)
+    tried = [
+        (picture, response),
+        _answer(picture, replace(response, has_offset=False), target),
+        _answer(picture, response, target),
+    ]
+    best, found = max(tried, key=lambda each: float(target.psnr_of(each[0])))
+    return best, {key: getattr(found, key) for key in sizes}
+
+
+def _answer(picture: Tensor, response: Response, target: Target) -> tuple[Tensor, Response]:
+    """The `picture` [3, h, w] with the response that fits its `target` best, and that response."""
     found = fit_response(picture, target, response, LARGEST_GAIN)
-    gain, light = (found.exposure / exposure).view(-1, 1, 1), picture - offset.view(-1, 1, 1)
-    return gain * light + found.offset.view(-1, 1, 1), {key: getattr(found, key) for key in sizes}
+    light = picture - response.offset.view(-1, 1, 1)
+    gain = (found.exposure / response.exposure).view(-1, 1, 1)
+    return gain * light + found.offset.view(-1, 1, 1), found
 
 
 def step_responses(

@@ -17,11 +17,16 @@ from torch.nn.functional import max_pool2d
 from ddrecon.cameras import Camera, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
+from ddrecon.pictures.noise import estimate_noise
 from ddrecon.reconstruct.levels import resample
 from ddrecon.scene import View
-from ddrecon.settings import FieldFile, ParameterSettings
+from ddrecon.settings import AUTO, MASKS, FieldFile, ParameterSettings
 
 KEY = "optimize.parameters.density.support"
+DARKEST = 0.1
+"""So much of each picture, at least, is background."""
+DEVIATIONS = 4.0
+"""Black is less than this above it."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,8 @@ def find_support(
     shown = [_shown(view, wanted) for view in views]
     empty = [view.name for view, pixels in zip(views, shown, strict=True) if not pixels.any()]
     if empty:
-        what = "its mask or alpha" if wanted == "masks" else f"a displayed value of {wanted:g}"
+        known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
+        what = known[wanted] if isinstance(wanted, str) else f"a displayed value of {wanted:g}"
         raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {what}")
     return Support(views, shown, settings.support_margin)
 
@@ -99,14 +105,29 @@ def _shown(view: View, wanted: str | float) -> Tensor:
     """Which pixels of `view` show something: bool [h, w].
 
     By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
-    where the brightest color is above `wanted`, a value as displayed, or is not known.
+    where the brightest color is above `wanted`, a value as displayed or `auto`, or is not known.
     """
-    if wanted == "masks" and view.mask is not None:
+    if wanted == MASKS and view.mask is not None:
         return view.mask > 0
     if view.image is None:
         raise ValueError(f"view {view.name} has no image")
-    shown = view.image.amax(0) > (0.0 if wanted == "masks" else _linear(float(wanted)))
+    if wanted == AUTO:
+        threshold = brightest_black(view.image, view.step)
+    else:
+        threshold = 0.0 if wanted == MASKS else _linear(float(wanted))
+    shown = view.image.amax(0) > threshold
     return shown if view.mask is None else shown | (view.mask == 0)
+
+
+def brightest_black(image: Tensor, step: float) -> float:
+    """The radiance up to which a picture `image` [3, h, w] may be black, by its own noise.
+
+    Its black is what the darkest part of its pixels, `DARKEST`, does not exceed; what is brighter
+    than that by `DEVIATIONS` of the noise there (E26) shows something.
+    """
+    brightest = image.amax(0).flatten()
+    black = brightest.kthvalue(max(1, round(DARKEST * len(brightest)))).values
+    return float(black + DEVIATIONS * estimate_noise(image, step).deviation(black))
 
 
 def _linear(displayed: float) -> float:

@@ -239,11 +239,11 @@ def _read_start(node: Node, rule: Rule) -> Any:
 
 
 def _read_support(node: Node, rule: Rule) -> float | str | FieldFile:
-    """`masks`, a displayed value, or `{file: path}`."""
+    """`masks`, `auto`, a displayed value, or `{file: path}`."""
     if isinstance(node.value, dict):
         return read_record(node, FieldFile, rule.folder)
     if isinstance(node.value, str):
-        return read_text(node, Rule(str, {"choices": (MASKS,)}, rule.folder))
+        return read_text(node, Rule(str, {"choices": (MASKS, AUTO)}, rule.folder))
     return read_number(node, rule)
 
 

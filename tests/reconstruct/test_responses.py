@@ -2,9 +2,13 @@
 
 import pytest
 import torch
+from media import box_grid, make_camera
 
 from ddrecon.losses import Target
-from ddrecon.reconstruct.responses import LARGEST_GAIN, Response, fit_response
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.responses import LARGEST_GAIN, Response, fit_held_out, fit_response
+from ddrecon.scene import View
+from ddrecon.settings import ParameterSettings
 
 
 def response(gain: list[float], offset: list[float]) -> Response:
@@ -39,3 +43,23 @@ def test_a_black_render_says_nothing_of_an_exposure() -> None:
     start = Response(torch.ones(1).double(), torch.zeros(1).double(), True, False)
     found = fit_response(torch.zeros(3, 4, 5, dtype=torch.float64), target, start, 2.0)
     assert found.exposure.tolist() == [1.0]
+
+
+def test_a_held_out_picture_is_never_shown_worse_for_its_response() -> None:
+    """A haze over a quarter of the black: least squares, which count the dark most, darken all."""
+    image = torch.zeros(3, 8, 8, dtype=torch.float64)
+    image[:, :, :4] = 0.3
+    picture = image.clone()
+    picture[:, :, 6:] = 0.05
+    target, view = Target.of(image, None, "display"), View("test", make_camera(size=(8, 8)))
+    one, grid = torch.ones(1, dtype=torch.float64), box_grid((2, 2, 2))
+    sought = [
+        Parameter(f"views.other.{key}", ParameterSettings(), 0.1, one, grid)
+        for key in ("exposure", "offset")
+    ]
+    fitted, found = fit_held_out(picture, view, target, sought)
+    assert target.psnr_of(fitted) >= target.psnr_of(picture)
+    dark = 0.7 * image
+    mended, _ = fit_held_out(dark, view, target, sought)
+    assert target.psnr_of(mended) > target.psnr_of(dark) + 20
+    assert set(found) == {"exposure", "offset"}

@@ -17,7 +17,7 @@ from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.support import hull_of
+from ddrecon.reconstruct.support import brightest_black, hull_of
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 
@@ -153,6 +153,18 @@ def test_masks_say_what_is_empty() -> None:
     assert 0 < part < 0.2
 
 
+@pytest.mark.parametrize("read", [0.002, 0.01])
+def test_auto_tells_black_from_faint_smoke_by_the_noise(read: float) -> None:
+    """Black is not shown but for one pixel in a thousand; what is 8 deviations above it is."""
+    generator = torch.Generator().manual_seed(3)
+    image = 0.02 + read * torch.randn(3, 120, 90, generator=generator)
+    faint = torch.zeros(120, 90, dtype=torch.bool)
+    faint[40:80, 30:60] = True
+    image[:, faint] += 8 * read
+    shown = image.amax(0) > brightest_black(image, 0.0)
+    assert shown[faint].float().mean() > 0.99 and shown[~faint].float().mean() < 0.001
+
+
 def refusal(scene: Scene) -> str:
     with pytest.raises(SceneError) as caught:
         Reconstruction(scene)
@@ -179,7 +191,7 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
-        ("density={support: alpha}", "density.support: expected one of masks, found"),
+        ("density={support: alpha}", "density.support: expected one of masks, auto, found"),
         ("density={support: 1.5}", "density.support: must be below 1, found 1.5"),
         ("g={support: masks}", "g.support: 'masks' is for density alone"),
         ("density={support: {file: none.npz}}", "support.file: "),
