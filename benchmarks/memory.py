@@ -1,10 +1,11 @@
 """Peak memory against what `ddrecon check` predicts, and bytes per cell and color of a forward and
 adjoint solve.
 
-    python benchmarks/memory.py
+    python benchmarks/memory.py [--count]
 
 Every figure is the highest resident size of a process of its own, less that of the same work on
-16^3 cells.
+16^3 cells. With `--count` it is the most numbers a cell that tensors hold at once, and which
+allocation found that many: exact, in one process, and the same on every machine.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ import os
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
+
+import torch
+from torch.multiprocessing.reductions import StorageWeakRef
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 SMALL = 16
 SCENE = {
@@ -35,6 +42,7 @@ CASES = {
     "RGB, g 0.3, one round": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "rounds": 1},
     "RGB, flux-limited": {"albedo": [0.95, 0.9, 0.8], "model": "flux_limited"},
     "RGB fields": {"albedo": [0.95, 0.9, 0.8], "fields": True},
+    "density, sigma_a and sigma_s": {"albedo": [0.95, 0.9, 0.8], "joint": True},
     "density, sigma_a and sigma_s, g 0.3": {"albedo": [0.95, 0.9, 0.8], "g": 0.3, "joint": True},
 }
 SOLVE = """
@@ -92,6 +100,72 @@ def peak(command: list[str]) -> int:
     return usage.ru_maxrss * 1024
 
 
+class Alive(TorchDispatchMode):
+    """Counts the bytes of all tensors that are alive, at their `peak`, and `where` that was."""
+
+    LEAST = 4096
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.known: dict[int, tuple[StorageWeakRef, int]] = {}
+        self.peak, self.where = 0, ""
+
+    def __torch_dispatch__(self, function, types, arguments=(), options=None):
+        made, is_new = function(*arguments, **(options or {})), False
+        for tensor in (leaf for leaf in tree_leaves(made) if isinstance(leaf, torch.Tensor)):
+            storage = tensor.untyped_storage()
+            known = self.known.get(storage._cdata)
+            if storage.nbytes() >= self.LEAST and (known is None or known[0].expired()):
+                self.known[storage._cdata] = StorageWeakRef(storage), storage.nbytes()
+                is_new = True
+        if is_new:
+            self.known = {key: one for key, one in self.known.items() if not one[0].expired()}
+            if (total := sum(size for _, size in self.known.values())) > self.peak:
+                self.peak, self.where = total, place()
+        return made
+
+
+def place() -> str:
+    """The innermost place in ddrecon that is being run."""
+    frame, outside = sys._getframe(), ("benchmarks/memory.py", "kernels/spare.py")
+    while frame is not None and (
+        "/ddrecon/" not in (name := frame.f_code.co_filename) or name.endswith(outside)
+    ):
+        frame = frame.f_back
+    if frame is None:
+        return ""
+    return f"{frame.f_code.co_filename.partition('/ddrecon/')[2]}, `{frame.f_code.co_name}`"
+
+
+def count(folder: Path, cells: int, case: dict[str, object]) -> tuple[float, float, str]:
+    """Numbers a cell at the peaks of a render and of an iteration, and where the latter is."""
+    import numpy as np
+
+    from ddrecon.diffusion.implicit import SolveMemory
+    from ddrecon.diffusion.solvers.fused import multigrid
+    from ddrecon.kernels import spare
+    from ddrecon.reconstruct.loop import Reconstruction
+    from ddrecon.renderer import render_each
+    from ddrecon.scene_file.build import load_scene
+
+    # As of a large volume, without what lies ready.
+    multigrid.ALONE = spare.MOST_BYTES = 0
+    np.save(folder / "view.npy", np.full((16, 16, 3), 0.1, np.float32))
+    path = folder / "scene.yaml"
+    path.write_text(json.dumps(scene_of(cells, 16, case, is_optimized=True)))
+    scene = load_scene(path)
+    scene.optimize = replace(scene.optimize, iterations=3)
+    with Alive() as render, torch.no_grad():
+        scene.volume.density = scene.volume.density.clone()
+        render_each(scene, scene.views, SolveMemory())
+    with Alive() as iteration:
+        run = Reconstruction(scene)
+        while not run.is_done:
+            run.step()
+    numbers = [mode.peak / 4 / cells**3 for mode in (render, iteration)]
+    return *numbers, iteration.where
+
+
 def measure(
     folder: Path, verb: str, cells: int, pixels: int, case: dict[str, object]
 ) -> tuple[int, int]:
@@ -113,12 +187,20 @@ def measure(
 
 
 def main() -> None:
-    """Prints two tables."""
+    """Prints a table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--cells", type=int, nargs="*", default=[64, 96])
     parser.add_argument("--pixels", type=int, default=256)
     parser.add_argument("--scene", choices=CASES, nargs="*", default=list(CASES))
+    parser.add_argument("--count", action="store_true")
     arguments = parser.parse_args()
+    if arguments.count:
+        print("| scene | render | iteration | at its peak |\n|---|---|---|---|")
+        for title in arguments.scene:
+            with tempfile.TemporaryDirectory() as name:
+                render, iteration, where = count(Path(name), 48, CASES[title])
+            print(f"| {title} | {render:.0f} | {iteration:.0f} | {where} |", flush=True)
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         print(

@@ -1,5 +1,5 @@
 """How long a render of the plume takes by transport rounds and degrees, relative to none in the
-same run: docs/accuracy.md.
+same run, on one thread: docs/accuracy.md.
 
 python benchmarks/rounds.py [--repeat 3]
 """
@@ -24,17 +24,17 @@ CASES = {
     "RGB": ["render.samples_per_pixel=1"],
     "RGB, 16 rays a pixel": ["render.samples_per_pixel=16"],
 }
-ROUNDS = ((0, 3), (1, 3), (2, 3), (3, 3), (1, 5), (2, 5))
+ROUNDS = ((0, 3), (1, 1), (1, 3), (2, 3), (3, 3), (1, 5), (2, 5), (3, 5))
 """Rounds and degrees."""
 
 
 def seconds(scene: Scene, repeat: int) -> float:
-    """The least time of a render of the first view, solves from zero."""
+    """The least time a processor needs for a render of the first view, solves from zero."""
     taken = []
     for _ in range(repeat + 1):
-        start = time.perf_counter()
+        start = time.process_time()
         render_each(scene, scene.views[:1], SolveMemory())
-        taken.append(time.perf_counter() - start)
+        taken.append(time.process_time() - start)
     return min(taken[1:])
 
 
@@ -43,6 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeat", type=int, default=3)
     arguments = parser.parse_args()
+    torch.set_num_threads(1)
     times: dict[tuple[int, int], list[float]] = {key: [] for key in ROUNDS}
     with torch.no_grad():
         for overrides in CASES.values():

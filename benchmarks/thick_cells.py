@@ -1,9 +1,9 @@
 """How far images are from the truth where cells are optically thick: a table for docs/accuracy.md.
 
 The truth is our own, on a grid six times as fine: the same density, linear between the centers of
-the coarse grid, with angles to degree 5 and five rounds.
+the coarse grid, with angles to degree 5 and five rounds. Rays have so many samples a coarse cell.
 
-    python benchmarks/thick_cells.py [-g -0.8]... [--depth 4]...
+    python benchmarks/thick_cells.py [-g -0.8]... [--depth 4]... [--samples 2]
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ LIGHTS: dict[str, tuple[Vector, Vector]] = {
 ROUNDS = (0, 1, 2, 3, 6)
 
 
-def coarse_scene(g: float, depth: float, lit: str, **diffusion: int) -> Scene:
+def coarse_scene(g: float, depth: float, lit: str, samples: int = 8, **diffusion: int) -> Scene:
     """Merged balls with `depth` optical depths a cell, lit from the `side` or from the `eye`."""
     travel, eye = LIGHTS[lit]
     width = math.tan(math.radians(11))
     case = Case(lit, BALLS, depth * CELLS, 0.95, g, [sun(travel)], eye, half_width=width)
     scene = case.scene(CELLS, tolerance=1e-5, **diffusion)
     views = [replace(view, camera=replace(view.camera, size=(PIXELS,) * 2)) for view in scene.views]
-    return replace(scene, views=views, render=RenderSettings(4, 8, 0.0))
+    return replace(scene, views=views, render=RenderSettings(4, samples, 0.0))
 
 
 def refine(scene: Scene) -> Scene:
@@ -64,6 +64,7 @@ def main() -> None:
     )
     parser.add_argument("-g", type=float, action="append")
     parser.add_argument("--depth", type=float, action="append")
+    parser.add_argument("--samples", type=int, default=8)
     given = parser.parse_args()
     columns = " | ".join(f"n = {rounds}" for rounds in ROUNDS)
     print(f"| g | depth of a cell | lit from the | {columns} |\n|{'---|' * (3 + len(ROUNDS))}")
@@ -74,7 +75,8 @@ def main() -> None:
                     fine = refine(coarse_scene(g, depth, lit, transport_rounds=5, degree=5))
                     truth = render(fine)
                     scenes = (
-                        coarse_scene(g, depth, lit, transport_rounds=n, degree=3) for n in ROUNDS
+                        coarse_scene(g, depth, lit, given.samples, transport_rounds=n, degree=3)
+                        for n in ROUNDS
                     )
                     errors = (f"{error(render(scene), truth):.3f}" for scene in scenes)
                     print(f"| {g} | {depth:g} | {lit} | {' | '.join(errors)} |", flush=True)

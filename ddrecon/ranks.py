@@ -156,19 +156,6 @@ def exchanged() -> tuple[int, float]:
     return (0, 0.0) if _group is None else (_group.bytes, _group.seconds)
 
 
-def assign(costs: Sequence[float], ranks: int) -> list[int]:
-    """The rank that does each of some jobs with these `costs`, so that all end at about one time.
-
-    The longest jobs are given out first, each to the rank with the least to do (Graham 1969,
-    doi:10.1137/0117039): no rank has more than 4/3 of what it must have.
-    """
-    owners, loads = [0] * len(costs), [0.0] * ranks
-    for job in sorted(range(len(costs)), key=lambda job: -costs[job]):
-        owners[job] = min(range(ranks), key=lambda rank: loads[rank])
-        loads[owners[job]] += costs[job]
-    return owners
-
-
 def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     """The sums over ranks of each of `tensors`, of one device: the same bits on all of them.
 
@@ -203,16 +190,14 @@ def swap_with_neighbors(
     That is of the shape of what they get; the first rank has none before it, the last none after.
     """
     assert _group is not None
-    dist, sent, got, jobs = torch.distributed, 0, list[Tensor | None](), list[Any]()
+    dist, got, jobs = torch.distributed, list[Tensor | None](), list[Any]()
     for other, tensor in ((_group.rank - 1, before), (_group.rank + 1, after)):
-        if tensor is None:
-            got.append(None)
-            continue
-        own, others = tensor.detach().contiguous(), torch.empty_like(tensor).contiguous()
-        jobs += [dist.P2POp(dist.isend, own, other), dist.P2POp(dist.irecv, others, other)]
-        got.append(others)
-        sent += own.nbytes
-    with _exchange(sent):
+        got.append(None)
+        if tensor is not None:
+            own, others = tensor.detach().contiguous(), tensor.new_empty(tensor.shape)
+            got[-1] = others
+            jobs += [dist.P2POp(dist.isend, own, other), dist.P2POp(dist.irecv, others, other)]
+    with _exchange(sum(tensor.nbytes for tensor in got if tensor is not None)):
         for job in dist.batch_isend_irecv(jobs):
             job.wait()
     return got[0], got[1]

@@ -36,7 +36,8 @@ from ddrecon.light.skylight import ambient_sky, scatter_sky, sum_unscattered_sky
 from ddrecon.march.emission import Emission
 from ddrecon.march.integral import march
 from ddrecon.march.sight import Sight, look_through
-from ddrecon.medium.coefficients import Medium, cut_volume, keep_medium, scale_medium
+from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
+from ddrecon.medium.cut import cut_volume
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
 from ddrecon.numerics.autodiff import is_varied, require_plain_autograd
 from ddrecon.numerics.remember import is_any_nonzero

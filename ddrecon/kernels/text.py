@@ -4,8 +4,8 @@
     scale.launch(count, {"x": x, "factor": 2.0}, {"out": out})
 
 What the text is given is declared as in C: pointers and numbers of type `F` (the kernel's own),
-`double`, `int`, `long`, `bool` or `half` (bfloat16); `F *fields[3]` are three pointers. It all goes
-into one record: a launch takes the same few microseconds, however much that is.
+`double`, `int`, `long` or `bool`; `F *fields[3]` are three pointers. It all goes into one record:
+a launch takes the same few microseconds, however much that is.
 """
 
 import re
@@ -26,7 +26,6 @@ _TYPES = {
     "int": ("int", wp.int32, torch.int32),
     "long": ("long long", wp.int64, torch.int64),
     "bool": ("bool", wp.bool, torch.bool),
-    "half": ("unsigned short", wp.uint16, torch.bfloat16),
 }
 BLOCK = """
 const int begin = item * length, end = begin + length < total ? begin + length : total;

@@ -6,6 +6,7 @@ on as sums along rays, which are as few as a slice has cells (E54).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +18,9 @@ from ddrecon.numerics.slicing import Slicing
 from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.slabs.exchange import add_halo, gather_parts
 from ddrecon.slabs.slab import HALO, Slab
+
+MARGIN = 2
+"""Rays beyond those that meet cells' centers: as far as interpolation reaches."""
 
 
 def sum_mass(
@@ -46,70 +50,90 @@ def sum_mass(
 
     # The slab with its halo; near its ends, where rays are missing, its neighbors' cells are right.
     third_order = ThirdOrder(0, 1, bound)
-    shear, slices, added = rays.through(field, slab.first, slab.last, has_end=False)
-    passed = mass_passed(*shear.look(slices), step, third_order, rays.cut(before))
-    shear = replace(shear, begin=shear.begin + added)
-    entered = slicing.lift(shear.to_cells(passed[added:], third_order))
+    some = rays.through(field, slab.first, slab.last)
+    before = some.cut(torch.einsum("rp,rp...->...", counted, sums))
+    passed = mass_passed(*some.shear.look(some.slices), step, third_order, before)
+    shear = replace(some.shear, begin=some.shear.begin + some.added)
+    own = slice(some.added, len(some.slices) - some.after)
+    entered = slicing.lift(shear.to_cells(passed[own], third_order))
     return add_halo(slab.own(entered), slab), step
 
 
 @dataclass(frozen=True)
-class _Rays:
-    """The rays of the `whole` grid, as a `slab` of it knows them.
+class _Part:
+    """Some layers of a slab as `slices`, and the rays that meet them.
 
-    `dim` is the one of slices [N, K, rows, columns] along which the grid is cut.
+    These are part of the whole's: from `first` on in rows and columns. So many slices were `added`
+    before, and so many `after`.
     """
+
+    shear: Shear
+    slices: Tensor
+    first: tuple[int, int]
+    added: int
+    after: int
+
+    def cut(self, sums: Tensor) -> Tensor:
+        """Those of `sums` [2, K, *lattice] on all rays of the whole that are on these."""
+        (row, column), (rows, columns) = self.first, self.shear.lattice
+        return sums[..., row : row + rows, column : column + columns]
+
+    def spread(self, sums: Tensor, lattice: tuple[int, int]) -> Tensor:
+        """`sums` [2, K, ...] on these rays as those on all of the whole's `lattice`."""
+        (row, column), (rows, columns) = self.first, self.shear.lattice
+        right, below = lattice[1] - column - columns, lattice[0] - row - rows
+        return pad(sums, (column, right, row, below))
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """The rays of the `whole` grid, of `count` slices, as a `slab` of it knows them."""
 
     slab: Slab
     slicing: Slicing
     whole: Shear
     count: int
-    dim: int
 
     @staticmethod
     def of(slab: Slab, slicing: Slicing, slope: Tensor) -> _Rays:
         """The rays along a beam of `slope` that meets the slices of `slicing`."""
         count, _, *size = (1 if axis == 0 else slab.whole.shape[axis - 1] for axis in slicing.order)
-        dim = slicing.order.index(1 + slab.axis)
-        return _Rays(slab, slicing, Shear.of(count, size, slope), count, dim)
+        return _Rays(slab, slicing, Shear.of(count, size, slope), count)
 
-    def through(
-        self, field: Tensor, begin: int, end: int, *, has_end: bool = True
-    ) -> tuple[Shear, Tensor, int]:
+    def through(self, field: Tensor, begin: int, end: int) -> _Part:
         """How rays go through the layers `begin` to `end` of the whole, whose `field` the slab has.
 
-        The slices of these layers, and how many were added before: where the beam crosses slabs
-        one by one there is an empty slice at either end, since the field bends there as well; the
-        last one only if it `has_end`.
+        Where the beam crosses slabs one by one, there is an empty slice at either end: the field
+        bends there as well.
         """
         slab, whole = self.slab, self.whole
-        layers = field.narrow(slab.axis - 3, begin - slab.first, end - begin)
-        slices = self.slicing.lay(layers)
-        if self.dim:
-            missing = whole.size[self.dim - 2] - (end - begin)
-            rows, columns = (missing, 0) if self.dim == 2 else (0, missing)
-            (height, width), (down, along) = whole.size, whole.lattice
-            size, lattice = (height - rows, width - columns), (down - rows, along - columns)
-            return replace(whole, size=size, lattice=lattice), slices, 0
-        first = self.count - end if self.slicing.is_reversed else begin
-        before, after = int(first > 0), int(has_end and first + len(slices) < self.count)
-        slices = pad(slices, (0, 0, 0, 0, 0, 0, before, after))
-        return replace(whole, begin=first - before), slices, before
+        slices = self.slicing.lay(field.narrow(slab.axis - 3, begin - slab.first, end - begin))
+        number, added, after, cut = 0, 0, 0, self.slicing.order.index(1 + slab.axis) - 2
+        if cut < 0:
+            number = self.count - end if self.slicing.is_reversed else begin
+            added, after = int(number > 0), int(number + len(slices) < self.count)
+            slices = pad(slices, (0, 0, 0, 0, 0, 0, added, after))
+            number -= added
+        firsts, counts, starts = [], [], []
+        for which, slope in enumerate(whole.slope.tolist()):
+            low, size = (begin if which == cut else 0), slices.shape[2 + which]
+            drifts = slope * number, slope * (number + len(slices) - 1)
+            nearest = math.floor(low + whole.first[which] - max(drifts)) - MARGIN
+            farthest = math.ceil(low + size + whole.first[which] - min(drifts)) + MARGIN
+            firsts.append(max(nearest, 0))
+            counts.append(min(farthest, whole.lattice[which]) - firsts[which])
+            starts.append(whole.first[which] + low - firsts[which])
+        shear = replace(
+            whole,
+            size=(slices.shape[2], slices.shape[3]),
+            lattice=(counts[0], counts[1]),
+            first=(starts[0], starts[1]),
+            begin=number,
+        )
+        return _Part(shear, slices, (firsts[0], firsts[1]), added, after)
 
     def sums(self, field: Tensor, begin: int, end: int) -> Tensor:
         """Sums of `Shear.look` over these layers, on all rays of the whole: [2, K, *lattice]."""
-        shear, slices, _ = self.through(field, begin, end)
-        found = torch.stack([each.sum(0) for each in shear.look(slices)])
-        if not self.dim:
-            return found
-        missing = self.whole.lattice[self.dim - 2] - found.shape[self.dim]
-        sides = (begin, missing - begin)
-        return pad(found, (0, 0, *sides) if self.dim == 2 else sides)
-
-    def cut(self, sums: Tensor) -> Tensor:
-        """Those of the `sums` on rays that meet the slab with its halo."""
-        if not self.dim:
-            return sums
-        slab = self.slab
-        others = self.whole.size[self.dim - 2] - slab.shape[slab.axis]
-        return sums.narrow(self.dim, slab.first, sums.shape[self.dim] - others)
+        part = self.through(field, begin, end)
+        found = torch.stack([each.sum(0) for each in part.shear.look(part.slices)])
+        return part.spread(found, self.whole.lattice)

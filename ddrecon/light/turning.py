@@ -13,6 +13,8 @@ from torch import Tensor
 from ddrecon.grid import Grid
 from ddrecon.light.shear import Shear, cross_grid
 from ddrecon.numerics.decay import decay_mean
+from ddrecon.slabs.exchange import gather_slabs
+from ddrecon.slabs.slab import Slab
 
 MOST = 1e30
 """The most that F may be of what was never scattered: deeper in, both are nothing."""
@@ -27,7 +29,8 @@ def turn_in_cells(
     order, the way that F goes.
     """
     slicing, slope, step = cross_grid(grid, direction)
-    fields = [slicing.lay(field) for field in (extinction, turned)]
+    # A stack is followed from both its ends: where ranks share cells, each has all of them here.
+    fields = [slicing.lay(gather_slabs(field, grid)) for field in (extinction, turned)]
     shear = Shear.of(fields[0].shape[0], fields[0].shape[2:], slope)
     depth, back = (shear.to_rays(field, 0.0) * step for field in fields)
     is_there = depth > 0
@@ -59,5 +62,6 @@ def turn_in_cells(
     far = (incoming - reflected * lost) * norm
     share = torch.stack(entering) * decay_mean(rate * depth) / decay_mean(depth)
     along, against = (near + reflected * far) * share, (reflected * near + far) * share
-    forth, back = (slicing.lift(shear.to_cells(values)) for values in (along, against))
+    found = (slicing.lift(shear.to_cells(values)) for values in (along, against))
+    forth, back = (grid.cut(field) if isinstance(grid, Slab) else field for field in found)
     return forth, back

@@ -16,10 +16,10 @@ from ddrecon.display import Displayed
 from ddrecon.grid import Grid
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_peak import SeenPhase
+from ddrecon.medium.sections import scale_sections
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decay_mean
 from ddrecon.numerics.remember import is_any_nonzero, remember
-from ddrecon.slabs.slab import Slab, own_slab
 
 P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
@@ -164,21 +164,6 @@ class Medium:
         return self.has_flux or not isinstance(self.seen.phase, HenyeyGreenstein)
 
 
-def cut_volume(volume: Volume) -> Volume:
-    """The slab of `volume` that this rank has; `volume` itself where ranks do not share cells."""
-    slab = own_slab(volume.grid)
-    if not isinstance(slab, Slab):
-        return volume
-    density, sigma_a, sigma_s = (
-        slab.cut(field) if field.shape[-3:] == volume.grid.shape else field
-        for field in (volume.density, volume.sigma_a, volume.sigma_s)
-    )
-    phase = volume.phase
-    if phase.cells is not None:
-        phase = phase.with_cells(slab.cut(phase.cells))
-    return Volume(slab, density, sigma_a, sigma_s, phase)
-
-
 def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
     """The delta-Eddington scaled medium of `volume`, by which the whole image is rendered.
 
@@ -233,7 +218,7 @@ def _find_coefficients(
             return Coefficient(sigma, field)
         return Coefficient(torch.ones_like(sigma[:, :1, :1, :1]), sigma * field)
 
-    scaled, kept, peak = _scale_sections(sigma_a, sigma_s, fraction)
+    scaled, kept, peak = scale_sections(sigma_a, sigma_s, fraction)
     scattering = coefficient(sigma_s)
     remaining = coefficient(kept)
     if sigma_s[0].numel() > 1 and fraction.shape[1:].numel() == 1:
@@ -267,39 +252,6 @@ def _for_cells(numbers: Tensor) -> Tensor:
     if numbers.ndim == 4:
         return numbers + 0
     return numbers[0] + 0 if len(numbers) == 1 else numbers.view(-1, 1, 1, 1) + 0
-
-
-def _scale_sections(
-    sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Per unit density kappa_a + (1 - f) kappa_s and its scattering; and `Medium`'s `peak`."""
-    has_peak = is_any_nonzero(fraction)
-    is_small = max(sigma_a[0].numel(), sigma_s[0].numel(), fraction.numel() // 3) == 1
-    find = _remember_scaled if is_small else _find_scaled
-    return find(sigma_a, sigma_s, fraction, has_peak)
-
-
-def _find_scaled(
-    sigma_a: Tensor, sigma_s: Tensor, fraction: Tensor, has_peak: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    remaining = (1 - fraction) * sigma_s
-    extinction = sigma_a + remaining
-    peak = _peak_per_mass(extinction, fraction * sigma_s) if has_peak else None
-    return extinction, remaining, peak
-
-
-_remember_scaled = remember(_find_scaled)
-
-
-def _peak_per_mass(extinction: Tensor, forward: Tensor) -> Tensor:
-    """`forward` scattering per unit of what is summed as mass.
-
-    That is density, or `extinction` where that varies; 0 where there is none.
-    """
-    extinction, forward = torch.broadcast_tensors(extinction, forward)
-    if extinction.shape[1:].numel() == 1:
-        return forward
-    return torch.where(extinction > 0, forward / torch.where(extinction > 0, extinction, 1), 0)
 
 
 def _broadcast(sigma: Tensor, g: Tensor) -> Tensor:

@@ -24,17 +24,18 @@ def conjugate_gradients(
     right: Tensor,
     tolerance: float,
     most: int,
+    ready: Tensor | None = None,
 ) -> Solved:
     """x [n] with A x = `right`, from zero, after at most so many products.
 
     `product` gives A v, A being symmetric and positive, and `precondition` about A^-1 v: it may
     vary a little from call to call (Golub and Ye 1999, doi:10.1137/S1064827597323415). Entries that
-    it leaves at 0 stay there, and the rest is solved for. It stops
-    where the preconditioned norm of the residual, sqrt(r^T M r), is below `tolerance` of what it
-    was.
+    it leaves at 0 stay there, and the rest is solved for. `ready` is what it makes of `right`, if
+    that is known. It stops where the preconditioned norm of the residual, sqrt(r^T M r), is below
+    `tolerance` of what it was.
     """
     value, residual = torch.zeros_like(right), right.clone()
-    ready = precondition(residual)
+    ready = precondition(residual) if ready is None else ready
     direction, square = ready.clone(), float(residual @ ready)
     first, count = square, 0
     while square > tolerance**2 * first and count < most:

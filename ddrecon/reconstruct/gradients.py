@@ -89,8 +89,8 @@ def _differentiate_views(
 ) -> tuple[list[Tensor], Tensor, list[Tensor | None]]:
     """The images of `own` views, the sum of their losses, and its derivatives by `inputs`.
 
-    `worlds` are scenes, and which of their views is rendered: of one that is another rank's, that
-    rank asks this one for its part of the derivative. Each view's is added up at once; None is 0.
+    `worlds` are scenes, and which of their views is rendered: of one that is another rank's, it
+    asks this one for its part of the derivative. Each view's is added up at once; None is zero.
     """
     sums: list[Tensor | None] = [None] * len(inputs)
     images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())

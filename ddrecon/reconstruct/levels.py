@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from torch import Tensor
@@ -9,6 +10,7 @@ from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interp
 
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
+from ddrecon.ranks import cells_are_shared
 from ddrecon.scene import Scene, View
 
 FEWEST_CELLS = 8
@@ -68,6 +70,15 @@ def resample(field: Tensor, grid: Grid) -> Tensor:
     else:
         resampled = interpolate(colors, grid.shape, mode="trilinear", align_corners=False)
     return resampled.view(*field.shape[:-3], *grid.shape)
+
+
+def resample_solutions(
+    solutions: Mapping[tuple[str, int], Tensor], grid: Grid
+) -> dict[tuple[str, int], Tensor]:
+    """`solutions` on `grid`; none where ranks share out cells, and have others on another grid."""
+    if cells_are_shared():
+        return {}
+    return {kind: resample(field, grid) for kind, field in solutions.items()}
 
 
 def _resample_cross_section(sigma: Tensor, grid: Grid) -> Tensor:

@@ -26,7 +26,7 @@ from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
-from ddrecon.reconstruct.levels import factors, resample, scene_at_level
+from ddrecon.reconstruct.levels import factors, resample_solutions, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
 from ddrecon.reconstruct.schedule import Schedule
@@ -186,7 +186,6 @@ class Reconstruction:
             "parameters": {parameter.name: parameter.state() for parameter in self.parameters},
             "stage": self.stage,
             "total": dict(vars(self.total)),
-            # Those of a slab are of no use to a run with other slabs.
             "solutions": {} if cells_are_shared() else dict(self.memory.last),
             "misfit": self.misfit,
             "seed": self.seed,
@@ -243,8 +242,7 @@ class Reconstruction:
             parameter.curvature = None
             if parameter.name == "density" and self.support is not None:
                 parameter.restrict(self.support.on(grid))
-        known = {} if cells_are_shared() else self.memory.last
-        self.memory.last = {kind: resample(field, grid) for kind, field in known.items()}
+        self.memory.last = resample_solutions(self.memory.last, grid)
 
     def _views(self) -> list[View]:
         views, wanted = self.train_level.views, self.settings.views_per_iteration

@@ -24,12 +24,6 @@ EPSILON = 1e-15
 
 That of a mean over pixels with respect to one cell is far smaller than the customary 1e-8.
 """
-HALVED = 1 << 20
-"""Fields of so many numbers keep their moments in half the bits, where they are in float32.
-
-They are the largest part of an iteration's memory. Rounding, to 1 in 256, is far below what a
-derivative changes from one iteration to the next (docs/benchmarks.md).
-"""
 
 
 class Parameter:
@@ -70,7 +64,7 @@ class Parameter:
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
         self.steps = 0
-        self.moments = self._kept(torch.zeros_like(value), torch.zeros_like(value))
+        self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
     def penalty(self) -> Tensor:
         """What its regularizers add to the loss, in units of the targets' mean square.
@@ -109,13 +103,6 @@ class Parameter:
             value.mul_(self.support)
         self.value = value.requires_grad_()
 
-    def _kept(self, *moments: Tensor) -> tuple[Tensor, Tensor]:
-        """`moments` in the type that they are kept in."""
-        is_long = self.is_field and self.value.numel() >= HALVED
-        is_halved = is_long and self.value.dtype is torch.float32
-        first, second = (one.to(torch.bfloat16 if is_halved else self.value) for one in moments)
-        return first, second
-
     def _step(
         self, before: Tensor, gradient: Tensor, rate: float | Tensor
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
@@ -127,13 +114,13 @@ class Parameter:
             return step_adam(
                 before, gradient, self.moments, BETAS, self.steps, rate, EPSILON, bounds
             )
-        first, second = (moment.to(before) for moment in self.moments)
+        first, second = self.moments
         weights = [1 - beta ** float(self.steps) for beta in BETAS]
         first = first.lerp(gradient, 1 - BETAS[0])
         second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
         size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
         value = before - first / size * (rate / weights[0])
-        return value.clamp_(self.low, self.high), self._kept(first, second)
+        return value.clamp_(self.low, self.high), (first, second)
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""
@@ -150,19 +137,20 @@ class Parameter:
         if not self.is_field:
             return
         self.value = self.value_on(grid).requires_grad_()
-        first, second = (resample(moment.to(self.value), grid) for moment in self.moments)
-        self.moments = self._kept(first * volume_ratio, second * volume_ratio**2)
+        first, second = (resample(moment, grid) for moment in self.moments)
+        self.moments = first * volume_ratio, second * volume_ratio**2
 
     def forget(self) -> None:
         """Has its optimizer begin anew where the value is."""
         self.steps = 0
-        self.moments = self._kept(torch.zeros_like(self.value), torch.zeros_like(self.value))
+        self.moments = torch.zeros_like(self.value), torch.zeros_like(self.value)
 
     def restrict(self, support: Tensor) -> None:
         """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
         self.support = support.to(self.value.dtype)
         self.value = (self.value.detach() * self.support).requires_grad_()
-        self.moments = self._kept(*(moment * self.support for moment in self.moments))
+        first, second = self.moments
+        self.moments = first * self.support, second * self.support
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps of it; further steps make new tensors."""
@@ -180,4 +168,5 @@ class Parameter:
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
         self.value = state["value"].to(self.value).clone().requires_grad_()
         self.steps, self.is_even = int(state["steps"]), state["is_even"]
-        self.moments = self._kept(*(moment.to(self.value) for moment in state["moments"]))
+        first, second = (moment.to(self.value) for moment in state["moments"])
+        self.moments = first, second

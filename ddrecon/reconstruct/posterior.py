@@ -20,6 +20,8 @@ from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like
 
 TOLERANCE = 0.5
 """How small a sample's residual is to be, of a right side's usual size."""
+NUMBERS = 0.03
+"""And where there are single numbers, which hang on all cells and come last."""
 TOLD = 0.4
 """And that of the change by which told numbers are counted: they err by its square."""
 MOST = 40
@@ -140,29 +142,42 @@ class Posterior:
         products, left = 1, 1.0
         for _ in range(ROUNDS):
             is_fixed = self.is_kept | self._is_held(change, residual)
-            left = self._size(residual, is_fixed)
+            ready = self._precondition(residual, is_fixed)
+            left = self._size(residual, ready, is_fixed)
             if left <= self.tolerance or products >= self.most:
                 break
-            solved = self._correct(residual, is_fixed, self.most - products, self.tolerance / left)
+            most, tolerance = self.most - products, self.tolerance / left
+            solved = self._correct(residual, is_fixed, most, tolerance, ready)
             products, residual = products + solved.products, solved.lacking
             wanted = change + solved.value
             change = self._within(wanted)
             # What was cut at bounds counts roughly first: where that does, no product is spent.
             cut = change - wanted
             rough = residual - self._rough_product(cut)
-            left = self._size(rough, self.is_kept | self._is_held(change, rough))
+            is_fixed = self.is_kept | self._is_held(change, rough)
+            left = self._size(rough, self._precondition(rough, is_fixed), is_fixed)
             if left <= self.tolerance:
                 break
             residual, products = residual - self.product(cut), products + 1
         return change, products, left
 
     def _correct(
-        self, right: Tensor, is_fixed: Tensor, most: int, tolerance: float = TOLERANCE
+        self,
+        right: Tensor,
+        is_fixed: Tensor,
+        most: int,
+        tolerance: float = TOLERANCE,
+        ready: Tensor | None = None,
     ) -> Solved:
-        """The change of all that is not fixed that H takes to `right`."""
-        return conjugate_gradients(
-            self.product, lambda part: self._precondition(part, is_fixed), right, tolerance, most
-        )
+        """The change of all that is not fixed that H takes to `right`.
+
+        `ready` is what the preconditioner makes of it, where that is known.
+        """
+
+        def precondition(part: Tensor) -> Tensor:
+            return self._precondition(part, is_fixed)
+
+        return conjugate_gradients(self.product, precondition, right, tolerance, most, ready)
 
     def _precondition(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
         """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E49).
@@ -183,11 +198,13 @@ class Posterior:
         """About H times `vector`: J^T W J by its `information`."""
         return self.information.product(vector) + self.prior.product(vector)
 
-    def _size(self, residual: Tensor, is_fixed: Tensor) -> float:
-        """How large `residual` is, about 1 being what a right side is on average."""
-        square = float(residual @ self._precondition(residual, is_fixed))
+    def _size(self, residual: Tensor, ready: Tensor, is_fixed: Tensor) -> float:
+        """How large `residual` is, about 1 being what a right side is on average.
+
+        `ready` is what the preconditioner makes of it.
+        """
         free = int((~is_fixed).sum())
-        return (max(square, 0.0) / (self.temperature * max(free, 1))) ** 0.5
+        return (max(float(residual @ ready), 0.0) / (self.temperature * max(free, 1))) ** 0.5
 
     def _solve_prior(self, right: Tensor) -> Tensor:
         """The draw from the prior whose disturbance is `right`."""

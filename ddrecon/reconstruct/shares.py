@@ -16,7 +16,6 @@ from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
 from ddrecon.ranks import (
-    assign,
     cells_are_shared,
     from_first,
     is_any,
@@ -103,6 +102,19 @@ def share_pictures(
         for view in views
     ]
     return dict(zip(names, sum_over_ranks(pictures), strict=True))
+
+
+def assign(costs: Sequence[float], ranks: int) -> list[int]:
+    """The rank that does each of some jobs with these `costs`, so that all end at about one time.
+
+    The longest jobs are given out first, each to the rank with the least to do (Graham 1969,
+    doi:10.1137/0117039): no rank has more than 4/3 of what it must have.
+    """
+    owners, loads = [0] * len(costs), [0.0] * ranks
+    for job in sorted(range(len(costs)), key=lambda job: -costs[job]):
+        owners[job] = min(range(ranks), key=lambda rank: loads[rank])
+        loads[owners[job]] += costs[job]
+    return owners
 
 
 _KNOWN: WeakKeyDictionary[View, tuple[Grid, RenderSettings, float]] = WeakKeyDictionary()

@@ -17,7 +17,14 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors, know_errors
-from ddrecon.reconstruct.posterior import PROBED, TOLERANCE, Posterior, Sample, generator_of
+from ddrecon.reconstruct.posterior import (
+    NUMBERS,
+    PROBED,
+    TOLERANCE,
+    Posterior,
+    Sample,
+    generator_of,
+)
 from ddrecon.variables.values import component_names
 
 
@@ -26,6 +33,7 @@ class Uncertainty:
 
     A sample is drawn with `step`; which one depends on `seed` and on how many there were. `noise`
     is that of all pictures, where their scene is not to say. `errors` is what was found before.
+    `tolerance` is that of samples; None is what density or numbers deserve.
     """
 
     def __init__(
@@ -33,7 +41,7 @@ class Uncertainty:
         run: Reconstruction,
         seed: int,
         noise: Noise | None = None,
-        tolerance: float = TOLERANCE,
+        tolerance: float | None = None,
         errors: PictureErrors | None = None,
     ):
         self.parameters = run.parameters
@@ -45,6 +53,8 @@ class Uncertainty:
         self.errors = (
             known or errors or find_errors(self.curvature, run.targets, gradient, seed, information)
         )
+        if tolerance is None:
+            tolerance = NUMBERS if self.tabled else TOLERANCE
         temperature = self.errors.temperature
         self.posterior = Posterior(
             self.curvature, gradient, temperature, seed, tolerance, information

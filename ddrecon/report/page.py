@@ -96,10 +96,20 @@ def side_by_side(*parts: str) -> str:
     return f'<div class="row">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
 
 
+class Drawing(str):
+    """An element that is put into a table as it is."""
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table of `rows` under `head`; it scrolls by itself where it is too wide."""
+    """A table of `rows` under `head`; it scrolls by itself where it is too wide.
+
+    Cells are text, but for a `Drawing`.
+    """
     above = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    lines = ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
+    lines = [
+        "".join(f"<td>{c if isinstance(c, Drawing) else escape(str(c))}</td>" for c in row)
+        for row in rows
+    ]
     text = "".join(f"<tr>{line}</tr>" for line in (above, *lines))
     return f'<div class="scroll"><table>{text}</table></div>'
 

@@ -88,8 +88,8 @@ class Request:
     """
 
     seed: int
-    noise: Noise | None
-    tolerance: float
+    noise: Noise | None = None
+    tolerance: float | None = None
     next_view: str | None = None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from ddrecon.io.images.table import png_of
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.uncertainty import Uncertainty
+from ddrecon.report.error_bar import draw_error_bar
 from ddrecon.report.page import paragraph, picture, section, table, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import find_white_value
@@ -77,10 +78,17 @@ def _numbers(record: Mapping[str, Any]) -> list[str]:
     """The table of numbers with their error bars, and of those that hang together."""
     names = list(record["numbers"])
     rows = [
-        (name, f"{number['value']:.5g}", f"± {number['deviation']:.2g}")
+        (
+            name,
+            f"{number['value']:.5g} ± {number['deviation']:.2g}",
+            draw_error_bar(name, number["value"], number["deviation"]),
+        )
         for name, number in record["numbers"].items()
     ]
-    parts = [table(["number", "value", "deviation"], rows)]
+    parts = [
+        table(["number", "value ± deviation", ""], rows),
+        paragraph("Thick: one deviation. Thin: two. The upright line is 0."),
+    ]
     pairs = [
         (names[i], names[j], f"{row[j]:+.2f}")
         for i, row in enumerate(record["correlations"])
@@ -96,22 +104,30 @@ def _numbers(record: Mapping[str, Any]) -> list[str]:
 
 
 def _next_views(record: Mapping[str, Any]) -> list[str]:
-    """The table of cameras whose pictures would tell most."""
+    """The table of pictures that would tell most."""
+    views = record["next_views"]
+    has_lights = any(view["light_directions"] for view in views)
     rows = [
         (
             view["name"],
             f"{100 * view['gain']:.1f} ± {100 * view['error']:.1f} %",
-            ", ".join(f"{row[3]:.3g}" for row in view["matrix"][:3]),
-        )
-        for view in record["next_views"]
+            _vector([row[3] for row in view["matrix"][:3]]),
+            "; ".join(_vector(way) for way in view["light_directions"]),
+        )[: 4 if has_lights else 3]
+        for view in views
     ]
+    head = ["picture", "of the variance, at least", "camera at x, y, z", "light travels along"]
     return [
         paragraph(
-            "How much of the variance of all cells a picture by each of these cameras would take"
-            " away at least, if it errs as the others do. Their matrices are in uncertainty.json."
+            "How much of the variance of all cells each of these pictures would take away at least,"
+            " if it errs as the others do. Matrices of cameras are in uncertainty.json."
         ),
-        table(["camera", "of the variance, at least", "stands at x, y, z"], rows),
+        table(head[: 4 if has_lights else 3], rows),
     ]
+
+
+def _vector(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
 
 
 def _how(record: Mapping[str, Any]) -> list[str]:

@@ -35,6 +35,7 @@ from ddrecon.diffusion.solvers.hierarchy import Level
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
+from ddrecon.light.turning import turn_in_cells
 from ddrecon.ranks import alone, join_ranks, own_rank, sum_over_ranks
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.renderer import render_each
@@ -44,6 +45,7 @@ from ddrecon.slabs.ghosts import Ghosts
 from ddrecon.slabs.slab import Slab, own_slab
 from ddrecon.variables.values import value_of, with_values
 
+DIRECTION = "lights.0.direction"
 RANKS, TELLS = 3, 1
 """How many there are, and which one's errors are told: it has neighbors on both sides."""
 SHAPES = {"z": (21, 4, 5), "y": (5, 22, 4), "x": (4, 5, 23)}
@@ -155,7 +157,7 @@ def seen_from(axis: str, *eyes: tuple[float, float, float], **settings: Any) -> 
 
 def forward_peak() -> Found:
     scene = scene_of("y", g=0.4, travel=(1.0, 3.0, 0.5))
-    return run(scene, [make_camera((2.0, -1.5, 1.0))], "g", has_tangents=True)
+    return run(scene, [make_camera((2.0, -1.5, 1.0))], "g", DIRECTION, has_tangents=True)
 
 
 def all_per_cell() -> Found:
@@ -163,6 +165,19 @@ def all_per_cell() -> Found:
     scene = scene_of("z", g=0.3, sigma_s=sigma_s)
     scene.volume.g = 0.5 * random_values(*SHAPES["z"], seed=6)
     return run(scene, [make_camera((2.5, 0.4, 0.6), is_perspective=False)], "g")
+
+
+def pairs() -> Found:
+    """Beams that backward peaks turn, of each cell its own."""
+    slab, direction = slab_of("y"), torch.tensor([0.2, 0.9, -0.3], dtype=torch.float64)
+    extinction = 5 * random_values(1, *SHAPES["y"], seed=7)
+    turned = 0.6 * extinction * random_values(1, *SHAPES["y"], seed=8)
+    right = turn_in_cells(extinction, turned, slab.whole, direction / direction.norm())
+    found = turn_in_cells(
+        slab.cut(extinction), slab.cut(turned), slab, direction / direction.norm()
+    )
+    for name, one, other in zip(("along", "against"), found, right, strict=True):
+        yield name, one, slab.cut(other)
 
 
 def point_light() -> Found:
@@ -205,6 +220,7 @@ CASES: dict[str, Callable[[], Found]] = {
     "light along x": partial(seen_from, "x", ASKEW),
     "forward peak": forward_peak,
     "all per cell": all_per_cell,
+    "pairs": pairs,
     "point light": point_light,
     "environment": environment,
     "lattice": lattice,

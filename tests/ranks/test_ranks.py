@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ddrecon.errors import RanksError, UsageError
-from ddrecon.ranks import assign, from_first, is_any, is_first, join_ranks, sum_over_ranks
+from ddrecon.ranks import from_first, is_any, is_first, join_ranks, sum_over_ranks
+from ddrecon.reconstruct.shares import assign
 
 COSTS = st.lists(st.floats(0.1, 100), min_size=1, max_size=30)
 

@@ -112,9 +112,14 @@ class Runs:
         return (self.folder / f"{list(JOBS).index(name)}.{rank}.{end}").read_text()
 
     def log(self, output: str) -> np.ndarray:
-        """The log in the folder `output`, without the times."""
+        """The log in the folder `output`, without the times.
+
+        And without the steps of solves: one that was cut off has begun nearer to its end.
+        """
         with (self.folder / output / "loss.csv").open() as stream:
-            rows = [row | {"seconds": "0"} for row in csv.DictReader(stream)]
+            rows = [
+                row | {"seconds": "0", "forward_iterations": "0"} for row in csv.DictReader(stream)
+            ]
         return np.array([[float(cell or 0) for cell in row.values()] for row in rows])
 
     def found(self, output: str) -> dict[str, np.ndarray]:

@@ -44,6 +44,11 @@ def test_the_other_pair_of_cross_sections_passes(name: str) -> None:
     assert result.has_passed, "\n".join(result.lines())
 
 
+def test_g_of_each_cell_passes() -> None:
+    (result,) = check("g", overrides=("optimize.parameters.g={init: -0.6, field: true}",))
+    assert result.has_passed, "\n".join(result.lines())
+
+
 def test_all_at_once_pass() -> None:
     scene = load_scene(CONFIG, overrides=SMALL, dtype=torch.float64)
     # None of them alone: `test_every_parameter_passes` checks those.

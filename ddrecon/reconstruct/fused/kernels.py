@@ -16,39 +16,22 @@ auto root_of = [](F x) __attribute__((always_inline)) -> F {
 #endif
 };
 """
-# Moments as they are kept: in full, or the upper half of a float, rounded to nearest.
-_FULL = """
-typedef F Kept;
-auto full = [](F x) __attribute__((always_inline)) -> F { return x; };
-auto kept = full;
-"""
-_HALVED = """
-typedef unsigned short Kept;
-auto full = [](Kept x) __attribute__((always_inline)) -> F {
-    return __builtin_bit_cast(float, (unsigned int)x << 16);
-};
-auto kept = [](F x) __attribute__((always_inline)) -> Kept {
-    const unsigned int bits = __builtin_bit_cast(unsigned int, (float)x);
-    return (Kept)((bits + 0x7fffu + (bits >> 16 & 1u)) >> 16);
-};
-"""
 _STEP = """
 const F* __restrict v = value + begin;
 const F* __restrict g = gradient + begin;
-const Kept* __restrict m = first_moment + begin;
-const Kept* __restrict s = second_moment + begin;
+const F* __restrict m = first_moment + begin;
+const F* __restrict s = second_moment + begin;
 F* __restrict new_v = new_value + begin;
-Kept* __restrict new_m = new_first + begin;
-Kept* __restrict new_s = new_second + begin;
+F* __restrict new_m = new_first + begin;
+F* __restrict new_s = new_second + begin;
 const int count = end - begin;
 for (int i = 0; i < count; ++i) {
-    const F first = full(m[i]), second = full(s[i]);
-    const F mean = first + forget_first * (g[i] - first);
-    const F square = second + forget_second * (g[i] * g[i] - second);
+    const F mean = m[i] + forget_first * (g[i] - m[i]);
+    const F square = s[i] + forget_second * (g[i] * g[i] - s[i]);
     const F moved = v[i] - rate * mean / (root_of(square) * root + epsilon);
     const F held = moved < low ? low : moved;
-    new_m[i] = kept(mean);
-    new_s[i] = kept(square);
+    new_m[i] = mean;
+    new_s[i] = square;
     new_v[i] = held > high ? high : held;
 }
 """
@@ -99,19 +82,13 @@ totals[item] = total;
 
 
 @functools.cache
-def step_kernel(bits: int, is_halved: bool = False) -> TextKernel:
-    """The kernel of a step of Adam: new value, first and second moment, each a flat array.
-
-    Moments `is_halved` are kept as bfloat16.
-    """
+def step_kernel(bits: int) -> TextKernel:
+    """The kernel of a step of Adam: new value, first and second moment, each a flat array."""
     given = """
     int length, total; F forget_first, forget_second, root, epsilon, rate, low, high;
-    F *value, *gradient, *new_value;
+    F *value, *gradient, *first_moment, *second_moment, *new_value, *new_first, *new_second
     """
-    moments = "*first_moment, *second_moment, *new_first, *new_second"
-    given += f"{'half' if is_halved else 'F'} {moments}"
-    text = BLOCK + _ROOT + (_HALVED if is_halved else _FULL) + _STEP
-    return TextKernel("step", bits, text, given)
+    return TextKernel("step", bits, BLOCK + _ROOT + _STEP, given)
 
 
 @functools.cache

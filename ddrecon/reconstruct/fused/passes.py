@@ -32,11 +32,8 @@ def step_adam(
     epsilon: float,
     bounds: tuple[float, float],
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """The new value, within its bounds, and the new moments, after `steps` with this one.
-
-    Moments are of the type of the value, or bfloat16.
-    """
-    new = [value.new_empty(value.shape, dtype=one.dtype) for one in (value, *moments)]
+    """The new value, within its bounds, and the new moments, after `steps` with this one."""
+    new = [value.new_empty(value.shape) for _ in range(3)]
     weights = [1 - beta**steps for beta in betas]
     items, length = cut(value.numel(), LENGTH, value)
     given = {
@@ -55,9 +52,7 @@ def step_adam(
         "high": bounds[1],
     }
     made = dict(zip(("new_value", "new_first", "new_second"), new, strict=True))
-    is_halved = moments[0].dtype is torch.bfloat16
-    kernel = step_kernel(torch.finfo(value.dtype).bits, is_halved)
-    kernel.launch(items, given, made, _threads(value))
+    step_kernel(torch.finfo(value.dtype).bits).launch(items, given, made, _threads(value))
     return new[0], (new[1], new[2])
 
 

@@ -38,3 +38,22 @@ def test_rounds_of_both_engines_agree(g: float, sigma: Sections):
     both = (image_and_gradients(engine, g, sigma) for engine in ("warp", "torch"))
     for found, known in zip(*both, strict=True):
         torch.testing.assert_close(found, known, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_tangents_are_those_of_the_adjoint(rounds: int):
+    use_engine("warp")
+    density, change = half_empty(7, 6, 5), random_values(7, 6, 5, seed=5)
+    scene = make_scene(density, directional=(3.0, 2.0, 1.0), transport_rounds=rounds)
+
+    def image(density: Tensor) -> Tensor:
+        sections = (density.new_tensor(section) for section in (0.5, 8.0, 0.4))
+        return render(replace(scene, volume=Volume(scene.volume.grid, density, *sections)))
+
+    shown, tangent = torch.func.jvp(image, (density,), (change,))
+    weights = random_values(*shown.shape, seed=3)
+    leaf = density.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad((image(leaf) * weights).sum(), leaf)
+    torch.testing.assert_close(
+        (tangent * weights).sum(), (gradient * change).sum(), rtol=1e-11, atol=0
+    )

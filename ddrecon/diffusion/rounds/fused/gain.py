@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,6 +32,20 @@ _TENSORS = (
     *("numbers", "extinction", "scattering", "imbalance", "swept", "diffuse"),
     *(*_SWEPT[1:], *_DIFFUSE[1:], *_LIGHT),
 )
+
+
+class _IsSo(NamedTuple):
+    """Whether there are fluxes, one field for both coefficients, an imbalance.
+
+    And whether `light` is what is `diffuse`, as in the first round.
+    """
+
+    HAS_FLUX: bool
+    SHARES_FIELD: bool
+    HAS_IMBALANCE: bool
+    IS_DIFFUSE: bool
+
+
 # The row's part of each array; those that light has not are the first.
 _ROWS = """
 const long long at = c * size + start;
@@ -94,8 +108,8 @@ for (int i = begin; i < end; ++i) {"""
             share_bar += by_gain * (fluxes[a][i] - fluxes[3 + a][i]) + by_turn * turn;
             cosine_sum += share * turn * flux_bars[3 + a][i];
             to[a][i] = share * (by_gain + by_turn);
-            to[3 + a][i] = -share * by_gain;
-            to[6 + a][i] = -share * by_turn;
+            to[3 + a][i] = -share * (IS_DIFFUSE ? by_gain + by_turn : by_gain);
+            if (!IS_DIFFUSE) to[6 + a][i] = -share * by_turn;
         }
     if (HAS_IMBALANCE) {
         share_bar -= source_bars[i] * off[i];
@@ -144,7 +158,7 @@ def gain_fused(
         diffuse.mean,
         *(swept.flux or ()),
         *(diffuse.flux or ()),
-        *(light.flux or ()),
+        *(() if diffuse is light else light.flux or ()),
     )
     if not flux:
         return Moments(mean), source, None
@@ -172,9 +186,10 @@ class _Gain(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
         given, is_so = _given(*ctx.saved_tensors)
-        has_flux, shares_field, has_imbalance = is_so
+        has_flux, shares_field, has_imbalance, is_diffuse = is_so
         like = given["swept"]
-        names = [*_SWEPT, *_DIFFUSE, *_LIGHT] if has_flux else ["swept", "diffuse"]
+        names = [*_SWEPT, *_DIFFUSE] if has_flux else ["swept", "diffuse"]
+        names += [*_LIGHT] * (has_flux and not is_diffuse)
         names += ["extinction"] + ["scattering"] * (not shares_field)
         names += ["imbalance"] * has_imbalance
         found = {f"{name}_bar": like.new_empty(like.shape) for name in names}
@@ -193,8 +208,7 @@ class _Gain(torch.autograd.Function):
         )
         sums = found["sums"].double().view(*numbers.shape, -1).sum(-1).to(numbers.dtype)
         off_bar = None if imbalance is None else found["imbalance_bar"]
-        light = ("swept", "diffuse", *_SWEPT[1:], *_DIFFUSE[1:], *_LIGHT)
-        light_bars = (found[f"{name}_bar"] for name in light[: 11 if has_flux else 2])
+        light_bars = (found[f"{n}_bar"] for n in _TENSORS[4:] if f"{n}_bar" in found)
         return None, sums, e_bar, s_bar, off_bar, *light_bars
 
     @staticmethod
@@ -205,7 +219,9 @@ class _Gain(torch.autograd.Function):
             found, like = _empty(given, is_so), given["swept"]
             kernel = functools.partial(gain_kernel, is_so)
             d_given = dict(zip(_TENSORS, d_values, strict=False))
-            if is_so[1]:
+            if is_so.IS_DIFFUSE:
+                d_given |= dict(zip(_LIGHT, d_values[9:], strict=True))
+            if is_so.SHARES_FIELD:
                 d_given["scattering"] = d_given["extinction"]
             # What is not found, without flux, is not written to either.
             unused = dict.fromkeys((name for name in _FOUND if name not in found), found["source"])
@@ -216,7 +232,7 @@ class _Gain(torch.autograd.Function):
         return d_found
 
 
-def _empty(given: dict[str, Any], is_so: tuple[bool, bool, bool]) -> dict[str, Tensor]:
+def _empty(given: dict[str, Any], is_so: _IsSo) -> dict[str, Tensor]:
     """Room for what is found, by its names."""
     like = given["swept"]
     return {name: like.new_empty(like.shape) for name in (_FOUND if is_so[0] else _FOUND[:2])}
@@ -230,11 +246,14 @@ def _given(
     swept: Tensor,
     diffuse: Tensor,
     *flux: Tensor,
-) -> tuple[dict[str, Any], tuple[bool, bool, bool]]:
-    """What both kernels are given, and whether flux, one field and an imbalance are.
+) -> tuple[dict[str, Any], _IsSo]:
+    """What both kernels are given, and what is so.
 
     The mean stands for arrays that are not.
     """
+    has_flux, is_diffuse = bool(flux), len(flux) == len((*_SWEPT[1:], *_DIFFUSE[1:]))
+    if is_diffuse:
+        flux = (*flux, *flux[3:])
     shares_field = scattering is None
     scattering = extinction if scattering is None else scattering
     vectors = (*_SWEPT[1:], *_DIFFUSE[1:], *_LIGHT)
@@ -245,7 +264,7 @@ def _given(
         "imbalance": swept if imbalance is None else imbalance,
         **dict(zip(vectors, flux or [swept] * len(vectors), strict=True)),
     }  # fmt: skip
-    return given, (bool(flux), shares_field, imbalance is not None)
+    return given, _IsSo(has_flux, shares_field, imbalance is not None, is_diffuse)
 
 
 _ARRAYS = " ".join((*_OF_MEDIUM, "imbalance", *_SWEPT, *_DIFFUSE, *_LIGHT))
@@ -253,19 +272,19 @@ _COLORS = "extinction_colors scattering_colors colors"
 
 
 @functools.cache
-def gain_kernel(is_so: tuple[bool, bool, bool], bits: int) -> Any:
-    """The kernel of gains; `is_so`: whether there are flux, one field for both, an imbalance."""
+def gain_kernel(is_so: _IsSo, bits: int) -> Any:
+    """The kernel of gains."""
     arrays = f"{_ARRAYS} {' '.join(_FOUND)}"
     return row_kernel("gain", bits, _told(is_so) + _GAIN, arrays, _COLORS)
 
 
 @functools.cache
-def gain_adjoint_kernel(is_so: tuple[bool, bool, bool], bits: int) -> Any:
+def gain_adjoint_kernel(is_so: _IsSo, bits: int) -> Any:
     """The kernel of the cotangents of all that gains are of."""
     bars = (f"{name}_bar" for name in f"{_ARRAYS} {' '.join(_FOUND)}".split())
     arrays = f"{_ARRAYS} {' '.join(bars)} sums"
     return row_kernel("gain_adjoint", bits, _told(is_so) + _ADJOINT, arrays, _COLORS)
 
 
-def _told(is_so: tuple[bool, bool, bool]) -> str:
-    return constants(HAS_FLUX=is_so[0], SHARES_FIELD=is_so[1], HAS_IMBALANCE=is_so[2])
+def _told(is_so: _IsSo) -> str:
+    return constants(**is_so._asdict())
