@@ -123,7 +123,7 @@ def _pair(
 def _pair_in_cells(
     medium: Medium, entered: Tensor, step: Tensor, turned: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_pair`, where the part that is `turned` differs from cell to cell (E40)."""
+    """As `_pair`, where the part that is `turned` differs from cell to cell (E37)."""
     extinction, back = medium.extinction.value, turned * medium.scattering.value
     forth, against = turn_in_cells(extinction, back, medium.grid, direction)
     tau = medium.extinction.mean_transmittance(entered, step)

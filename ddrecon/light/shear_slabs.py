@@ -1,7 +1,7 @@
 """The mass that a beam passes, in slabs: each rank sums it in its own, behind that of the others.
 
 Mass is linear in the field but for bounds on its corrections. So what lies before a slab is handed
-on as sums along rays, which are as few as a slice has cells (E54).
+on as sums along rays, which are as few as a slice has cells (E42).
 """
 
 from __future__ import annotations

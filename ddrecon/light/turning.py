@@ -1,4 +1,4 @@
-"""Pairs of beams where the backward peak differs from cell to cell (docs/theory.md E40).
+"""Pairs of beams where the backward peak differs from cell to cell (docs/theory.md E37).
 
 The rays of a beam go from slice to slice, as those that sum its mass do. A slice is a layer that
 lets light pass and turns light back; layers are added up from the far end, and followed from the

@@ -1,4 +1,4 @@
-"""View rays through a grid in slabs: each rank integrates what lies in its own (E53).
+"""View rays through a grid in slabs: each rank integrates what lies in its own (E41).
 
 A ray runs through one slab after the other. What a slab adds depends on the others by the mass
 alone that lies before it. So ranks tell each other the masses that rays pass, and add up radiance.

@@ -2,7 +2,7 @@
 
 The number that differs is interpolated to the nodes of rays, as density is. Without a forward peak
 the phase function is evaluated there. With one, S of E13 is looked up by that number and by the
-angle: its polynomials are kept at even steps of the number, the rungs (docs/theory.md E39).
+angle: its polynomials are kept at even steps of the number, the rungs (docs/theory.md E36).
 """
 
 from __future__ import annotations

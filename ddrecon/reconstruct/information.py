@@ -1,4 +1,4 @@
-"""What pictures say of all cells, roughly: J^T W J as a scale of each cell and one spectrum (E49).
+"""What pictures say of all cells, roughly: J^T W J as a scale of each cell and one spectrum (E38).
 
 Pictures tell sums along rays: smooth changes of a field far better than rough ones. The diagonal of
 J^T W J does not know that. How it hangs together is nearly the same everywhere, but for its scale,

@@ -35,7 +35,7 @@ PRECONDITION = 0.1
 PROBED = -1
 """The number of random vectors that belong to no sample, but to information."""
 BEGIN = 0.25
-"""The part of the way from a draw of the prior to what pictures roughly leave of it (E50)."""
+"""The part of the way from a draw of the prior to what pictures roughly leave of it (E39)."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Posterior:
         return self.curvature.data_product(vector) + self.prior.product(vector)
 
     def _begin(self, prior: Tensor, right: Tensor) -> Tensor:
-        """Where a sample begins: from the draw `prior` on towards what pictures leave of it (E50).
+        """Where a sample begins: from the draw `prior` on towards what pictures leave of it (E39).
 
         `right` is what it came of.
         """
@@ -180,7 +180,7 @@ class Posterior:
         return conjugate_gradients(self.product, precondition, right, tolerance, most, ready)
 
     def _precondition(self, vector: Tensor, is_fixed: Tensor) -> Tensor:
-        """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E49).
+        """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E38).
 
         That again is solved by conjugate gradients, to which it counts by its diagonal alone.
         """

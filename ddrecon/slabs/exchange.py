@@ -1,4 +1,4 @@
-"""What ranks exchange of fields in slabs, differentiable: E52.
+"""What ranks exchange of fields in slabs, differentiable: E40.
 
 The objective is a sum over ranks. So every adjoint is the transpose of the exchange as a whole:
 what one rank has lent to others is added up by those others' cotangents.
@@ -25,13 +25,13 @@ from ddrecon.slabs.slab import Slab
 
 
 def add_halo(own: Tensor, slab: Slab) -> Tensor:
-    """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them (E52)."""
+    """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them (E40)."""
     field: Tensor = _AddHalo.apply(own, slab)
     return field
 
 
 def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
-    """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part (E52).
+    """All cells [..., z, y, x] of the whole of which `grid` is a slab, and `field` a part (E40).
 
     `field` itself where `grid` is the whole.
     """
@@ -47,13 +47,13 @@ def gather_own(own: Tensor, slab: Slab) -> Tensor:
 
 
 def gather_parts(part: Tensor) -> Tensor:
-    """What each rank has as `part`, any shape, one after the other along a new first axis (E52)."""
+    """What each rank has as `part`, any shape, one after the other along a new first axis (E40)."""
     parts: Tensor = _Gather.apply(part[None], -part.ndim - 1, [1] * rank_count(), own_rank())
     return parts
 
 
 def sum_slabs(part: Tensor) -> Tensor:
-    """The sum over ranks of `part`, any shape, differentiable (E52)."""
+    """The sum over ranks of `part`, any shape, differentiable (E40)."""
     total: Tensor = _Sum.apply(part)
     return total
 
