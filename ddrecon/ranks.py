@@ -166,7 +166,8 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     flat = torch.cat([tensor.detach().flatten() for tensor in tensors])
     with _exchange(flat.nbytes):
         torch.distributed.all_reduce(flat)
-        _wait_for_gpu(flat)
+        if flat.is_cuda:
+            torch.cuda.synchronize(flat.device)
     parts = flat.split([tensor.numel() for tensor in tensors])
     return [part.view(like.shape).to(like.dtype) for part, like in zip(parts, tensors, strict=True)]
 
@@ -178,7 +179,6 @@ def gather_from_ranks(part: Tensor) -> list[Tensor]:
     parts = [torch.empty_like(part) for _ in range(_group.count)]
     with _exchange(part.nbytes):
         torch.distributed.all_gather(parts, part)
-        _wait_for_gpu(part)
     return parts
 
 
@@ -231,12 +231,6 @@ def from_first(value: T) -> T:
         torch.distributed.broadcast(content, 0)
     copy: T = torch.load(BytesIO(content.numpy().tobytes()), map_location="cpu", weights_only=True)
     return copy
-
-
-def _wait_for_gpu(tensor: Tensor) -> None:
-    """Waits for what a GPU does with `tensor`, so that what fails there fails here."""
-    if tensor.is_cuda:
-        torch.cuda.synchronize(tensor.device)
 
 
 @contextmanager

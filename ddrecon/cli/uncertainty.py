@@ -43,7 +43,7 @@ SAMPLES = 16
 @click.option(
     "--tolerance",
     type=click.FloatRange(min=0, max=1, min_open=True),
-    help="What a sample may lack. Left out: 0.5, and 0.03 where single numbers are optimized.",
+    help="What a sample may lack. Left out: 0.5, and 0.01 where single numbers are optimized.",
 )
 @click.option("--keep-samples", "has_samples", is_flag=True, help="Also write each sample.")
 @click.option(

@@ -46,7 +46,6 @@ def sum_mass(
     neighbor = slab.rank + (-1 if is_upwards else 1)
     if 0 <= neighbor < len(counted):
         counted[neighbor, 1] = 0
-    before = torch.einsum("rp,rp...->...", counted, sums)
 
     # The slab with its halo; near its ends, where rays are missing, its neighbors' cells are right.
     third_order = ThirdOrder(0, 1, bound)
@@ -114,6 +113,7 @@ class _Rays:
             added, after = int(number > 0), int(number + len(slices) < self.count)
             slices = pad(slices, (0, 0, 0, 0, 0, 0, added, after))
             number -= added
+        # The rays that meet these cells on the first slice, on the last or between.
         firsts, counts, starts = [], [], []
         for which, slope in enumerate(whole.slope.tolist()):
             low, size = (begin if which == cut else 0), slices.shape[2 + which]

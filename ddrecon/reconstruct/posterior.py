@@ -20,7 +20,7 @@ from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like
 
 TOLERANCE = 0.5
 """How small a sample's residual is to be, of a right side's usual size."""
-NUMBERS = 0.03
+NUMBERS = 0.01
 """And where there are single numbers, which hang on all cells and come last."""
 TOLD = 0.4
 """And that of the change by which told numbers are counted: they err by its square."""
