@@ -142,10 +142,11 @@ class Reconstruction:
         # Check: a derivative that is not finite would spoil the parameters for good.
         numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
+        # Solutions are not in it: solves only begin there.
         self.before_step = None
-        # Not the solutions, where solves only begin.
-        self.before_step = {key: part for key, part in self.state().items() if key != "solutions"}
-        self.before_step["parameters"] = {p.name: p.backup() for p in self.parameters}
+        backups = {parameter.name: parameter.backup() for parameter in self.parameters}
+        self.before_step = self.state() | {"parameters": backups}
+        del self.before_step["solutions"]
         # Step: every parameter against its derivative.
         self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
         self._step(gradients, compared)
@@ -207,11 +208,8 @@ class Reconstruction:
         for parameter in self.parameters:
             curvature = state["parameters"][parameter.name]["curvature"]
             parameter.curvature = None if curvature is None else curvature.to(parameter.value)
-        if "solutions" in state:
-            self.memory.last = {
-                kind: field.to(self.scene.volume.density)
-                for kind, field in state["solutions"].items()
-            }
+        for kind, field in state.get("solutions", {}).items():
+            self.memory.last[kind] = field.to(self.scene.volume.density)
 
     def _settle_smoothing(self) -> None:
         """Finds the weight of density's total variation where the scene asks for that."""
