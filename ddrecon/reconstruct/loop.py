@@ -23,9 +23,11 @@ from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.brightness import lights_due, step_brightness
+from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
+from ddrecon.reconstruct.joint import moves_together, step_together
 from ddrecon.reconstruct.levels import factors, resample, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
@@ -81,6 +83,7 @@ class Reconstruction:
         self.parameters = setup.start_parameters(scene, self.settings)
         setup.choose_steps(self.parameters, self.train, self.loss in QUADRATIC)
         self.gauges = find_gauges(self.train, self.parameters)
+        self.moves_together = moves_together(self.parameters, self.loss)
         self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
         weights = {view.name: view.weight for view in self.train.views}
@@ -273,6 +276,11 @@ class Reconstruction:
 
         What cameras do, and how bright lights are, goes part of the way to what fits best.
         """
+        if self.moves_together and self.schedule.moves_together(self.iteration):
+            known = self.parameters, self.targets, self.power
+            curvature = Curvature(self.train_level, *known, self.memory.last)
+            step_together(curvature, self.targets, self.power, self.gauges)
+            return
         pictures, names = compared.pictures, {view.name for view in compared.views}
         values = {name: value.detach() for name, value in self._values().items()}
         seen = [p for p in self.parameters if p.view is None or p.view in names]

@@ -95,7 +95,7 @@ class Posterior:
         lacking += self.curvature.adjoint(
             {name: scale * disturbed[name] - w * changes[name] for name, w in weights.items()}
         )
-        change, products, residual = self._minimize(begin, lacking)
+        change, products, residual = self.minimize(begin, lacking)
         return Sample(change, prior, products, residual)
 
     def _disturbances(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -130,7 +130,7 @@ class Posterior:
         """Which entries are at a bound that `residual` presses them against."""
         return (change <= self.low) & (residual < 0) | (change >= self.high) & (residual > 0)
 
-    def _minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
+    def minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
         """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.
 
         And how many products that took, and what is left. Which cells are at a bound is guessed,
@@ -140,7 +140,7 @@ class Posterior:
         products, left = 1, 1.0
         for _ in range(ROUNDS):
             is_fixed = self.is_kept | self._is_held(change, residual)
-            left = self._size(residual, is_fixed)
+            left = self.size(residual, is_fixed)
             if left <= self.tolerance or products >= self.most:
                 break
             solved = self._correct(residual, is_fixed, self.most - products, self.tolerance / left)
@@ -150,7 +150,7 @@ class Posterior:
             # What was cut at bounds counts roughly first: where that does, no product is spent.
             cut = change - wanted
             rough = residual - self._rough_product(cut)
-            left = self._size(rough, self.is_kept | self._is_held(change, rough))
+            left = self.size(rough, self.is_kept | self._is_held(change, rough))
             if left <= self.tolerance:
                 break
             residual, products = residual - self.product(cut), products + 1
@@ -183,7 +183,7 @@ class Posterior:
         """About H times `vector`: J^T W J by its `information`."""
         return self.information.product(vector) + self.prior.product(vector)
 
-    def _size(self, residual: Tensor, is_fixed: Tensor) -> float:
+    def size(self, residual: Tensor, is_fixed: Tensor) -> float:
         """How large `residual` is, about 1 being what a right side is on average."""
         square = float(residual @ self._precondition(residual, is_fixed))
         free = int((~is_fixed).sum())

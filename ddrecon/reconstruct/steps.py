@@ -11,7 +11,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.poses import calibration_prior, pose_curvature, step_pose
+from ddrecon.reconstruct.poses import pose_curvature, step_pose, weigh_calibration
 from ddrecon.reconstruct.responses import step_responses
 from ddrecon.reconstruct.schedule import Schedule
 from ddrecon.reconstruct.shares import take_from_owners
@@ -103,8 +103,8 @@ def solve_poses(
     grid = scene.volume.grid
     for pose in poses:
         assert pose.view is not None and pose.curvature is not None
-        prior = calibration_prior(scene.view(pose.view).camera, grid)
-        step_pose(pose, gradients[pose.name], pose.curvature, prior)
+        held = weigh_calibration(pose, pose.curvature, scene.view(pose.view).camera, grid)
+        step_pose(pose, gradients[pose.name], pose.curvature, held)
 
 
 def share_out(gradients: Mapping[str, Tensor], views: Sequence[View]) -> dict[str, Tensor]:
