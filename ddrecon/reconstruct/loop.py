@@ -22,16 +22,16 @@ from ddrecon.losses import QUADRATIC
 from ddrecon.ranks import cells_are_shared
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.ahead import compile_ahead
-from ddrecon.reconstruct.brightness import lights_due, step_brightness
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
 from ddrecon.reconstruct.gradients import Differentiated, differentiate
+from ddrecon.reconstruct.joint import moves_together, step_together
 from ddrecon.reconstruct.levels import factors, resample_solutions, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
 from ddrecon.reconstruct.schedule import Schedule
 from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
-from ddrecon.reconstruct.steps import share_out, solve_poses, solve_responses, step_parameters
+from ddrecon.reconstruct.steps import solve_numbers, step_parameters
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
@@ -270,16 +270,17 @@ class Reconstruction:
 
         What cameras do, and how bright lights are, goes part of the way to what fits best.
         """
-        pictures, names = compared.pictures, {view.name for view in compared.views}
+        is_due = self.schedule.moves_together(self.iteration)
+        if is_due and moves_together(self.parameters, self.loss):
+            known = self.targets, self.power, self.gauges, self.memory.last
+            step_together(self.train_level, self.parameters, *known)
+            return
         values = {name: value.detach() for name, value in self._values().items()}
+        names = {view.name for view in compared.views}
         seen = [p for p in self.parameters if p.view is None or p.view in names]
         solved = step_parameters(seen, gradients, self.schedule, self.iteration)
-        solve_responses(solved, self.train_level, pictures, self.targets)
-        lights, level = lights_due(solved, self.iteration), self.train_level
-        step_brightness(lights, level, values, pictures, self.targets, self.memory.last)
-        if poses := [p for p in solved if p.key == "camera"]:
-            own = share_out(gradients, compared.views)
-            solve_poses(poses, level, own, values, self.targets, self.memory.last, pictures)
+        about = self.train_level, values, self.targets, self.memory.last
+        solve_numbers(solved, gradients, compared, *about, self.iteration)
         for gauge in self.gauges:
             gauge.hold()
 

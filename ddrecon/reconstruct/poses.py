@@ -56,23 +56,33 @@ def pose_curvature(light_field: LightField, scene: Scene, name: str, target: Tar
     return 2 * (matrix @ matrix.T) / target.count
 
 
-def step_pose(parameter: Parameter, gradient: Tensor, curvature: Tensor, prior: Tensor) -> None:
-    """Takes the twist `parameter` part of the way to the least of its loss and of the `prior`.
+def step_pose(parameter: Parameter, gradient: Tensor, curvature: Tensor, held: Tensor) -> None:
+    """Takes the twist `parameter` part of the way to the least of its loss and its calibration.
 
-    `gradient` [6] and `curvature` [6, 6] are of the loss of its view; the prior [6, 6] is that of
-    `calibration_prior`.
+    `gradient` [6] and `curvature` [6, 6] are of the loss of its view; `held` [6, 6] is how its
+    calibration counts against that, of `weigh_calibration`.
     """
     unit = pixel_units(parameter)
     value, loss_slope = parameter.value.detach().double() / unit, gradient.double() * unit
-    bent, held = (matrix.double() * unit * unit[:, None] for matrix in (curvature, prior))
-    # The prior, as strong as what the picture says of a shift in the image by TRUST.
-    held = held * (TRUST**2 * bent.diagonal()[3:5].mean())
+    bent, held = (matrix.double() * unit * unit[:, None] for matrix in (curvature, held))
     tiny = torch.finfo(torch.float32).tiny
     both = bent + held + tiny * torch.eye(6).to(bent)
     step = torch.linalg.solve(both, loss_slope + held @ value)
     step = PART * step * (LARGEST_STEP / step.abs().max().clamp(min=LARGEST_STEP))
     moved = ((value - step) * unit).to(parameter.value)
     parameter.value = moved.clamp(parameter.low, parameter.high).requires_grad_()
+
+
+def weigh_calibration(
+    parameter: Parameter, curvature: Tensor, camera: Camera, grid: Grid
+) -> Tensor:
+    """The second derivative [6, 6] of what the calibration of `camera` adds to its view's loss.
+
+    It is as strong as what the picture, by the loss's `curvature` [6, 6], says of a shift in the
+    image by `TRUST`; `parameter` is the twist of the camera.
+    """
+    of_shifts = (curvature.diagonal().double() * pixel_units(parameter) ** 2)[3:5].mean()
+    return calibration_prior(camera, grid) * (TRUST**2 * of_shifts)
 
 
 def pixel_units(parameter: Parameter) -> Tensor:

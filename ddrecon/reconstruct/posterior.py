@@ -97,7 +97,7 @@ class Posterior:
         lacking += self.curvature.adjoint(
             {name: scale * disturbed[name] - w * changes[name] for name, w in weights.items()}
         )
-        change, products, residual = self._minimize(begin, lacking)
+        change, products, residual = self.minimize(begin, lacking)
         return Sample(change, prior, products, residual)
 
     def _disturbances(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -132,7 +132,7 @@ class Posterior:
         """Which entries are at a bound that `residual` presses them against."""
         return (change <= self.low) & (residual < 0) | (change >= self.high) & (residual > 0)
 
-    def _minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
+    def minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
         """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.
 
         And how many products that took, and what is left. Which cells are at a bound is guessed,
@@ -154,8 +154,7 @@ class Posterior:
             # What was cut at bounds counts roughly first: where that does, no product is spent.
             cut = change - wanted
             rough = residual - self._rough_product(cut)
-            is_fixed = self.is_kept | self._is_held(change, rough)
-            left = self._size(rough, self._precondition(rough, is_fixed), is_fixed)
+            left = self.size(rough, self.is_kept | self._is_held(change, rough))
             if left <= self.tolerance:
                 break
             residual, products = residual - self.product(cut), products + 1
@@ -197,6 +196,10 @@ class Posterior:
     def _rough_product(self, vector: Tensor) -> Tensor:
         """About H times `vector`: J^T W J by its `information`."""
         return self.information.product(vector) + self.prior.product(vector)
+
+    def size(self, residual: Tensor, is_fixed: Tensor) -> float:
+        """How large `residual` is, about 1 being what a right side is on average."""
+        return self._size(residual, self._precondition(residual, is_fixed), is_fixed)
 
     def _size(self, residual: Tensor, ready: Tensor, is_fixed: Tensor) -> float:
         """How large `residual` is, about 1 being what a right side is on average.

@@ -25,6 +25,10 @@ WINDOW = 20
 """Iterations over which the loss has to fall,"""
 FALL = 0.01
 """by more than this part of itself; else it has come to rest."""
+TOGETHER = 32
+"""Of so many iterations at a resolution, the last is one in which all that is sought moves together
+(E43).
+"""
 
 
 @dataclass
@@ -78,6 +82,12 @@ class Schedule:
         It is for parameters that begin to move after the part `release` of the run.
         """
         return rate_at(self.place(iteration), self.planned, round(release * self.planned))
+
+    def moves_together(self, iteration: int) -> bool:
+        """Whether `iteration` is one of the last at its resolution, in which all moves together."""
+        place, ends = self.place(iteration), self._part_ends
+        parts = zip([0, *ends[:-1]], ends, strict=True)
+        return any(end - (end - begin) // TOGETHER <= place < end for begin, end in parts)
 
     @property
     def chi_square(self) -> float | None:

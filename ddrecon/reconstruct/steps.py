@@ -10,8 +10,10 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.ranks import sum_over_ranks
+from ddrecon.reconstruct.brightness import lights_due, step_brightness
+from ddrecon.reconstruct.objective import Comparison
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.poses import calibration_prior, pose_curvature, step_pose
+from ddrecon.reconstruct.poses import pose_curvature, step_pose, weigh_calibration
 from ddrecon.reconstruct.responses import step_responses
 from ddrecon.reconstruct.schedule import Schedule
 from ddrecon.reconstruct.shares import take_from_owners
@@ -51,6 +53,30 @@ def _let_go(parameters: Sequence[Parameter], schedule: Schedule, iteration: int)
         parameter.is_even = False
     for parameter in parameters if due else ():
         parameter.forget()
+
+
+def solve_numbers(
+    parameters: Sequence[Parameter],
+    gradients: Mapping[str, Tensor],
+    compared: Comparison,
+    scene: Scene,
+    values: Mapping[str, Tensor],
+    targets: Mapping[str, Target],
+    solutions: Mapping[tuple[str, int], Tensor],
+    iteration: int,
+) -> None:
+    """Takes exposures, lights and poses among `parameters` part of the way to what fits best.
+
+    What was `compared` are views of `scene` with `values` of all parameters, by which `gradients`
+    are; `solutions` are near to the light in it.
+    """
+    pictures = compared.pictures
+    solve_responses(parameters, scene, pictures, targets)
+    lights = lights_due(parameters, iteration)
+    step_brightness(lights, scene, values, pictures, targets, solutions)
+    if poses := [p for p in parameters if p.key == "camera"]:
+        own = share_out(gradients, compared.views)
+        solve_poses(poses, scene, own, values, targets, solutions, pictures)
 
 
 def solve_responses(
@@ -103,8 +129,8 @@ def solve_poses(
     grid = scene.volume.grid
     for pose in poses:
         assert pose.view is not None and pose.curvature is not None
-        prior = calibration_prior(scene.view(pose.view).camera, grid)
-        step_pose(pose, gradients[pose.name], pose.curvature, prior)
+        held = weigh_calibration(pose, pose.curvature, scene.view(pose.view).camera, grid)
+        step_pose(pose, gradients[pose.name], pose.curvature, held)
 
 
 def share_out(gradients: Mapping[str, Tensor], views: Sequence[View]) -> dict[str, Tensor]:
