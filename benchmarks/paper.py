@@ -33,7 +33,6 @@ from paper_shown import (
     draw_parts,
     draw_rounds,
     first,
-    result_overrides,
     shape,
     show_density,
     show_derivatives,
@@ -125,12 +124,9 @@ EXPERIMENTS = (
 
 def optimize(name: str, folder: Path, overrides: list[str]) -> Run:
     """Runs the config `name` into `folder`, and renders what it found."""
-    run = Run(name, folder)
     ddrecon("optimize", CONFIGS / f"{name}.yaml", "-o", folder, *as_options(overrides))
-    ddrecon(
-        "render", folder / "scene.yaml", "-o", folder / "views", *as_options(result_overrides(run))
-    )
-    return run
+    ddrecon("render", folder, "-o", folder / "views")
+    return Run(name, folder)
 
 
 def at_paper_size(

@@ -155,9 +155,10 @@ def draw_parts(runs: Runs) -> None:
         },
     )
     for name in parts:
-        run, places = runs[name], {"start": ["volume.density={file: ../../data/shapes/bunny.npz}"]}
-        for place, overrides in (places | {"end": result_overrides(run)}).items():
-            folder, scene = run.folder / f"derivative_{place}", CONFIGS / "fig09.yaml"
+        run, bunny = runs[name], ["volume.density={file: ../../data/shapes/bunny.npz}"]
+        places = {"start": (CONFIGS / "fig09.yaml", bunny), "end": (run.folder, [])}
+        for place, (scene, overrides) in places.items():
+            folder = run.folder / f"derivative_{place}"
             ddrecon(
                 "render",
                 scene,
@@ -298,18 +299,3 @@ def round_values(values: float | list[float]) -> str:
         if isinstance(values, float)
         else f"[{', '.join(f'{value:.3g}' for value in values)}]"
     )
-
-
-def result_overrides(run: Run) -> list[str]:
-    """Overrides that put what `run` found into its scene."""
-    fields = [
-        f"volume.{path.stem}={{file: {path.resolve()}}}"
-        for path in sorted((run.folder / "volumes").glob("*.npz"))
-    ]
-    numbers = json.loads((run.folder / "parameters.json").read_text())
-    lights = [
-        f"{name}={value[0] if len(value) == 1 else value}"
-        for name, value in numbers.items()
-        if name.startswith("lights.")
-    ]
-    return [*fields, f"volume.g={numbers['g']}", *lights]

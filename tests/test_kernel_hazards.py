@@ -181,7 +181,7 @@ def test_a_failing_share_waits_for_the_others(monkeypatch: pytest.MonkeyPatch):
         done.set()
 
     monkeypatch.setattr(launch.wp, "launch", fake)
-    monkeypatch.setattr(launch, "_load", lambda *_: None)
+    monkeypatch.setattr(launch, "load", lambda *_: None)
     with pytest.raises(ValueError, match="no"):
         launch.launch(None, 2, [], like, threads=2)
     assert done.is_set()

@@ -32,7 +32,11 @@ EDITS = {
         "sigma_S:",
         ["6:3: volume.sigma_S: unknown key; did you mean 'sigma_s'?", "missing key 'sigma_s'"],
     ),
-    "wrong type": ("g: 0.3", "g: soon", ["7:6: volume.g: expected a number, found 'soon'"]),
+    "wrong type": (
+        "g: 0.3",
+        "g: soon",
+        ["7:6: volume.g: expected a number, {constant: number} or {file: path}, found 'soon'"],
+    ),
     "out of range": ("g: 0.3", "g: 2", ["7:6: volume.g: must be below 1, found 2"]),
     "repeated key": (
         "g: 0.3",

@@ -25,7 +25,11 @@ from ddrecon.renderer import solve_light
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.rounds.fused.blend import blend_adjoint_kernel, blend_kernel  # noqa: E402
 from ddrecon.diffusion.rounds.fused.by_cells import cell_kernels  # noqa: E402
-from ddrecon.diffusion.rounds.fused.gain import gain_adjoint_kernel, gain_kernel  # noqa: E402
+from ddrecon.diffusion.rounds.fused.gain import (  # noqa: E402
+    GainCase,
+    gain_adjoint_kernel,
+    gain_kernel,
+)
 from ddrecon.diffusion.rounds.fused.sweep import sweep_fused  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -297,7 +301,9 @@ def test_light_after_rounds_is_that_of_torch(g: float):
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
     kernels = [*cell_kernels(32, False, True)]
-    kernels += [gain_kernel((True, False, True), 32), gain_adjoint_kernel((True, False, True), 32)]
+    for is_diffuse in (True, False):
+        case = GainCase(True, False, True, is_diffuse)
+        kernels += [gain_kernel(case, 32), gain_adjoint_kernel(case, 32)]
     kernels += [blend_kernel(32), blend_adjoint_kernel(32)]
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)

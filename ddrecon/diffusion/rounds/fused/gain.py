@@ -34,7 +34,7 @@ _TENSORS = (
 )
 
 
-class _IsSo(NamedTuple):
+class GainCase(NamedTuple):
     """Whether there are fluxes, one field for both coefficients, an imbalance.
 
     And whether `light` is what is `diffuse`, as in the first round.
@@ -232,7 +232,7 @@ class _Gain(torch.autograd.Function):
         return d_found
 
 
-def _empty(given: dict[str, Any], is_so: _IsSo) -> dict[str, Tensor]:
+def _empty(given: dict[str, Any], is_so: GainCase) -> dict[str, Tensor]:
     """Room for what is found, by its names."""
     like = given["swept"]
     return {name: like.new_empty(like.shape) for name in (_FOUND if is_so[0] else _FOUND[:2])}
@@ -246,7 +246,7 @@ def _given(
     swept: Tensor,
     diffuse: Tensor,
     *flux: Tensor,
-) -> tuple[dict[str, Any], _IsSo]:
+) -> tuple[dict[str, Any], GainCase]:
     """What both kernels are given, and what is so.
 
     The mean stands for arrays that are not.
@@ -264,7 +264,7 @@ def _given(
         "imbalance": swept if imbalance is None else imbalance,
         **dict(zip(vectors, flux or [swept] * len(vectors), strict=True)),
     }  # fmt: skip
-    return given, _IsSo(has_flux, shares_field, imbalance is not None, is_diffuse)
+    return given, GainCase(has_flux, shares_field, imbalance is not None, is_diffuse)
 
 
 _ARRAYS = " ".join((*_OF_MEDIUM, "imbalance", *_SWEPT, *_DIFFUSE, *_LIGHT))
@@ -272,19 +272,19 @@ _COLORS = "extinction_colors scattering_colors colors"
 
 
 @functools.cache
-def gain_kernel(is_so: _IsSo, bits: int) -> Any:
+def gain_kernel(is_so: GainCase, bits: int) -> Any:
     """The kernel of gains."""
     arrays = f"{_ARRAYS} {' '.join(_FOUND)}"
     return row_kernel("gain", bits, _told(is_so) + _GAIN, arrays, _COLORS)
 
 
 @functools.cache
-def gain_adjoint_kernel(is_so: _IsSo, bits: int) -> Any:
+def gain_adjoint_kernel(is_so: GainCase, bits: int) -> Any:
     """The kernel of the cotangents of all that gains are of."""
     bars = (f"{name}_bar" for name in f"{_ARRAYS} {' '.join(_FOUND)}".split())
     arrays = f"{_ARRAYS} {' '.join(bars)} sums"
     return row_kernel("gain_adjoint", bits, _told(is_so) + _ADJOINT, arrays, _COLORS)
 
 
-def _told(is_so: _IsSo) -> str:
+def _told(is_so: GainCase) -> str:
     return constants(**is_so._asdict())
