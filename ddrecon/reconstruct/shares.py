@@ -28,7 +28,6 @@ from ddrecon.ranks import (
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
-from ddrecon.variables.values import RESPONSE
 
 CELL_COST = 0.5
 """What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
@@ -52,12 +51,7 @@ def require_sharing(scene: Scene, names: Collection[str]) -> None:
         problems.append(
             "diffusion.transport_rounds: rounds need all cells; say 0 to do without them"
         )
-    others = [
-        name
-        for name in names
-        if name.startswith("lights.")
-        or (name.startswith("views.") and name.rpartition(".")[2] not in RESPONSE)
-    ]
+    others = [name for name in names if name.startswith(("lights.", "views."))]
     if others:
         more = f" and {len(others) - 1} more need" if len(others) > 1 else ": needs"
         problems.append(f"optimize.parameters.{others[0]}{more} all cells; leave them out")

@@ -72,8 +72,7 @@ RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density", 
 TALL = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch", "-D", "diffusion.warm_start=false"
 KNOWN = (
     "-D",
-    "optimize.parameters={density: {init: 0.4, tv: 1e-3}, sigma_s: {field: true}, g: {}, "
-    "views.*.exposure: {}}",
+    "optimize.parameters={density: {init: 0.4, tv: 1e-3}, sigma_s: {field: true}, g: {}}",
 )
 CELLS = "--share", "cells"
 JOBS = {
