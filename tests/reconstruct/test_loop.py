@@ -14,7 +14,7 @@ from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct import parameters
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.run.checkpoint import load_checkpoint, save_checkpoint
+from ddrecon.run.checkpoint import FORMAT, load_checkpoint, save_checkpoint
 from ddrecon.scene import Scene
 from ddrecon.settings import ParameterSettings
 
@@ -133,7 +133,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path) -> None:
 
 def test_a_checkpoint_of_another_format_is_refused(tmp_path: Path):
     torch.save({"format": 1, "scene": {}, "state": {}}, tmp_path / "last.pt")
-    with pytest.raises(FormatError, match="a checkpoint of format 1; this version reads 5"):
+    with pytest.raises(FormatError, match=f"of format 1; this version reads {FORMAT}"):
         load_checkpoint(tmp_path, {})
 
 
