@@ -31,6 +31,19 @@ TOLERANCE = 1e-4
 """Relative residual of solves without a light, whose share is a difference of pictures."""
 ROUNDING = 1e-6
 """Lights that no picture tells apart better than this keep their ratio."""
+ALBEDO = ("sigma_a", "sigma_s", "albedo")
+"""What says how much light a medium gives back."""
+
+
+def can_solve_light(light: Parameter, parameters: Sequence[Parameter]) -> bool:
+    """Whether the brightness of `light` is solved for, among all `parameters` of a run.
+
+    A light that is a map, or starts from black, has no share in pictures yet. Where it is sought
+    how much the medium scatters or absorbs, twice the light is half the scattering of thin smoke:
+    what fits best for the medium as it is runs ahead of it along that valley, further each time.
+    """
+    is_known = not any(parameter.name in ALBEDO for parameter in parameters)
+    return is_known and light.value.numel() <= 3 and bool((light.value > 0).all())
 
 
 def lights_due(parameters: Sequence[Parameter], iteration: int) -> list[Parameter]:

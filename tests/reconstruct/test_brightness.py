@@ -15,7 +15,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import ParameterSettings
-from ddrecon.variables.values import value_of
+from ddrecon.variables.values import value_of, with_values
 
 NAMES = ("lights.0.irradiance", "lights.1.radiance")
 
@@ -77,3 +77,23 @@ def test_a_light_that_starts_from_black_descends(
     wanted = replace(ball_scene.optimize, parameters={NAMES[1]: ParameterSettings()})
     scene = replace(lit(ball_scene, torch.full((3,), start)), optimize=wanted)
     assert Reconstruction(scene).parameters[0].is_fitted is is_fitted
+
+
+def test_a_light_descends_where_scattering_can_be_exchanged_for_it(ball_scene: Scene) -> None:
+    """In thin smoke both change pictures alike, so that no solve tells how bright the light is."""
+    names = (NAMES[0], "sigma_s")
+    lamp_alone = replace(ball_scene, lights=ball_scene.lights[:1])
+    thin = with_values(lamp_alone, {"density": torch.full((16, 16, 16), 1e-4)})
+    doubled = []
+    for name in names:
+        scene = with_values(thin, {name: 2 * value_of(thin, name)})
+        with torch.no_grad():
+            doubled += render_each(scene, scene.views[:1], SolveMemory())
+    torch.testing.assert_close(*doubled, rtol=0.01, atol=1e-3 * float(doubled[0].max()))
+    assert ball_scene.optimize is not None
+    for sought, is_fitted in (((NAMES[0], "density"), True), (names, False)):
+        wanted = replace(
+            ball_scene.optimize, parameters={name: ParameterSettings() for name in sought}
+        )
+        lamp = Reconstruction(replace(ball_scene, optimize=wanted)).parameters[0]
+        assert lamp.is_fitted is is_fitted
