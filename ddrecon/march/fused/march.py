@@ -23,6 +23,7 @@ from ddrecon.march.fused.cells import cells_of
 from ddrecon.march.fused.compose import compose
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.lattice import Lattice
 
 
@@ -51,7 +52,7 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
 def _integrate(emission: Emission, sampler: Bands | Equidistant, packed: Packed) -> Tensor:
     """Scattered radiance and opacity [2 C, R] along rays."""
     layout, (cells, fields) = layout_of(emission), cells_of(sampler)
-    along, third_order = see_beams(emission, packed), sampler.channels.third_order
+    along, third_order = see_beams(emission, layout, packed), sampler.channels.third_order
     numbers = numbers_of(emission, 0.0 if third_order is None else third_order.bound)
     out, masses, _ = Integrate.apply(
         layout,
@@ -65,12 +66,14 @@ def _integrate(emission: Emission, sampler: Bands | Equidistant, packed: Packed)
     )
     irradiances = [beam.irradiance for beam in emission.beams]
     scales = emission.extinction.scale, emission.scattering.scale
-    return compose(out, masses, *scales, irradiances, along.factors)
+    remaining = None if emission.remaining is None else emission.remaining.scale
+    return compose(out, masses, *scales, irradiances, along.factors, remaining)
 
 
 def layout_of(emission: Emission) -> Layout:
     """How the fields of `emission` stand in a node."""
     extinction, scattering, peak = emission.extinction, emission.scattering, emission.peak
+    remaining = emission.remaining
     return Layout(
         emission.colors,
         extinction.field.shape[0],
@@ -80,4 +83,6 @@ def layout_of(emission: Emission) -> Layout:
         None if peak is None else peak.shape[0] if is_field(peak) else 0,
         emission.seen.colors,
         torch.finfo(emission.diffuse.dtype).bits,
+        form_of(emission),
+        0 if remaining is None else remaining.field.shape[0],
     )
