@@ -1,10 +1,10 @@
 """Whether runs of several processes are the run of one: all losses, and fields at the end.
 
-    python benchmarks/agreement.py plume|many [--cells 96] [--ranks 2 4] [--share cells]
+    python benchmarks/agreement.py plume|many -o runs/agree [--cells 96] [--ranks 2 4] [--killed]
 
 `plume` is configs/plume.yaml, `many` seeks density, sigma_a and sigma_s per cell and color of a
-cloud whose pictures are rendered first. Both run coarse to fine. The first process of a further
-run is left without another, killed half-way; more of them then go on with --resume.
+cloud whose pictures are rendered first. Both run coarse to fine. With --killed a process of a
+further run is killed half-way, and as many as were tried last go on with --resume.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -106,51 +106,55 @@ def write_many(folder: Path, cells: int) -> Path:
     return scene
 
 
+def go_on(folder: Path, command: Sequence[str], ranks: Sequence[int], half: int) -> None:
+    """Has the last of a few processes killed in iteration `half`, and more go on.
+
+    `ranks` are the numbers of both; the `command` of the run lacks where it goes.
+    """
+    few, many = ranks[0], ranks[-1]
+    torn = [*command, "-o", str(folder / "torn")]
+    processes = start(few, *torn, "--preview-every", str(half))
+    # Pictures of that iteration say that it was made.
+    while not any((folder / "torn").glob(f"previews/*_{half:06d}.png")):
+        time.sleep(0.05)
+    processes[-1].send_signal(signal.SIGKILL)
+    told = [process.communicate()[1] for process in processes]
+    print(f"{few}, the last killed: {told[0].splitlines()[-1]}", flush=True)
+    run(many, *torn, "--resume")
+    print(f"gone on by {many}: {compare(folder / 'torn', folder / 'one')}", flush=True)
+
+
 def main() -> None:
     """Prints a line a run."""
     parser = argparse.ArgumentParser()
     parser.add_argument("scene", choices=("plume", "many"))
+    parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--cells", type=int, default=96)
     parser.add_argument("--iterations", type=int, default=30)
     parser.add_argument("--ranks", type=int, nargs="+", default=[2, 4])
     parser.add_argument("--share", choices=("views", "cells"), default="views")
-    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--killed", action="store_true")
     parser.add_argument("-D", dest="overrides", action="append", default=[])
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        if options.scene == "plume":
-            cells, scene = options.cells, PLUME
-            grid = ["-D", f"volume.resolution=[{cells}, {cells * 3 // 2}, {cells}]"]
-        else:
-            grid, scene = [], write_many(folder, options.cells)
-        settings = [str(scene), "--iterations", str(options.iterations), *grid]
-        settings += [text for override in options.overrides for text in ("-D", override)]
-
-        def optimize(ranks: int, output: str, *more: str) -> list[str]:
-            shared = ["--share", options.share] if ranks > 1 else []
-            # Slabs have the torch engine alone; one process then has the same.
-            engine = "torch" if options.share == "cells" else options.engine
-            command = ["optimize", *settings, "-o", str(folder / output), "--engine", engine]
-            return [*command, *shared, *more]
-
-        print(f"1: {run(1, *optimize(1, 'one')):.0f} s", flush=True)
-        for ranks in options.ranks:
-            taken = run(ranks, *optimize(ranks, str(ranks)))
-            line = compare(folder / str(ranks), folder / "one")
-            print(f"{ranks}: {taken:.0f} s; {line}", flush=True)
-        few, many = options.ranks[0], options.ranks[-1]
-        half = options.iterations // 2
-        processes = start(few, *optimize(few, "torn", "--preview-every", str(half)))
-        # Pictures of that iteration say that it was made.
-        while not any((folder / "torn").glob(f"previews/*_{half:06d}.png")):
-            time.sleep(0.05)
-        processes[-1].send_signal(signal.SIGKILL)
-        told = [process.communicate()[1] for process in processes]
-        print(f"{few}, the last killed: {told[0].splitlines()[-1]}", flush=True)
-        run(many, *optimize(many, "torn", "--resume"))
-        line = compare(folder / "torn", folder / "one")
-        print(f"gone on by {many}: {line}", flush=True)
+    folder, cells, command = options.output, options.cells, ["optimize"]
+    folder.mkdir(parents=True)
+    if options.scene == "plume":
+        grid = f"volume.resolution=[{cells}, {cells * 3 // 2}, {cells}]"
+        command += [str(PLUME), "-D", grid]
+    else:
+        command += [str(write_many(folder, cells))]
+    command += ["--iterations", str(options.iterations)]
+    command += [text for override in options.overrides for text in ("-D", override)]
+    # Slabs have torch's operations alone; one process then has the same.
+    alone, shared = command, command
+    if options.share == "cells":
+        alone, shared = [*command, "--engine", "torch"], [*command, "--share", "cells"]
+    print(f"1: {run(1, *alone, '-o', str(folder / 'one')):.0f} s", flush=True)
+    for ranks in options.ranks:
+        taken = run(ranks, *shared, "-o", str(folder / str(ranks)))
+        print(f"{ranks}: {taken:.0f} s; {compare(folder / str(ranks), folder / 'one')}", flush=True)
+    if options.killed:
+        go_on(folder, shared, options.ranks, options.iterations // 2)
 
 
 if __name__ == "__main__":
