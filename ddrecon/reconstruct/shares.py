@@ -82,9 +82,9 @@ def share_pictures(
 ) -> dict[str, Tensor]:
     """The pictures [3, h, w] of `views` of the volume of `scene`, by name, on all ranks.
 
-    Each is what `picture_of` gives one of them.
+    Each is what `picture_of` gives one of them. Of cells in slabs all ranks look at all views.
     """
-    if rank_count() == 1:
+    if rank_count() == 1 or cells_are_shared():
         return {view.name: picture_of(view) for view in views}
     names = [view.name for view in views]
     owners = _owners(scene, dict(zip(names, views, strict=True)), names)
