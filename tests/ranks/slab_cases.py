@@ -40,7 +40,7 @@ from ddrecon.ranks import alone, join_ranks, own_rank, sum_over_ranks
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
-from ddrecon.slabs.exchange import add_halo, gather_parts, gather_slabs, sum_slabs
+from ddrecon.slabs.exchange import add_halo, gather_parts, gather_slabs, sum_slabs, swap_layers
 from ddrecon.slabs.ghosts import Ghosts
 from ddrecon.slabs.slab import Slab, own_slab
 from ddrecon.variables.values import value_of, with_values
@@ -74,6 +74,7 @@ def exchange(axis: str) -> Found:
         "gather_slabs": lambda x: gather_slabs(add_halo(x, slab), slab),
         "gather_parts": lambda x: gather_parts(x[:, :3, :3, :3]),
         "sum_slabs": lambda x: sum_slabs(x[:, :3, :3, :3]),
+        "swap_layers": lambda x: torch.stack(swap_layers(x[:, :3, :3, :3], x[:, 1:4, 1:4, 1:4])),
     }
     for name, apply in exchanges.items():
         x = own.clone().requires_grad_()
@@ -160,11 +161,18 @@ def forward_peak() -> Found:
     return run(scene, [make_camera((2.0, -1.5, 1.0))], "g", DIRECTION, has_tangents=True)
 
 
-def all_per_cell() -> Found:
+def all_per_cell(**settings: Any) -> Found:
     sigma_s = 5 + 5 * random_values(3, *SHAPES["z"], seed=5)
-    scene = scene_of("z", g=0.3, sigma_s=sigma_s)
+    scene = scene_of("z", g=0.3, sigma_s=sigma_s, **settings)
     scene.volume.g = 0.5 * random_values(*SHAPES["z"], seed=6)
     return run(scene, [make_camera((2.5, 0.4, 0.6), is_perspective=False)], "g")
+
+
+def rounds(axis: str, g: float, count: int, degree: int) -> Found:
+    """Rounds of transport, whose light goes from slab to slab (E56)."""
+    settings = {"g": g, "transport_rounds": count, "degree": degree}
+    scene = scene_of(axis, ambient=(0.2, 0.3, 0.4), **settings)
+    return run(scene, [make_camera(ACROSS)], "g", has_tangents=True)
 
 
 def pairs() -> Found:
@@ -220,6 +228,10 @@ CASES: dict[str, Callable[[], Found]] = {
     "light along x": partial(seen_from, "x", ASKEW),
     "forward peak": forward_peak,
     "all per cell": all_per_cell,
+    "rounds along z": partial(rounds, "z", 0.4, 2, 3),
+    "rounds along y": partial(rounds, "y", 0.0, 1, 1),
+    "rounds along x": partial(rounds, "x", 0.3, 2, 1),
+    "rounds, all per cell": partial(all_per_cell, transport_rounds=1),
     "pairs": pairs,
     "point light": point_light,
     "environment": environment,
