@@ -153,7 +153,8 @@ def scene_of(axis: str, **settings: Any) -> Scene:
 
 def seen_from(axis: str, *eyes: tuple[float, float, float], **settings: Any) -> Found:
     scene = scene_of(axis, ambient=(0.2, 0.3, 0.4), **settings)
-    return run(scene, [make_camera(eye) for eye in eyes], has_tangents=len(eyes) > 1)
+    names = ["lights.1.radiance", "views.v0.camera"] if len(eyes) > 1 else []
+    return run(scene, [make_camera(eye) for eye in eyes], *names, has_tangents=len(eyes) > 1)
 
 
 def forward_peak() -> Found:
@@ -172,7 +173,7 @@ def rounds(axis: str, g: float, count: int, degree: int) -> Found:
     """Rounds of transport, whose light goes from slab to slab (E56)."""
     settings = {"g": g, "transport_rounds": count, "degree": degree}
     scene = scene_of(axis, ambient=(0.2, 0.3, 0.4), **settings)
-    return run(scene, [make_camera(ACROSS)], "g", has_tangents=True)
+    return run(scene, [make_camera(ACROSS)], "g", "lights.1.radiance", has_tangents=True)
 
 
 def pairs() -> Found:
