@@ -142,7 +142,7 @@ def sweep_scattered(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    if is_fused():
+    if is_fused() and not isinstance(medium.grid, Slab):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
