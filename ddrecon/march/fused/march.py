@@ -40,17 +40,30 @@ def march_rays(
         crossing.near,
         crossing.far,
     )
-    return crossing.hit, _integrate(emission, sampler, packed)
+    return crossing.hit, _integrate(emission, sampler, packed)[0]
+
+
+def integrate_rays(
+    emission: Emission, sampler: Bands | Equidistant, rays: Rays, crossing: Crossing
+) -> Tensor:
+    """Radiance [C] and mass [K] along those of `rays` that are in `crossing`: [C + K, P]."""
+    axis = sampler.axis if isinstance(sampler, Bands) else None
+    ends = crossing.hit, crossing.near, crossing.far
+    packed = pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
+    composed, masses = _integrate(emission, sampler, packed)
+    return torch.cat([composed[: emission.colors], masses])
 
 
 def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
     """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
     packed = pack_lattice(emission.grid, bands.axis, lattice)
-    return _integrate(emission, bands, packed).unflatten(1, lattice.shape)
+    return _integrate(emission, bands, packed)[0].unflatten(1, lattice.shape)
 
 
-def _integrate(emission: Emission, sampler: Bands | Equidistant, packed: Packed) -> Tensor:
-    """Scattered radiance and opacity [2 C, R] along rays."""
+def _integrate(
+    emission: Emission, sampler: Bands | Equidistant, packed: Packed
+) -> tuple[Tensor, Tensor]:
+    """Scattered radiance and opacity [2 C, R] along rays, and mass [K, R]."""
     layout, (cells, fields) = layout_of(emission), cells_of(sampler)
     along, third_order = see_beams(emission, layout, packed), sampler.channels.third_order
     numbers = numbers_of(emission, 0.0 if third_order is None else third_order.bound)
@@ -67,7 +80,7 @@ def _integrate(emission: Emission, sampler: Bands | Equidistant, packed: Packed)
     irradiances = [beam.irradiance for beam in emission.beams]
     scales = emission.extinction.scale, emission.scattering.scale
     remaining = None if emission.remaining is None else emission.remaining.scale
-    return compose(out, masses, *scales, irradiances, along.factors, remaining)
+    return compose(out, masses, *scales, irradiances, along.factors, remaining), masses
 
 
 def layout_of(emission: Emission) -> Layout:
