@@ -19,8 +19,16 @@ import torch
 from torch import Tensor
 
 from ddrecon.march.emission import Emission
+from ddrecon.march.fused.layout import Layout
 from ddrecon.medium.phase import PhaseFunction
-from ddrecon.medium.phase_cells import at_ends, end_table, is_steep, peak_tables
+from ddrecon.medium.phase_cells import (
+    EVEN_STEPS,
+    STEEP_STEPS,
+    at_ends,
+    end_table,
+    is_steep,
+    peak_tables,
+)
 from ddrecon.numerics.angle_table import STEPS, angle_of
 from ddrecon.numerics.remember import remember
 
@@ -40,8 +48,9 @@ def find_along_rays(
 ) -> Tensor:
     """What rays are given of p for a beam seen at `cosine` [R]: `Layout.ray_terms` rows [., R].
 
-    Both of `at_ends`, of the phase function `kind` with its `others` (`others_of`); or the cosine, and between which angles of tables it is: the first of them,
-    and the part of the way to the second.
+    Both of `at_ends`, of the phase function `kind` with its `others` (`others_of`); or the cosine,
+    and between which angles of tables it is: the first of them, and the part of the way to the
+    second.
     """
     if form == "linear":
         return torch.stack(at_ends(kind(*others, cosine.new_zeros(())), cosine))
@@ -62,6 +71,16 @@ def table_of_cells(emission: Emission) -> Tensor:
     if emission.peak is None:
         return like.new_empty(0, 1)
     return _flatten(peak_tables(phase, emission.seen.degree), like.dtype)
+
+
+def last_rung(layout: Layout) -> int:
+    """The number of the last rung of tables, from 0 on."""
+    return STEEP_STEPS if layout.form == "steep" else EVEN_STEPS
+
+
+def table_rows(layout: Layout) -> int:
+    """Rows of the table of a color: values and slopes by angle, of all rungs if it has them."""
+    return 2 * (STEPS + 1) * (2 * (last_rung(layout) + 1) if layout.has_rungs else 1)
 
 
 @remember

@@ -20,10 +20,10 @@ from ddrecon.march.fused.bundle import (
     table_of,
 )
 from ddrecon.march.fused.cells import cells_of
+from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.fused.compose import compose
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.lattice import Lattice
 
 
