@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ddrecon.display import Displayed
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.sections import scale_sections
 from ddrecon.numerics.autodiff import is_varied, recompute
@@ -170,7 +170,7 @@ def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
     f is what of the phase function lies beyond `degree`, g' = (g - f) / (1 - f). Source: Joseph,
     Wiscombe, Weinman 1976, doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
     """
-    fraction = _forward_fraction(type(volume.phase), degree, *volume.phase.numbers)
+    fraction = _forward_fraction(volume.phase.kind, degree, *volume.phase.numbers)
     return _medium(volume, SeenPhase(volume.phase, degree), fraction)
 
 
@@ -183,7 +183,7 @@ def keep_medium(volume: Volume) -> Medium:
 
 
 def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
-    g = _mean_cosine(type(volume.phase), *volume.phase.numbers)
+    g = _mean_cosine(volume.phase.kind, *volume.phase.numbers)
     fraction = g.new_zeros(()) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
     find = _find_coefficients
@@ -233,12 +233,12 @@ def _mass_bound(scale: Tensor) -> Tensor:
 
 
 @remember
-def _mean_cosine(kind: type[PhaseFunction], *numbers: Tensor) -> Tensor:
+def _mean_cosine(kind: PhaseKind, *numbers: Tensor) -> Tensor:
     return _for_cells(kind(*numbers).moments(2)[:, 1])
 
 
 @remember
-def _forward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+def _forward_fraction(kind: PhaseKind, degree: int, *numbers: Tensor) -> Tensor:
     return _for_cells(kind(*numbers).forward_fraction(degree))
 
 

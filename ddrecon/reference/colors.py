@@ -12,7 +12,8 @@ from dataclasses import fields, replace
 from torch import Tensor
 
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
-from ddrecon.medium.phase import PhaseFunction, TwoLobe
+from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.scene import Scene
 
 

@@ -8,7 +8,8 @@ import torch
 
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.reference.mitsuba_volume import grid_volume
 
 COSINES = 1 << 15

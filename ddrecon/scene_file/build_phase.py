@@ -13,7 +13,8 @@ from torch import Tensor
 from ddrecon.errors import DataWarning
 from ddrecon.io.phase_files import read_moments, read_phase_table
 from ddrecon.medium.mie import scatter_droplets
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Legendre, Tabulated
 from ddrecon.numerics.angle_table import at_even_angles
 from ddrecon.numerics.legendre import COUNTS

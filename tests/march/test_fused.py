@@ -17,7 +17,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.phase import TwoLobe
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import run_case

@@ -11,7 +11,8 @@ from media import box_grid, random_values
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.phase_series import Legendre, Tabulated
 from ddrecon.numerics.angle_table import STEPS

@@ -12,7 +12,8 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.angle_table import angle_of

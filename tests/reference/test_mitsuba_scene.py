@@ -14,7 +14,8 @@ from torch import Tensor
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.medium.phase import Draine, TwoLobe
+from ddrecon.medium.phase import Draine
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
 from ddrecon.scene import Scene

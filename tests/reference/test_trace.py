@@ -15,7 +15,8 @@ from torch import Tensor
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
 from ddrecon.renderer import render

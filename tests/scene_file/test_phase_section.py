@@ -13,7 +13,8 @@ import yaml
 from example_scene import SCENE, changed
 
 from ddrecon.errors import DataWarning, FormatError, SceneError
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, Rayleigh, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, Rayleigh
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_series import Legendre, Tabulated
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.dump import dump_scene

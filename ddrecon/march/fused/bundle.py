@@ -13,7 +13,7 @@ from ddrecon.light.beam import Beam, leaving_cosine
 from ddrecon.march.box import intersect_box
 from ddrecon.march.emission import Emission, is_field
 from ddrecon.march.lattice import Lattice
-from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase import PhaseKind
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.chebyshev import COEFFICIENTS
 from ddrecon.numerics.remember import remember
@@ -106,7 +106,7 @@ def see_beams(emission: Emission, packed: Packed) -> Along:
     def see(*towards: Tensor) -> Along:
         numbers = len(phase.numbers)
         return _see_directional(
-            packed.direction, type(phase), degree, has_peak, numbers, *phase.numbers, *towards
+            packed.direction, phase.kind, degree, has_peak, numbers, *phase.numbers, *towards
         )
 
     towards = [beam.direction for beam in emission.beams if isinstance(beam, Beam)]
@@ -131,7 +131,7 @@ def see_beams(emission: Emission, packed: Packed) -> Along:
 @remember
 def _see_directional(
     direction: Tensor,
-    kind: type[PhaseFunction],
+    kind: PhaseKind,
     degree: int,
     has_peak: bool,
     numbers: int,
