@@ -7,6 +7,7 @@ cross sections are constant, rays need march through one field only, the density
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -32,7 +33,8 @@ class Volume(Displayed):
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
     [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function; or in its place `g`
     in (-1, 1), the mean cosine of Henyey and Greenstein's. Tensors may be replaced or require
-    gradients. Raises ValueError where shapes disagree.
+    gradients. `media`: what the volume was mixed from, by name (`mixture`). Raises ValueError where
+    shapes disagree.
     """
 
     grid: Grid
@@ -40,6 +42,7 @@ class Volume(Displayed):
     sigma_a: Tensor
     sigma_s: Tensor
     phase: PhaseFunction
+    media: Mapping[str, Volume] | None = None
 
     def __init__(
         self,
@@ -49,11 +52,13 @@ class Volume(Displayed):
         sigma_s: Tensor,
         phase: PhaseFunction | Tensor | None = None,
         g: Tensor | None = None,
+        media: Mapping[str, Volume] | None = None,
     ):
         phase = phase if g is None else g
         if phase is None:
             raise TypeError("a volume needs a phase function, or g")
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
+        self.media = media
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
         if tuple(self.density.shape) != self.grid.shape:
             raise ValueError(

@@ -17,10 +17,18 @@ from torch import Tensor
 
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind
+from ddrecon.medium.phase_blend import Mixture
 from ddrecon.medium.phase_peak import peak_table
 from ddrecon.medium.remaining import turned_table
-from ddrecon.numerics.angle_table import angle_of, look_up_between
+from ddrecon.numerics.angle_table import (
+    STEPS,
+    angle_of,
+    look_up,
+    look_up_between,
+    with_slopes,
+)
 from ddrecon.numerics.chebyshev import evaluate_positive
+from ddrecon.numerics.legendre import even_angles
 from ddrecon.numerics.remember import remember
 
 STEEP_STEP, STEEP_STEPS = 0.05, 54
@@ -55,14 +63,52 @@ class SeenNodes:
 
         Where g is not positive there is no peak, and S is p.
         """
-        plain = self.value(angle.cos().to(self.number))
+        kind, number = self.phase.kind, self.number.movedim(1, 0)
+        if depth is None and not is_steep(kind):
+            other, change = look_up(end_table(self.phase).to(number), angle).unbind(-1)
+            return (other + number * change).movedim(0, 1)
+        plain = self.value(angle.cos().to(number))
         if depth is None:
             return plain
-        kind, number = self.phase.kind, self.number.movedim(1, 0)
-        tables = _peak_tables(kind, self.degree, *_rungs_and_others(self.phase, 0)).to(number)
+        tables = peak_tables(self.phase, self.degree).to(number)
         coefficients = _look_up(tables, _place(kind, number.clamp(min=0), 0), angle)
         seen = evaluate_positive(coefficients.permute(3, 1, 0, 2), depth)
-        return torch.where(self.number > 0, seen, plain) if kind is HenyeyGreenstein else seen
+        return torch.where(self.number > 0, seen, plain) if is_steep(kind) else seen
+
+
+def is_steep(kind: PhaseKind) -> bool:
+    """Whether the number is g, and rungs are even in artanh g; else p is linear in it, a weight."""
+    return kind is HenyeyGreenstein
+
+
+def has_one_table(phase: PhaseFunction) -> bool:
+    """Whether colors share all numbers, but that which differs from cell to cell, if one does."""
+    if phase.cells is None or not isinstance(phase, Mixture):
+        return True
+    return all(part.colors == 1 for part in phase.parts)
+
+
+def peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
+    """Polynomials of S at all rungs, and slopes between, [1 or 3, n, 2, steps + 1, 2, K]."""
+    return _peak_tables(phase.kind, degree, *_rungs_and_others(phase, 0))
+
+
+def at_ends(phase: PhaseFunction, cosine: Tensor) -> tuple[Tensor, Tensor]:
+    """p where a weight is 0, and its change until that is 1: [1 or 3, *cosine.shape] each."""
+    none, whole = (phase.with_cells(cosine.new_tensor(end)).value(cosine) for end in (0.0, 1.0))
+    return none, whole - none
+
+
+def end_table(phase: PhaseFunction) -> Tensor:
+    """The two of `at_ends` over the angle, as `look_up` has them, [1 or 3, steps + 1, 2, 2]."""
+    return _end_table(phase.kind, *others_of(phase))
+
+
+@remember
+def _end_table(kind: PhaseKind, *others: Tensor) -> Tensor:
+    cosines = even_angles(STEPS).to(others[0].device).cos()
+    phase = kind(*(each.double() for each in others), cosines.new_zeros(()))
+    return torch.cat([with_slopes(end) for end in at_ends(phase, cosines)], -1)
 
 
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
@@ -79,8 +125,12 @@ def _rungs_and_others(phase: PhaseFunction, backward: int) -> list[Tensor]:
 
     Of g so many of them are `backward`.
     """
-    *others, number = phase.numbers
-    return [_rungs(phase.kind, backward, number.device), *others]
+    return [_rungs(phase.kind, backward, phase.numbers[0].device), *others_of(phase)]
+
+
+def others_of(phase: PhaseFunction) -> list[Tensor]:
+    """All numbers of `phase` but the last, which may differ from cell to cell."""
+    return list(phase.numbers[:-1])
 
 
 def _look_up(tables: Tensor, place: Tensor, angle: Tensor) -> Tensor:
@@ -97,7 +147,7 @@ def _look_up(tables: Tensor, place: Tensor, angle: Tensor) -> Tensor:
 
 def _place(kind: PhaseKind, number: Tensor, backward: int) -> Tensor:
     """Between which of the rungs `number` is, counted from the first."""
-    if kind is not HenyeyGreenstein:
+    if not is_steep(kind):
         return number * EVEN_STEPS
     return torch.atanh(number) / STEEP_STEP + backward
 
@@ -106,7 +156,7 @@ def _place(kind: PhaseKind, number: Tensor, backward: int) -> Tensor:
 @torch.inference_mode(False)
 def _rungs(kind: PhaseKind, backward: int, device: torch.device) -> Tensor:
     """The numbers at which tables are kept, [n]: even steps of artanh g, or of a weight."""
-    if kind is HenyeyGreenstein:
+    if is_steep(kind):
         steps = torch.arange(-backward, STEEP_STEPS + 1, dtype=torch.float64, device=device)
         return torch.tanh(STEEP_STEP * steps)
     return torch.arange(EVEN_STEPS + 1, dtype=torch.float64, device=device) / EVEN_STEPS
