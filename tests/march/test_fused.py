@@ -17,7 +17,8 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import run_case
@@ -82,13 +83,16 @@ def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: in
 
 
 def cellwise_phase(kind: str, density: Tensor) -> PhaseFunction:
-    """One with both signs of g; or of two lobes, by color, and without a forward peak."""
+    """Both signs of g; two lobes, by color or backward; or weights that colors share."""
     numbers = random_values(*SHAPE, seed=7, dtype=density.dtype)
     if kind == "g by cell":
         return HenyeyGreenstein(1.6 * numbers - 0.7)
     if kind == "weight by cell":
         colors = random_values(3, *SHAPE, seed=8, dtype=density.dtype)
         return TwoLobe(density.new_tensor([0.6, -0.4]), colors)
+    if kind == "blend by cell":
+        air = Rayleigh(density.new_zeros(()))
+        return Blend(HenyeyGreenstein(density.new_tensor([0.6, 0.5, -0.3])), air, numbers)
     return TwoLobe(density.new_tensor([-0.2, -0.5]), numbers)
 
 
@@ -136,6 +140,7 @@ EMISSIONS = [
     ("g by cell", OUTSIDE, [*LIGHT, "sigma_s"]),
     ("weight by cell", OUTSIDE, ["density", "phase.g", "phase.weight", *POINT]),
     ("weight by cell", OUTSIDE, ["density", "phase.g", "phase.weight"]),
+    ("blend by cell", OUTSIDE, ["density", "phase.phases.0.g", "phase.weight"]),
     ("backward weight by cell", OUTSIDE, [LIGHT[0], "phase.g", "phase.weight", LIGHT[-1]]),
 ]
 each_case = pytest.mark.parametrize(
@@ -253,12 +258,12 @@ def kernels_for(architecture: int) -> list:
     """Some of all kernels: no text depends on the architecture, and each takes seconds."""
     if architecture == 80:
         one = Layout(1, 1, 1, (False, True), 0, 0, 1, 32)
-        several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 3)
+        several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 1, 3, 3)
         walks = [tangent_kernel(one, True), adjoint_kernel(one, True, True)]
         return [*walks, packet_integral_kernel(several), packet_adjoint_kernel(one)]
     one = Layout(1, 1, 1, (True,), 0, 0, 1, 32)
     several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64)
-    steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1)
+    steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1, 1, 1)
     walks = [integral_kernel(steep), adjoint_kernel(one, False, True)]
     return [*walks, packet_integral_kernel(one), packet_adjoint_kernel(several)]
 
