@@ -17,6 +17,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
@@ -60,16 +61,19 @@ def step_brightness(
     pictures: Mapping[str, Tensor],
     targets: Mapping[str, Target],
     solutions: Mapping[tuple[str, int], Tensor],
+    names: Sequence[str],
 ) -> None:
     """Takes the brightness of `lights` part of the way to what fits the `pictures` best.
 
-    Those are of views of `scene`, rendered by this rank with the `values` of all parameters;
-    `solutions` are near to the light in it. Nothing happens without lights.
+    Those are of views of `scene`, rendered by this rank with the `values` of all parameters; all
+    ranks' views are called `names`. `solutions` are near to the light. Nothing happens without
+    lights.
     """
     if not lights:
         return
     with torch.no_grad():
-        shares = light_shares(lights, scene, values, pictures, solutions)
+        rendered = names if has_slabs(scene) else list(pictures)
+        shares = light_shares(lights, scene, values, pictures, solutions, rendered)
     sums = [
         normal_sums(share, picture, targets[name], scene.view(name).weight)
         for (name, picture), share in zip(pictures.items(), shares, strict=True)
@@ -92,10 +96,11 @@ def light_shares(
     values: Mapping[str, Tensor],
     pictures: Mapping[str, Tensor],
     solutions: Mapping[tuple[str, int], Tensor],
+    names: Sequence[str],
 ) -> list[Tensor]:
     """What of each of the `pictures` of views of `scene` is each light's, [lights, 3, h, w].
 
-    It is what the picture lacks without the light.
+    It is what the picture lacks without the light. `names` are the views that are rendered for it.
     """
     diffusion = replace(scene.diffusion, tolerance=min(scene.diffusion.tolerance, TOLERANCE))
     scene, lacking = replace(scene, diffusion=diffusion), []
@@ -103,8 +108,9 @@ def light_shares(
         memory = SolveMemory()
         memory.last = dict(solutions)
         dark = with_values(scene, {**values, light.name: torch.zeros_like(light.value)})
-        rest = render_each(dark, [dark.view(name) for name in pictures], memory)
-        lacking.append([one - other for one, other in zip(pictures.values(), rest, strict=True)])
+        rest = render_each(dark, [dark.view(name) for name in names], memory)
+        others = dict(zip(names, rest, strict=True))
+        lacking.append([picture - others[name] for name, picture in pictures.items()])
     return [torch.stack(shares) for shares in zip(*lacking, strict=True)]
 
 

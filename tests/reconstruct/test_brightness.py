@@ -34,7 +34,8 @@ def test_what_each_light_has_of_a_picture_sums_to_it(ball_scene: Scene) -> None:
     lights = [Parameter(n, ParameterSettings(), 0.1, v, grid) for n, v in values.items()]
     with torch.no_grad():
         image = render_each(scene, scene.views[:1], SolveMemory())[0]
-        shares = light_shares(lights, scene, values, {scene.views[0].name: image}, {})[0]
+        pictures = {scene.views[0].name: image}
+        shares = light_shares(lights, scene, values, pictures, {}, list(pictures))[0]
     torch.testing.assert_close(shares.sum(0) + 0.01, image, rtol=0, atol=1e-5)
 
 
