@@ -110,12 +110,12 @@ def names(bits: int) -> dict[str, str | int]:
     if bits == 32:
         return {
             "number": "float", "integer": "int", "exp": "expf", "digits": 23, "most": "87.0",
-            "shift": "12582912.0", "log2_high": "0.693145751953125",
+            "shift": "12582912.0", "root_bits": "0x3f3504f3", "log2_high": "0.693145751953125",
             "log2_low": "1.42860682030941723212e-6", "first": first, "horner": horner,
         }  # fmt: skip
     return {
         "number": "double", "integer": "long long", "exp": "exp", "digits": 52, "most": "700.0",
-        "shift": "6755399441055744.0", "log2_high": "0.693147180369123816490",
+        "shift": "6755399441055744.0", "root_bits": "0x3fe6a09e667f3bcd", "log2_high": "0.693147180369123816490",
         "log2_low": "1.90821492927058770002e-10", "first": first, "horner": horner,
     }  # fmt: skip
 
