@@ -113,8 +113,7 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
         def both(values: Tensor, nodes: Nodes, _: Tensor) -> Tensor:
             return torch.cat(integrate_segments(emission, values, nodes))
 
-        has_kernels = is_fused() and emission.seen.phase.cells is None
-        found = look() if has_kernels else find(emission, sampler, both)
+        found = look() if is_fused() else find(emission, sampler, both)
         scattered, mass = found[:colors], found[colors:]
         front, total = _masses(slab, rays, mass)
         scattered = scattered * torch.exp(-scale * front)

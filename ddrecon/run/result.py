@@ -10,7 +10,7 @@ from ddrecon.lenses import MODELS
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import PAIRS, PHASE, VOLUME
+from ddrecon.variables.kinds import PAIRS, PHASE, is_of_volume
 
 LENS = ("focal", "principal_point", "distortion")
 RESULT = "result.yaml"
@@ -49,7 +49,7 @@ def describe_result(
         "bounds": {"min": list(low), "max": list(high)},
         "resolution": list(reversed(scene.volume.grid.shape)),
     }
-    volume = {name: value for name, value in values.items() if name in VOLUME}
+    volume = {name: value for name, value in values.items() if is_of_volume(name)}
     replaced = {
         name for pair in PAIRS if set(pair) & set(volume) for name in (*PAIRS[0], *PAIRS[1])
     }
@@ -79,12 +79,17 @@ def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str,
     """The section `volume` with reconstructed `numbers` of its phase function."""
     if "phase" not in volume or not numbers:
         return {**volume, **numbers}
-    found = {name.removeprefix(PHASE): number for name, number in numbers.items()}
-    if "coefficients" in found:
-        # They count from chi_1 on, and replace those of a file.
-        found["coefficients"] = [1.0, *found["coefficients"]]
-        volume["phase"].pop("file", None)
-    return volume | {"phase": volume["phase"] | found}
+    for name, number in numbers.items():
+        *path, key = name.removeprefix(PHASE).split(".")
+        section = volume["phase"]
+        for step in path:
+            section = section[int(step)] if isinstance(section, list) else section[step]
+        section[key] = number
+        if key == "coefficients":
+            # They count from chi_1 on, and replace those of a file.
+            section[key] = [1.0, *number]
+            section.pop("file", None)
+    return volume
 
 
 def _lens(values: Mapping[str, Any], camera: dict[str, Any]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, FIELDS, PHASE, VOLUME
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, FIELDS, PHASE, is_of_volume
 from ddrecon.variables.values import fields_of, value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
@@ -154,7 +154,7 @@ class RunFolder:
         """
         parameters: dict[str, Any] = {}
         for name in variable_names(scene):
-            is_told = name in VOLUME and name not in ("density", *EXTINCTION_AND_ALBEDO)
+            is_told = is_of_volume(name) and name not in ("density", *EXTINCTION_AND_ALBEDO)
             if is_told and (value := value_of(scene, name)).ndim < 2:
                 parameters[name] = value.tolist()
         for name in variable_names(scene):

@@ -26,7 +26,11 @@ from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, TwoLobeSection
+from ddrecon.scene_file.phase_schema import (
+    BlendSection,
+    HenyeyGreensteinSection,
+    TwoLobeSection,
+)
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.rounds import choose_rounds
 from ddrecon.scene_file.schema import VolumeSection
@@ -139,7 +143,7 @@ def _quantities(section: VolumeSection) -> dict[str, tuple[str, Any]]:
     found = {name: (f"volume.{name}", getattr(section, name)) for name in names}
     if isinstance(section.phase, HenyeyGreensteinSection):
         found["g"] = "volume.phase.g", section.phase.g
-    elif isinstance(section.phase, TwoLobeSection):
+    elif isinstance(section.phase, TwoLobeSection | BlendSection):
         found["phase.weight"] = "volume.phase.weight", section.phase.weight
     return found
 

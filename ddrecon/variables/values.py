@@ -20,7 +20,14 @@ from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, FIELDS, PHASE, VOLUME, kind_of
+from ddrecon.variables.kinds import (
+    CROSS_SECTIONS,
+    EXTINCTION_AND_ALBEDO,
+    FIELDS,
+    PHASE,
+    is_of_volume,
+    kind_of,
+)
 
 RESPONSE = {"exposure": 1.0, "offset": 0.0}
 """What a camera does to radiance, and what it is where a view has none (E28)."""
@@ -58,7 +65,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
     if (known := _own_name(scene.volume, name)) not in variable_names(scene):
         names = [known for known in variable_names(scene) if not known.startswith("views.")]
         raise KeyError(f"no variable {name!r}; besides views, the scene has {', '.join(names)}")
-    if known in VOLUME:
+    if is_of_volume(known):
         return _volume_value(scene.volume, known)
     section, _, path = name.partition(".")
     if section == "views":
@@ -87,7 +94,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     ]
     views = [_replace_view(view, values, scene) for view in scene.views]
     volume = _replace_volume(
-        scene.volume, {name: values[name] for name in VOLUME if name in values}
+        scene.volume, {name: value for name, value in values.items() if is_of_volume(name)}
     )
     return replace(scene, volume=volume, lights=lights, views=views)
 
@@ -123,10 +130,10 @@ def _tensors(light: Light) -> list[str]:
 
 def _volume_names(volume: Volume) -> list[str]:
     """The variables of `volume`: its phase function has its own numbers, or g alone."""
-    known = [name for name in VOLUME if name != "g" and not name.startswith(PHASE)]
+    known = ["density", *CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO]
     if isinstance(volume.phase, HenyeyGreenstein):
         return [*known, "g"]
-    return [*known, *(PHASE + name for name in volume.phase.VARIABLES)]
+    return [*known, *(PHASE + name for name in volume.phase.variables)]
 
 
 def _own_name(volume: Volume, name: str) -> str:
@@ -137,8 +144,7 @@ def _own_name(volume: Volume, name: str) -> str:
 
 def _volume_value(volume: Volume, name: str) -> Tensor:
     if name.startswith(PHASE):
-        number: Tensor = getattr(volume.phase, name.removeprefix(PHASE))
-        return number
+        return volume.phase.variables[name.removeprefix(PHASE)]
     if name not in EXTINCTION_AND_ALBEDO:
         value: Tensor = getattr(volume, name)
         return value
@@ -164,8 +170,9 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         phase = HenyeyGreenstein(stored.pop("g"))
     numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
     if numbers:
-        parts = {name.removeprefix(PHASE): number for name, number in numbers.items()}
-        phase = replace(phase, **parts)
+        phase = phase.with_variables(
+            {name.removeprefix(PHASE): number for name, number in numbers.items()}
+        )
     changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
 

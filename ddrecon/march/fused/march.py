@@ -20,11 +20,12 @@ from ddrecon.march.fused.bundle import (
     table_of,
 )
 from ddrecon.march.fused.cells import cells_of
+from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.fused.compose import compose
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.lattice import Lattice
+from ddrecon.medium.phase_cells import count_tables
 
 
 def march_rays(
@@ -86,7 +87,7 @@ def _integrate(
 def layout_of(emission: Emission) -> Layout:
     """How the fields of `emission` stand in a node."""
     extinction, scattering, peak = emission.extinction, emission.scattering, emission.peak
-    remaining = emission.remaining
+    remaining, phase = emission.remaining, emission.seen.phase
     return Layout(
         emission.colors,
         extinction.field.shape[0],
@@ -97,5 +98,7 @@ def layout_of(emission: Emission) -> Layout:
         emission.seen.colors,
         torch.finfo(emission.diffuse.dtype).bits,
         form_of(emission),
+        0 if phase.cells is None else len(phase.cells),
+        count_tables(phase),
         0 if remaining is None else remaining.field.shape[0],
     )

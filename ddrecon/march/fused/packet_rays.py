@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from ddrecon.kernels.packets import packet_program
 from ddrecon.kernels.text import TextKernel
+from ddrecon.march.fused.cellwise import table_rows
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
 from ddrecon.march.fused.packet_cellwise import RUNGS, SEE
 from ddrecon.march.fused.packet_optics import CUBICS, DECAYS, POINTS, POLYNOMIALS
-from ddrecon.numerics.angle_table import STEPS
 
 GIVEN = """
 F *planes, *rays, *angles, *coefficients, *numbers, *table; int *slices;
@@ -175,7 +175,7 @@ auto peak_of = [&](const Node& node, int c) -> V {
     return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
 };
 auto first_of = [&](int b, int c) -> int {
-    return b * RAY_TERMS + (HAS_NUMBERS ? 0 : c * PHASE_STEP * COEFFICIENTS);
+    return b * RAY_TERMS + c * CURVE_STEP;
 };
 // Of p of beam b in color c: coefficients over the depth of the peak.
 auto curve_of = [&](const Node& node, int b, int c) -> const V* {
@@ -258,7 +258,8 @@ def packet_kernel(
 ) -> TextKernel:
     """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`.
 
-    It `has_slopes` of p at nodes, which the integral itself does not need. With `changes` it is given `all_fields`: `fields`, from which it samples, and their changes.
+    It `has_slopes` of p at nodes, which the integral itself does not need. With `changes` it is
+    given `all_fields`: `fields`, from which it samples, and their changes.
     """
     optics = DECAYS + POLYNOMIALS + CUBICS + POINTS + RUNGS
     structs = PLACES + RUNS + ROWS + VALUES + optics + _RECORDS
@@ -294,11 +295,13 @@ def _constants(layout: Layout, has_slopes: bool) -> str:
         "PHASE_STEP": layout.phase_step,
         "TERMS": layout.terms,
         "CURVES": len(layout.beams) * layout.phases * layout.terms,
-        "TABLE_STEP": 0 if layout.form else 2 * (STEPS + 1) * layout.terms,
+        "TABLE_STEP": layout.table_step * table_rows(layout) * layout.terms,
+        "CURVE_STEP": layout.curve_step,
         "RAY_TERMS": layout.ray_terms,
         "FIRST_DIFFUSING": layout.diffusing_from,
         "DIFFUSING_STEP": layout.diffusing_step,
         "FIRST_NUMBER": layout.first_number,
+        "NUMBER_STEP": layout.number_step,
     }
     answers = {
         "HAS_NUMBERS": layout.form is not None,

@@ -53,7 +53,8 @@ auto changing_curve = [&](const Node& node, int b, int c, V* d_curve) -> const V
         const Cubic angle = angle_of(node, b, cosine);
         const V place = Rungs::place(number_of(node, c * PHASE_STEP));
         const Cubic rung = Cubic::at(place, LAST_RUNG);
-        Rungs::read(d_table, rung, angle, d_curve, nullptr, nullptr);
+        const F* const changes_of_table = d_table + c * PHASE_STEP * TABLE_STEP;
+        Rungs::read(changes_of_table, rung, angle, d_curve, nullptr, nullptr);
     } else {
         Point::curve(node.point[b], d_table + c * PHASE_STEP * TABLE_STEP, d_curve);
     }
@@ -62,7 +63,7 @@ auto changing_curve = [&](const Node& node, int b, int c, V* d_curve) -> const V
 // The change of p on the way `way` to the light, of which the depth of its peak changes.
 auto change_of_p = [&](const Node& node, const Node& change, int b, int c, V way, V d_depth) -> V {
     const int phase = b * PHASES + c * PHASE_STEP;
-    const V d_number = HAS_NUMBERS ? change.v[FIRST_NUMBER + c * PHASE_STEP] : none;
+    const V d_number = HAS_NUMBERS ? change.v[FIRST_NUMBER + c * NUMBER_STEP] : none;
     V d_p = none, d_plain = none;
     if (has_curve(b)) {
         V d_curve[TERMS];
