@@ -113,7 +113,7 @@ def render(
     if has_mp4:
         require_mp4()
     loaded = session.with_lights(lights).load(scene)
-    require_sharing(loaded, ())
+    require_sharing(loaded)
     views = session.pick_views(loaded, names)
     if lights or count is not None:
         loaded = remove_targets(loaded, views, count)
@@ -192,7 +192,7 @@ def optimize(
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
-    require_sharing(built, built.optimize.parameters if built.optimize else ())
+    require_sharing(built)
     for doubt in find_doubts(built):
         warnings.warn(doubt, DataWarning, 2)
     if not is_first():

@@ -33,6 +33,7 @@ optimize:
     density: {init: 0.4, tv: 1e-3}
     sigma_s: {field: true}
     g: {}
+    lights.0.irradiance: {}
     views.a.camera: {}
     views.c.camera: {}
     views.*.exposure: {}
@@ -78,10 +79,7 @@ def told(ranks: int, output: str, *options: str) -> dict[str, Any]:
 RENDER = ["render", "scene.yaml", "--engine", "torch", "--gradient", "density", "-o"]
 BENCH = ["bench", "scene.yaml", "--engine", "torch"]
 TALL = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch", "-D", "diffusion.warm_start=false"
-KNOWN = (
-    "-D",
-    "optimize.parameters={density: {init: 0.4, tv: 1e-3}, sigma_s: {field: true}, g: {}}",
-)
+ROUNDS = "-D", "diffusion.transport_rounds=1", "-D", "diffusion.degree=1"
 CELLS = "--share", "cells"
 JOBS = {
     "one": job(1, "one"),
@@ -100,11 +98,11 @@ JOBS = {
     "told by two": told(2, "told by two"),
     "told in cells": told(2, "told in cells", *CELLS),
     "checked": {"ranks": 2, "arguments": ["check", "scene.yaml"]},
-    "whole": job(1, "whole", *TALL, *KNOWN),
-    "cells": job(2, "cells", *TALL, *KNOWN, *CELLS, "--preview-every", "4"),
-    "cells killed": job(3, "torn", *TALL, *KNOWN, *CELLS, failing=[2, 4, "killed"]),
-    "cells resumed": job(2, "torn", *TALL, *KNOWN, *CELLS, "--resume"),
-    "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.transport_rounds=1"),
+    "whole": job(1, "whole", *TALL, *ROUNDS),
+    "cells": job(2, "cells", *TALL, *ROUNDS, *CELLS, "--preview-every", "4"),
+    "cells killed": job(3, "torn", *TALL, *ROUNDS, *CELLS, failing=[2, 4, "killed"]),
+    "cells resumed": job(2, "torn", *TALL, *ROUNDS, *CELLS, "--resume"),
+    "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.model=flux_limited"),
     "tall": {"ranks": 1, "arguments": [*RENDER, "tall", *TALL]},
     "tall cells": {"ranks": 2, "arguments": [*RENDER, "tall cells", *TALL, *CELLS]},
     "measured": {"ranks": 2, "arguments": [*BENCH, "--json", "bench.json"]},
@@ -172,7 +170,7 @@ def test_ranks_find_what_one_finds(runs: Runs, output: str, alone: str) -> None:
     np.testing.assert_allclose(runs.log(output), runs.log(alone), rtol=1e-7)
     expected, found = runs.found(alone), runs.found(output)
     assert expected.keys() == found.keys()
-    assert alone == "whole" or {"views.c.exposure", "views.d.camera"} <= found.keys()
+    assert {"views.c.exposure", "views.d.camera"} <= found.keys()
     for name, value in expected.items():
         np.testing.assert_allclose(found[name], value, rtol=1e-6, atol=1e-8, err_msg=name)
 
@@ -229,8 +227,7 @@ def test_ranks_render_in_slabs_what_one_renders(runs: Runs) -> None:
 def test_what_slabs_cannot_do_is_refused(runs: Runs) -> None:
     assert runs.codes["cells refused"][0] == 2
     lines = runs.text("cells refused", 0, "err").splitlines()
-    assert len(lines) == 2 and all(line.startswith("--share cells: ") for line in lines)
-    assert "diffusion.transport_rounds" in lines[0] and "views.a.camera and 7 more" in lines[1]
+    assert len(lines) == 1 and lines[0].startswith("--share cells: diffusion.model: flux_limited")
     assert not (runs.folder / "none").exists()
 
 
