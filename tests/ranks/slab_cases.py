@@ -247,7 +247,16 @@ CASES: dict[str, Callable[[], Found]] = {
 }
 
 
-FUSED = "light along y", "light along x", "rounds along y", "environment", "lattice", "inside"
+FUSED = (
+    "light along x",
+    "light along y",
+    "forward peak",
+    "all per cell",
+    "rounds along y",
+    "environment",
+    "lattice",
+    "inside",
+)
 """Cases in which slabs have fused kernels."""
 
 
