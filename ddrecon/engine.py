@@ -5,8 +5,8 @@ all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. 
 same formulas, so their numbers agree to rounding. Torch's are, with either engine: point lights but
 for the mass on the way to them, the scattering of skies towards a camera, tangents in forward mode
 by where lights are, the model `flux_limited`, the scheme `printed`, and solvers other than
-`multigrid`. So are view rays, and of light and of rounds what has the phase function in it, where
-that differs from cell to cell.
+`multigrid`. So is of light and of rounds what has the phase function in it, where that differs from
+cell to cell.
 """
 
 from __future__ import annotations

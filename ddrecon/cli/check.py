@@ -125,8 +125,7 @@ def _parts_in_torch(scene: Scene) -> tuple[str, ...]:
     """The parts that are torch's with every engine, for what `scene` asks of them."""
     settings = scene.diffusion
     is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    diffusion = () if is_fused and settings.solver == "multigrid" else ("diffusion",)
-    return diffusion if scene.volume.phase.cells is None else (*diffusion, "view rays")
+    return () if is_fused and settings.solver == "multigrid" else ("diffusion",)
 
 
 def _count_entries(name: str, count: int) -> str:

@@ -113,7 +113,7 @@ def render(
     if has_mp4:
         require_mp4()
     loaded = session.with_lights(lights).load(scene)
-    require_sharing(loaded, ())
+    require_sharing(loaded)
     views = session.pick_views(loaded, names)
     if lights or count is not None:
         loaded = remove_targets(loaded, views, count)
@@ -179,7 +179,7 @@ def optimize(
     has_uncertainty: bool,
 ) -> None:
     """Reconstruct what SCENE asks for from its views' images."""
-    from ddrecon.cli.uncertainty import add_uncertainty, require_one_process
+    from ddrecon.cli.uncertainty import add_uncertainty, follow_added
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
@@ -188,17 +188,17 @@ def optimize(
 
     if has_events:
         require_tensorboard()
-    if has_uncertainty:
-        require_one_process()
     if iterations is not None:
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
-    require_sharing(built, built.optimize.parameters if built.optimize else ())
+    require_sharing(built)
     for doubt in find_doubts(built):
         warnings.warn(doubt, DataWarning, 2)
     if not is_first():
-        follow_run(built, scene_file, resume=resume, preview_every=preview_every)
+        run = follow_run(built, scene_file, resume=resume, preview_every=preview_every)
+        if has_uncertainty:
+            follow_added(run)
         return
     with (
         open_run(built, scene_file, output, environment, may_exist=overwrite, resume=resume) as (
@@ -209,7 +209,8 @@ def optimize(
     ):
         if is_watched:
             folder.save_often(SAVE_EVERY)
-        summary = drive_run(run, folder, preview_every, session.is_quiet, has_events)
+        settings = preview_every, session.is_quiet, has_events
+        summary = drive_run(run, folder, *settings, is_last=not has_uncertainty)
         lines = summary_lines(summary, output)
         if has_uncertainty:
             record, more = add_uncertainty(run, output, session.is_quiet)

@@ -23,7 +23,7 @@ from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
 from ddrecon.kernels.spare import keep_freed_memory
 from ddrecon.progress import bar_settings
-from ddrecon.ranks import cells_are_shared, is_first, join_ranks, rank_count
+from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import build_scene
@@ -138,8 +138,8 @@ def open_session(
     """Sets torch and the engine up as the options say.
 
     Under torchrun it meets the other ranks, to `share` views or cells. Raises UsageError for a
-    device that is not there, or an engine that has no slabs; MissingExtraError for an engine that
-    is not there, RanksError for other ranks.
+    device that is not there, MissingExtraError for an engine that is not there, RanksError for
+    other ranks.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError(
@@ -148,10 +148,6 @@ def open_session(
         )
     place = torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
     join_ranks(place.type == "cuda", share == "cells")
-    if cells_are_shared():
-        if engine == "warp":
-            raise UsageError("--share cells: only the engine torch has slabs; leave --engine out")
-        engine = "torch"
     use_engine(engine or current_engine())
     if place.type == "cuda" and rank_count() > 1:
         place = _own_gpu()

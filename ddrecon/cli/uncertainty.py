@@ -74,15 +74,15 @@ def uncertainty(
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.next_view import FEWEST
-    from ddrecon.run.uncertainty_folder import (
+    from ddrecon.run.uncertainty import (
         Request,
         drive_uncertainty,
         dtype_of,
         follow_uncertainty,
         state_of,
         take_up,
-        uncertainty_lines,
     )
+    from ddrecon.run.uncertainty_folder import uncertainty_lines
 
     if next_view and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
@@ -107,21 +107,12 @@ def uncertainty(
     session.show(record, uncertainty_lines(record, output))
 
 
-def require_one_process() -> None:
-    """Raises UsageError under torchrun, where a run ends with the first rank alone."""
-    from ddrecon.ranks import rank_count
-
-    if rank_count() > 1:
-        raise click.UsageError(
-            "--uncertainty takes one process; run `ddrecon uncertainty` by torchrun afterwards"
-        )
-
-
 def add_uncertainty(
     run: Reconstruction, folder: Path, is_quiet: bool
 ) -> tuple[dict[str, Any], list[str]]:
     """How sure `run` is, told in `uncertainty` within its `folder`: the record, and its lines."""
-    from ddrecon.run.uncertainty_folder import Request, drive_uncertainty, uncertainty_lines
+    from ddrecon.run.uncertainty import Request, drive_uncertainty
+    from ddrecon.run.uncertainty_folder import uncertainty_lines
 
     path = folder / "uncertainty"
     path.mkdir(exist_ok=True)
@@ -135,3 +126,10 @@ def add_uncertainty(
         is_quiet=is_quiet,
     )
     return record, uncertainty_lines(record, path)
+
+
+def follow_added(run: Reconstruction) -> None:
+    """Does this rank's part of what `add_uncertainty` does on the first."""
+    from ddrecon.run.uncertainty import Request, follow_uncertainty
+
+    follow_uncertainty(run, SAMPLES, Request(run.seed))

@@ -210,7 +210,7 @@ def _bench_shared(session: Session, path: Path, report: Path | None) -> None:
     from ddrecon.reconstruct.shares import require_sharing
 
     scene = replace(session, dtype=torch.float32).load(path)
-    require_sharing(scene, scene.optimize.parameters if scene.optimize else ())
+    require_sharing(scene)
     measured = measure_shared(scene, session.progress)
     if is_first():
         click.echo("\n".join(shared_lines(scene, measured)))

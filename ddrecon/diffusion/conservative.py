@@ -7,7 +7,7 @@ a time: memory is what limits the size of a volume.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from torch import Tensor
@@ -49,7 +49,8 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
-        if is_fused() and isinstance(self.closure, Closure):
+        is_whole = not isinstance(self.medium.grid, Slab)
+        if is_whole and is_fused() and isinstance(self.closure, Closure):
             from ddrecon.diffusion.fused.closure import close_medium
 
             return close_medium(self.medium, self.closure)
@@ -102,38 +103,44 @@ class DiffusionProblem:
         )
         return -(z + y + x)
 
+    def solved(self, solve: SolverWithMemory[Operator], right: Tensor) -> Tensor:
+        """u of A u = `right`; in slabs by a solve in all ranks' own cells together."""
+        slab, (operator, _) = self.medium.grid, self.system
+        if not isinstance(slab, Slab):
+            return solve_diffusion(solve, operator, right)
+        ghosts = Ghosts.of(slab)
+        if solve.start is not None:
+            solve = replace(solve, start=_inner(slab, ghosts, solve.start))
+        right = ghosts.without(_inner(slab, ghosts, right))
+        return add_halo(ghosts.own(solve_diffusion(solve, self._shared_operator, right)), slab)
+
+    @cached_property
+    def _shared_operator(self) -> Operator:
+        """A of this rank's own cells.
+
+        It is made in the slab with its halo, whose outermost faces are not those of the box: no
+        rank's own cells have them.
+        """
+        slab, (operator, _) = self.medium.grid, self.system
+        assert isinstance(slab, Slab)
+        ghosts = Ghosts.of(slab)
+        z, y, x = (_inner(slab, ghosts, faces) for faces in operator.conductances)
+        return Operator((z, y, x), _inner(slab, ghosts, operator.loss), ghosts=ghosts)
+
     def _source_flux(self) -> dict[int, Tensor | None]:
         return dict(zip(AXES, self.source.flux or (None, None, None), strict=True))
 
 
 def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operator]) -> Moments:
     """L0 and, where `problem` has flux, L1."""
-    grid = problem.medium.grid
-    if isinstance(grid, Slab):
-        mean = _solve_in_slabs(solve, *problem.system, grid)
-    else:
-        mean = solve_diffusion(solve, *problem.system)
+    mean = problem.solved(solve, problem.system[1])
     return Moments(mean, problem.flux(mean))
 
 
-def _solve_in_slabs(
-    solve: SolverWithMemory[Operator], operator: Operator, right: Tensor, slab: Slab
-) -> Tensor:
-    """L0 in this rank's `slab`, by a solve in all ranks' own cells together.
-
-    `operator` and `right` are made in the slab with its halo, whose outermost faces are not those
-    of the box: no rank's own cells have them.
-    """
-    ghosts = Ghosts.of(slab)
+def _inner(slab: Slab, ghosts: Ghosts, u: Tensor) -> Tensor:
+    """The part of `u` in `slab` that lies in its own cells, faces and `ghosts` (a view)."""
     first, last = (halo - layers for halo, layers in zip(slab.halo, ghosts.layers, strict=True))
-
-    def inner(u: Tensor) -> Tensor:
-        return u.narrow(ghosts.axis, first, u.shape[ghosts.axis] - first - last)
-
-    z, y, x = map(inner, operator.conductances)
-    shared = Operator((z, y, x), inner(operator.loss), ghosts=ghosts)
-    solution = solve_diffusion(solve, shared, ghosts.without(inner(right)))
-    return add_halo(ghosts.own(solution), slab)
+    return u.narrow(ghosts.axis, first, u.shape[ghosts.axis] - first - last)
 
 
 def _diffusion(medium: Medium, closure: Callable[[Tensor], Tensor]) -> Tensor:

@@ -49,14 +49,14 @@ auto decay = [](F depth) -> F {{
 # psi' = -1/6 + depth / 12 - depth^2 / 40 + ...
 _PSI = """
 auto psi_series = [](F depth) -> F {{
-    F series = F(1);
-    {series}
-    return F(0.5) * series;
+    F p = F({psi_last});
+    {psi_horner}
+    return p;
 }};
 auto psi_slope_series = [](F depth) -> F {{
-    F series = F(1);
-    {slopes}
-    return F({first_slope}) * series;
+    F p = F({slope_last});
+    {slope_horner}
+    return p;
 }};
 """
 # Before a loop: its turns do not touch what others write, which clang cannot see of many arrays.
@@ -87,22 +87,21 @@ auto total = [](const F* values, int count) -> double {
 def taylor(bits: int, shift: int, sign: int, variable: str) -> tuple[str, str]:
     """The last coefficient sign^k / (k + shift)! that counts, and Horner's lines for the others."""
     terms = 14 if bits == 64 else 8
-    coefficients = [sign**k / math.factorial(k + shift) for k in range(terms)]
+    return _horner([sign**k / math.factorial(k + shift) for k in range(terms)], variable)
+
+
+def _horner(coefficients: list[float], variable: str) -> tuple[str, str]:
+    """The last of these coefficients of a series, and Horner's lines for the others."""
     lines = [f"p = p * {variable} + F({c!r});" for c in reversed(coefficients[:-1])]
     return repr(coefficients[-1]), " ".join(lines)
 
 
 def _series(terms: int) -> dict[str, str]:
-    """Horner's lines of psi and of psi', from the ratios of their coefficients."""
-
-    def lines(ratios: list[float]) -> str:
-        return " ".join(f"series = F(1) - depth * series * F({r!r});" for r in reversed(ratios))
-
-    return {
-        "series": lines([1 / (k + 3) for k in range(terms)]),
-        "slopes": lines([(k + 2) / ((k + 1) * (k + 4)) for k in range(terms)]),
-        "first_slope": repr(-1 / 6),
-    }
+    """Horner's lines of psi and of psi'."""
+    psi = [(-1) ** k / math.factorial(k + 2) for k in range(terms + 1)]
+    slopes = [(k + 1) * (-1) ** (k + 1) / math.factorial(k + 3) for k in range(terms + 1)]
+    parts = *_horner(psi, "depth"), *_horner(slopes, "depth")
+    return dict(zip(("psi_last", "psi_horner", "slope_last", "slope_horner"), parts, strict=True))
 
 
 def names(bits: int) -> dict[str, str | int]:
@@ -111,12 +110,12 @@ def names(bits: int) -> dict[str, str | int]:
     if bits == 32:
         return {
             "number": "float", "integer": "int", "exp": "expf", "digits": 23, "most": "87.0",
-            "shift": "12582912.0", "log2_high": "0.693145751953125",
+            "shift": "12582912.0", "root_bits": "0x3f3504f3", "log2_high": "0.693145751953125",
             "log2_low": "1.42860682030941723212e-6", "first": first, "horner": horner,
         }  # fmt: skip
     return {
         "number": "double", "integer": "long long", "exp": "exp", "digits": 52, "most": "700.0",
-        "shift": "6755399441055744.0", "log2_high": "0.693147180369123816490",
+        "shift": "6755399441055744.0", "root_bits": "0x3fe6a09e667f3bcd", "log2_high": "0.693147180369123816490",
         "log2_low": "1.90821492927058770002e-10", "first": first, "horner": horner,
     }  # fmt: skip
 

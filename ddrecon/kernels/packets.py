@@ -61,6 +61,8 @@ struct P {{
     INLINE V gather(const F* p, I at) {{ return p[at]; }}
     INLINE void add(F* p, I at, V x) {{ atomicAdd(p + at, x); }}
     INLINE V decay(V depth) {{ return {exp}(-depth); }}
+    INLINE V log(V x) {{ return ::log(x); }}
+    INLINE void add_one(F* p, F x) {{ atomicAdd(p, x); }}
 #else
     INLINE V all(F x) {{ return x - V{{}}; }}
     INLINE I whole(V x) {{ return __builtin_convertvector(x, I); }}
@@ -86,6 +88,17 @@ struct P {{
     }}
     INLINE void add(F* p, I at, V x) {{
         for (int l = 0; l < LANES; ++l) p[at[l]] += x[l];
+    }}
+    INLINE void add_one(F* p, F x) {{ *p += x; }}
+    // log x = n log 2 + log m with x = 2^n m > 0 and m between the root of 1/2 and that of 2:
+    // log m = 2 (s + s^3 / 3 + s^5 / 5 + ...), where s = (m - 1) / (m + 1).
+    INLINE V log(V x) {{
+        const M bits = __builtin_bit_cast(M, x), n = (bits - ({integer}){root_bits}) >> {digits};
+        const V m = __builtin_bit_cast(V, bits - (n << {digits}));
+        const V s = (m - F(1)) / (m + F(1)), square = s * s;
+        V p = all(F({odd_first}));
+        {odd}
+        return F(2) * s * p + __builtin_convertvector(n, V) * F(0.69314718055994530942);
     }}
     // exp(-depth) = 2^n e^r with n whole and |r| < log(2) / 2, as in `native`.
     INLINE V decay(V depth) {{
@@ -127,7 +140,14 @@ struct P {{
 @functools.cache
 def _definitions(bits: int) -> str:
     psi_first, psi = taylor(bits, 2, -1, "depth")
-    return _TEXT.format(**names(bits), psi_first=psi_first, psi=psi, lanes=LANES)
+    odd = [1 / (2 * k + 1) for k in range(11 if bits == 64 else 6)]
+    series = {
+        "psi_first": psi_first,
+        "psi": psi,
+        "odd_first": odd[-1],
+        "odd": " ".join(f"p = p * square + F({each!r});" for each in reversed(odd[:-1])),
+    }
+    return _TEXT.format(**names(bits), **series, lanes=LANES)
 
 
 def packet_program(bits: int, body: str) -> str:

@@ -71,15 +71,12 @@ def march(
 
 
 def _pick_engine(emission: Emission) -> tuple[Callable[..., Part], Callable[..., Tensor]]:
-    """How rays and lattices of rays are marched by the engine in use.
-
-    Phase functions that differ from cell to cell have no fused kernels.
-    """
+    """How rays and lattices of rays are marched by the engine in use."""
     if isinstance(emission.grid, Slab):
         from ddrecon.march import slabs
 
         return slabs.march_rays, slabs.march_lattice
-    if current_engine() == "warp" and emission.seen.phase.cells is None:
+    if current_engine() == "warp":
         from ddrecon.march.fused import march as fused
 
         return fused.march_rays, fused.march_lattice

@@ -20,6 +20,7 @@ from ddrecon.march.emission import Channels, Emission
 from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.integral import Integrate, Part, integrate_segments, opacity_of
 from ddrecon.march.lattice import Lattice
+from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.slabs.exchange import gather_parts, sum_slabs
 from ddrecon.slabs.slab import Slab
@@ -27,6 +28,8 @@ from ddrecon.slabs.slab import Slab
 Sampler = Bands | Equidistant
 Find = Callable[[Emission, Sampler, Integrate], Tensor]
 """What is found along all rays, [*, R], by an integral of values that are sampled."""
+Look = Callable[[], Tensor]
+"""Radiance and mass along all rays, [C + K, R], as fused kernels find them."""
 
 
 def march_rays(emission: Emission, sampler: Sampler, rays: Rays, crossing: Crossing) -> Part:
@@ -47,7 +50,13 @@ def march_rays(emission: Emission, sampler: Sampler, rays: Rays, crossing: Cross
         index, found = integral.march_rays(emission, sampler, hitting, own, of_some)
         return found.new_zeros(len(found), count).index_copy(1, index, found)
 
-    return crossing.hit, _compose(emission, sampler, hitting, find)
+    def look() -> Tensor:
+        from ddrecon.march.fused.march import integrate_rays
+
+        found = integrate_rays(emission, sampler, hitting, own)
+        return found.new_zeros(len(found), count).index_copy(1, inside, found)
+
+    return crossing.hit, _compose(emission, sampler, hitting, find, look)
 
 
 def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
@@ -80,13 +89,23 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
         found = integral.march_lattice(emission, sampler, own, intersect, of_some).flatten(1)
         return found.new_zeros(len(found), len(near)).index_copy(1, numbers, found)
 
-    return _compose(emission, bands, rays, find).unflatten(1, lattice.shape)
+    def look() -> Tensor:
+        from ddrecon.march.fused.march import integrate_rays
+
+        some = own.rays(own.rows, 2 * max(slab.whole.extent))
+        near, far = intersect(some)
+        inside = torch.arange(len(near), device=near.device)
+        found = integrate_rays(emission, bands, some, Crossing(inside, near, far))
+        return found.new_zeros(len(found), len(rays.origin)).index_copy(1, numbers, found)
+
+    return _compose(emission, bands, rays, find, look).unflatten(1, lattice.shape)
 
 
-def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find) -> Tensor:
+def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look: Look) -> Tensor:
     """Radiance and opacity [2 C, R] of all slabs along `rays`, in this one of which `find` looks.
 
-    With a forward peak (E13) radiance depends on all mass before it, which is then found first.
+    Or `look`, by fused kernels. With a forward peak (E13) radiance depends on all mass before it,
+    which is then found first; kernels begin without any.
     """
     slab, colors, scale = _slab_of(emission), emission.colors, emission.extinction.scale.view(-1, 1)
     if emission.peak is None:
@@ -94,7 +113,8 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find) -> Te
         def both(values: Tensor, nodes: Nodes, _: Tensor) -> Tensor:
             return torch.cat(integrate_segments(emission, values, nodes))
 
-        found = find(emission, sampler, both)
+        has_kernels = is_fused() and emission.seen.phase.cells is None
+        found = look() if has_kernels else find(emission, sampler, both)
         scattered, mass = found[:colors], found[colors:]
         front, total = _masses(slab, rays, mass)
         scattered = scattered * torch.exp(-scale * front)

@@ -18,8 +18,15 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
 from ddrecon.medium.phase_peak import peak_table
 from ddrecon.medium.remaining import turned_table
-from ddrecon.numerics.angle_table import angle_of, look_up_between
+from ddrecon.numerics.angle_table import (
+    STEPS,
+    angle_of,
+    look_up,
+    look_up_between,
+    with_slopes,
+)
 from ddrecon.numerics.chebyshev import evaluate_positive
+from ddrecon.numerics.legendre import even_angles
 from ddrecon.numerics.remember import remember
 
 STEEP_STEP, STEEP_STEPS = 0.05, 54
@@ -52,16 +59,46 @@ class SeenNodes:
 
         Where g is not positive there is no peak, and S is p.
         """
-        angle = angle[:, None]
+        angle, kind = angle[:, None], type(self.phase)
+        if depth is None and not is_steep(kind):
+            other, change = look_up(end_table(self.phase).to(self.number), angle).unbind(-1)
+            return other[0] + self.number * change[0]
         plain = self.value(angle.cos().to(self.number))
         if depth is None:
             return plain
-        kind = type(self.phase)
-        table = _peak_tables(kind, self.degree, *_rungs_and_others(self.phase, 0)).to(self.number)
+        table = peak_tables(self.phase, self.degree).to(self.number)
         place, angle = torch.broadcast_tensors(_place(kind, self.number.clamp(min=0), 0), angle)
         coefficients = look_up_between(table, place, angle.double())
         seen = evaluate_positive(coefficients.movedim(-1, 0), depth)
-        return torch.where(self.number > 0, seen, plain) if kind is HenyeyGreenstein else seen
+        return torch.where(self.number > 0, seen, plain) if is_steep(kind) else seen
+
+
+def is_steep(kind: type[PhaseFunction]) -> bool:
+    """Whether the number is g, and rungs are even in artanh g; else p is linear in it, a weight."""
+    return kind is HenyeyGreenstein
+
+
+def peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
+    """Polynomials of S at all rungs, and slopes from one to the next, [n, 2, steps + 1, 2, K]."""
+    return _peak_tables(type(phase), degree, *_rungs_and_others(phase, 0))
+
+
+def at_ends(phase: PhaseFunction, cosine: Tensor) -> tuple[Tensor, Tensor]:
+    """p where a weight is 0, and how much that changes until it is 1: [*cosine.shape] each."""
+    none, whole = (phase.with_cells(cosine.new_tensor(end)).value(cosine)[0] for end in (0.0, 1.0))
+    return none, whole - none
+
+
+def end_table(phase: PhaseFunction) -> Tensor:
+    """The two of `at_ends` over the angle, as `look_up` has them, [1, steps + 1, 2, 2]."""
+    return _end_table(type(phase), *others_of(phase))
+
+
+@remember
+def _end_table(kind: type[PhaseFunction], *others: Tensor) -> Tensor:
+    cosines = even_angles(STEPS).to(others[0].device).cos()
+    phase = kind(*(each.double() for each in others), cosines.new_zeros(()))
+    return torch.cat([with_slopes(end[None]) for end in at_ends(phase, cosines)], -1)
 
 
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
@@ -79,15 +116,17 @@ def _rungs_and_others(phase: PhaseFunction, backward: int) -> list[Tensor]:
 
     Of g so many of them are `backward`.
     """
-    others = [one.name for one in fields(phase) if one.name != phase.CELLWISE]
-    numbers = [getattr(phase, name) for name in others]
-    device = phase.numbers[0].device
-    return [_rungs(type(phase), backward, device), *numbers]
+    return [_rungs(type(phase), backward, phase.numbers[0].device), *others_of(phase)]
+
+
+def others_of(phase: PhaseFunction) -> list[Tensor]:
+    """All numbers of `phase` but that which differs from cell to cell, in their order."""
+    return [getattr(phase, one.name) for one in fields(phase) if one.name != phase.CELLWISE]
 
 
 def _place(kind: type[PhaseFunction], number: Tensor, backward: int) -> Tensor:
     """Between which of the rungs `number` is, counted from the first."""
-    if kind is not HenyeyGreenstein:
+    if not is_steep(kind):
         return number * EVEN_STEPS
     return torch.atanh(number) / STEEP_STEP + backward
 
@@ -96,7 +135,7 @@ def _place(kind: type[PhaseFunction], number: Tensor, backward: int) -> Tensor:
 @torch.inference_mode(False)
 def _rungs(kind: type[PhaseFunction], backward: int, device: torch.device) -> Tensor:
     """The numbers at which tables are kept, [n]: even steps of artanh g, or of a weight."""
-    if kind is HenyeyGreenstein:
+    if is_steep(kind):
         steps = torch.arange(-backward, STEEP_STEPS + 1, dtype=torch.float64, device=device)
         return torch.tanh(STEEP_STEP * steps)
     return torch.arange(EVEN_STEPS + 1, dtype=torch.float64, device=device) / EVEN_STEPS

@@ -17,6 +17,7 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.losses import Target
 from ddrecon.ranks import sum_over_ranks
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
@@ -31,6 +32,19 @@ TOLERANCE = 1e-4
 """Relative residual of solves without a light, whose share is a difference of pictures."""
 ROUNDING = 1e-6
 """Lights that no picture tells apart better than this keep their ratio."""
+ALBEDO = ("sigma_a", "sigma_s", "albedo")
+"""What says how much light a medium gives back."""
+
+
+def can_solve_light(light: Parameter, parameters: Sequence[Parameter]) -> bool:
+    """Whether the brightness of `light` is solved for, among all `parameters` of a run.
+
+    A light that is a map, or starts from black, has no share in pictures yet. Where it is sought
+    how much the medium scatters or absorbs, twice the light is half the scattering of thin smoke:
+    what fits best for the medium as it is runs ahead of it along that valley, further each time.
+    """
+    is_known = not any(parameter.name in ALBEDO for parameter in parameters)
+    return is_known and light.value.numel() <= 3 and bool((light.value > 0).all())
 
 
 def lights_due(parameters: Sequence[Parameter], iteration: int) -> list[Parameter]:
@@ -47,16 +61,19 @@ def step_brightness(
     pictures: Mapping[str, Tensor],
     targets: Mapping[str, Target],
     solutions: Mapping[tuple[str, int], Tensor],
+    names: Sequence[str],
 ) -> None:
     """Takes the brightness of `lights` part of the way to what fits the `pictures` best.
 
-    Those are of views of `scene`, rendered by this rank with the `values` of all parameters;
-    `solutions` are near to the light in it. Nothing happens without lights.
+    Those are of views of `scene`, rendered by this rank with the `values` of all parameters; all
+    ranks' views are called `names`. `solutions` are near to the light. Nothing happens without
+    lights.
     """
     if not lights:
         return
     with torch.no_grad():
-        shares = light_shares(lights, scene, values, pictures, solutions)
+        rendered = names if has_slabs(scene) else list(pictures)
+        shares = light_shares(lights, scene, values, pictures, solutions, rendered)
     sums = [
         normal_sums(share, picture, targets[name], scene.view(name).weight)
         for (name, picture), share in zip(pictures.items(), shares, strict=True)
@@ -79,10 +96,11 @@ def light_shares(
     values: Mapping[str, Tensor],
     pictures: Mapping[str, Tensor],
     solutions: Mapping[tuple[str, int], Tensor],
+    names: Sequence[str],
 ) -> list[Tensor]:
     """What of each of the `pictures` of views of `scene` is each light's, [lights, 3, h, w].
 
-    It is what the picture lacks without the light.
+    It is what the picture lacks without the light. `names` are the views that are rendered for it.
     """
     diffusion = replace(scene.diffusion, tolerance=min(scene.diffusion.tolerance, TOLERANCE))
     scene, lacking = replace(scene, diffusion=diffusion), []
@@ -90,8 +108,9 @@ def light_shares(
         memory = SolveMemory()
         memory.last = dict(solutions)
         dark = with_values(scene, {**values, light.name: torch.zeros_like(light.value)})
-        rest = render_each(dark, [dark.view(name) for name in pictures], memory)
-        lacking.append([one - other for one, other in zip(pictures.values(), rest, strict=True)])
+        rest = render_each(dark, [dark.view(name) for name in names], memory)
+        others = dict(zip(names, rest, strict=True))
+        lacking.append([picture - others[name] for name, picture in pictures.items()])
     return [torch.stack(shares) for shares in zip(*lacking, strict=True)]
 
 

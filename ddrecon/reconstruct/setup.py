@@ -10,6 +10,7 @@ import torch
 from ddrecon.errors import SceneError
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise, estimate_noise
+from ddrecon.reconstruct.brightness import can_solve_light
 from ddrecon.reconstruct.divergence import describe_flaw
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -159,8 +160,7 @@ def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bo
 
     Poses with a loss that is no sum of squares (E29); and where those of only some of several views
     of `train` are sought, or of a single one: then no calibration of all is to be mended, but a
-    camera to be found, which may be far off. Lights that are a map, or start from black: that has
-    no share in pictures yet (E35).
+    camera to be found, which may be far off. For lights see `can_solve_light`.
     """
     poses = [parameter for parameter in parameters if parameter.key == "camera"]
     if not is_quadratic or not len(poses) == len(train.views) > 1:
@@ -168,4 +168,4 @@ def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bo
             pose.is_fitted = False
     for light in parameters:
         if light.name.startswith("lights.") and light.is_fitted:
-            light.is_fitted = light.value.numel() <= 3 and bool((light.value > 0).all())
+            light.is_fitted = can_solve_light(light, parameters)

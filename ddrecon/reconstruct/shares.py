@@ -28,6 +28,7 @@ from ddrecon.ranks import (
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
+from ddrecon.slabs.slab import Slab, own_slab
 
 CELL_COST = 0.5
 """What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
@@ -35,11 +36,8 @@ COARSE = 16
 """A view's rays are counted as if it had about so many pixels along its shorter side."""
 
 
-def require_sharing(scene: Scene, names: Collection[str]) -> None:
-    """Raises UsageError where ranks are to share cells, and cannot in `scene`.
-
-    `names` are the variables that are optimized.
-    """
+def require_sharing(scene: Scene) -> None:
+    """Raises UsageError where ranks are to share cells, and cannot in `scene`."""
     if not cells_are_shared():
         return
     settings, problems = scene.diffusion, list[str]()
@@ -47,16 +45,13 @@ def require_sharing(scene: Scene, names: Collection[str]) -> None:
         problems.append("diffusion.model: flux_limited light needs all cells; say p1")
     if settings.scheme == "printed":
         problems.append("diffusion.scheme: the printed scheme needs all cells; say conservative")
-    if settings.rounds:
-        problems.append(
-            "diffusion.transport_rounds: rounds need all cells; say 0 to do without them"
-        )
-    others = [name for name in names if name.startswith(("lights.", "views."))]
-    if others:
-        more = f" and {len(others) - 1} more need" if len(others) > 1 else ": needs"
-        problems.append(f"optimize.parameters.{others[0]}{more} all cells; leave them out")
     if problems:
         raise UsageError([f"--share cells: {problem}, or share views" for problem in problems])
+
+
+def has_slabs(scene: Scene) -> bool:
+    """Whether ranks share out the cells of `scene`, so that all of them render each view."""
+    return isinstance(own_slab(scene.volume.grid), Slab)
 
 
 def own_views(scene: Scene, names: Sequence[str]) -> list[str]:
@@ -82,9 +77,9 @@ def share_pictures(
 ) -> dict[str, Tensor]:
     """The pictures [3, h, w] of `views` of the volume of `scene`, by name, on all ranks.
 
-    Each is what `picture_of` gives one of them.
+    Each is what `picture_of` gives one of them. Of cells in slabs all ranks look at all views.
     """
-    if rank_count() == 1:
+    if rank_count() == 1 or has_slabs(scene):
         return {view.name: picture_of(view) for view in views}
     names = [view.name for view in views]
     owners = _owners(scene, dict(zip(names, views, strict=True)), names)

@@ -16,7 +16,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.poses import pose_curvature, step_pose, weigh_calibration
 from ddrecon.reconstruct.responses import step_responses
 from ddrecon.reconstruct.schedule import Schedule
-from ddrecon.reconstruct.shares import take_from_owners
+from ddrecon.reconstruct.shares import has_slabs, take_from_owners
 from ddrecon.renderer import solve_light
 from ddrecon.scene import Scene, View
 from ddrecon.variables.values import RESPONSE, with_values
@@ -73,7 +73,8 @@ def solve_numbers(
     pictures = compared.pictures
     solve_responses(parameters, scene, pictures, targets)
     lights = lights_due(parameters, iteration)
-    step_brightness(lights, scene, values, pictures, targets, solutions)
+    names = list(dict.fromkeys(view.name for view in compared.views))
+    step_brightness(lights, scene, values, pictures, targets, solutions, names)
     if poses := [p for p in parameters if p.key == "camera"]:
         own = share_out(gradients, compared.views)
         solve_poses(poses, scene, own, values, targets, solutions, pictures)
@@ -109,7 +110,7 @@ def solve_poses(
 
     `gradients` are those of each view's own loss, by the `values` of all parameters. A curvature is
     found once for each resolution, in the light that `solutions` are near to, by the rank whose
-    `own` the view is.
+    `own` the view is; in slabs by all ranks together.
     """
     lacking = [pose for pose in poses if pose.curvature is None]
     if lacking:
@@ -118,12 +119,14 @@ def solve_poses(
         with torch.no_grad():
             world = with_values(scene, values)
             light_field = solve_light(world, memory)
-        found = [
-            pose_curvature(light_field, world, pose.name, targets[pose.view])
-            if pose.view is not None and pose.view in own
-            else pose.value.new_zeros(len(pose.value), len(pose.value))
-            for pose in lacking
-        ]
+        found = []
+        for pose in lacking:
+            assert pose.view is not None
+            curvature = pose.value.new_zeros(len(pose.value), len(pose.value))
+            if pose.view in own or has_slabs(scene):
+                whole = pose_curvature(light_field, world, pose.name, targets[pose.view])
+                curvature = whole if pose.view in own else curvature
+            found.append(curvature)
         for pose, curvature in zip(lacking, sum_over_ranks(found), strict=True):
             pose.curvature = curvature
     grid = scene.volume.grid

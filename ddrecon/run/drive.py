@@ -16,7 +16,7 @@ from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError,
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_settings
-from ddrecon.ranks import cells_are_shared, from_first, is_any, leave_ranks
+from ddrecon.ranks import alone, cells_are_shared, from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.smoothing import smoothing_text
@@ -88,8 +88,8 @@ def _resume(run: Reconstruction, path: Path, scene: dict[str, Any]) -> Path:
 
 def follow_run(
     scene: Scene, scene_file: SceneFile, *, resume: bool, preview_every: int | None
-) -> None:
-    """Does this rank's part of a run of `scene` that the first rank drives, and alone writes.
+) -> Reconstruction:
+    """This rank's part of a run of `scene` that the first rank drives, and alone writes; done.
 
     Where ranks share cells, that is also a part of the pictures that the first one writes.
     """
@@ -106,6 +106,7 @@ def follow_run(
     if cells_are_shared():
         scene, light_field, *_ = render_run(run)
         turntable_images(scene, light_field)
+    return run
 
 
 def drive_run(
@@ -114,10 +115,12 @@ def drive_run(
     preview_every: int | None,
     is_quiet: bool,
     has_events: bool = False,
+    is_last: bool = True,
 ) -> dict[str, Any]:
     """The summary of `run`, advanced until it is done, its results in `folder`.
 
     `preview_every` counts iterations between pictures; `has_events` logs for TensorBoard as well.
+    Unless this `is_last` of what they do, ranks stay together.
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
     before it is passed on. So do a divergence and the end of another rank; any other failure leaves
     the checkpoints written so far.
@@ -156,10 +159,13 @@ def drive_run(
                 f"the state after {run.iteration} iterations is kept in "
                 f"{folder.checkpoints / LAST}: go on from it with --resume"
             ) from error
-    if not cells_are_shared():
-        # What is left the first rank does by itself.
+    if cells_are_shared():
+        return folder.finish(run)
+    # What is left the first rank does by itself.
+    if is_last:
         leave_ranks()
-    return folder.finish(run)
+    with alone():
+        return folder.finish(run)
 
 
 @contextmanager

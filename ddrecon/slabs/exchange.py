@@ -58,6 +58,20 @@ def sum_slabs(part: Tensor) -> Tensor:
     return total
 
 
+def swap_layers(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
+    """What the ranks below and above have for this one, which has `below` and `above` for them.
+
+    All are of one shape; zero where no rank is. Differentiable (E40).
+    """
+    layers: tuple[Tensor, Tensor] = _Swap.apply(below, above)
+    return layers
+
+
+def renew_halo(field: Tensor, slab: Slab) -> Tensor:
+    """`field` [..., z, y, x] of `slab` with its neighbors' cells as they have them (E40)."""
+    return add_halo(slab.own(field), slab)
+
+
 def join_parts(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
     """All ranks' `own` parts one after the other along `axis` < 0, of `sizes`; no derivatives."""
     most = max(sizes)
@@ -149,3 +163,32 @@ class _Sum(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, d_part: Tensor) -> Tensor:
         return sum_over_ranks([d_part])[0]
+
+
+class _Swap(torch.autograd.Function):
+    """Layers that go to the neighbors and come from them: its own transpose."""
+
+    @staticmethod
+    def forward(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
+        return _swap(below, above)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, *layers_bar: Tensor) -> tuple[Tensor, Tensor]:
+        return _swap(*layers_bar)
+
+    @staticmethod
+    def jvp(ctx: Any, *d_layers: Tensor) -> tuple[Tensor, Tensor]:
+        return _swap(*d_layers)
+
+
+def _swap(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
+    got = swap_with_neighbors(
+        below if own_rank() > 0 else None, above if own_rank() + 1 < rank_count() else None
+    )
+    from_below, from_above = (torch.zeros_like(below) if one is None else one for one in got)
+    return from_below, from_above

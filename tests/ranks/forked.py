@@ -2,9 +2,10 @@
 
     python forked.py JOBS FOLDER
 
-JOBS is a JSON list of {"ranks": N, "arguments": [...], "failing": [...]}. What rank R of job J
-prints goes to FOLDER/J.R.out and J.R.err; FOLDER/codes.json has the exit codes, job by job.
-"failing" [rank, iteration, how] ends a rank before that iteration: "killed", or by an error.
+JOBS is a JSON list of {"ranks": N, "arguments": [...], "failing": [...], "samples": S}. What rank
+R of job J prints goes to FOLDER/J.R.out and J.R.err; FOLDER/codes.json has the exit codes, job by
+job. "failing" [rank, iteration, how] ends a rank before that iteration: "killed", or by an error.
+So many "samples" are what `optimize --uncertainty` draws.
 """
 
 from __future__ import annotations
@@ -17,16 +18,27 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio.plugins.pillow  # noqa: F401
+import PIL.Image
 import torch
+import torch._decomp.decompositions_for_jvp
 import torch._dynamo
 
+# What commands import is imported once, before there are several processes. So is, above, what
+# pictures and derivatives in forward mode need.
+import ddrecon.cli.session
+import ddrecon.cli.uncertainty
+import ddrecon.ranks
+import ddrecon.run.render_folder
+import ddrecon.run.uncertainty
+import ddrecon.scene_file.build
+import ddrecon.scene_file.doubts
 from ddrecon.cli import main
 from ddrecon.errors import FormatError
 from ddrecon.reconstruct.loop import Reconstruction
 
-# What commands import is imported once, before there are several; so is what derivatives in forward
-# mode import, above.
-from ddrecon.run import drive, render_folder  # noqa: F401
+PIL.Image.init()
+ddrecon.ranks.TOLD_SECONDS = 0.5
 
 LOADED = set(sys.modules)
 
@@ -60,6 +72,7 @@ def do(job: dict[str, Any], rank: int) -> int:
     """The exit code of one rank."""
     if job.get("failing", [None])[0] == rank:
         fail_before(*job["failing"][1:])
+    ddrecon.cli.uncertainty.SAMPLES = job.get("samples", 0)
     try:
         main(job["arguments"], standalone_mode=False)
         code = 0

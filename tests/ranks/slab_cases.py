@@ -1,8 +1,9 @@
 """What three ranks find in slabs, beside what each finds alone.
 
-    python slab_cases.py FILE
+    python slab_cases.py FILE [ENGINE]
 
-FILE gets, by case and by what was compared, the largest difference over the largest value.
+FILE gets, by case and by what was compared, the largest difference over the largest value. What
+slabs find by ENGINE, torch's operations find alone.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import os
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,14 +34,14 @@ from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.operator import AXES, Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
-from ddrecon.engine import use_engine
+from ddrecon.engine import current_engine, use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.light.turning import turn_in_cells
 from ddrecon.ranks import alone, join_ranks, own_rank, sum_over_ranks
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
-from ddrecon.slabs.exchange import add_halo, gather_parts, gather_slabs, sum_slabs
+from ddrecon.slabs.exchange import add_halo, gather_parts, gather_slabs, sum_slabs, swap_layers
 from ddrecon.slabs.ghosts import Ghosts
 from ddrecon.slabs.slab import Slab, own_slab
 from ddrecon.variables.values import value_of, with_values
@@ -74,6 +75,7 @@ def exchange(axis: str) -> Found:
         "gather_slabs": lambda x: gather_slabs(add_halo(x, slab), slab),
         "gather_parts": lambda x: gather_parts(x[:, :3, :3, :3]),
         "sum_slabs": lambda x: sum_slabs(x[:, :3, :3, :3]),
+        "swap_layers": lambda x: torch.stack(swap_layers(x[:, :3, :3, :3], x[:, 1:4, 1:4, 1:4])),
     }
     for name, apply in exchanges.items():
         x = own.clone().requires_grad_()
@@ -137,9 +139,11 @@ def run(scene: Scene, cameras: list[Any], *more: str, has_tangents: bool = False
     def loss_of(view: View, image: Tensor) -> Tensor:
         return (weights[view.name] * image).sum() + image.square().sum()
 
-    is_told = own_rank() == TELLS
+    is_told, engine = own_rank() == TELLS, current_engine()
+    use_engine("torch")
     with alone():
         right = find() if is_told else {}
+    use_engine(engine)
     found = find()
     for name, value in right.items():
         yield name, found[name], value
@@ -152,7 +156,8 @@ def scene_of(axis: str, **settings: Any) -> Scene:
 
 def seen_from(axis: str, *eyes: tuple[float, float, float], **settings: Any) -> Found:
     scene = scene_of(axis, ambient=(0.2, 0.3, 0.4), **settings)
-    return run(scene, [make_camera(eye) for eye in eyes], has_tangents=len(eyes) > 1)
+    names = ["lights.1.radiance", "views.v0.camera"] if len(eyes) > 1 else []
+    return run(scene, [make_camera(eye) for eye in eyes], *names, has_tangents=len(eyes) > 1)
 
 
 def forward_peak() -> Found:
@@ -160,11 +165,18 @@ def forward_peak() -> Found:
     return run(scene, [make_camera((2.0, -1.5, 1.0))], "g", DIRECTION, has_tangents=True)
 
 
-def all_per_cell() -> Found:
+def all_per_cell(**settings: Any) -> Found:
     sigma_s = 5 + 5 * random_values(3, *SHAPES["z"], seed=5)
-    scene = scene_of("z", g=0.3, sigma_s=sigma_s)
+    scene = scene_of("z", g=0.3, sigma_s=sigma_s, **settings)
     scene.volume.g = 0.5 * random_values(*SHAPES["z"], seed=6)
     return run(scene, [make_camera((2.5, 0.4, 0.6), is_perspective=False)], "g")
+
+
+def rounds(axis: str, g: float, count: int, degree: int, has_tangents: bool = False) -> Found:
+    """Rounds of transport, whose light goes from slab to slab (E56)."""
+    settings: dict[str, Any] = {"g": g, "transport_rounds": count, "degree": degree}
+    scene = scene_of(axis, ambient=(0.2, 0.3, 0.4), **settings)
+    return run(scene, [make_camera(ACROSS)], "g", "lights.1.radiance", has_tangents=has_tangents)
 
 
 def pairs() -> Found:
@@ -220,6 +232,10 @@ CASES: dict[str, Callable[[], Found]] = {
     "light along x": partial(seen_from, "x", ASKEW),
     "forward peak": forward_peak,
     "all per cell": all_per_cell,
+    "rounds along z": partial(rounds, "z", 0.4, 1, 3),
+    "rounds along y": partial(rounds, "y", 0.3, 2, 1, has_tangents=True),
+    "rounds along x": partial(rounds, "x", 0.0, 1, 1),
+    "rounds, all per cell": partial(all_per_cell, transport_rounds=1, degree=1),
     "pairs": pairs,
     "point light": point_light,
     "environment": environment,
@@ -231,18 +247,22 @@ CASES: dict[str, Callable[[], Found]] = {
 }
 
 
-def compare() -> dict[str, dict[str, float]]:
+FUSED = "light along y", "light along x", "rounds along y", "environment", "lattice", "inside"
+"""Cases in which slabs have fused kernels."""
+
+
+def compare(names: Collection[str]) -> dict[str, dict[str, float]]:
     return {
         name: {
             what: float((found - right).abs().max() / right.abs().max())
-            for what, found, right in case()
+            for what, found, right in CASES[name]()
         }
-        for name, case in CASES.items()
+        for name in names
     }
 
 
-def main(file: Path) -> None:
-    use_engine("torch")
+def main(file: Path, engine: str = "torch") -> None:
+    use_engine(engine)
     torch.set_num_threads(1)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -258,7 +278,7 @@ def main(file: Path) -> None:
                 "MASTER_PORT": str(port),
             }
             join_ranks(has_gpu=False, has_slabs=True)
-            errors = compare()
+            errors = compare(CASES if engine == "torch" else FUSED)
             if rank == TELLS:
                 file.write_text(json.dumps(errors))
             os._exit(0)
@@ -268,4 +288,4 @@ def main(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *sys.argv[2:])

@@ -15,7 +15,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.settings import ParameterSettings
-from ddrecon.variables.values import value_of
+from ddrecon.variables.values import value_of, with_values
 
 NAMES = ("lights.0.irradiance", "lights.1.radiance")
 
@@ -34,7 +34,8 @@ def test_what_each_light_has_of_a_picture_sums_to_it(ball_scene: Scene) -> None:
     lights = [Parameter(n, ParameterSettings(), 0.1, v, grid) for n, v in values.items()]
     with torch.no_grad():
         image = render_each(scene, scene.views[:1], SolveMemory())[0]
-        shares = light_shares(lights, scene, values, {scene.views[0].name: image}, {})[0]
+        pictures = {scene.views[0].name: image}
+        shares = light_shares(lights, scene, values, pictures, {}, list(pictures))[0]
     torch.testing.assert_close(shares.sum(0) + 0.01, image, rtol=0, atol=1e-5)
 
 
@@ -77,3 +78,23 @@ def test_a_light_that_starts_from_black_descends(
     wanted = replace(ball_scene.optimize, parameters={NAMES[1]: ParameterSettings()})
     scene = replace(lit(ball_scene, torch.full((3,), start)), optimize=wanted)
     assert Reconstruction(scene).parameters[0].is_fitted is is_fitted
+
+
+def test_a_light_descends_where_scattering_can_be_exchanged_for_it(ball_scene: Scene) -> None:
+    """In thin smoke both change pictures alike, so that no solve tells how bright the light is."""
+    names = (NAMES[0], "sigma_s")
+    lamp_alone = replace(ball_scene, lights=ball_scene.lights[:1])
+    thin = with_values(lamp_alone, {"density": torch.full((16, 16, 16), 1e-4)})
+    doubled = []
+    for name in names:
+        scene = with_values(thin, {name: 2 * value_of(thin, name)})
+        with torch.no_grad():
+            doubled += render_each(scene, scene.views[:1], SolveMemory())
+    torch.testing.assert_close(*doubled, rtol=0.01, atol=1e-3 * float(doubled[0].max()))
+    assert ball_scene.optimize is not None
+    for sought, is_fitted in (((NAMES[0], "density"), True), (names, False)):
+        wanted = replace(
+            ball_scene.optimize, parameters={name: ParameterSettings() for name in sought}
+        )
+        lamp = Reconstruction(replace(ball_scene, optimize=wanted)).parameters[0]
+        assert lamp.is_fitted is is_fitted

@@ -87,6 +87,17 @@ def radiance_along(
     box, None for none.
     """
     course = Course.of(medium.grid, direction)
+    gained = course.lift(follow(*step_along(medium, scatters, inflow, course), course))
+    return gained if inflow is None else gained + inflow
+
+
+def step_along(
+    medium: Medium, scatters: Tensor, inflow: Tensor | None, course: Course
+) -> tuple[Tensor, Tensor]:
+    """The part of I that a step to each cell lets pass, and what it adds, laid out for `course`.
+
+    As `radiance_along` has them. With an `inflow`, I is what there is more than that.
+    """
     scatters = course.lay(scatters)
     # over the step to each cell: the depth int kappa_t ds, and int (1 - f) kappa_s ds
     mass = _step_integral(medium.extinction, course)
@@ -99,12 +110,11 @@ def radiance_along(
     # what scatters along the step and reaches its end, and the part of I that is lost on it
     line, lost = decayed_line(scatters, course.before(scatters, is_repeated=True), depth)
     source = line * (scattering_mass * _scale(medium.remaining))
-    if inflow is None:
-        return course.lift(follow(1 - lost, source, course))
-    # Light from outside is there without a medium. The rest, I - inflow, is zero where rays enter
-    # and loses inflow * lost on every step: a white furnace stays exact.
-    source = source - inflow.view(1, -1, 1, 1) * lost
-    return course.lift(follow(1 - lost, source, course)) + inflow
+    if inflow is not None:
+        # Light from outside is there without a medium. The rest, I - inflow, is zero where rays
+        # enter and loses inflow * lost on every step: a white furnace stays exact.
+        source = source - inflow.view(1, -1, 1, 1) * lost
+    return 1 - lost, source
 
 
 def follow(passed: Tensor, source: Tensor, course: Course) -> Tensor:

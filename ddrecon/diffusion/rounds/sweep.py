@@ -15,12 +15,16 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
+from ddrecon.diffusion.rounds.slabs import REACH, pass_on, radiance_through
+from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_forward, is_fused
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
+from ddrecon.slabs.exchange import add_halo
+from ddrecon.slabs.slab import Slab
 
 DIRECTIONS = {1: 18, 3: 26, 5: 50, 7: 86}
 """By the degree to which angles are kept, directions of a rule that is exact to twice that.
@@ -57,15 +61,48 @@ class Parts(NamedTuple):
             source,
         )
 
-    def radiance(self, medium: Medium, scatters: Tensor, direction: Direction) -> Tensor:
-        """I along `direction` of what `scatters` (E11), these parts standing for the `medium`'s."""
+    def radiance(
+        self, medium: Medium, scatters: Tensor, direction: Direction, entering: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """I along `direction` of what `scatters` (E11), these parts standing for the `medium`'s.
+
+        And, in slabs, what leaves this one of what is `entering` (E56).
+        """
         field = self.extinction_field if self.scattering_field is None else self.scattering_field
         medium = replace(
             medium,
             extinction=Coefficient(self.extinction_scale, self.extinction_field),
             remaining=Coefficient(self.scattering_scale, field),
         )
-        return radiance_along(medium, scatters, self.inflow, direction)
+        if isinstance(medium.grid, Slab):
+            return radiance_through(medium, scatters, self.inflow, direction, entering)
+        return radiance_along(medium, scatters, self.inflow, direction), entering
+
+    def of_slab(self, slab: Slab, part: Slab) -> Parts:
+        """These parts of a `slab` in a `part` of it."""
+
+        def cut(field: Tensor) -> Tensor:
+            begin = part.first - slab.first
+            return field.narrow(slab.axis - 3, begin, part.shape[slab.axis])
+
+        return self._replace(
+            extinction_field=cut(self.extinction_field),
+            scattering_field=None if self.scattering_field is None else cut(self.scattering_field),
+            source=cut(self.source),
+        )
+
+    def nothing(self, grid: Grid) -> Tensor:
+        """A layer of no light, [C, z, y, x], across the slabs of `grid`; a number without slabs.
+
+        It varies where any of these parts does: in forward mode all layers are exchanged alike.
+        """
+        if not isinstance(grid, Slab):
+            return self.source.new_zeros(())
+        layer = torch.zeros_like(self.source[0].narrow(grid.axis - 3, 0, 1))
+        for part in self:
+            if part is not None and is_forward():
+                layer = layer + 0 * part.flatten()[0]
+        return layer
 
 
 class Ray(NamedTuple):
@@ -82,11 +119,16 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
     `source` [K, C, z, y, x]: moments of what scatters, to some degree; `inflow`: light from
     outside, as of `radiance_along`; `degree`: by which directions are chosen (`DIRECTIONS`).
     """
-    parts = Parts.of(medium, source, inflow)
+    parts, slab = Parts.of(medium, source, inflow), medium.grid
+    if isinstance(slab, Slab):
+        narrow = slab.narrowed(REACH)
+        medium, parts = replace(medium, grid=narrow), parts.of_slab(slab, narrow)
+    moments: Tensor
     if is_forward():
-        return _sum_over_directions(medium, degree, parts)
-    moments: Tensor = _Sweep.apply(medium, degree, *parts)
-    return moments
+        moments, _ = _sum_over_directions(medium, degree, parts)
+    else:
+        moments = _Sweep.apply(medium, degree, *parts)
+    return add_halo(moments, slab) if isinstance(slab, Slab) else moments
 
 
 def sweep_scattered(
@@ -100,7 +142,7 @@ def sweep_scattered(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    if is_fused():
+    if is_fused() and not isinstance(medium.grid, Slab):
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
         if medium.is_cellwise:
@@ -120,7 +162,8 @@ class _Sweep(torch.autograd.Function):
     def forward(ctx: Any, medium: Medium, degree: int, *parts: Any) -> Tensor:
         ctx.medium, ctx.degree = medium, degree
         ctx.save_for_backward(*parts)
-        return _sum_over_directions(medium, degree, Parts(*parts))
+        moments, ctx.entering = _sum_over_directions(medium, degree, Parts(*parts))
+        return moments
 
     @staticmethod
     def backward(ctx: Any, *moment_bars: Tensor) -> tuple[Tensor | None, ...]:
@@ -134,23 +177,33 @@ class _Sweep(torch.autograd.Function):
         varied = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
         totals = [torch.zeros_like(leaf) for leaf in varied]
         source_bar = torch.zeros_like(source) if ctx.needs_input_grad[-1] else None
-        for ray in _rays(ctx.degree, source):
+        rays = list(_rays(ctx.degree, source))
+
+        def send_back(number: int, leaving_bar: Tensor) -> Tensor:
+            ray, entering = rays[number], ctx.entering[number].requires_grad_()
             # what scatters along this direction, as a leaf, so that its cotangent is spread once
             scatters = torch.tensordot(ray.harmonics, source, 1)
             scatters.requires_grad_(source_bar is not None)
             # I along this direction once more (E11), with the graph of this direction alone
             with torch.enable_grad():
-                radiance = parts.radiance(ctx.medium, scatters, ray.direction)
+                found = parts.radiance(ctx.medium, scatters, ray.direction, entering)
             # E17 transposed: I_bar is the sum over moments of weight times moment_bar
             radiance_bar = torch.tensordot(ray.weight * ray.harmonics, moments_bar, 1)
             # E11 transposed, by autograd: what each part receives from this direction
-            wanted = varied if source_bar is None else [*varied, scatters]
-            bars = list(torch.autograd.grad(radiance, wanted, radiance_bar, allow_unused=True))
+            wanted = [entering, *varied, *([] if source_bar is None else [scatters])]
+            bars = torch.autograd.grad(
+                found, wanted, (radiance_bar, leaving_bar), allow_unused=True
+            )
             if source_bar is not None:
-                add_outer(source_bar, ray.harmonics, bars.pop())
-            for total, bar in zip(totals, bars, strict=True):
+                add_outer(source_bar, ray.harmonics, bars[-1])
+            for total, bar in zip(totals, bars[1:], strict=False):
                 if bar is not None:
                     total += bar
+            return nothing if bars[0] is None else bars[0]
+
+        nothing = parts.nothing(ctx.medium.grid).detach()
+        directions = [ray.direction for ray in rays]
+        pass_on(ctx.medium.grid, directions, nothing, send_back, is_backward=True)
         remaining = iter(totals)
         part_bars = (
             None if leaf is None or not leaf.requires_grad else next(remaining) for leaf in leaves
@@ -158,14 +211,23 @@ class _Sweep(torch.autograd.Function):
         return None, None, *part_bars, source_bar
 
 
-def _sum_over_directions(medium: Medium, degree: int, parts: Parts) -> Tensor:
-    """The means over the sphere of I Y_k (E17)."""
-    moments = torch.zeros_like(parts.source)
-    for ray in _rays(degree, parts.source):
+def _sum_over_directions(
+    medium: Medium, degree: int, parts: Parts
+) -> tuple[Tensor, dict[int, Tensor]]:
+    """The means over the sphere of I Y_k (E17), and by direction what entered a slab."""
+    grid, entered = medium.grid, dict[int, Tensor]()
+    rays = list(_rays(degree, parts.source))
+    moments = torch.zeros_like(grid.own(parts.source) if isinstance(grid, Slab) else parts.source)
+
+    def add(number: int, entering: Tensor) -> Tensor:
+        ray, entered[number] = rays[number], entering
         scatters = torch.tensordot(ray.harmonics, parts.source, 1)
-        radiance = parts.radiance(medium, scatters, ray.direction)
-        moments = add_outer(moments, ray.weight * ray.harmonics, radiance)
-    return moments
+        radiance, leaving = parts.radiance(medium, scatters, ray.direction, entering)
+        add_outer(moments, ray.weight * ray.harmonics, radiance)
+        return leaving
+
+    pass_on(grid, [ray.direction for ray in rays], parts.nothing(grid), add)
+    return moments, entered
 
 
 def add_outer(total: Tensor, factors: Tensor, field: Tensor | None) -> Tensor:

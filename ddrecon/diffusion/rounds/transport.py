@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.conservative import DiffusionProblem
-from ddrecon.diffusion.implicit import SolverWithMemory, solve_diffusion
+from ddrecon.diffusion.implicit import SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_scattered
@@ -26,6 +26,8 @@ from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.quadrature import sphere_quadrature
 from ddrecon.numerics.remember import is_any_nonzero
+from ddrecon.slabs.exchange import renew_halo
+from ddrecon.slabs.slab import Slab, whole_of
 
 SPECTRUM = 0.9
 """A finite medium's spectrum is about that part of an infinite one's."""
@@ -45,9 +47,19 @@ def run_rounds(
     """
     if rounds == 0:
         return light
+    grid = problem.medium.grid
+    light = _renewed(light, grid)
     for round_index, factor in enumerate(_blending(problem.medium, rounds), 1):
-        light = _round(problem, light, solve, degree, round_index, factor)
+        light = _renewed(_round(problem, light, solve, degree, round_index, factor), grid)
     return light
+
+
+def _renewed(light: Moments, grid: Grid) -> Moments:
+    """`light`, whose flux is right where slabs end: there it was made of half of what is around."""
+    if light.flux is None or not isinstance(grid, Slab):
+        return light
+    z, y, x = (renew_halo(along, grid) for along in light.flux)
+    return replace(light, flux=(z, y, x))
 
 
 def _round(
@@ -74,7 +86,7 @@ def _round(
     if turned is not None:
         source = source + problem.spread(turned)
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
-    mean = solve_diffusion(solve_round, operator, right + source)
+    mean = problem.solved(solve_round, right + source)
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
     new = Moments(mean, problem.flux(mean, turned))
     if swept.higher is None or factor is None:
@@ -182,7 +194,7 @@ def _transport_share(medium: Medium, degree: int) -> Tensor:
 
 def _share_length(medium: Medium, degree: int) -> Tensor:
     """exp(-p_1) (mean step) [u], by whose optical depth theta is (E30), [C or 1, 1, 1, 1]."""
-    return _mean_step(medium.grid, degree) * torch.exp(-remaining_moments(medium)[1])
+    return _mean_step(whole_of(medium.grid), degree) * torch.exp(-remaining_moments(medium)[1])
 
 
 @functools.cache

@@ -12,8 +12,11 @@ from ddrecon.grid import Grid
 from ddrecon.light.beam import Beam, leaving_cosine
 from ddrecon.march.box import intersect_box
 from ddrecon.march.emission import Emission, is_field
+from ddrecon.march.fused.cellwise import find_along_rays, table_of_cells
+from ddrecon.march.fused.layout import Layout
 from ddrecon.march.lattice import Lattice
 from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase_cells import others_of
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.chebyshev import COEFFICIENTS
 from ddrecon.numerics.remember import remember
@@ -98,12 +101,16 @@ def _bundle(
     return torch.cat([places, speeds, near[:, None], far[:, None]], 1)
 
 
-def see_beams(emission: Emission, packed: Packed) -> Along:
+def see_beams(emission: Emission, layout: Layout, packed: Packed) -> Along:
     """The beams of `emission` along rays."""
     has_peak = emission.peak is not None
     phase, degree = emission.seen.phase, emission.seen.degree
 
     def see(*towards: Tensor) -> Along:
+        if layout.form is not None:
+            others = others_of(phase)
+            given = type(phase), layout.form, len(others)
+            return _see_cellwise(packed.direction, *given, *others, *towards)
         numbers = len(phase.numbers)
         return _see_directional(
             packed.direction, type(phase), degree, has_peak, numbers, *phase.numbers, *towards
@@ -118,7 +125,7 @@ def see_beams(emission: Emission, packed: Packed) -> Along:
             seen.append(see(beam.direction))
         else:
             angles = torch.stack(beam.passing(packed.origin, packed.direction))
-            unused = angles.new_zeros(COEFFICIENTS * phase.colors, angles.shape[1])
+            unused = angles.new_zeros(layout.ray_terms, angles.shape[1])
             seen.append(Along(angles, unused, (None,)))
     feet, squares = zip(*(each.angles.split(1) for each in seen), strict=True)
     return Along(
@@ -156,11 +163,29 @@ def _see_directional(
     return Along(angles, torch.cat([none, *fitted]), (None,) * len(towards))
 
 
+@remember
+def _see_cellwise(
+    direction: Tensor, kind: type[PhaseFunction], form: str, others: int, *tensors: Tensor
+) -> Along:
+    """Beams along rays, scattered by a phase function `kind` that differs from cell to cell.
+
+    `tensors`: so many `others` of its numbers, and the unit vectors along which beams go.
+    """
+    known, towards = tensors[:others], tensors[others:]
+    cosines = [leaving_cosine(direction, each) for each in towards]
+    none, ones = direction.new_zeros(0, len(direction)), direction.new_ones(1, len(direction))
+    rows = [find_along_rays(cosine, form, kind, known) for cosine in cosines]
+    angles = [none, *(cosine[None] for cosine in cosines), *[ones] * len(towards)]
+    return Along(torch.cat(angles), torch.cat([none, *rows]), (None,) * len(towards))
+
+
 def table_of(emission: Emission) -> Tensor:
     """Coefficients of p over the angle, [phases * (steps + 1) * 2, terms], for point lights.
 
-    Without rows where there are none.
+    Without rows where there are none; `table_of_cells` where p differs from cell to cell.
     """
+    if emission.seen.phase.cells is not None:
+        return table_of_cells(emission)
     table = emission.seen.table(emission.peak is not None).to(emission.diffuse)
     has_points = any(not isinstance(beam, Beam) for beam in emission.beams)
     return table.flatten(0, 2) if has_points else table.new_empty(0, table.shape[-1])

@@ -27,20 +27,24 @@ def compose(
     scattering: Tensor,
     irradiances: Sequence[Tensor],
     factors: Sequence[Tensor | None],
+    remaining: Tensor | None = None,
 ) -> Tensor:
     """Scattered radiance and opacity [2 C, R].
 
     `out` [C (1 + beams), R] and `masses` [K, R] are the integrals; `scale` and `scattering` [C or
     1] those of both coefficients. What does not change along a ray is multiplied in here: the
     `irradiances` of beams [C or 1], and p where it is one of the `factors` [1 or C, R] (E2); the
-    scale of kappa_s; and E1's 1 - tau of what is behind.
+    scale of kappa_s, or for diffuse light that of what is `remaining`, where given; and E1's
+    1 - tau of what is behind.
     """
-    fixed = [scale, scattering, *irradiances, *(each for each in factors if each is not None)]
+    remaining = scattering if remaining is None else remaining
+    scales = scale, scattering, remaining
+    fixed = [*scales, *irradiances, *(each for each in factors if each is not None)]
     colors = len(out) // (1 + len(irradiances))
     has_colors = any(each is not None and len(each) > 1 for each in factors)
     if has_colors or is_forward() or any(each.requires_grad for each in fixed):
-        return _compose(colors, out, masses, scale, scattering, irradiances, factors)
-    weights = _weights(colors, scale, scattering, *irradiances)
+        return _compose(colors, out, masses, scale, scattering, irradiances, factors, remaining)
+    weights = _weights(colors, *scales, *irradiances)
     composed: Tensor = _Compose.apply(out, masses, weights, _phases(out.shape[1], *factors))
     return composed
 
@@ -53,21 +57,26 @@ def _compose(
     scattering: Tensor,
     irradiances: Sequence[Tensor],
     factors: Sequence[Tensor | None],
+    remaining: Tensor,
 ) -> Tensor:
     """The same by torch's operations."""
-    scattered, *arriving = out.split(colors)
+    diffuse, *arriving = out.split(colors)
+    scattered = diffuse * remaining.view(-1, 1)
     for irradiance, light, factor in zip(irradiances, arriving, factors, strict=True):
         weighted = light if factor is None else light * factor
-        scattered = scattered + weighted * (irradiance.view(-1, 1) / (4 * math.pi))
+        strength = scattering.view(-1, 1) * irradiance.view(-1, 1) / (4 * math.pi)
+        scattered = scattered + weighted * strength
     opacity = -torch.expm1(-scale.view(-1, 1).expand(colors, 1) * masses)
-    return torch.cat([scattered * scattering.view(-1, 1), opacity])
+    return torch.cat([scattered, opacity])
 
 
 @remember
-def _weights(colors: int, scale: Tensor, scattering: Tensor, *irradiances: Tensor) -> Tensor:
+def _weights(
+    colors: int, scale: Tensor, scattering: Tensor, remaining: Tensor, *irradiances: Tensor
+) -> Tensor:
     """The weights [2 + beams, C]: extinction's scale, and what diffuse light and beams count."""
     strengths = [each.view(-1) / (4 * math.pi) * scattering.view(-1) for each in irradiances]
-    rows = scale.view(-1), scattering.view(-1), *strengths
+    rows = scale.view(-1), remaining.view(-1), *strengths
     return torch.stack([row.expand(colors) for row in rows])
 
 

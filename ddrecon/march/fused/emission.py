@@ -19,7 +19,14 @@ from ddrecon.march.fused.rays import ray_types, vectors
 
 @functools.cache
 def _channels(layout: Layout) -> SimpleNamespace:
-    """Channels of color c in a node: kappa_s, diffuse light, and the mass from here to beam b."""
+    """Channels of color c in a node: kappa_s, of beams and of diffuse light, and that light itself.
+
+    And the mass from here to beam b.
+    """
+
+    @wp.func
+    def diffusing(c: int) -> int:
+        return wp.static(layout.diffusing_from) + c * wp.static(layout.diffusing_step)
 
     @wp.func
     def scattering(c: int) -> int:
@@ -33,7 +40,9 @@ def _channels(layout: Layout) -> SimpleNamespace:
     def to_light(b: int, k: int) -> int:
         return wp.static(layout.first_mass) + b * wp.static(layout.extinction) + k
 
-    return SimpleNamespace(scattering=scattering, diffuse=diffuse, to_light=to_light)
+    return SimpleNamespace(
+        diffusing=diffusing, scattering=scattering, diffuse=diffuse, to_light=to_light
+    )
 
 
 @functools.cache
@@ -48,7 +57,7 @@ def emission(layout: Layout) -> Any:
         ray: records.Ray, here: records.Stop, m: t.Mass, given: records.Bundle
     ) -> records.Stop:
         for c in range(wp.static(C)):
-            here.w[c] = here.v[at.scattering(c)] * here.v[at.diffuse(c)]
+            here.w[c] = here.v[at.diffusing(c)] * here.v[at.diffuse(c)]
             here.u[c] = ray.scale[c] * m[c * wp.static(layout.mass_step)]
         for b in range(wp.static(BEAMS)):
             for c in range(wp.static(C)):
@@ -56,7 +65,7 @@ def emission(layout: Layout) -> Any:
                 k = c * wp.static(layout.mass_step)
                 mass = m[k] + here.v[at.to_light(b, k)]
                 depth = light.depth_of(here.v, ray.peak, c, mass)
-                p = light.phase(ray, depth, b, c, here.held, given)
+                p = light.phase(ray, here.v, depth, b, c, here.held, given)
                 here.p[i] = p
                 here.w[i] = here.v[at.scattering(c)] * p
                 here.u[i] = ray.scale[c] * mass
@@ -91,8 +100,8 @@ def emission_adjoint(layout: Layout) -> Any:
         found.u = here_bar.u
         for c in range(wp.static(layout.colors)):
             k = c * wp.static(layout.mass_step)
-            found.v[at.scattering(c)] += here_bar.w[c] * here.v[at.diffuse(c)]
-            found.v[at.diffuse(c)] += here_bar.w[c] * here.v[at.scattering(c)]
+            found.v[at.diffusing(c)] += here_bar.w[c] * here.v[at.diffuse(c)]
+            found.v[at.diffuse(c)] += here_bar.w[c] * here.v[at.diffusing(c)]
             found_m[k] += here_bar.u[c] * ray.scale[c]
             ray_bar.scale[c] += here_bar.u[c] * m[k]
         for b in range(wp.static(len(layout.beams))):
@@ -141,10 +150,14 @@ def _beam_adjoint(layout: Layout) -> Any:
         here_bar.v[s] += here_bar.w[i] * here.p[i]
         p_bar = here_bar.w[i] * here.v[s]
         # p of E13 by depth = kappa_peak mass
-        depth_bar, held_bar, ray_bar = phase_adjoint(
-            ray, here.held, depth, b, c, given, here.p[i], p_bar, ray_bar, here_bar.held, bars
+        number = light.number_of(here.v, c)
+        depth_bar, number_bar, held_bar, ray_bar = phase_adjoint(
+            ray, number, depth, b, c, here.held, given, here.p[i], p_bar, ray_bar, bars
         )
-        here_bar.held = held_bar
+        here_bar.held += held_bar
+        if wp.static(layout.form is not None):
+            of_number = wp.static(layout.first_number) + c * wp.static(layout.phase_step)
+            here_bar.v[of_number] += number_bar
         if wp.static(layout.peak is not None):
             mass_bar += depth_bar * light.peak_of(here.v, ray.peak, c)
             if wp.static(bool(layout.peak)):
@@ -179,7 +192,7 @@ def emission_tangent(layout: Layout) -> Any:
     ) -> Stop:
         for c in range(wp.static(layout.colors)):
             k = c * wp.static(layout.mass_step)
-            s = at.scattering(c)
+            s = at.diffusing(c)
             d = at.diffuse(c)
             d_here.w[c] = d_here.v[s] * here.v[d] + here.v[s] * d_here.v[d]
             d_here.u[c] = d_ray.scale[c] * m[k] + ray.scale[c] * d_m[k]
@@ -224,8 +237,10 @@ def _beam_tangent(layout: Layout) -> Any:
         if wp.static(layout.peak is not None):
             peak = light.peak_of(here.v, ray.peak, c)
             d_depth = light.peak_of(d_here.v, d_ray.peak, c) * mass + peak * d_mass
+        number, d_number = light.number_of(here.v, c), light.number_of(d_here.v, c)
+        p, held, d_held = here.p[i], here.held, d_here.held
         d_p = phase_tangent(
-            ray, here.held, depth, b, c, given, here.p[i], d_ray, d_depth, d_here.held, d_given
+            ray, number, depth, b, c, held, given, p, d_ray, d_number, d_depth, d_held, d_given
         )
         d_here.w[i] = d_here.v[s] * here.p[i] + here.v[s] * d_p
         d_here.u[i] = d_ray.scale[c] * mass + ray.scale[c] * d_mass

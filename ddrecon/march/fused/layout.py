@@ -16,6 +16,10 @@ class Layout:
     `scattering` (0: it is the extinction's field again; else 1 or C), and `peak`: None without a
     forward peak, 0 where it is one number a color, else 1 or C channels. `phases`: 1, or C where
     colors have phase functions of their own. `bits` of a number: 32 or 64.
+
+    Where the phase function differs from cell to cell, `form` is how it depends on the number that
+    does (`cellwise`): a node holds as many of these as there are `phases`, and 1 or C channels
+    of what `remaining` scatters of diffuse light; else None and 0.
     """
 
     colors: int
@@ -26,6 +30,8 @@ class Layout:
     peak: int | None
     phases: int
     bits: int
+    form: str | None = None
+    remaining: int = 0
 
     @property
     def masses(self) -> int:
@@ -78,14 +84,48 @@ class Layout:
         return int(self.phases > 1)
 
     @property
+    def first_number(self) -> int:
+        """Where the numbers of phase functions begin."""
+        return self.first_peak + (self.peak or 0)
+
+    @property
+    def first_remaining(self) -> int:
+        """Where what scatters diffuse light begins, if it is not what scatters beams."""
+        return self.first_number + (self.phases if self.form else 0)
+
+    @property
+    def diffusing_from(self) -> int:
+        """Where the field that scatters diffuse light begins."""
+        return self.first_remaining if self.remaining else self.scattering_from
+
+    @property
+    def diffusing_step(self) -> int:
+        """From that of a color to that of the next one."""
+        return int(self.remaining > 1) if self.remaining else self.scattering_step
+
+    @property
+    def has_rungs(self) -> bool:
+        """Whether p is looked up by a number that differs from cell to cell."""
+        return self.form in ("even", "steep") and self.peak is not None
+
+    @property
     def terms(self) -> int:
-        """Coefficients of p over the depth of the peak: 1 where there is none."""
-        return 1 if self.peak is None else COEFFICIENTS
+        """Coefficients of p over the depth of the peak, or where there is none over the number."""
+        if self.peak is not None:
+            return COEFFICIENTS
+        return 2 if self.form == "linear" else 1
+
+    @property
+    def ray_terms(self) -> int:
+        """Numbers of each beam that a ray is given: coefficients of p, or where to find them."""
+        if self.form is None:
+            return self.phases * COEFFICIENTS
+        return 2 if self.form == "linear" else 3
 
     @property
     def channels(self) -> int:
         """All channels of a node."""
-        return self.first_peak + (self.peak or 0)
+        return self.first_remaining + self.remaining
 
     @property
     def outputs(self) -> int:

@@ -23,6 +23,7 @@ from ddrecon.march.fused.cells import cells_of
 from ddrecon.march.fused.compose import compose
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.lattice import Lattice
 
 
@@ -39,19 +40,32 @@ def march_rays(
         crossing.near,
         crossing.far,
     )
-    return crossing.hit, _integrate(emission, sampler, packed)
+    return crossing.hit, _integrate(emission, sampler, packed)[0]
+
+
+def integrate_rays(
+    emission: Emission, sampler: Bands | Equidistant, rays: Rays, crossing: Crossing
+) -> Tensor:
+    """Radiance [C] and mass [K] along those of `rays` that are in `crossing`: [C + K, P]."""
+    axis = sampler.axis if isinstance(sampler, Bands) else None
+    ends = crossing.hit, crossing.near, crossing.far
+    packed = pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
+    composed, masses = _integrate(emission, sampler, packed)
+    return torch.cat([composed[: emission.colors], masses])
 
 
 def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
     """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
     packed = pack_lattice(emission.grid, bands.axis, lattice)
-    return _integrate(emission, bands, packed).unflatten(1, lattice.shape)
+    return _integrate(emission, bands, packed)[0].unflatten(1, lattice.shape)
 
 
-def _integrate(emission: Emission, sampler: Bands | Equidistant, packed: Packed) -> Tensor:
-    """Scattered radiance and opacity [2 C, R] along rays."""
+def _integrate(
+    emission: Emission, sampler: Bands | Equidistant, packed: Packed
+) -> tuple[Tensor, Tensor]:
+    """Scattered radiance and opacity [2 C, R] along rays, and mass [K, R]."""
     layout, (cells, fields) = layout_of(emission), cells_of(sampler)
-    along, third_order = see_beams(emission, packed), sampler.channels.third_order
+    along, third_order = see_beams(emission, layout, packed), sampler.channels.third_order
     numbers = numbers_of(emission, 0.0 if third_order is None else third_order.bound)
     out, masses, _ = Integrate.apply(
         layout,
@@ -65,12 +79,14 @@ def _integrate(emission: Emission, sampler: Bands | Equidistant, packed: Packed)
     )
     irradiances = [beam.irradiance for beam in emission.beams]
     scales = emission.extinction.scale, emission.scattering.scale
-    return compose(out, masses, *scales, irradiances, along.factors)
+    remaining = None if emission.remaining is None else emission.remaining.scale
+    return compose(out, masses, *scales, irradiances, along.factors, remaining), masses
 
 
 def layout_of(emission: Emission) -> Layout:
     """How the fields of `emission` stand in a node."""
     extinction, scattering, peak = emission.extinction, emission.scattering, emission.peak
+    remaining = emission.remaining
     return Layout(
         emission.colors,
         extinction.field.shape[0],
@@ -80,4 +96,6 @@ def layout_of(emission: Emission) -> Layout:
         None if peak is None else peak.shape[0] if is_field(peak) else 0,
         emission.seen.colors,
         torch.finfo(emission.diffuse.dtype).bits,
+        form_of(emission),
+        0 if remaining is None else remaining.field.shape[0],
     )

@@ -1,35 +1,38 @@
 """p of a beam at a node (E2, E13), inside fused kernels, and both derivatives of that.
 
-Over the depth of the peak p is a polynomial, or constant without a peak. Its coefficients are the
-ray's, for light from one direction; for light from a point they come from a table, by the angle at
-the node. Without a peak, p of light from one direction is the same along the ray and comes in
-later: 1.
+It is a polynomial of coefficients that `node_curves` has. Without a peak, p of light from one
+direction is the same along the ray and comes in later: 1. Where p differs from cell to cell by g,
+it is Henyey and Greenstein's formula where that is not positive, or has no peak.
 """
 
 import functools
-import math
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.node_curves import (
+    curves,
+    is_point,
+    rungs,
+    spots,
+    spreading_curves,
+    weighing,
+)
 from ddrecon.march.fused.rays import ray_types, vectors
-from ddrecon.numerics.angle_table import STEPS
-from ddrecon.numerics.chebyshev import COEFFICIENTS, SCALE
-
-
-def _is_point(layout: Layout) -> Any:
-    """Of each beam, whether it is light from a point."""
-    numbers = [int(is_point) for is_point in layout.beams] or [0]
-    return wp.types.vector(length=len(numbers), dtype=wp.int32)(*numbers)
+from ddrecon.numerics.chebyshev import SCALE
 
 
 @functools.cache
 def node_phase(layout: Layout) -> SimpleNamespace:
-    """`peak_of` color c: kappa_peak per unit of mass; `depth_of` a mass; `phase`, p behind that."""
-    t, records, IS_POINT = vectors(layout), ray_types(layout), _is_point(layout)
-    curve_of, over_depth = _curves(layout).curve, _polynomial(layout)
+    """`peak_of` color c: kappa_peak per unit of mass; `depth_of` a mass; `phase`, p behind that.
+
+    `number_of` color c: that of the phase function there, 0 where none differs.
+    """
+    t, records, which = vectors(layout), ray_types(layout), _choices(layout)
+    curve_of, over_depth = curves(layout).curve, _polynomial(layout)
+    spot_of, plain = spots(layout).spot_of, _plain(layout)
 
     @wp.func
     def peak_of(v: t.Node, peak: t.Color, c: int) -> t.F:
@@ -44,26 +47,60 @@ def node_phase(layout: Layout) -> SimpleNamespace:
         return t.F(0.0)
 
     @wp.func
+    def number_of(v: t.Node, c: int) -> t.F:
+        if wp.static(layout.form is not None):
+            return v[wp.static(layout.first_number) + c * wp.static(layout.phase_step)]
+        return t.F(0.0)
+
+    @wp.func
     def phase(
-        ray: records.Ray, depth: t.F, b: int, c: int, held: t.F, given: records.Bundle
+        ray: records.Ray, v: t.Node, depth: t.F, b: int, c: int, held: t.F, given: records.Bundle
     ) -> t.F:
-        if wp.static(IS_POINT)[b] == 1 or wp.static(layout.peak is not None):
-            p = over_depth.value(curve_of(ray, b, c, held, given), over_depth.place(depth))
+        number = number_of(v, c)
+        if which.is_plain(number):
+            return plain.value(number, spot_of(ray, b, c, held, given).cosine)
+        if which.has_curve(b):
+            curve = curve_of(ray, number, b, c, held, given, given)
+            p = over_depth.value(curve, over_depth.place(depth, number))
             if wp.static(layout.peak is None):
                 return p
             return wp.max(p, t.F(0.0))
         return t.F(1.0)
 
-    return SimpleNamespace(peak_of=peak_of, depth_of=depth_of, phase=phase)
+    return SimpleNamespace(peak_of=peak_of, depth_of=depth_of, number_of=number_of, phase=phase)
+
+
+@functools.cache
+def _choices(layout: Layout) -> SimpleNamespace:
+    """Whether p is by its formula, `is_plain`; or by coefficients, `has_curve`; else it is 1."""
+    t, IS_POINT = vectors(layout), is_point(layout)
+    is_curved = layout.peak is not None or layout.form == "linear"
+
+    @wp.func
+    def is_plain(number: t.F) -> bool:
+        if wp.static(layout.form == "steep"):
+            return wp.static(layout.peak is None) or number <= t.F(0.0)
+        return False
+
+    @wp.func
+    def has_curve(b: int) -> bool:
+        return wp.static(is_curved) or wp.static(IS_POINT)[b] == 1
+
+    return SimpleNamespace(is_plain=is_plain, has_curve=has_curve)
 
 
 @functools.cache
 def _polynomial(layout: Layout) -> SimpleNamespace:
-    """E13 by its coefficients at the `place` of a depth: `value`, and `slope` by depth."""
+    """E13 by its coefficients at the `place` of a depth: `value`, and `slope` by depth.
+
+    Without a peak the place is the number itself.
+    """
     t, last = vectors(layout), layout.terms - 1
 
     @wp.func
-    def place(depth: t.F) -> t.F:
+    def place(depth: t.F, number: t.F) -> t.F:
+        if wp.static(layout.peak is None):
+            return number
         return t.F(1.0) - t.F(wp.static(2.0 * SCALE)) / (depth + t.F(wp.static(SCALE)))
 
     @wp.func
@@ -85,172 +122,192 @@ def _polynomial(layout: Layout) -> SimpleNamespace:
 
 
 @functools.cache
-def _spots(layout: Layout) -> SimpleNamespace:
-    """Where in the table the angle of light from a point is, and how that turns along the ray.
-
-    Four rows from `row` on, values and slopes on both sides of the angle, count by `weights`; these
-    change with the angle by `slopes`, the angle along the ray by `along` and with the square of the
-    point's distance from the ray by `across`.
-    """
-    t, Ray = vectors(layout), ray_types(layout).Ray
-    step = math.pi / STEPS
-
-    @wp.struct
-    class Spot:
-        row: int
-        weights: t.Weights
-        slopes: t.Weights
-        along: t.F
-        across: t.F
+def _plain(layout: Layout) -> SimpleNamespace:
+    """(1 - g^2) / (1 + g^2 - 2 g w)^(3/2): `value`, and slopes `by_g` and `by_cosine`."""
+    t = vectors(layout)
 
     @wp.func
-    def spot_of(ray: Ray, b: int, c: int, held: t.F) -> Spot:
-        spot = Spot()
-        apart = wp.sqrt(ray.across[b])
-        away = ray.foot[b] + held
-        square = ray.across[b] + away * away
-        spot.along = apart / square
-        spot.across = -t.F(0.5) * away / (apart * square)
-        place = wp.atan2(apart, -away) * t.F(wp.static(1.0 / step))
-        first = wp.clamp(int(place), 0, wp.static(STEPS - 1))
-        spot.row = 2 * (c * wp.static(layout.phase_step * (STEPS + 1)) + first)
-        # Hermite's cubics: values by (1 + 2 t)(1 - t)^2, slopes by t (1 - t)^2, and mirrored.
-        one, u = t.F(1.0), place - t.F(first)
-        rest = one - u
-        h = t.F(wp.static(step))
-        spot.weights = t.Weights(
-            (one + u + u) * rest * rest,
-            h * u * rest * rest,
-            (one + rest + rest) * u * u,
-            -h * rest * u * u,
-        )
-        per = t.F(wp.static(1.0 / step))
-        bend = t.F(6.0) * u * rest * per
-        spot.slopes = t.Weights(-bend, rest * (rest - u - u), bend, u * (u - rest - rest))
-        return spot
+    def square_of(g: t.F, cosine: t.F) -> t.F:
+        return t.F(1.0) + g * g - t.F(2.0) * g * cosine
 
     @wp.func
-    def weigh(table: wp.array2d(dtype=t.F), row: int, weights: t.Weights) -> t.Curve:
-        curve = t.Curve()
-        for k in range(wp.static(layout.terms)):
-            for j in range(4):
-                curve[k] += weights[j] * table[row + j, k]
-        return curve
+    def value(g: t.F, cosine: t.F) -> t.F:
+        square = square_of(g, cosine)
+        return (t.F(1.0) - g * g) / (square * wp.sqrt(square))
 
-    return SimpleNamespace(Spot=Spot, spot_of=spot_of, weigh=weigh)
+    @wp.func
+    def by_g(g: t.F, cosine: t.F) -> t.F:
+        square = square_of(g, cosine)
+        bend = t.F(3.0) * (t.F(1.0) - g * g) * (g - cosine) / square
+        return (-t.F(2.0) * g - bend) / (square * wp.sqrt(square))
+
+    @wp.func
+    def by_cosine(g: t.F, cosine: t.F) -> t.F:
+        square = square_of(g, cosine)
+        return t.F(3.0) * g * (t.F(1.0) - g * g) / (square * square * wp.sqrt(square))
+
+    return SimpleNamespace(value=value, by_g=by_g, by_cosine=by_cosine)
 
 
 @functools.cache
-def _curves(layout: Layout) -> SimpleNamespace:
-    """`curve`: the coefficients of beam b in color c over depth; `first`: where a ray's stand."""
-    t, records, spots = vectors(layout), ray_types(layout), _spots(layout)
-    IS_POINT, spot_of, weigh = _is_point(layout), spots.spot_of, spots.weigh
+def _slopes(layout: Layout) -> SimpleNamespace:
+    """The function `find` of the derivatives of p by all but its coefficients.
+
+    Those by the place in tables of the angle, and by the cosine, are of light from one direction;
+    that of light from a point turns along the ray. `place`: where on the curve p is.
+    """
+    t, records, which = vectors(layout), ray_types(layout), _choices(layout)
+    spot_of, rung_of, table = spots(layout).spot_of, rungs(layout).rung_of, weighing(layout)
+    curve_of, over_depth, plain = curves(layout).curve, _polynomial(layout), _plain(layout)
+    IS_POINT, has_spots = is_point(layout), layout.has_rungs or any(layout.beams)
+
+    @wp.struct
+    class Slopes:
+        is_lit: bool
+        place: t.F
+        depth: t.F
+        number: t.F
+        along: t.F
+        across: t.F
+        angle: t.F
+        cosine: t.F
 
     @wp.func
-    def first(b: int, c: int) -> int:
-        phase = b * wp.static(layout.phases) + c * wp.static(layout.phase_step)
-        return phase * wp.static(COEFFICIENTS)
+    def turn(slopes: Slopes, ray: records.Ray, b: int, c: int, held: t.F, given: records.Bundle):
+        """Hands the slope by a point's angle on to the ray's way past it."""
+        spot = spot_of(ray, b, c, held, given)
+        by_place = slopes.angle + slopes.cosine * spot.bend
+        slopes.along = by_place * spot.along
+        slopes.across = by_place * spot.across
+        return slopes
 
     @wp.func
-    def curve(ray: records.Ray, b: int, c: int, held: t.F, given: records.Bundle) -> t.Curve:
+    def by_curve(
+        ray: records.Ray, number: t.F, b: int, c: int, held: t.F, given: records.Bundle, place: t.F
+    ) -> Slopes:
+        slopes = Slopes()
+        slopes.place = place
+        slopes.is_lit = True
+        curve = curve_of(ray, number, b, c, held, given, given)
+        if wp.static(layout.peak is not None):
+            slopes.depth = over_depth.slope(curve, place)
+        if wp.static(layout.form == "linear"):
+            slopes.number = curve[wp.static(layout.terms - 1)]
+        if wp.static(layout.has_rungs):
+            spot = spot_of(ray, b, c, held, given)
+            rung = rung_of(number)
+            climbing = table.weigh_rungs(
+                given.table, rung.first, rung.slopes, spot.row, spot.weights
+            )
+            slopes.number = over_depth.value(climbing, place)
+            turning = table.weigh_rungs(
+                given.table, rung.first, rung.weights, spot.row, spot.slopes
+            )
+            slopes.angle = over_depth.value(turning, place)
+        elif wp.static(has_spots):
+            if wp.static(IS_POINT)[b] == 1:
+                spot = spot_of(ray, b, c, held, given)
+                turning = table.weigh(given.table, spot.row, spot.slopes)
+                slopes.angle = over_depth.value(turning, place)
+        return slopes
+
+    @wp.func
+    def find(
+        ray: records.Ray,
+        number: t.F,
+        depth: t.F,
+        b: int,
+        c: int,
+        held: t.F,
+        given: records.Bundle,
+        p: t.F,
+    ) -> Slopes:
+        slopes = Slopes()
+        if which.is_plain(number):
+            cosine = spot_of(ray, b, c, held, given).cosine
+            slopes.number = plain.by_g(number, cosine)
+            slopes.cosine = plain.by_cosine(number, cosine)
+        elif which.has_curve(b) and (wp.static(layout.peak is None) or p > t.F(0.0)):
+            slopes = by_curve(ray, number, b, c, held, given, over_depth.place(depth, number))
         if wp.static(IS_POINT)[b] == 1:
-            spot = spot_of(ray, b, c, held)
-            return weigh(given.table, spot.row, spot.weights)
-        own = t.Curve()
-        for k in range(wp.static(layout.terms)):
-            own[k] = given.coefficients[first(b, c) + k, ray.index]
-        return own
+            slopes = turn(slopes, ray, b, c, held, given)
+        return slopes
 
-    return SimpleNamespace(first=first, curve=curve)
+    return SimpleNamespace(Slopes=Slopes, find=find)
 
 
 @functools.cache
 def node_phase_adjoint(layout: Layout) -> Any:
-    """The function of the bars that `p_bar` of p behind `depth` is for depth, distance and ray.
+    """The function of the bars that `p_bar` of p is for depth, number, distance and ray.
 
     Those of coefficients are added to arrays; arrays without rows take none.
     """
-    t, records, spots = vectors(layout), ray_types(layout), _spots(layout)
-    Ray, Bundle, IS_POINT = records.Ray, records.Bundle, _is_point(layout)
-    curves, over_depth = _curves(layout), _polynomial(layout)
+    t, records, slopes = vectors(layout), ray_types(layout), _slopes(layout)
+    Ray, Bundle, IS_POINT = records.Ray, records.Bundle, is_point(layout)
+    spread_curve = spreading_curves(layout)
 
     @wp.func
     def phase_adjoint(
         ray: Ray,
-        held: t.F,
+        number: t.F,
         depth: t.F,
         b: int,
         c: int,
+        held: t.F,
         given: Bundle,
         p: t.F,
         p_bar: t.F,
         ray_bar: Ray,
-        held_bar: t.F,
         bars: Bundle,
     ):
-        depth_bar = t.F(0.0)
-        place = over_depth.place(depth)
-        has_peak = wp.static(layout.peak is not None)
-        is_lit = p > t.F(0.0) or not has_peak
-        if is_lit and (has_peak or wp.static(IS_POINT)[b] == 1):
-            curve = curves.curve(ray, b, c, held, given)
-            depth_bar = p_bar * over_depth.slope(curve, place)
-            power = p_bar
-            if wp.static(IS_POINT)[b] == 1:
-                spot = spots.spot_of(ray, b, c, held)
-                turning = spots.weigh(given.table, spot.row, spot.slopes)
-                angle_bar = p_bar * over_depth.value(turning, place)
-                ray_bar.foot[b] += angle_bar * spot.along
-                ray_bar.across[b] += angle_bar * spot.across
-                held_bar += angle_bar * spot.along
-                if bars.table.shape[0] > 0:
-                    for k in range(wp.static(layout.terms)):
-                        for j in range(4):
-                            wp.atomic_add(bars.table, spot.row + j, k, spot.weights[j] * power)
-                        power = power * place
-            elif bars.coefficients.shape[0] > 0:
-                for k in range(wp.static(layout.terms)):
-                    row = curves.first(b, c) + k
-                    bars.coefficients[row, ray.index] = bars.coefficients[row, ray.index] + power
-                    power = power * place
-        return depth_bar, held_bar, ray_bar
+        by = slopes.find(ray, number, depth, b, c, held, given, p)
+        ray_bar.foot[b] += p_bar * by.along
+        ray_bar.across[b] += p_bar * by.across
+        if by.is_lit:
+            spread_curve(ray, number, b, c, held, given, by.place, p_bar, bars)
+        if wp.static(layout.form in ("even", "steep")):  # noqa: SIM102 - static conditions alone
+            if wp.static(IS_POINT)[b] == 0 and bars.coefficients.shape[0] > 0:
+                r, at = ray.index, b * wp.static(layout.ray_terms)
+                bars.coefficients[at, r] = bars.coefficients[at, r] + p_bar * by.cosine
+                bars.coefficients[at + 2, r] = bars.coefficients[at + 2, r] + p_bar * by.angle
+        return p_bar * by.depth, p_bar * by.number, p_bar * by.along, ray_bar
 
     return phase_adjoint
 
 
 @functools.cache
 def node_phase_tangent(layout: Layout) -> Any:
-    """The function of the change of p behind `depth` with those of all its arguments."""
-    t, records, spots = vectors(layout), ray_types(layout), _spots(layout)
-    Ray, Bundle, IS_POINT = records.Ray, records.Bundle, _is_point(layout)
-    curves, over_depth = _curves(layout), _polynomial(layout)
+    """The function of the change of p with those of all its arguments."""
+    t, records, slopes = vectors(layout), ray_types(layout), _slopes(layout)
+    Ray, Bundle, IS_POINT = records.Ray, records.Bundle, is_point(layout)
+    curve_of, over_depth = curves(layout).curve, _polynomial(layout)
 
     @wp.func
     def phase_tangent(
         ray: Ray,
-        held: t.F,
+        number: t.F,
         depth: t.F,
         b: int,
         c: int,
+        held: t.F,
         given: Bundle,
         p: t.F,
         d_ray: Ray,
+        d_number: t.F,
         d_depth: t.F,
         d_held: t.F,
         d_given: Bundle,
     ) -> t.F:
-        d_p = t.F(0.0)
-        place = over_depth.place(depth)
-        has_peak = wp.static(layout.peak is not None)
-        is_lit = p > t.F(0.0) or not has_peak
-        if is_lit and (has_peak or wp.static(IS_POINT)[b] == 1):
-            d_p = over_depth.slope(curves.curve(ray, b, c, held, given), place) * d_depth
-            d_p += over_depth.value(curves.curve(ray, b, c, held, d_given), place)
-            if wp.static(IS_POINT)[b] == 1:
-                spot = spots.spot_of(ray, b, c, held)
-                d_angle = spot.along * (d_ray.foot[b] + d_held) + spot.across * d_ray.across[b]
-                turning = spots.weigh(given.table, spot.row, spot.slopes)
-                d_p += over_depth.value(turning, place) * d_angle
+        by = slopes.find(ray, number, depth, b, c, held, given, p)
+        d_p = by.depth * d_depth + by.number * d_number
+        d_p += by.along * (d_ray.foot[b] + d_held) + by.across * d_ray.across[b]
+        if by.is_lit:
+            d_p += over_depth.value(curve_of(ray, number, b, c, held, given, d_given), by.place)
+        if wp.static(layout.form in ("even", "steep")):  # noqa: SIM102 - static conditions alone
+            if wp.static(IS_POINT)[b] == 0:
+                at = b * wp.static(layout.ray_terms)
+                d_p += by.cosine * d_given.coefficients[at, ray.index]
+                d_p += by.angle * d_given.coefficients[at + 2, ray.index]
         return d_p
 
     return phase_tangent

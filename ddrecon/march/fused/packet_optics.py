@@ -48,53 +48,66 @@ struct Polynomial {{
     }}
 }};
 """
+CUBICS = """
+// A place between two of even places, where cubics have their values and slopes (Hermite).
+struct Cubic {
+    I first;
+    V part;
+    INLINE Cubic at(V place, int steps) {
+        Cubic q;
+        q.first = P::whole(P::least(P::most(place, P::all(F(0))), P::all(F(steps - 1))));
+        q.part = place - P::real(q.first);
+        return q;
+    }
+    // What value and slope at both places count, which are a `step` apart; and how that changes.
+    INLINE void weights(const Cubic& q, F step, V* w) {
+        const V u = q.part, rest = F(1) - u;
+        w[0] = (F(1) + u + u) * rest * rest;
+        w[1] = step * u * rest * rest;
+        w[2] = (F(1) + rest + rest) * u * u;
+        w[3] = -step * rest * u * u;
+    }
+    INLINE void slopes(const Cubic& q, F step, V* w) {
+        const V u = q.part, rest = F(1) - u;
+        w[0] = F(-6) * u * rest;
+        w[1] = step * rest * (rest - u - u);
+        w[2] = F(6) * u * rest;
+        w[3] = step * u * (u - rest - rest);
+    }
+};
+"""
 POINTS = f"""
 constexpr int STEPS = {STEPS};
 struct Point {{
-    // Light from a point whose foot is at -`foot` on a ray, `across` the square of its distance.
-    // Its angle lies between two of the table of p: the first of four rows, and what they count.
-    I row;
-    V weights[4];
-    INLINE Point at(V foot, V across, V t) {{
-        Point point;
+    // Light from a point whose foot is at -`foot` on a ray, `across` the square of its distance:
+    // between which angles of the table of p it is.
+    INLINE Cubic at(V foot, V across, V t) {{
         const V apart = P::root(across), away = -(foot + t);
         V place = P::all(F(0));
         for (int l = 0; l < LANES; ++l)
             P::put(place, l, wp::atan2(P::lane(apart, l), P::lane(away, l)));
-        place *= F({STEPS / math.pi!r});
-        const V first = P::real(P::whole(P::least(place, P::all(F(STEPS - 1)))));
-        const V u = place - first;
-        point.row = 2 * P::whole(first);
-        const V rest = F(1) - u, h = P::all(F({math.pi / STEPS!r}));
-        point.weights[0] = (F(1) + u + u) * rest * rest;
-        point.weights[1] = h * u * rest * rest;
-        point.weights[2] = (F(1) + rest + rest) * u * u;
-        point.weights[3] = -h * rest * u * u;
-        return point;
+        return Cubic::at(place * F({STEPS / math.pi!r}), STEPS);
     }}
     // The coefficients of p over the depth of the peak; `table` is that of the color.
-    INLINE void curve(const Point& point, const F* table, V* out) {{
-        const I at = point.row * TERMS;
+    INLINE void curve(const Cubic& angle, const F* table, V* out) {{
+        V weights[4];
+        Cubic::weights(angle, F({math.pi / STEPS!r}), weights);
+        const I at = 2 * TERMS * angle.first;
         for (int k = 0; k < TERMS; ++k) {{
-            V total = point.weights[0] * P::gather(table + k, at);
-            for (int j = 1; j < 4; ++j)
-                total += point.weights[j] * P::gather(table + j * TERMS + k, at);
+            V total = weights[0] * P::gather(table + k, at);
+            for (int j = 1; j < 4; ++j) total += weights[j] * P::gather(table + j * TERMS + k, at);
             out[k] = total;
         }}
     }}
     // What bars of these are for the table.
-    INLINE void spread(const Point& point, F* table_bar, const V* bar) {{
+    INLINE void spread(const Cubic& angle, F* table_bar, const V* bar) {{
+        V weights[4];
+        Cubic::weights(angle, F({math.pi / STEPS!r}), weights);
         for (int l = 0; l < LANES; ++l)
             for (int j = 0; j < 4; ++j)
-                for (int k = 0; k < TERMS; ++k) {{
-                    F* const at = table_bar + (P::lane_of(point.row, l) + j) * TERMS + k;
-                    const F more = P::lane(point.weights[j], l) * P::lane(bar[k], l);
-#if defined(__CUDA_ARCH__)
-                    atomicAdd(at, more);
-#else
-                    *at += more;
-#endif
-                }}
+                for (int k = 0; k < TERMS; ++k)
+                    P::add_one(table_bar + (2 * P::lane_of(angle.first, l) + j) * TERMS + k,
+                               P::lane(weights[j], l) * P::lane(bar[k], l));
     }}
     // The integral of 1 / r^2: the angle that the way subtends over the distance.
     INLINE V subtended(V foot, V across, V t0, V t1) {{

@@ -10,7 +10,8 @@ from ddrecon.kernels.packets import packet_program
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
-from ddrecon.march.fused.packet_optics import DECAYS, POINTS, POLYNOMIALS
+from ddrecon.march.fused.packet_cellwise import RUNGS, SEE
+from ddrecon.march.fused.packet_optics import CUBICS, DECAYS, POINTS, POLYNOMIALS
 from ddrecon.numerics.angle_table import STEPS
 
 GIVEN = """
@@ -22,11 +23,12 @@ int ray_count, node_count, rows, columns, plane_stride, row_stride, column_strid
 _RECORDS = """
 struct Ray {
     V o0, o1, o2, d0, d1, d2, near, far;
-    V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * PHASES * COEFFICIENTS + 1];
+    V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * RAY_TERMS + 1];
 };
 // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at
 // and `t` held in the box; values; emission, depth, exp(-depth), and p; of light from points their
-// angle, and the coefficients of p over the depth of the peak.
+// angle, and the coefficients of p over the depth of the peak. Where p differs from cell to cell,
+// how these change with the number and with the angle's place in tables; and p without a peak.
 struct Node {
     Place y, x;
     Corners q;
@@ -36,8 +38,9 @@ struct Node {
     Run run[LANES];
 #endif
     V s, t, v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
-    Point point[BEAMS + 1];
-    V curve[BEAMS * PHASES * TERMS + 1];
+    Cubic point[BEAMS + 1];
+    V curve[CURVES + 1], by_number[HAS_SLOPES * CURVES + 1], by_angle[HAS_SLOPES * CURVES + 1];
+    Plain plain[IS_STEEP * BEAMS * PHASES + 1];
 };
 """
 _BEGIN = """
@@ -58,8 +61,8 @@ for (int b = 0; b < BEAMS; ++b) {
     ray.foot[b] = P::load(angles + b * (last + 1), begin, 1, last);
     ray.across[b] = P::load(angles + (BEAMS + b) * (last + 1), begin, 1, last);
 }
-if (HAS_PEAK)
-    for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k)
+if (HAS_PEAK || HAS_NUMBERS)
+    for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         ray.coefficients[k] = P::load(coefficients + k * (last + 1), begin, 1, last);
 auto distance = [&](int n) -> V { return (planes[n] - ray.o0) / ray.d0; };
 // Nodes before the box and behind it are held at its faces: between them nothing is added.
@@ -166,47 +169,64 @@ auto locate = [&](int n, Node& node) {
     for (int c = FIRST_OWN_SCATTERING; c < FIRST_PEAK; ++c)
         node.is_empty = node.is_empty && P::every(node.v[c] == P::all(F(0)));
 };
+"""
+_EMIT = """
 auto peak_of = [&](const Node& node, int c) -> V {
     return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
 };
-auto first_of = [&](int b, int c) -> int { return (b * PHASES + c * PHASE_STEP) * COEFFICIENTS; };
+auto first_of = [&](int b, int c) -> int {
+    return b * RAY_TERMS + (HAS_NUMBERS ? 0 : c * PHASE_STEP * COEFFICIENTS);
+};
 // Of p of beam b in color c: coefficients over the depth of the peak.
 auto curve_of = [&](const Node& node, int b, int c) -> const V* {
-    if (!IS_POINT[b]) return ray.coefficients + first_of(b, c);
+    if (!IS_POINT[b] && !HAS_RUNGS) return ray.coefficients + first_of(b, c);
     return node.curve + (b * PHASES + c * PHASE_STEP) * TERMS;
 };
-// All else at node n: all outputs' emission, depth and p behind the mass `m`.
-auto emit = [&](int n, Node& node, const W* m) {
+// Whether p of a beam is by such coefficients at all, and in which lanes it is.
+auto has_curve = [&](int b) -> bool {
+    return HAS_PEAK || IS_LINEAR || (IS_POINT[b] && !IS_STEEP);
+};
+auto is_peaked = [&](const Node& node, int c) -> M {
+    return (IS_STEEP ? number_of(node, c * PHASE_STEP) : P::all(F(1))) > P::all(F(0));
+};
+// Where on that curve p is behind mass on both ways: by the depth of the peak, or by the number.
+auto place_of = [&](const Node& node, int c, V way) -> V {
+    if (HAS_PEAK) return Polynomial::place(peak_of(node, c) * way);
+    return IS_LINEAR ? number_of(node, c * PHASE_STEP) : P::all(F(0));
+};
+// All else at node n: all outputs' emission, depth and p behind the mass `m`; if p of light from
+// one direction `turns` with that, how p changes as well.
+auto emit = [&](int n, Node& node, const W* m, bool turns = false) {
     sample(node, n, EXTINCTION, FIRST_OWN_SCATTERING);
-    if (IS_PEAK_FIELD) sample(node, n, FIRST_PEAK, CHANNELS);
+    if (FIRST_PEAK < CHANNELS) sample(node, n, FIRST_PEAK, CHANNELS);
     for (int k = 0; k < MASSES; ++k) {
         const V bent = bound * node.bend[k];
         node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
     }
     for (int c = 0; c < C; ++c) {
-        const V scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
+        const V scattering = node.v[FIRST_DIFFUSING + c * DIFFUSING_STEP];
         node.w[c] = scattering * node.v[FIRST_DIFFUSE + c * DIFFUSE_STEP];
         node.u[c] = scale[c] * P::narrow(m[c * MASS_STEP]);
     }
     for (int b = 0; b < BEAMS; ++b) {
         if (IS_POINT[b]) {
             node.point[b] = Point::at(ray.foot[b], ray.across[b], node.t);
-            for (int h = 0; h < PHASES; ++h)
+            for (int h = 0; h < PHASES && !HAS_RUNGS && !IS_STEEP; ++h)
                 Point::curve(node.point[b], table + h * TABLE_STEP,
                              node.curve + (b * PHASES + h) * TERMS);
         }
+        if (HAS_RUNGS || IS_STEEP) see_number(node, b, turns && !IS_POINT[b]);
         for (int c = 0; c < C; ++c) {
             const int i = C + b * C + c;
             const V mass = P::narrow(m[c * MASS_STEP]);
             const V scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
             const V way = mass + node.v[FIRST_MASS + b * EXTINCTION + c * MASS_STEP];
             V p = P::all(F(1));
-            if (HAS_PEAK) {
-                const V place = Polynomial::place(peak_of(node, c) * way);
-                p = Polynomial::at(curve_of(node, b, c), place);
-                p = P::most(p, P::all(F(0)));
-            } else if (IS_POINT[b]) {
-                p = curve_of(node, b, c)[0];
+            if (has_curve(b)) p = Polynomial::at(curve_of(node, b, c), place_of(node, c, way));
+            if (HAS_PEAK) p = P::most(p, P::all(F(0)));
+            if (IS_STEEP) {
+                const V plain = node.plain[b * PHASES + c * PHASE_STEP].value;
+                p = HAS_PEAK ? P::pick(is_peaked(node, c), p, plain) : plain;
             }
             node.p[i] = p;
             node.w[i] = scattering * p;
@@ -229,21 +249,28 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 
 
 def packet_kernel(
-    name: str, layout: Layout, walk: str, given: str, changes: bool = False
+    name: str,
+    layout: Layout,
+    walk: str,
+    given: str,
+    has_slopes: bool = True,
+    changes: bool = False,
 ) -> TextKernel:
     """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`.
 
-    With `changes` it is given `all_fields`: `fields`, from which it samples, and their changes.
+    It `has_slopes` of p at nodes, which the integral itself does not need. With `changes` it is given `all_fields`: `fields`, from which it samples, and their changes.
     """
-    structs = PLACES + RUNS + ROWS + VALUES + DECAYS + POLYNOMIALS + POINTS + _RECORDS
+    optics = DECAYS + POLYNOMIALS + CUBICS + POINTS + RUNGS
+    structs = PLACES + RUNS + ROWS + VALUES + optics + _RECORDS
     chosen = "const F* const* fields = all_fields;" if changes else ""
-    text = _constants(layout) + structs + chosen + _BEGIN + walk
+    constants = _constants(layout, has_slopes)
+    text = constants + structs + chosen + _BEGIN + SEE + _EMIT + walk
     fields = f"all_fields[{2 * layout.channels}]" if changes else f"fields[{layout.channels}]"
     declared = f"{GIVEN} F *{fields}; {given}"
     return TextKernel(name, layout.bits, text, declared, packet_program)
 
 
-def _constants(layout: Layout) -> str:
+def _constants(layout: Layout, has_slopes: bool) -> str:
     """Where in a node the channels of color c are: the first of a kind plus c times its step."""
     numbers = {
         "MOST_RUNS": 5,
@@ -266,10 +293,23 @@ def _constants(layout: Layout) -> str:
         "PHASES": layout.phases,
         "PHASE_STEP": layout.phase_step,
         "TERMS": layout.terms,
-        "TABLE_STEP": 2 * (STEPS + 1) * layout.terms,
-        "HAS_PEAK": int(layout.peak is not None),
-        "IS_PEAK_FIELD": int(bool(layout.peak)),
+        "CURVES": len(layout.beams) * layout.phases * layout.terms,
+        "TABLE_STEP": 0 if layout.form else 2 * (STEPS + 1) * layout.terms,
+        "RAY_TERMS": layout.ray_terms,
+        "FIRST_DIFFUSING": layout.diffusing_from,
+        "DIFFUSING_STEP": layout.diffusing_step,
+        "FIRST_NUMBER": layout.first_number,
+    }
+    answers = {
+        "HAS_NUMBERS": layout.form is not None,
+        "HAS_RUNGS": layout.has_rungs,
+        "IS_STEEP": layout.form == "steep",
+        "IS_LINEAR": layout.form == "linear",
+        "HAS_SLOPES": has_slopes and layout.has_rungs,
+        "HAS_PEAK": layout.peak is not None,
+        "IS_PEAK_FIELD": bool(layout.peak),
     }
     lines = [f"constexpr int {name} = {number};" for name, number in numbers.items()]
+    lines += [f"constexpr bool {name} = {int(answer)};" for name, answer in answers.items()]
     points = ", ".join(str(int(is_point)) for is_point in (*layout.beams, False))
     return "\n" + "\n".join([*lines, f"constexpr int IS_POINT[BEAMS + 1] = {{{points}}};"])

@@ -17,9 +17,10 @@ _WALK = """
 const F *d_scale = d_numbers, *d_peaks = d_numbers + C;
 const F d_bound = d_numbers[2 * C];
 const V none = P::all(F(0));
-V d_coefficients_of[BEAMS * PHASES * COEFFICIENTS + 1];
-if (HAS_PEAK && d_coefficients)
-    for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k)
+V d_coefficients_of[BEAMS * RAY_TERMS + 1];
+const bool turns = HAS_NUMBERS && d_coefficients;
+if ((HAS_PEAK || HAS_NUMBERS) && d_coefficients)
+    for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         d_coefficients_of[k] = P::load(d_coefficients + k * (last + 1), begin, 1, last);
 auto sample_change = [&](Node& change, int n, int from, int to) {
     fields = all_fields + CHANNELS;
@@ -42,25 +43,50 @@ auto locate_change = [&](int n, Node& node, Node& change) {
     for (int c = FIRST_OWN_SCATTERING; c < FIRST_PEAK; ++c)
         node.is_empty = node.is_empty && P::every(change.v[c] == none);
 };
-// The change of p in the depth of its peak, `depth`, and in its coefficients.
-auto change_of_p = [&](Node& node, int b, int c, V p, V depth, V d_depth) -> V {
-    const int phase = b * PHASES + c * PHASE_STEP;
-    V d_curve[TERMS];
-    const V* d_terms = d_coefficients ? d_coefficients_of + phase * COEFFICIENTS : nullptr;
-    if (IS_POINT[b] && d_table) {
+// The changes of p's coefficients themselves, if they change: by rays, or by tables.
+auto changing_curve = [&](const Node& node, int b, int c, V* d_curve) -> const V* {
+    if (!IS_POINT[b] && !HAS_RUNGS)
+        return d_coefficients ? d_coefficients_of + first_of(b, c) : nullptr;
+    if (!d_table) return nullptr;
+    if (HAS_RUNGS) {
+        V cosine;
+        const Cubic angle = angle_of(node, b, cosine);
+        const V place = Rungs::place(number_of(node, c * PHASE_STEP));
+        const Cubic rung = Cubic::at(place, LAST_RUNG);
+        Rungs::read(d_table, rung, angle, d_curve, nullptr, nullptr);
+    } else {
         Point::curve(node.point[b], d_table + c * PHASE_STEP * TABLE_STEP, d_curve);
-        d_terms = d_curve;
-    } else if (IS_POINT[b]) d_terms = nullptr;
-    if (!HAS_PEAK) return IS_POINT[b] && d_terms ? d_terms[0] : none;
-    const V place = Polynomial::place(depth);
-    V d_p = d_depth * Polynomial::slope(curve_of(node, b, c), place);
-    if (d_terms) d_p += Polynomial::at(d_terms, place);
-    return P::pick(p > none, d_p, none);
+    }
+    return d_curve;
+};
+// The change of p on the way `way` to the light, of which the depth of its peak changes.
+auto change_of_p = [&](const Node& node, const Node& change, int b, int c, V way, V d_depth) -> V {
+    const int phase = b * PHASES + c * PHASE_STEP;
+    const V d_number = HAS_NUMBERS ? change.v[FIRST_NUMBER + c * PHASE_STEP] : none;
+    V d_p = none, d_plain = none;
+    if (has_curve(b)) {
+        V d_curve[TERMS];
+        const V place = place_of(node, c, way), *curve = curve_of(node, b, c);
+        const V* d_terms = changing_curve(node, b, c, d_curve);
+        if (d_terms) d_p = Polynomial::at(d_terms, place);
+        if (HAS_PEAK) d_p += d_depth * Polynomial::slope(curve, place);
+        if (IS_LINEAR) d_p += d_number * curve[TERMS - 1];
+        if (HAS_RUNGS) d_p += d_number * Polynomial::at(node.by_number + phase * TERMS, place);
+        if (HAS_RUNGS && turns && !IS_POINT[b])
+            d_p += d_coefficients_of[b * RAY_TERMS + 2]
+                 * Polynomial::at(node.by_angle + phase * TERMS, place);
+        if (HAS_PEAK) d_p = P::pick(node.p[(1 + b) * C + c] > none, d_p, none);
+    }
+    if (!IS_STEEP) return d_p;
+    d_plain = node.plain[phase].by_g * d_number;
+    if (turns && !IS_POINT[b])
+        d_plain += node.plain[phase].by_cosine * d_coefficients_of[b * RAY_TERMS];
+    return HAS_PEAK ? P::pick(is_peaked(node, c), d_p, d_plain) : d_plain;
 };
 // The change of all else at node n, behind the mass `m` and its change.
 auto emit_change = [&](int n, Node& node, Node& change, const W* m, const V* d_m) {
     sample_change(change, n, EXTINCTION, FIRST_OWN_SCATTERING);
-    if (IS_PEAK_FIELD) sample_change(change, n, FIRST_PEAK, CHANNELS);
+    if (FIRST_PEAK < CHANNELS) sample_change(change, n, FIRST_PEAK, CHANNELS);
     for (int k = 0; k < MASSES; ++k) {
         const V bend = node.bend[k], bent = bound * bend;
         const V inverse = F(1) / P::root(F(1) + bent * bent);
@@ -68,7 +94,7 @@ auto emit_change = [&](int n, Node& node, Node& change, const W* m, const V* d_m
             * (change.bend[k] - bent * bend * bend * d_bound);
     }
     for (int c = 0; c < C; ++c) {
-        const int s = FIRST_SCATTERING + c * SCATTERING_STEP, k = c * MASS_STEP;
+        const int s = FIRST_DIFFUSING + c * DIFFUSING_STEP, k = c * MASS_STEP;
         const int d = FIRST_DIFFUSE + c * DIFFUSE_STEP;
         change.w[c] = change.v[s] * node.v[d] + node.v[s] * change.v[d];
         change.u[c] = scale[c] * d_m[k] + d_scale[c] * P::narrow(m[k]);
@@ -78,15 +104,14 @@ auto emit_change = [&](int n, Node& node, Node& change, const W* m, const V* d_m
             const int i = C + b * C + c, k = c * MASS_STEP, j = FIRST_MASS + b * EXTINCTION + k;
             const int s = FIRST_SCATTERING + c * SCATTERING_STEP;
             const V way = P::narrow(m[k]) + node.v[j], d_way = d_m[k] + change.v[j];
-            V depth = none, d_depth = none;
+            V d_depth = none;
             if (HAS_PEAK) {
                 const V peak = peak_of(node, c);
                 const V d_peak = IS_PEAK_FIELD ? change.v[FIRST_PEAK + c * PEAK_STEP]
                                                : P::all(d_peaks[c]);
-                depth = peak * way;
                 d_depth = peak * d_way + d_peak * way;
             }
-            const V d_p = change_of_p(node, b, c, node.p[i], depth, d_depth);
+            const V d_p = change_of_p(node, change, b, c, way, d_depth);
             change.w[i] = change.v[s] * node.p[i] + node.v[s] * d_p;
             change.u[i] = scale[c] * d_way + d_scale[c] * way;
         }
@@ -107,7 +132,7 @@ for (int n = first_node + 1; n <= last_node; ++n) {
     b->is_lit = !(a->is_empty && b->is_empty);
     if (b->is_lit) {
         if (!a->is_lit) {
-            emit(n - 1, *a, m);
+            emit(n - 1, *a, m, turns);
             emit_change(n - 1, *a, *d_a, m, d_m);
         }
         // The mass passed on the way to the next node, and what it emits behind that.
@@ -115,7 +140,7 @@ for (int n = first_node + 1; n <= last_node; ++n) {
             m[k] += mass_between(*a, *b, k);
             d_m[k] += F(0.5) * (d_a->v[k] + d_b->v[k]) * (b->t - a->t);
         }
-        emit(n, *b, m);
+        emit(n, *b, m, turns);
         emit_change(n, *b, *d_b, m, d_m);
         // E2, E3: what arrives from the segment between both.
         for (int i = 0; i < OUT; ++i) {

@@ -54,7 +54,7 @@ const V none = P::all(F(0));
 V inside = none;
 for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
 V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], bound_bar = none;
-V polynomial_bar[BEAMS * PHASES * COEFFICIENTS + 1];
+V polynomial_bar[BEAMS * RAY_TERMS + 1];
 const bool varies_polynomials = polynomials_bar;
 for (int i = 0; i < OUT; ++i)
     bar[i] = inside * P::load(out_bar + (long long)i * (last + 1), begin, 1, last);
@@ -65,12 +65,25 @@ for (int k = 0; k < EXTINCTION; ++k) {
     m[k] = P::load_wide(masses + row, begin, last);
 }
 for (int c = 0; c < C; ++c) scale_bar[c] = peak_bar[c] = none;
-for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k) polynomial_bar[k] = none;
+for (int k = 0; k < BEAMS * RAY_TERMS; ++k) polynomial_bar[k] = none;
+// Of p in tables by number and angle, the bars of both.
+auto finish_rungs = [&](const Node& node, int b, int c, V p_bar, V place, V* v_bar) {
+    const int first = (b * PHASES + c * PHASE_STEP) * TERMS;
+    v_bar[FIRST_NUMBER + c * PHASE_STEP] += p_bar * Polynomial::at(node.by_number + first, place);
+    if (!IS_POINT[b] && varies_polynomials)
+        polynomial_bar[b * RAY_TERMS + 2] += p_bar * Polynomial::at(node.by_angle + first, place);
+};
+auto spread_to_rungs = [&](const Node& node, int b, int c, const V* curve_bar) {
+    V cosine;
+    const Cubic angle = angle_of(node, b, cosine);
+    const V place = Rungs::place(number_of(node, c * PHASE_STEP));
+    Rungs::spread(table_bar, Cubic::at(place, LAST_RUNG), angle, curve_bar);
+};
 // What node b emits, and its values go back to the cells. Its mass is that behind it, `m_b`.
 auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_bar, const V* u_bar,
                   V* m_bar) {
     for (int c = 0; c < C; ++c) {
-        const int k = c * MASS_STEP, s = FIRST_SCATTERING + c * SCATTERING_STEP;
+        const int k = c * MASS_STEP, s = FIRST_DIFFUSING + c * DIFFUSING_STEP;
         const int d = FIRST_DIFFUSE + c * DIFFUSE_STEP;
         const V mass = P::narrow(m_b[k]), scattering = node.v[s];
         v_bar[s] += w_bar[c] * node.v[d];
@@ -90,21 +103,31 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
             const V p_bar = w_bar[i] * scattering;
             V depth_bar = none;
             // What scatters nothing has no phase function to vary.
-            if ((HAS_PEAK || IS_POINT[b]) && !node.is_empty) {
-                const V place = Polynomial::place(HAS_PEAK ? peak_of(node, c) * way : none);
-                V power = HAS_PEAK ? P::pick(node.p[i] > none, p_bar, none) : p_bar;
-                if (HAS_PEAK)
-                    depth_bar = power * Polynomial::slope(curve_of(node, b, c), place);
+            if (has_curve(b) && !node.is_empty) {
+                const V place = place_of(node, c, way), *curve = curve_of(node, b, c);
+                const M counts = (node.p[i] > none) & is_peaked(node, c);
+                V power = HAS_PEAK ? P::pick(counts, p_bar, none) : p_bar;
+                if (HAS_PEAK) depth_bar = power * Polynomial::slope(curve, place);
+                if (IS_LINEAR) v_bar[FIRST_NUMBER + c * PHASE_STEP] += power * curve[TERMS - 1];
+                if (HAS_RUNGS) finish_rungs(node, b, c, power, place, v_bar);
                 V powers[TERMS];
                 for (int k = 0; k < TERMS; ++k) {
                     powers[k] = power;
                     power *= place;
                 }
-                if (IS_POINT[b] && table_bar)
+                if (HAS_RUNGS && table_bar) spread_to_rungs(node, b, c, powers);
+                if (!HAS_RUNGS && IS_POINT[b] && table_bar)
                     Point::spread(node.point[b], table_bar + c * PHASE_STEP * TABLE_STEP, powers);
-                if (!IS_POINT[b] && varies_polynomials)
+                if (!HAS_RUNGS && !IS_POINT[b] && varies_polynomials)
                     for (int k = 0; k < TERMS; ++k)
                         polynomial_bar[first_of(b, c) + k] += powers[k];
+            }
+            if (IS_STEEP) {
+                const Plain& plain = node.plain[b * PHASES + c * PHASE_STEP];
+                const V plain_bar = HAS_PEAK ? P::pick(is_peaked(node, c), none, p_bar) : p_bar;
+                v_bar[FIRST_NUMBER + c * PHASE_STEP] += plain_bar * plain.by_g;
+                if (!IS_POINT[b] && varies_polynomials)
+                    polynomial_bar[b * RAY_TERMS] += plain_bar * plain.by_cosine;
             }
             if (HAS_PEAK) {
                 way_bar += depth_bar * peak_of(node, c);
@@ -133,7 +156,7 @@ for (int c = 0; c < CHANNELS; ++c) b_bar[c] = none;
 for (int i = 0; i < OUT; ++i) wb_bar[i] = ub_bar[i] = none;
 if (first_node < last_node) {
     locate(last_node, *b);
-    emit(last_node, *b, m);
+    emit(last_node, *b, m, varies_polynomials);
 }
 // Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
 for (int n = last_node - 1; n >= first_node; --n) {
@@ -143,7 +166,7 @@ for (int n = last_node - 1; n >= first_node; --n) {
         m_b[k] = m[k];
         m[k] -= mass_between(*a, *b, k);
     }
-    emit(n, *a, m);
+    emit(n, *a, m, varies_polynomials);
     const bool is_empty = a->is_empty && b->is_empty;
     for (int i = 0; i < OUT; ++i) {
         V by_a = none, by_b = none;
@@ -184,7 +207,7 @@ for (int c = 0; c < C; ++c) {
 }
 numbers_bar[2 * C * packets + item] = P::sum(bound_bar);
 if (varies_polynomials)
-    for (int k = 0; k < BEAMS * PHASES * COEFFICIENTS; ++k)
+    for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
             polynomials_bar[(long long)k * (last + 1) + begin + l] =
                 P::lane(polynomial_bar[k], l);
@@ -194,7 +217,7 @@ if (varies_polynomials)
 @functools.cache
 def packet_integral_kernel(layout: Layout) -> TextKernel:
     """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
-    return packet_kernel("integrate", layout, _INTEGRATE, "F *out; double *masses")
+    return packet_kernel("integrate", layout, _INTEGRATE, "F *out; double *masses", False)
 
 
 @functools.cache

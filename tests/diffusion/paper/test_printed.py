@@ -31,6 +31,7 @@ TO_ROUNDING: dict[str, Any] = {
     "rtol": 1e-6,
     "check_forward_ad": True,
     "nondet_tol": 1e-10,
+    "fast_mode": True,
 }
 
 

@@ -52,7 +52,7 @@ class Rows:
         # slabs begin anew in the middle, where the ways meet
         low, high = self.depth // 2, self.depth - self.depth // 2
         self.slabs = -(-low // self.slab) + -(-high // self.slab)
-        self.fields, self.ranges = surround(self._matter(), self.pitch)
+        self.fields, self.ranges, self.densest = surround(self._matter(), self.pitch)
         self.channels = [len(field) for field in swept.fields]
 
     def follow(self, is_saved: bool) -> tuple[Tensor, Tensor | None]:
@@ -133,7 +133,7 @@ class Rows:
             "slab": self.slab, "slabs": self.slabs, "directions": swept.directions,
             "extinction": self.fields[0], "scattering": self.fields[-1],
             "scales": swept.scales, "parts": tables.parts, "matrices": tables.matrices,
-            "ranges": self.ranges, "groups": tables.groups, "points": tables.points,
+            "ranges": self.ranges, "densest": self.densest, "groups": tables.groups, "points": tables.points,
             "pairs": tables.pairs, "order": tables.moments, "depth": self.depth,
             "height": self.height, "width": self.width, "pitch": self.pitch,
             "colors": self.colors, "count": self.count, "even": tables.even, "most": tables.most,

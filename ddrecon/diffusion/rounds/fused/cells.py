@@ -72,7 +72,7 @@ for (int point = 0; point < point_count; ++point) {
         from.at[a] = from.at[a] < 0 ? 0 : from.at[a] < n[a] ? from.at[a] : n[a] - 1;
     far += part * near[all + index(from)];
 }
-const bool is_empty = false;
+const bool is_empty = false, is_all_thin = false;
 const F near_here = near[all + cell], mass = half_step * (e[cell] + e_far);
 const F scattering_mass = SHARES_FIELD ? mass : half_step * (sc[cell] + sc_far);
 """

@@ -84,6 +84,7 @@ for (int t = height - 1; t >= 0; --t) {
     to_directions(to_weighted_light, read, bar_of, 0, width);
     const int* range = ranges + 4 * (k * height + r);
     const int from = range[0], to = range[1];
+    const F deepest = scale * densest[k * height + r];
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
     F *__restrict source_bars = scratch_row(own + 0), *__restrict passing = scratch_row(own + 1);
     F *__restrict scale_bar = scratch_row(own + 2), *__restrict strength_bar = scratch_row(own + 3);
@@ -124,8 +125,9 @@ for (int t = height - 1; t >= 0; --t) {
             back_from[i] = (is_inside ? back_lines[place] + own_back_line : empty_row)
                 + point[3 * i + 2] * x_way;
         }
-        auto pass = [&](auto points, auto along, auto empty, int from, int to) {
-            constexpr bool is_empty = decltype(empty)::value;
+        auto pass = [&](auto points, auto along, auto matter, int from, int to) {
+            constexpr bool is_empty = decltype(matter)::is_empty;
+            constexpr bool is_all_thin = decltype(matter)::is_thin;
             INDEPENDENT
             for (int c = from; c < to; ++c) {"""
     + ENDS
@@ -155,7 +157,8 @@ for (int t = height - 1; t >= 0; --t) {
         };
         auto pass_all = [&](auto points, auto along) {
             pass(points, along, Empty(), 0, from);
-            pass(points, along, Filled(), from, to);
+            if (is_thin_row) pass(points, along, Thin(), from, to);
+            else pass(points, along, Thick(), from, to);
             pass(points, along, Empty(), to, width);
         };
         if (is_along) {

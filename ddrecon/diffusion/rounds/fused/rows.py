@@ -9,7 +9,8 @@ are kept, each in the place of one that no step needs any more. I before each sl
 saved: for the adjoint, light goes through a slab once more, and lines of all its slices are kept.
 
 Behind each row there are at least two cells that hold what is beyond its ends. Where a step meets
-no medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row.
+no medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row. In
+`Thin` ones no step is half an optical depth, and what passes needs no exponential.
 """
 
 from ddrecon.diffusion.rounds.fused.jobs import Job
@@ -22,7 +23,7 @@ POINTERS = 64
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
     F *found, *saved, *returning, *e_bar, *sc_bar, *light_parts[5], *source_parts[5], *bars[5];
-    double *sums; int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
+    F *densest; double *sums; int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
     int directions, extinction_channels, scattering_channels
 """
@@ -56,8 +57,9 @@ auto save_of = [&](int s, int t, int direction) -> long long {
 };
 F* own_scratch = scratch + ((long long)lane * scratch_rows) * pitch;
 auto scratch_row = [&](int i) -> F* { return own_scratch + (long long)i * pitch; };
-struct Empty { enum { value = 1 }; };
-struct Filled { enum { value = 0 }; };
+struct Empty { enum { is_empty = 1, is_thin = 1 }; };
+struct Thin { enum { is_empty = 0, is_thin = 1 }; };
+struct Thick { enum { is_empty = 0, is_thin = 0 }; };
 struct One { enum { value = 1 }; };
 struct Two { enum { value = 2 }; };
 struct Four { enum { value = 4 }; };
@@ -86,6 +88,7 @@ const int* point = points + 16 * (begin + j) + 3;
 const int point_count = point[-3], x_way = point[-2], is_along = point[-1];
 const int used = point_count == 1 && !is_along ? 1 : 4;
 const F half_step = parts[5 * (begin + j)];
+const bool is_thin_row = half_step * deepest < F(0.25);
 const F part[4] = {parts[5 * (begin + j) + 1], parts[5 * (begin + j) + 2],
                    parts[5 * (begin + j) + 3], parts[5 * (begin + j) + 4]};
 """
@@ -123,16 +126,17 @@ const F mass = half_step * (e[c] + gather(points, e_from, part, c));
 const F scattering_mass
     = SHARES_FIELD ? mass : half_step * (sc[c] + gather(points, sc_from, part, c));
 """
-# phi, psi and what is lost, of the depth of a step; and what of its source reaches its end.
+# phi, psi, what passes and what is lost, of the depth of a step; and what of its source reaches its
+# end. `is_all_thin`: so are all steps of a stretch.
 DECAYED = """
 const F depth_of_step = is_empty ? F(0) : scale * mass;
-const F passed = is_empty ? F(1) : decay(depth_of_step);
-const bool is_thin = is_empty || depth_of_step < F(0.5);
+const F kept = is_all_thin ? F(0) : decay(depth_of_step);
+const bool is_thin = is_all_thin || depth_of_step < F(0.5);
 const F inverse = F(1) / (is_thin ? F(0.5) : depth_of_step);
 const F series = psi_series(is_thin ? depth_of_step : F(0));
-const F phi = is_empty ? F(1) : is_thin ? F(1) - depth_of_step * series : (F(1) - passed) * inverse;
+const F phi = is_empty ? F(1) : is_thin ? F(1) - depth_of_step * series : (F(1) - kept) * inverse;
 const F psi = is_empty ? F(0.5) : is_thin ? series : (F(1) - phi) * inverse;
-const F lost = depth_of_step * phi;
+const F lost = depth_of_step * phi, passed = is_all_thin ? F(1) - lost : kept;
 const F line_mean = far * phi + (near_here - far) * psi;
 """
 # E11 transposed, the source being line times scattering depth: cotangents of the step's numbers.
@@ -173,6 +177,7 @@ for (int t = 0; t < height; ++t) {
     // Where steps meet a medium, and where what scatters is asked for.
     const int* range = ranges + 4 * (k * height + r);
     const int from = range[0], to = range[1];
+    const F deepest = scale * densest[k * height + r];
     const int near_begin = KEEPS ? 0 : range[2], near_end = KEEPS ? width : range[3];
     auto read = [&](int k, F* row, int from, int to) {
         read_scattering(color * cells + at, k, row, from, to);
@@ -196,8 +201,9 @@ for (int t = 0; t < height; ++t) {
         }"""
     + UPSTREAM
     + """
-        auto pass = [&](auto points, auto along, auto empty, int from, int to) {
-            constexpr bool is_empty = decltype(empty)::value;
+        auto pass = [&](auto points, auto along, auto matter, int from, int to) {
+            constexpr bool is_empty = decltype(matter)::is_empty;
+            constexpr bool is_all_thin = decltype(matter)::is_thin;
             INDEPENDENT
             for (int c = from; c < to; ++c) {
                 const F arriving = gather(points, light_from, part, c);
@@ -217,7 +223,8 @@ for (int t = 0; t < height; ++t) {
         };
         auto pass_all = [&](auto points, auto along) {
             pass(points, along, Empty(), 0, from);
-            pass(points, along, Filled(), from, to);
+            if (is_thin_row) pass(points, along, Thin(), from, to);
+            else pass(points, along, Thick(), from, to);
             pass(points, along, Empty(), to, width);
         };
         if (is_along) {

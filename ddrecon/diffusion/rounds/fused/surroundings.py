@@ -19,6 +19,7 @@ const int z = item / (height + 2) - 1, y = item % (height + 2) - 1;
 const bool is_inside = z >= 0 && z < depth && y >= 0 && y < height;
 const long long rows = (long long)(depth + 2) * (height + 2);
 int from = width, to = 0;
+F top = F(0);
 F* begin = larger;
 for (int field = 0; field < fields; ++field) {
     const F* cells = field ? scattering : extinction;
@@ -31,12 +32,14 @@ for (int field = 0; field < fields; ++field) {
         for (int c = 0; is_inside && c < width; ++c) {
             const F value = cells[row * width + c];
             out[c] = value;
+            top = field == 0 && value > top ? value : top;
             from = value != F(0) && c < from ? c : from;
             to = value != F(0) ? c + 1 : to;
         }
     }
     begin += MARGIN + channels * rows * pitch;
 }
+tops[item] = top;
 occupied[2 * item] = from;
 occupied[2 * item + 1] = to;
 """
@@ -48,10 +51,12 @@ _REACH = (
 const int z = item / height, y = item % height;
 for (int cells = 1; cells <= 2; ++cells) {
     int from = width, to = 0;
+    F top = F(0);
     for (int k = z - cells; k <= z + cells; ++k)
         for (int r = y - cells; r <= y + cells; ++r) {
             if (k < 0 || k >= depth || r < 0 || r >= height) continue;
-            const int* one = occupied + 2 * ((k + 1) * (height + 2) + r + 1);
+            const int row = (k + 1) * (height + 2) + r + 1, *one = occupied + 2 * row;
+            top = tops[row] > top ? tops[row] : top;
             from = one[0] < from ? one[0] : from;
             to = one[1] > to ? one[1] : to;
         }
@@ -59,6 +64,7 @@ for (int cells = 1; cells <= 2; ++cells) {
     from = from > cells ? from - cells : 0;
     to = (to + cells + MARGIN - 1) / MARGIN * MARGIN;
     int* range = ranges + 4 * item + 2 * (cells - 1);
+    if (cells == 1) densest[item] = top;
     range[0] = is_met ? from / MARGIN * MARGIN : 0;
     range[1] = is_met ? to < width ? to : width : 0;
 }
@@ -66,12 +72,13 @@ for (int cells = 1; cells <= 2; ++cells) {
 )
 
 
-def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor]:
-    """One or two `fields` [K, z, y, x], with empty cells around them; and `ranges` of their rows.
+def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor, Tensor]:
+    """One or two `fields` [K, z, y, x] with empty cells around them, `ranges` and `densest` of rows.
 
     They are flat: MARGIN zeros and [K, z + 2, y + 2, pitch]. `ranges` [z, y, 4]: from and to where
     steps to the cells of a row meet a medium, and where those meet one that begin at these cells.
-    They begin where vectors do; empty ones are from 0 to 0.
+    They begin where vectors do; empty ones are from 0 to 0. `densest` [z, y]: the largest value of
+    the first field that steps to these cells meet.
     """
     _, depth, height, width = fields[0].shape
     rows = (depth + 2) * (height + 2)
@@ -86,18 +93,22 @@ def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor
         "fields": len(fields),
         "depth": depth, "height": height, "width": width, "pitch": pitch,
     }  # fmt: skip
-    made = {"larger": larger, "occupied": occupied, "ranges": ranges}
+    tops, densest = larger.new_empty(rows), larger.new_empty(depth * height)
+    made = {
+        "larger": larger, "occupied": occupied, "ranges": ranges,
+        "tops": tops, "densest": densest,
+    }  # fmt: skip
     surround_rows, reach = surround_kernels(torch.finfo(larger.dtype).bits)
     surround_rows.launch(rows, given, made)
     reach.launch(depth * height, given, made, threads=1)
-    return list(larger.split(sizes)), ranges
+    return list(larger.split(sizes)), ranges, densest
 
 
 @functools.cache
 def surround_kernels(bits: int) -> tuple[TextKernel, TextKernel]:
     """The kernels that copy rows and find where they are not empty, and where that matters."""
     given = """
-    F *extinction, *scattering, *larger; int *occupied, *ranges;
+    F *extinction, *scattering, *larger, *tops, *densest; int *occupied, *ranges;
     int fields, extinction_channels, scattering_channels, depth, height, width, pitch
     """
     texts = {"surround_rows": _SURROUND, "reach_rows": _REACH}

@@ -97,6 +97,7 @@ for (int t = 0; t < height; ++t) {
     // Where steps meet a medium or its change, and where what scatters is asked for.
     const int* range = ranges + 4 * (k * height + r);
     const int from = range[0], to = range[1];
+    const F deepest = scale * densest[k * height + r];
     auto read = [&](int k, F* row, int from, int to) {
         read_scattering(color * cells + at, k, row, from, to);
     };
@@ -122,8 +123,9 @@ for (int t = 0; t < height; ++t) {
     + UPSTREAM
     + _CHANGES_UPSTREAM
     + """
-        auto pass = [&](auto points, auto along, auto empty, int from, int to) {
-            constexpr bool is_empty = decltype(empty)::value;
+        auto pass = [&](auto points, auto along, auto matter, int from, int to) {
+            constexpr bool is_empty = decltype(matter)::is_empty;
+            constexpr bool is_all_thin = decltype(matter)::is_thin;
             INDEPENDENT
             for (int c = from; c < to; ++c) {
                 const F arriving = gather(points, light_from, part, c);
@@ -144,7 +146,8 @@ for (int t = 0; t < height; ++t) {
         };
         auto pass_all = [&](auto points, auto along) {
             pass(points, along, Empty(), 0, from);
-            pass(points, along, Filled(), from, to);
+            if (is_thin_row) pass(points, along, Thin(), from, to);
+            else pass(points, along, Thick(), from, to);
             pass(points, along, Empty(), to, width);
         };
         if (is_along) {
