@@ -31,6 +31,7 @@ from ddrecon.scene_file.phase_schema import (
     TableSection,
     TwoLobeSection,
 )
+from ddrecon.scene_file.schema import MediumSection, VolumeSection
 from ddrecon.settings import FieldFile
 
 FAR_OFF = 0.01
@@ -38,9 +39,14 @@ FAR_OFF = 0.01
 
 
 def build_phase(
-    scene_file: SceneFile, cells: Tensor | None, dtype: torch.dtype, device: torch.device
+    scene_file: SceneFile,
+    volume: VolumeSection | MediumSection,
+    key: str,
+    cells: Tensor | None,
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> PhaseFunction:
-    """The phase function of the scene in `dtype` on `device`.
+    """The phase function of the section `volume` at `key` of the scene, in `dtype` on `device`.
 
     `cells`: that of its numbers which a file gives cell by cell, [z, y, x] or [C, z, y, x]. Raises
     SceneError, FormatError, or MissingExtraError for droplets without miepython.
@@ -55,7 +61,7 @@ def build_phase(
     def build(section: PhaseSection | None, key: str) -> PhaseFunction:
         match section:
             case None:
-                return HenyeyGreenstein(tensor(scene_file.tree.volume.g))
+                return HenyeyGreenstein(tensor(volume.g))
             case HenyeyGreensteinSection():
                 return HenyeyGreenstein(tensor(section.g))
             case TwoLobeSection():
@@ -74,7 +80,7 @@ def build_phase(
                 return Tabulated(_droplets(section).to(device, dtype))
         return Rayleigh(tensor(0.0))
 
-    return build(scene_file.tree.volume.phase, "volume.phase")
+    return build(volume.phase, f"{key}.phase")
 
 
 def _moments(scene_file: SceneFile, section: LegendreSection, key: str) -> Tensor:

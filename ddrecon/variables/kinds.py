@@ -1,7 +1,8 @@
 """The table of variables: all that is known of each kind of number that can be optimized.
 
 A kind is named by a pattern: N is the place in a list, counted from 0, and NAME a view's name, or
-`*` for all training views. `ddrecon.variables.values` reads and replaces the values.
+`*` for all training views. Where there are two media, `media.cloud.density` is of the same kind as
+`density`. `ddrecon.variables.values` reads and replaces the values.
 """
 
 from __future__ import annotations
@@ -139,8 +140,22 @@ def kind_of(name: str) -> Kind:
     return KINDS[pattern_of(name)]
 
 
+def split_name(name: str) -> tuple[str, str]:
+    """The medium that the variable `name` is of, as `media.cloud.`, and the rest of its name.
+
+    The first is empty where it is of no medium.
+    """
+    match = re.fullmatch(r"(media\.[^.]+\.)?(.*)", name)
+    assert match is not None
+    return match[1] or "", match[2]
+
+
 def pattern_of(name: str) -> str:
     """The pattern in `KINDS` that `name` follows, or `name` itself where it follows none."""
     if match := re.fullmatch(r"views\..+\.([a-z_]+)", name):
         return f"views.NAME.{match[1]}"
+    medium, name = split_name(name)
+    if medium and name == "g":
+        # two media are a blend: its weight differs from cell to cell, and no number of its parts
+        return "phase.phases.N.g"
     return re.sub(r"^(lights|phase\.phases)\.[0-9]{1,9}\.", r"\1.N.", name)

@@ -45,13 +45,20 @@ def march_rays(
 
 
 def integrate_rays(
-    emission: Emission, sampler: Bands | Equidistant, rays: Rays, crossing: Crossing
+    emission: Emission,
+    sampler: Bands | Equidistant,
+    rays: Rays,
+    crossing: Crossing,
+    fronts: Tensor | None = None,
 ) -> Tensor:
-    """Radiance [C] and mass [K] along those of `rays` that are in `crossing`: [C + K, P]."""
+    """Radiance [C] and mass [K] along those of `rays` that are in `crossing`: [C + K, P].
+
+    Behind the mass `fronts` [K, P], which counts as mass along them.
+    """
     axis = sampler.axis if isinstance(sampler, Bands) else None
     ends = crossing.hit, crossing.near, crossing.far
     packed = pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
-    composed, masses = _integrate(emission, sampler, packed)
+    composed, masses = _integrate(emission, sampler, packed, fronts)
     return torch.cat([composed[: emission.colors], masses])
 
 
@@ -62,7 +69,10 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
 
 
 def _integrate(
-    emission: Emission, sampler: Bands | Equidistant, packed: Packed
+    emission: Emission,
+    sampler: Bands | Equidistant,
+    packed: Packed,
+    fronts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Scattered radiance and opacity [2 C, R] along rays, and mass [K, R]."""
     layout, (cells, fields) = layout_of(emission), cells_of(sampler)
@@ -76,6 +86,7 @@ def _integrate(
         along.polynomials,
         numbers,
         table_of(emission),
+        packed.bundle.new_empty(layout.extinction, 0) if fronts is None else fronts,
         *fields,
     )
     irradiances = [beam.irradiance for beam in emission.beams]

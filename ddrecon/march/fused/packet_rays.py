@@ -15,10 +15,12 @@ from ddrecon.march.fused.packet_cellwise import RUNGS, SEE
 from ddrecon.march.fused.packet_optics import CUBICS, DECAYS, POINTS, POLYNOMIALS
 
 GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers, *table; int *slices;
+F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices;
 int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride;
 """
-"""As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells."""
+"""As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells. Without `fronts`
+there is no mass before the rays.
+"""
 
 _RECORDS = """
 struct Ray {
@@ -65,6 +67,9 @@ if (HAS_PEAK || HAS_NUMBERS)
     for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         ray.coefficients[k] = P::load(coefficients + k * (last + 1), begin, 1, last);
 auto distance = [&](int n) -> V { return (planes[n] - ray.o0) / ray.d0; };
+auto front_of = [&](const F* masses, int k) -> V {
+    return masses ? P::load(masses + (long long)k * (last + 1), begin, 1, last) : P::all(F(0));
+};
 // Nodes before the box and behind it are held at its faces: between them nothing is added.
 int first_node = 0, last_node = node_count - 1;
 while (first_node < last_node && P::every(distance(first_node + 1) <= ray.near)) ++first_node;

@@ -17,7 +17,7 @@ _INTEGRATE = """
 V total[OUT];
 W m[EXTINCTION];
 for (int i = 0; i < OUT; ++i) total[i] = P::all(F(0));
-for (int k = 0; k < EXTINCTION; ++k) m[k] = P::wide(total[0]);
+for (int k = 0; k < EXTINCTION; ++k) m[k] = P::wide(front_of(fronts, k));
 Node nodes[2];
 Node* a = nodes;
 Node* b = nodes + 1;
@@ -207,6 +207,10 @@ for (int c = 0; c < C; ++c) {
     numbers_bar[(C + c) * packets + item] = P::sum(peak_bar[c]);
 }
 numbers_bar[2 * C * packets + item] = P::sum(bound_bar);
+if (fronts_bar)
+    for (int k = 0; k < EXTINCTION; ++k)
+        for (int l = 0; l < LANES && begin + l <= last; ++l)
+            fronts_bar[(long long)k * (last + 1) + begin + l] = P::lane(m_bar[k], l);
 if (varies_polynomials)
     for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
@@ -230,6 +234,6 @@ def packet_adjoint_kernel(layout: Layout) -> TextKernel:
     """
     given = f"""
     double *masses, *numbers_bar; int packets;
-    F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *bars[{layout.channels}]
+    F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *fronts_bar, *bars[{layout.channels}]
     """
     return packet_kernel("transpose", layout, SPREAD + _TRANSPOSE, given)
