@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from ddrecon.march.fused import optics
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.node_curves import (
     curves,
@@ -32,7 +33,7 @@ def node_phase(layout: Layout) -> SimpleNamespace:
     """
     t, records, which = vectors(layout), ray_types(layout), _choices(layout)
     curve_of, over_depth = curves(layout).curve, _polynomial(layout)
-    spot_of, plain = spots(layout).spot_of, _plain(layout)
+    spot_of, plain = spots(layout).spot_of, optics.henyey_greenstein(t.F)
 
     @wp.func
     def peak_of(v: t.Node, peak: t.Color, c: int) -> t.F:
@@ -148,34 +149,6 @@ def _polynomial(layout: Layout) -> SimpleNamespace:
 
 
 @functools.cache
-def _plain(layout: Layout) -> SimpleNamespace:
-    """(1 - g^2) / (1 + g^2 - 2 g w)^(3/2): `value`, and slopes `by_g` and `by_cosine`."""
-    t = vectors(layout)
-
-    @wp.func
-    def square_of(g: t.F, cosine: t.F) -> t.F:
-        return t.F(1.0) + g * g - t.F(2.0) * g * cosine
-
-    @wp.func
-    def value(g: t.F, cosine: t.F) -> t.F:
-        square = square_of(g, cosine)
-        return (t.F(1.0) - g * g) / (square * wp.sqrt(square))
-
-    @wp.func
-    def by_g(g: t.F, cosine: t.F) -> t.F:
-        square = square_of(g, cosine)
-        bend = t.F(3.0) * (t.F(1.0) - g * g) * (g - cosine) / square
-        return (-t.F(2.0) * g - bend) / (square * wp.sqrt(square))
-
-    @wp.func
-    def by_cosine(g: t.F, cosine: t.F) -> t.F:
-        square = square_of(g, cosine)
-        return t.F(3.0) * g * (t.F(1.0) - g * g) / (square * square * wp.sqrt(square))
-
-    return SimpleNamespace(value=value, by_g=by_g, by_cosine=by_cosine)
-
-
-@functools.cache
 def _slopes(layout: Layout) -> SimpleNamespace:
     """The function `find` of the derivatives of p by all but its coefficients.
 
@@ -184,7 +157,11 @@ def _slopes(layout: Layout) -> SimpleNamespace:
     """
     t, records, which = vectors(layout), ray_types(layout), _choices(layout)
     spot_of, rung_of, table = spots(layout).spot_of, rungs(layout).rung_of, weighing(layout)
-    curve_of, over_depth, plain = curves(layout).curve, _polynomial(layout), _plain(layout)
+    curve_of, over_depth, plain = (
+        curves(layout).curve,
+        _polynomial(layout),
+        optics.henyey_greenstein(t.F),
+    )
     IS_POINT = is_point(layout)
 
     @wp.struct

@@ -93,3 +93,31 @@ def points(scalar: Any, role: str) -> SimpleNamespace:
         return wp.atan2(apart * (t1 - t0), across + (foot + t0) * (foot + t1)) / apart
 
     return SimpleNamespace(subtended=subtended)
+
+
+@functools.cache
+def henyey_greenstein(scalar: Any) -> SimpleNamespace:
+    """(1 - g^2) / (1 + g^2 - 2 g w)^(3/2): `value`, and slopes `by_g` and `by_cosine`."""
+    F = scalar
+
+    @wp.func
+    def square_of(g: F, cosine: F) -> F:
+        return F(1.0) + g * g - F(2.0) * g * cosine
+
+    @wp.func
+    def value(g: F, cosine: F) -> F:
+        square = square_of(g, cosine)
+        return (F(1.0) - g * g) / (square * wp.sqrt(square))
+
+    @wp.func
+    def by_g(g: F, cosine: F) -> F:
+        square = square_of(g, cosine)
+        bend = F(3.0) * (F(1.0) - g * g) * (g - cosine) / square
+        return (-F(2.0) * g - bend) / (square * wp.sqrt(square))
+
+    @wp.func
+    def by_cosine(g: F, cosine: F) -> F:
+        square = square_of(g, cosine)
+        return F(3.0) * g * (F(1.0) - g * g) / (square * square * wp.sqrt(square))
+
+    return SimpleNamespace(value=value, by_g=by_g, by_cosine=by_cosine)
