@@ -8,7 +8,6 @@ import torch
 
 from ddrecon.engine import engine_of_parts
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.medium.phase_cells import has_one_table
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.reconstruct.setup import select_views, start_support
@@ -126,8 +125,7 @@ def _parts_in_torch(scene: Scene) -> tuple[str, ...]:
     """The parts that are torch's with every engine, for what `scene` asks of them."""
     settings = scene.diffusion
     is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    diffusion = () if is_fused and settings.solver == "multigrid" else ("diffusion",)
-    return diffusion if has_one_table(scene.volume.phase) else (*diffusion, "view rays")
+    return () if is_fused and settings.solver == "multigrid" else ("diffusion",)
 
 
 def _count_entries(name: str, count: int) -> str:

@@ -23,7 +23,7 @@ from ddrecon.march.lattice import Lattice, interpolate_between, is_rough
 from ddrecon.march.samplers import make_sampler
 from ddrecon.march.sight import Sight
 from ddrecon.march.slices import Slices
-from ddrecon.medium.phase_cells import SeenNodes, has_one_table
+from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decayed_sum
@@ -71,15 +71,12 @@ def march(
 
 
 def _pick_engine(emission: Emission) -> tuple[Callable[..., Part], Callable[..., Tensor]]:
-    """How rays and lattices of rays are marched by the engine in use.
-
-    Fused kernels read one table for all colors where the phase function differs from cell to cell.
-    """
+    """How rays and lattices of rays are marched by the engine in use."""
     if isinstance(emission.grid, Slab):
         from ddrecon.march import slabs
 
         return slabs.march_rays, slabs.march_lattice
-    if current_engine() == "warp" and has_one_table(emission.seen.phase):
+    if current_engine() == "warp":
         from ddrecon.march.fused import march as fused
 
         return fused.march_rays, fused.march_lattice

@@ -81,11 +81,9 @@ def is_steep(kind: PhaseKind) -> bool:
     return kind is HenyeyGreenstein
 
 
-def has_one_table(phase: PhaseFunction) -> bool:
-    """Whether colors share all numbers, but that which differs from cell to cell, if one does."""
-    if phase.cells is None or not isinstance(phase, Mixture):
-        return True
-    return all(part.colors == 1 for part in phase.parts)
+def count_tables(phase: PhaseFunction) -> int:
+    """How many colors have other numbers besides that of cells; 1 where they share them."""
+    return max(part.colors for part in phase.parts) if isinstance(phase, Mixture) else 1
 
 
 def peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
