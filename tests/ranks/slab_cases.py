@@ -249,7 +249,8 @@ CASES: dict[str, Callable[[], Found]] = {
 
 FEW = [name for name in CASES if name.startswith(("exchange", "system"))]
 FEW += ["light along x", "rounds along x"]
-FUSED = ["light along y", "light along x", "rounds along y", "environment", "lattice", "inside"]
+FUSED = ["light along x", "light along y", "forward peak", "all per cell", "rounds along y"]
+FUSED += ["environment", "lattice", "inside"]
 GROUPS = {"few": FEW, "others": [name for name in CASES if name not in FEW], "fused": FUSED}
 """Cases that tell most in little time, the others, and those in which slabs have fused kernels."""
 
