@@ -195,15 +195,15 @@ def count(case: Case) -> tuple[Case, dict[str, list[int]]]:
 class Law:
     """Bytes that a rank hands to exchanges of one kind, for one purpose, and how often it does.
 
-    `factors` are bytes a unit of what they grow with; `error` is that of the fit. Calls are so many
-    a cycle, and as many again.
+    `factors` are bytes a unit of what they grow with; `error` is that of the fit. `calls` are how
+    many there are a cycle, a view, and once.
     """
 
     kind: str
     purpose: str
     factors: tuple[float, ...]
     error: float
-    calls: tuple[float, float]
+    calls: tuple[float, ...]
 
     def seconds(self, case: Case, link: float) -> float:
         """How long they take in `case` by links of so many bytes a second."""
@@ -212,7 +212,7 @@ class Law:
         # Neighbors swap at the same time; a ring hands on all parts, or each sum twice.
         others = case.ranks - 1
         often = {SWAP: 1.0, GATHER: others, SUM: 2 * others / case.ranks}
-        calls = self.calls[0] * case.cycles + self.calls[1]
+        calls = sum(a * b for a, b in zip(self.calls, (case.cycles, case.views, 1), strict=True))
         steps = 1 if self.kind == SWAP else math.log2(case.ranks)
         return often.get(self.kind, 1.0) * part / link + calls * CALL * steps
 
@@ -228,15 +228,15 @@ def fit(counted: list[tuple[Case, dict[str, list[int]]]]) -> list[Law]:
             np.array([found.get(key, [0, 0])[i] for _, found in counted], float) for i in (0, 1)
         )
         bytes_ *= sides
-        cycles = np.array([[case.cycles, 1.0] for case, _ in counted])
-        often = np.linalg.lstsq(cycles, calls, rcond=None)[0]
+        steps = np.array([[case.cycles, case.views, 1.0] for case, _ in counted])
+        often = np.linalg.lstsq(steps, calls, rcond=None)[0]
         factors, error = np.zeros(0), 0.0
         if law_of := LAWS.get((kind, purpose)):
             matrix = np.array([[law(case) for law in law_of.values()] for case, _ in counted])
             scale = 1 / np.maximum(bytes_, 1)[:, None]
             factors = np.linalg.lstsq(matrix * scale, bytes_ * scale[:, 0], rcond=None)[0]
             error = float(np.abs((matrix @ factors) * scale[:, 0] - 1).max())
-        laws.append(Law(kind, purpose, tuple(factors), error, (often[0], often[1])))
+        laws.append(Law(kind, purpose, tuple(factors), error, tuple(often)))
     return laws
 
 
@@ -246,7 +246,7 @@ def print_laws(laws: list[Law]) -> None:
     for law in laws:
         grown = LAWS.get((law.kind, law.purpose), {})
         shown = " + ".join(f"{f:.3g} x {name}" for f, name in zip(law.factors, grown, strict=True))
-        calls = f"{law.calls[0]:.1f} a cycle + {law.calls[1]:.1f}"
+        calls = "{:.1f} a cycle + {:.1f} a view + {:.1f}".format(*law.calls)
         print(f"| {law.kind} | {law.purpose} | {shown} | {calls} | {100 * law.error:.0f} % |")
 
 
