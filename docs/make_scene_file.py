@@ -437,7 +437,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density and 0 for others. `auto` finds it by leaving a view out."
+                " density, of which it is that of log(1 + 10 density) / 3, and 0 for others."
+                " `auto` finds it by leaving a view out."
             ),
             "l1": "Weight of its mean, which empties what no picture needs.",
             "field": (
