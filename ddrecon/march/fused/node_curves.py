@@ -193,9 +193,7 @@ def curves(layout: Layout) -> SimpleNamespace:
         if wp.static(layout.has_rungs):
             rung = rung_of(number)
             spot = spot_of(ray, b, c, held, places)
-            return table.weigh_rungs(
-                given.table, rung.first, rung.weights, spot.row, spot.weights
-            )
+            return table.weigh_rungs(given.table, rung.first, rung.weights, spot.row, spot.weights)
         if wp.static(IS_POINT)[b] == 1:
             spot = spot_of(ray, b, c, held, places)
             return table.weigh(given.table, spot.row, spot.weights)
