@@ -36,17 +36,22 @@ def conjugate_gradients(
     """
     value, residual = torch.zeros_like(right), right.clone()
     ready = precondition(residual) if ready is None else ready
-    direction, square = ready.clone(), float(residual @ ready)
+    direction, square = ready.clone(), _dot(residual, ready)
     first, count = square, 0
     while square > tolerance**2 * first and count < most:
         along = product(direction)
         count += 1
-        step = square / max(float(direction @ along), torch.finfo(right.dtype).tiny)
+        step = square / max(_dot(direction, along), torch.finfo(right.dtype).tiny)
         value.add_(direction, alpha=step)
         before = residual.clone()
         residual.sub_(along, alpha=step)
         ready = precondition(residual)
-        new, lasting = float(residual @ ready), float(before @ ready)
+        new, lasting = _dot(residual, ready), _dot(before, ready)
         direction.mul_((new - lasting) / square).add_(ready)
         square = new
     return Solved(value, residual, count)
+
+
+def _dot(one: Tensor, other: Tensor) -> float:
+    """Their product, summed in float64: steps hang on differences of such sums."""
+    return float(one.double() @ other.double())

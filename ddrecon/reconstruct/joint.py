@@ -26,6 +26,8 @@ from ddrecon.variables.values import with_values
 
 TOLERANCE = 0.1
 """How small a step's residual is to be, of what it was."""
+MOST = 12
+"""Products with J^T W J that a step may take."""
 LENGTHS = (1.0, 0.5, 0.25, 0.125)
 """Parts of a step that are tried until the objective falls."""
 
@@ -53,59 +55,81 @@ def step_together(
     near to the light. Nothing moves where the objective would not fall.
     """
     curvature = Curvature(scene, parameters, targets, power, solutions)
-    levels = {p.name: _level(p.value.detach()) for p in parameters if p.tv}
-    gradient = _gradient(curvature, targets, power * _penalties(parameters, levels))
-    posterior = Posterior(curvature, gradient, _misfit(curvature, targets), seed=0)
-    # Cameras err from where a calibration put them; all else is held only about where it is.
-    held = posterior.prior.held
-    held.update(_weigh_calibrations(curvature))
-    told = {p.name: held[p.name] @ p.value.detach() for p in parameters if p.key == "camera"}
-    pull = -gradient - curvature.join(told)
-    posterior.tolerance = TOLERANCE * posterior.size(pull, posterior.is_kept)
-    change = curvature.split(posterior.minimize(torch.zeros_like(pull), pull)[0])
-
-    def objective(images: Mapping[str, Tensor]) -> float:
-        total = sum(view.weight for view in curvature.scene.views)
-        with torch.no_grad():
-            of_views = [
-                view.weight / total * targets[view.name].loss_of(images[view.name])
-                for view in curvature.scene.views
-            ]
-            penalties = [power * _penalties(parameters, levels)]
-            calibration = [
-                p.value @ held[p.name] @ p.value / 2 for p in parameters if p.key == "camera"
-            ]
-        return float(sum(of_views + penalties + calibration))
-
-    before, now = {p.name: p.value for p in parameters}, objective(curvature.images)
+    objective = _Objective(curvature, targets, power)
+    change = curvature.split(_find_change(curvature, objective))
+    before, now = {p.name: p.value for p in parameters}, objective.at(curvature.images)
     for length in LENGTHS:
         for p in parameters:
-            start = before[p.name].detach()
-            value = start + length * change[p.name]
-            if p.is_direction:
-                value = value * (start.norm() / value.norm())
-            p.value = value.clamp(p.low, p.high).requires_grad_()
+            _move(p, before[p.name].detach(), length * change[p.name])
         for gauge in gauges:
             gauge.hold()
-        if objective(_render(curvature)) < now:
+        if objective.at(_render(curvature)) < now:
             return
     for p in parameters:
         p.value = before[p.name]
 
 
-def _gradient(curvature: Curvature, targets: Mapping[str, Target], penalties: Tensor) -> Tensor:
-    """The derivative [n] of the loss of all views and of `penalties`, where `curvature` is."""
-    views, parameters = list(curvature.scene.views), curvature.parameters
-    leaves, memory = {p.name: p.value for p in parameters}, curvature.new_memory()
-    compared, names = Comparison(views, targets), [view.name for view in views]
-    found = differentiate(curvature.scene, names, leaves, compared, memory).gradients
-    if penalties.requires_grad:
-        bars = torch.autograd.grad(penalties, list(leaves.values()), allow_unused=True)
-        found = {
-            n: found[n] if bar is None else found[n] + bar
-            for n, bar in zip(leaves, bars, strict=True)
-        }
-    return curvature.join(found)
+class _Objective:
+    """What a step makes less: the loss of all views, penalties, and how far cameras are moved.
+
+    The views are those of `curvature`, and so are the parameters; `targets` are by view, `power` is
+    the unit of penalties. `held` [6, 6] is how strongly each camera's calibration counts, by name.
+    """
+
+    def __init__(self, curvature: Curvature, targets: Mapping[str, Target], power: float):
+        self.curvature, self.targets, self.power = curvature, targets, power
+        self.parameters = curvature.parameters
+        self.levels = {p.name: _level(p.value.detach()) for p in self.parameters if p.tv}
+        self.held = _weigh_calibrations(curvature)
+
+    def at(self, images: Mapping[str, Tensor]) -> float:
+        """Its value where the parameters are now, which the `images` [3, h, w] by view are of."""
+        views = self.curvature.scene.views
+        total = sum(view.weight for view in views)
+        with torch.no_grad():
+            parts = [
+                view.weight / total * self.targets[view.name].loss_of(images[view.name])
+                for view in views
+            ]
+            parts.append(self.power * _penalties(self.parameters, self.levels))
+            cameras = [p for p in self.parameters if p.name in self.held]
+            parts += [p.value @ self.held[p.name] @ p.value / 2 for p in cameras]
+        return float(sum(parts))
+
+    def gradient(self) -> Tensor:
+        """Its derivative [n] where `curvature` is."""
+        curvature, views = self.curvature, list(self.curvature.scene.views)
+        leaves, memory = {p.name: p.value for p in self.parameters}, curvature.new_memory()
+        compared, names = Comparison(views, self.targets), [view.name for view in views]
+        found = differentiate(curvature.scene, names, leaves, compared, memory).gradients
+        penalties = self.power * _penalties(self.parameters, self.levels)
+        if penalties.requires_grad:
+            bars = torch.autograd.grad(penalties, list(leaves.values()), allow_unused=True)
+            found = {
+                n: found[n] if bar is None else found[n] + bar
+                for n, bar in zip(leaves, bars, strict=True)
+            }
+        told = {n: held @ leaves[n].detach() for n, held in self.held.items()}
+        return curvature.join(found) + curvature.join(told)
+
+
+def _find_change(curvature: Curvature, objective: _Objective) -> Tensor:
+    """How all parameters are to move [n], to the least of the quadratic of `objective`."""
+    gradient, misfit = objective.gradient(), _misfit(curvature, objective.targets)
+    posterior = Posterior(curvature, gradient, misfit, seed=0)
+    # Cameras err from where a calibration put them; all else is held only about where it is.
+    posterior.prior.held.update(objective.held)
+    posterior.tolerance = TOLERANCE * posterior.size(-gradient, posterior.is_kept)
+    posterior.most = MOST
+    return posterior.minimize(torch.zeros_like(gradient), -gradient)[0]
+
+
+def _move(parameter: Parameter, start: Tensor, change: Tensor) -> None:
+    """Takes `parameter` from `start` by `change`, within bounds; a direction keeps its length."""
+    value = start + change
+    if parameter.is_direction:
+        value = value * (start.norm() / value.norm())
+    parameter.value = value.clamp(parameter.low, parameter.high).requires_grad_()
 
 
 def _penalties(parameters: Sequence[Parameter], levels: Mapping[str, Tensor]) -> Tensor:

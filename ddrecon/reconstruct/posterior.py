@@ -16,6 +16,7 @@ from ddrecon.numerics.conjugate_gradients import Solved, conjugate_gradients
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.information import Information
 from ddrecon.reconstruct.limits import find_bounds, find_gauge, find_kept
+from ddrecon.reconstruct.numbers import number_curvature, single_numbers, solve_numbers_within
 from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like
 
 TOLERANCE = 0.5
@@ -80,6 +81,10 @@ class Posterior:
         # The optimum is one: what is left of a derivative elsewhere belongs to the optimizer.
         self.gradient = torch.where(at_bound, gradient, 0)
         self.gauge = find_gauge(curvature)
+        numbers = single_numbers(curvature.parameters)
+        self.numbers = {p.name: p.value.numel() for p in numbers}
+        self.is_number = curvature.join({p.name: torch.ones_like(p.value) for p in numbers}).bool()
+        self.between = number_curvature(curvature, numbers)
         self.information = information or Information(curvature, generator_of(seed, PROBED))
 
     def sample(self, number: int) -> Sample:
@@ -182,16 +187,31 @@ class Posterior:
         """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E38).
 
         That again is solved by conjugate gradients, to which it counts by its diagonal alone.
+        Single numbers are solved for by themselves, all together (E51).
         """
+        is_out = is_fixed | self.is_number
 
         def precondition(part: Tensor) -> Tensor:
-            return self.prior.solve(part, is_fixed, self.information.diagonal, DIAGONAL)
+            return self.prior.solve(part, is_out, self.information.diagonal, DIAGONAL)
 
         free = self._without_gauge(vector.masked_fill(is_fixed, 0))
+        fields = free.masked_fill(is_out, 0)
         ready = conjugate_gradients(
-            self._rough_product, precondition, free, PRECONDITION, INNER
-        ).value
-        return self._without_gauge(ready.masked_fill(is_fixed, 0))
+            self._rough_product, precondition, fields, PRECONDITION, INNER
+        ).value.masked_fill(is_out, 0)
+        at = self.is_number
+        if self.numbers:
+            gauge = None if self.gauge is None else self.gauge[at]
+            held = self.between + self._held_numbers()
+            ready[at] = solve_numbers_within(held, free[at], is_fixed[at], gauge)
+        return self._without_gauge(ready)
+
+    def _held_numbers(self) -> Tensor:
+        """How single numbers are held but by pictures, [k, k]."""
+        parts = [(self.prior.held[name].double().cpu(), n) for name, n in self.numbers.items()]
+        return torch.block_diag(
+            *(held if held.ndim == 2 else held * torch.eye(n) for held, n in parts)
+        ).double()
 
     def _rough_product(self, vector: Tensor) -> Tensor:
         """About H times `vector`: J^T W J by its `information`."""

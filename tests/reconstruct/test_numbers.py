@@ -1,0 +1,93 @@
+"""What pictures say of single numbers, against products with the whole matrix."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from media import make_camera, make_scene, random_values
+
+from ddrecon.losses import Target
+from ddrecon.reconstruct.curvature import Curvature
+from ddrecon.reconstruct.numbers import number_curvature, single_numbers, solve_numbers_within
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.posterior import Posterior
+from ddrecon.scene import View
+from ddrecon.settings import ParameterSettings
+from ddrecon.variables.values import value_of
+
+NAMES = (
+    "lights.0.irradiance",
+    "density",
+    "g",
+    "views.one.camera",
+    "views.two.exposure",
+    "views.two.offset",
+)
+
+
+@pytest.fixture(scope="module")
+def curvature() -> Curvature:
+    """Two views, of which one moves its camera and the other is exposed, in light of one number."""
+    density = 0.3 + random_values(3, 3, 3)
+    base = make_scene(density, g=0.3, ambient=(0.2, 0.3, 0.4), transport_rounds=0)
+    images = random_values(2, 3, 4, 5, seed=2)
+    one = View("one", make_camera((0.2, 0.3, 2.5)), images[0])
+    two = View("two", make_camera((2.4, -0.3, 0.5)), images[1], weight=2.0)
+    two = replace(two, exposure=density.new_tensor([1.1, 1.2, 0.9]), offset=density.new_zeros(1))
+    scene = replace(base, views=[one, two])
+    parameters = [
+        Parameter(name, ParameterSettings(), 0.1, value_of(scene, name), scene.volume.grid)
+        for name in NAMES
+    ]
+    # Twists are about cameras as they were told: the derivative is where it has moved to.
+    parameters[3].value = 0.02 * random_values(6, seed=3)
+    targets = {view.name: Target.of(view.image, None) for view in scene.views}
+    return Curvature(scene, parameters, targets, 0.3)
+
+
+def test_it_is_the_part_of_the_matrix_between_numbers(curvature: Curvature) -> None:
+    numbers = single_numbers(curvature.parameters)
+    assert [number.name for number in numbers] == [name for name in NAMES if name != "density"]
+    chosen = curvature.join({number.name: torch.ones_like(number.value) for number in numbers})
+    places = chosen.nonzero()[:, 0]
+    found = number_curvature(curvature, numbers)
+    size = found.diagonal().sqrt()
+    for ways in random_values(3, len(places)) - 0.5:
+        change = torch.zeros(curvature.size, dtype=torch.float64)
+        change[places] = ways / size
+        wanted = curvature.data_product(change)[places]
+        # Solves for tangents and adjoints end at their tolerance.
+        torch.testing.assert_close(found @ (ways / size) / size, wanted / size, rtol=0, atol=1e-5)
+
+
+def test_numbers_are_solved_for_within_what_is_sought() -> None:
+    """As by the matrix in a basis of what is free and shown, with units that differ widely."""
+    units = torch.logspace(-3, 3, 7, dtype=torch.float64)
+    root, gauge = random_values(7, 7, seed=1), random_values(7, 2, seed=2)
+    matrix = (root @ root.T + torch.eye(7)) * units * units[:, None]
+    gauge = torch.linalg.qr(gauge / units[:, None])[0]
+    right, is_fixed = units * random_values(7, seed=3), torch.arange(7) == 4
+    found = solve_numbers_within(matrix, right, is_fixed, gauge)
+    free = ~is_fixed
+    basis = torch.linalg.svd((gauge[free] / units[free, None]).T)[2][2:].T / units[free, None]
+    within = torch.linalg.solve(basis.T @ matrix[free][:, free] @ basis, basis.T @ right[free])
+    assert float(found[4]) == 0
+    torch.testing.assert_close(
+        (units * found)[free], units[free] * (basis @ within), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_alone_they_are_found_in_one_product(curvature: Curvature) -> None:
+    """The preconditioner is the inverse where all else is fixed."""
+    posterior = Posterior(curvature, torch.zeros(curvature.size), 1e-4, seed=0)
+    is_fixed = ~posterior.is_number
+    wanted = random_values(curvature.size, seed=5) - 0.5
+    wanted = wanted.masked_fill(is_fixed, 0)
+    found = posterior._precondition(posterior.product(wanted), is_fixed)
+    wanted, found = wanted[posterior.is_number], found[posterior.is_number]
+    size = posterior.between.diagonal().sqrt()
+    torch.testing.assert_close(
+        size * found, size * wanted, rtol=1e-3, atol=1e-3 * float((size * wanted).norm())
+    )
