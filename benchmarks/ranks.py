@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from scaling import start_run, with_colors, with_views
@@ -37,8 +38,11 @@ LINKS = {1: float("inf"), 8: 450e9, 64: 50e9}
 """Bytes a second one way, by ranks: NVLink 4 inside a machine, InfiniBand NDR between machines."""
 
 
-def parts_of(cells: int) -> tuple[float, float, int, int]:
-    """Seconds of an iteration without views, and of a view; cells; bytes that are exchanged."""
+def parts_of(cells: int, rounds: int = 1) -> tuple[float, float, int, int]:
+    """Seconds of an iteration without views, and of a view; cells; bytes that are exchanged.
+
+    With so many transport `rounds`.
+    """
     times, sent = [], [0]
 
     def count(found: Sequence[Tensor | None], _: object) -> list[Tensor | None]:
@@ -48,6 +52,7 @@ def parts_of(cells: int) -> tuple[float, float, int, int]:
     gradients.sum_found = count
     for views in (1, 5):
         scene = plume_scene(cells, PIXELS * cells, torch.float32, torch.device("cpu"))
+        scene = replace(scene, diffusion=replace(scene.diffusion, transport_rounds=rounds))
         run, taken = start_run(with_views(with_colors(scene, 3), views)), []
         for _ in range(5):
             start = time.process_time()

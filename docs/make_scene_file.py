@@ -24,6 +24,7 @@ KIND_NAMES = {
     schema.Quantity: "number, [r, g, b] or {file: ...}",
     schema.Density: "number or {file: ...}",
     phase_schema.PhaseSection: "{type: ...}",
+    phase_schema.Parts: "list of two {type: ...}",
     settings.Start: "number, list or {file: ...}",
     settings.Weight: "number or `auto`",
     settings.Iterations: "whole number or `auto`",
@@ -107,6 +108,15 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         {
             "g": "The mean cosine of each.",
             "weight": "The part of the first; a file has one a cell.",
+        },
+    ),
+    (
+        "volume.phase: {type: blend}",
+        phase_schema.BlendSection,
+        "Two kinds of scatterers in the same place: droplets and air, smoke and dust.",
+        {
+            "phases": "Both phase functions; neither is `two_lobe` or `blend`, or has a g by cell.",
+            "weight": "The part of scattering that is the first's; a file has one a cell.",
         },
     ),
     (
@@ -511,7 +521,7 @@ def _parameters() -> str:
             "## Names of parameters",
             "",
             "What can be found.",
-            "N is a light's place in the list, counted from 0.",
+            "N is the place of a light, or of a blend's part, in its list, counted from 0.",
             "NAME is a view's name, or `*` for all training views.",
             "[Commands](cli.md#names-of-parameters) has the same names, by light.",
             "",

@@ -75,7 +75,8 @@ class SolverWithMemory(Generic[AnyOperator]):
     """A solver, its tolerance, and the memory that its solves share.
 
     `round_index` tells the solves of one render apart: 0 is diffusion's own, transport rounds count
-    from 1. Forward solves that remember nothing begin at `start`, or at zero.
+    from 1. Forward solves that remember nothing begin at `start`, or at zero; adjoint ones at the
+    negative of the next round's, since a round takes away what it begins with (E12).
     """
 
     solver: Callable[[AnyOperator, Tensor, Tensor | None, float], Solution]
@@ -90,6 +91,9 @@ class SolverWithMemory(Generic[AnyOperator]):
         guess = self.last_solution(kind)
         if guess is None and kind == "forward":
             guess = self.start
+        if guess is None and kind == "adjoint":
+            later = self.last_solution(kind, self.round_index + 1)
+            guess = None if later is None else -later
         solution = self.solver(operator, source, guess, self.tolerance_of(kind))
         self.remember(kind, solution, began)
         return solution.value
@@ -98,11 +102,16 @@ class SolverWithMemory(Generic[AnyOperator]):
         """How exactly to solve."""
         return max(self.tolerance, self.memory.tolerance_floor.get(kind, 0.0))
 
-    def last_solution(self, kind: str) -> Tensor | None:
-        """Where to start from; None for tangents, whose directions have nothing in common."""
+    def last_solution(self, kind: str, round_index: int | None = None) -> Tensor | None:
+        """What was found in this round; None for tangents, whose directions have nothing in common.
+
+        `round_index`: of another round.
+        """
         if not self.memory.is_warm or kind == "tangent":
             return None
-        return self.memory.last.get((kind, self.round_index))
+        return self.memory.last.get(
+            (kind, self.round_index if round_index is None else round_index)
+        )
 
     def remember(self, kind: str, solution: Solution, began: float) -> None:
         """Keeps `solution` and the record of the solve that `began` at that time."""

@@ -37,9 +37,13 @@ def compile_rehearsed(computation: Callable[[], object]) -> None:
     """
     if load.cache_info().currsize:
         return
-    # Whatever goes wrong in a rehearsal goes wrong again in earnest, or came of the zeros.
-    with _rehearsal() as kernels, contextlib.suppress(Exception):
-        computation()
+    with _rehearsal() as kernels:
+        try:
+            computation()
+        except Exception as error:
+            # It goes wrong again in earnest, and is told there; or it came of the zeros, and what
+            # the rehearsal did not come to is compiled when it is needed.
+            LOG.debug("the rehearsal ended early, by %s: %s", type(error).__name__, error)
     if not kernels:
         return
     # The first one compiles what all have in common. Adjoints, which come last, take longest.

@@ -115,8 +115,9 @@ def names(bits: int) -> dict[str, str | int]:
         }  # fmt: skip
     return {
         "number": "double", "integer": "long long", "exp": "exp", "digits": 52, "most": "700.0",
-        "shift": "6755399441055744.0", "root_bits": "0x3fe6a09e667f3bcd", "log2_high": "0.693147180369123816490",
-        "log2_low": "1.90821492927058770002e-10", "first": first, "horner": horner,
+        "shift": "6755399441055744.0", "root_bits": "0x3fe6a09e667f3bcd",
+        "log2_high": "0.693147180369123816490", "log2_low": "1.90821492927058770002e-10",
+        "first": first, "horner": horner,
     }  # fmt: skip
 
 

@@ -49,7 +49,7 @@ def march_plainly(emission: Emission, rays: Rays, steps: int) -> tuple[Tensor, T
     for beam in emission.beams:
         # E2: kappa_s p E tau / (4 pi), where tau is what lies between the light and the node.
         travel, irradiance = _unattenuated(beam, points, rays.direction)
-        cosine = -(travel * rays.direction).sum(-1)
+        cosine = -(travel * rays.direction).sum(-1).expand(distance.shape)
         mass = _interpolate(grid, beam.mass, points)
         if emission.peak is None:
             phase = seen.value(cosine[..., None])[..., 0]

@@ -28,8 +28,9 @@ from ddrecon.slabs.slab import Slab
 Sampler = Bands | Equidistant
 Find = Callable[[Emission, Sampler, Integrate], Tensor]
 """What is found along all rays, [*, R], by an integral of values that are sampled."""
-Look = Callable[[], Tensor]
-"""Radiance and mass along all rays, [C + K, R], as fused kernels find them."""
+Look = Callable[[Emission, Sampler, Tensor | None], Tensor]
+"""Radiance and mass along all rays, [C + K, R], behind masses [K, R], as fused kernels find them.
+"""
 
 
 def march_rays(emission: Emission, sampler: Sampler, rays: Rays, crossing: Crossing) -> Part:
@@ -50,10 +51,11 @@ def march_rays(emission: Emission, sampler: Sampler, rays: Rays, crossing: Cross
         index, found = integral.march_rays(emission, sampler, hitting, own, of_some)
         return found.new_zeros(len(found), count).index_copy(1, index, found)
 
-    def look() -> Tensor:
+    def look(emission: Emission, sampler: Sampler, fronts: Tensor | None) -> Tensor:
         from ddrecon.march.fused.march import integrate_rays
 
-        found = integrate_rays(emission, sampler, hitting, own)
+        fronts = None if fronts is None else fronts[:, inside]
+        found = integrate_rays(emission, sampler, hitting, own, fronts)
         return found.new_zeros(len(found), count).index_copy(1, inside, found)
 
     return crossing.hit, _compose(emission, sampler, hitting, find, look)
@@ -89,13 +91,14 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
         found = integral.march_lattice(emission, sampler, own, intersect, of_some).flatten(1)
         return found.new_zeros(len(found), len(near)).index_copy(1, numbers, found)
 
-    def look() -> Tensor:
+    def look(emission: Emission, sampler: Sampler, fronts: Tensor | None) -> Tensor:
         from ddrecon.march.fused.march import integrate_rays
 
         some = own.rays(own.rows, 2 * max(slab.whole.extent))
         near, far = intersect(some)
         inside = torch.arange(len(near), device=near.device)
-        found = integrate_rays(emission, bands, some, Crossing(inside, near, far))
+        fronts = None if fronts is None else fronts[:, numbers]
+        found = integrate_rays(emission, sampler, some, Crossing(inside, near, far), fronts)
         return found.new_zeros(len(found), len(rays.origin)).index_copy(1, numbers, found)
 
     return _compose(emission, bands, rays, find, look).unflatten(1, lattice.shape)
@@ -105,7 +108,7 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
     """Radiance and opacity [2 C, R] of all slabs along `rays`, in this one of which `find` looks.
 
     Or `look`, by fused kernels. With a forward peak (E13) radiance depends on all mass before it,
-    which is then found first; kernels begin without any.
+    which is then found first.
     """
     slab, colors, scale = _slab_of(emission), emission.colors, emission.extinction.scale.view(-1, 1)
     if emission.peak is None:
@@ -113,8 +116,7 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
         def both(values: Tensor, nodes: Nodes, _: Tensor) -> Tensor:
             return torch.cat(integrate_segments(emission, values, nodes))
 
-        has_kernels = is_fused() and emission.seen.phase.cells is None
-        found = look() if has_kernels else find(emission, sampler, both)
+        found = look(emission, sampler, None) if is_fused() else find(emission, sampler, both)
         scattered, mass = found[:colors], found[colors:]
         front, total = _masses(slab, rays, mass)
         scattered = scattered * torch.exp(-scale * front)
@@ -127,7 +129,11 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
             return integrate_segments(emission, values, nodes, front[:, index])[0]
 
         front, total = _masses(slab, rays, find(emission, _of_mass(emission, sampler), passed))
-        scattered = find(emission, sampler, after)
+        scattered = (
+            look(emission, sampler, front)[:colors]
+            if is_fused()
+            else find(emission, sampler, after)
+        )
     return torch.cat([sum_slabs(scattered), opacity_of(emission, total)])
 
 

@@ -7,6 +7,7 @@ cross sections are constant, rays need march through one field only, the density
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from ddrecon.display import Displayed
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.sections import scale_sections
 from ddrecon.numerics.autodiff import is_varied, recompute
@@ -32,7 +33,8 @@ class Volume(Displayed):
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
     [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function; or in its place `g`
     in (-1, 1), the mean cosine of Henyey and Greenstein's. Tensors may be replaced or require
-    gradients. Raises ValueError where shapes disagree.
+    gradients. `media`: what the volume was mixed from, by name (`mixture`). Raises ValueError where
+    shapes disagree.
     """
 
     grid: Grid
@@ -40,6 +42,7 @@ class Volume(Displayed):
     sigma_a: Tensor
     sigma_s: Tensor
     phase: PhaseFunction
+    media: Mapping[str, Volume] | None = None
 
     def __init__(
         self,
@@ -49,11 +52,13 @@ class Volume(Displayed):
         sigma_s: Tensor,
         phase: PhaseFunction | Tensor | None = None,
         g: Tensor | None = None,
+        media: Mapping[str, Volume] | None = None,
     ):
         phase = phase if g is None else g
         if phase is None:
             raise TypeError("a volume needs a phase function, or g")
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
+        self.media = media
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
         if tuple(self.density.shape) != self.grid.shape:
             raise ValueError(
@@ -170,7 +175,7 @@ def scale_medium(volume: Volume, degree: int = P1_DEGREE) -> Medium:
     f is what of the phase function lies beyond `degree`, g' = (g - f) / (1 - f). Source: Joseph,
     Wiscombe, Weinman 1976, doi:10.1175/1520-0469(1976)033<2452:TDEAFR>2.0.CO;2.
     """
-    fraction = _forward_fraction(type(volume.phase), degree, *volume.phase.numbers)
+    fraction = _forward_fraction(volume.phase.kind, degree, *volume.phase.numbers)
     return _medium(volume, SeenPhase(volume.phase, degree), fraction)
 
 
@@ -183,7 +188,7 @@ def keep_medium(volume: Volume) -> Medium:
 
 
 def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
-    g = _mean_cosine(type(volume.phase), *volume.phase.numbers)
+    g = _mean_cosine(volume.phase.kind, *volume.phase.numbers)
     fraction = g.new_zeros(()) if fraction is None else fraction
     sigma_a, sigma_s = _broadcast(volume.sigma_a, g), _broadcast(volume.sigma_s, g)
     find = _find_coefficients
@@ -233,12 +238,12 @@ def _mass_bound(scale: Tensor) -> Tensor:
 
 
 @remember
-def _mean_cosine(kind: type[PhaseFunction], *numbers: Tensor) -> Tensor:
+def _mean_cosine(kind: PhaseKind, *numbers: Tensor) -> Tensor:
     return _for_cells(kind(*numbers).moments(2)[:, 1])
 
 
 @remember
-def _forward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+def _forward_fraction(kind: PhaseKind, degree: int, *numbers: Tensor) -> Tensor:
     return _for_cells(kind(*numbers).forward_fraction(degree))
 
 

@@ -3,7 +3,7 @@
 They are normalized to 4 pi over the sphere, as in docs/theory.md E2. A phase function is known by
 its Legendre moments chi_l (E22), the mean of P_l(cosine) over scattered light: chi_0 = 1, and
 chi_1 is the mean cosine g. Its numbers may differ by color; what is computed from them has the
-color as first axis, of size 1 where all colors share one phase function. One of its numbers may
+color as first axis, of size 1 where all colors share one phase function. Its last number may
 differ from cell to cell, [z, y, x] or [C, z, y, x]: then moments are followed by the cells' axes.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
@@ -22,6 +22,9 @@ from ddrecon.numerics.legendre import COUNTS
 
 NEGLIGIBLE = 1e-9
 """Moments below this are left out of series."""
+
+PhaseKind = Callable[..., "PhaseFunction"]
+"""What makes phase functions of their numbers: mostly their class."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,7 @@ class PhaseFunction(ABC):
         """p >= 0, normalized to 4 pi, `[C, *cosine.shape]`.
 
         `cosine`: between the directions of travel before and after scattering, in [-1, 1]. A number
-        that differs from cell to cell broadcasts against it as it is.
+        that differs from cell to cell is here [C or 1, *cosine.shape].
         """
 
     @abstractmethod
@@ -72,8 +75,22 @@ class PhaseFunction(ABC):
 
     @property
     def numbers(self) -> tuple[Tensor, ...]:
-        """All numbers, in the order of the fields."""
+        """All numbers, as `kind` takes them; last is what may differ from cell to cell."""
         return tuple(getattr(self, field.name) for field in fields(self))
+
+    @property
+    def kind(self) -> PhaseKind:
+        """What makes such a phase function of its `numbers`; it can be hashed."""
+        return type(self)
+
+    @property
+    def variables(self) -> dict[str, Tensor]:
+        """Those of its numbers that can be optimized, by name."""
+        return {name: getattr(self, name) for name in self.VARIABLES}
+
+    def with_variables(self, values: Mapping[str, Tensor]) -> Self:
+        """The same with other `values` of variables."""
+        return replace(self, **values)
 
     @functools.cached_property
     def colors(self) -> int:
@@ -85,7 +102,7 @@ class PhaseFunction(ABC):
     def cells(self) -> Tensor | None:
         """The number that differs from cell to cell, [C, z, y, x]; None where none does."""
         number = None if self.CELLWISE is None else getattr(self, self.CELLWISE)
-        return None if number is None or number.ndim < 3 else _colored(number)
+        return None if number is None or number.ndim < 3 else colored(number)
 
     def with_cells(self, number: Tensor) -> Self:
         """The same with another `number` in place of that which differs from cell to cell."""
@@ -116,7 +133,7 @@ class HenyeyGreenstein(PhaseFunction):
     g: Tensor
 
     def value(self, cosine: Tensor) -> Tensor:
-        return henyey_greenstein(cosine, _beside(self.g, cosine))
+        return henyey_greenstein(cosine, beside(self.g, cosine))
 
     def moments(self, count: int) -> Tensor:
         return _powers(self.g, 0, count)
@@ -128,55 +145,7 @@ class HenyeyGreenstein(PhaseFunction):
         return _powers((-self.g).clamp(min=0), degree + 1, count)
 
     def length(self) -> int:
-        return _length_of(self.g)
-
-
-@dataclass(frozen=True, eq=False)
-class TwoLobe(PhaseFunction):
-    """`weight` of the first of two Henyey-Greenstein functions, and the rest of the second.
-
-    `g` [2]: their mean cosines; `weight`: in [0, 1], scalar, [3] or of cells.
-    """
-
-    NAME = "two_lobe"
-    VARIABLES = ("g", "weight")
-    CELLWISE = "weight"
-
-    g: Tensor
-    weight: Tensor
-
-    def value(self, cosine: Tensor) -> Tensor:
-        weight = _beside(self.weight, cosine)
-        first, second = (lobe.value(cosine) for lobe in self.lobes)
-        if self.cells is not None:
-            first, second = first[0], second[0]
-        return weight * first + (1 - weight) * second
-
-    def moments(self, count: int) -> Tensor:
-        return self._mix([lobe.moments(count) for lobe in self.lobes])
-
-    def peak_tail(self, degree: int, count: int) -> Tensor:
-        return self._mix([lobe.peak_tail(degree, count) for lobe in self.lobes])
-
-    def backward_tail(self, degree: int, count: int) -> Tensor:
-        return self._mix([lobe.backward_tail(degree, count) for lobe in self.lobes])
-
-    def length(self) -> int:
-        return _length_of(self.g)
-
-    @property
-    def lobes(self) -> tuple[HenyeyGreenstein, HenyeyGreenstein]:
-        """Both functions."""
-        return HenyeyGreenstein(self.g[0]), HenyeyGreenstein(self.g[1])
-
-    def _mix(self, parts: Sequence[Tensor]) -> Tensor:
-        """Moments [1, count] of the two lobes as those of both."""
-        weight = self.cells
-        if weight is None:
-            weight = self.weight.reshape(-1, 1)
-        else:
-            weight, parts = weight[:, None], [part[..., None, None, None] for part in parts]
-        return weight * parts[0] + (1 - weight) * parts[1]
+        return length_of(self.g)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,8 +192,8 @@ class Draine(PhaseFunction):
     alpha: Tensor
 
     def value(self, cosine: Tensor) -> Tensor:
-        alpha, norm = _beside(self.alpha, cosine), _beside(self._norm, cosine)
-        g = _beside(self.g, cosine)
+        alpha, norm = beside(self.alpha, cosine), beside(self._norm, cosine)
+        g = beside(self.g, cosine)
         return henyey_greenstein(cosine, g) * (1 + alpha * cosine * cosine) / norm
 
     def moments(self, count: int) -> Tensor:
@@ -245,7 +214,7 @@ class Draine(PhaseFunction):
         return self._lobe.backward_tail(degree, count).expand(self._norm.numel(), -1)
 
     def length(self) -> int:
-        return _length_of(self.g)
+        return length_of(self.g)
 
     @property
     def _lobe(self) -> HenyeyGreenstein:
@@ -262,12 +231,12 @@ def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
     return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
 
 
-def _beside(number: Tensor, cosine: Tensor) -> Tensor:
+def beside(number: Tensor, cosine: Tensor) -> Tensor:
     """`number`, scalar or [C], to broadcast against `[C, *cosine.shape]`; of cells as it is."""
     return number if number.ndim > 2 else number.reshape(-1, *[1] * cosine.ndim)
 
 
-def _colored(number: Tensor) -> Tensor:
+def colored(number: Tensor) -> Tensor:
     """A `number` of cells, [z, y, x] or [C, z, y, x], with colors."""
     return number if number.ndim == 4 else number[None]
 
@@ -276,12 +245,12 @@ def _powers(g: Tensor, first: int, count: int) -> Tensor:
     """g^l for `count` degrees l from `first` on, [C, count] or [C, count, z, y, x]."""
     degree = torch.arange(first, first + count, dtype=g.dtype, device=g.device)
     if g.ndim > 2:
-        powers: Tensor = _colored(g)[:, None] ** degree.view(-1, 1, 1, 1)
+        powers: Tensor = colored(g)[:, None] ** degree.view(-1, 1, 1, 1)
         return powers
     return g.reshape(-1, 1) ** degree
 
 
-def _length_of(g: Tensor) -> int:
+def length_of(g: Tensor) -> int:
     """How many powers of the largest of `g` are not negligible."""
     largest = float(g.detach().abs().max())
     return next((count for count in COUNTS if largest**count < NEGLIGIBLE), COUNTS[-1])

@@ -2,20 +2,22 @@
 
 The number that differs is interpolated to the nodes of rays, as density is. Without a forward peak
 the phase function is evaluated there. With one, S of E13 is looked up by that number and by the
-angle: its polynomials are kept at even steps of the number, the rungs (docs/theory.md E36).
+angle: its polynomials are kept at even steps of the number, the rungs (docs/theory.md E36), for
+each color whose phase function has other numbers besides.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Medium
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, PhaseKind
+from ddrecon.medium.phase_blend import Mixture
 from ddrecon.medium.phase_peak import peak_table
 from ddrecon.medium.remaining import turned_table
 from ddrecon.numerics.angle_table import (
@@ -47,8 +49,10 @@ class SeenNodes:
     degree: int
 
     def value(self, cosine: Tensor) -> Tensor:
-        """p [N, C, R] at `cosine` [R] or [N, 1, R]."""
-        return self.phase.with_cells(self.number).value(cosine)
+        """p [N, C, R] at `cosine` [R] or [N, R]."""
+        number = self.number.movedim(1, 0)
+        found = self.phase.with_cells(number).value(cosine.expand(number.shape[1:]))
+        return found.movedim(0, 1)
 
     def along(self, depth: Tensor, cosine: Tensor) -> Tensor:
         """S at `depth` [N, C, R] along R rays, each with one `cosine` [R]."""
@@ -59,56 +63,59 @@ class SeenNodes:
 
         Where g is not positive there is no peak, and S is p.
         """
-        angle, kind = angle[:, None], type(self.phase)
+        kind, number = self.phase.kind, self.number.movedim(1, 0)
         if depth is None and not is_steep(kind):
-            other, change = look_up(end_table(self.phase).to(self.number), angle).unbind(-1)
-            return other[0] + self.number * change[0]
-        plain = self.value(angle.cos().to(self.number))
+            other, change = look_up(end_table(self.phase).to(number), angle).unbind(-1)
+            return (other + number * change).movedim(0, 1)
+        plain = self.value(angle.cos().to(number))
         if depth is None:
             return plain
-        table = peak_tables(self.phase, self.degree).to(self.number)
-        place, angle = torch.broadcast_tensors(_place(kind, self.number.clamp(min=0), 0), angle)
-        coefficients = look_up_between(table, place, angle.double())
-        seen = evaluate_positive(coefficients.movedim(-1, 0), depth)
+        tables = peak_tables(self.phase, self.degree).to(number)
+        coefficients = _look_up(tables, _place(kind, number.clamp(min=0), 0), angle)
+        seen = evaluate_positive(coefficients.permute(3, 1, 0, 2), depth)
         return torch.where(self.number > 0, seen, plain) if is_steep(kind) else seen
 
 
-def is_steep(kind: type[PhaseFunction]) -> bool:
+def is_steep(kind: PhaseKind) -> bool:
     """Whether the number is g, and rungs are even in artanh g; else p is linear in it, a weight."""
     return kind is HenyeyGreenstein
 
 
+def count_tables(phase: PhaseFunction) -> int:
+    """How many colors have other numbers besides that of cells; 1 where they share them."""
+    return max(part.colors for part in phase.parts) if isinstance(phase, Mixture) else 1
+
+
 def peak_tables(phase: PhaseFunction, degree: int) -> Tensor:
-    """Polynomials of S at all rungs, and slopes from one to the next, [n, 2, steps + 1, 2, K]."""
-    return _peak_tables(type(phase), degree, *_rungs_and_others(phase, 0))
+    """Polynomials of S at all rungs, and slopes between, [1 or 3, n, 2, steps + 1, 2, K]."""
+    return _peak_tables(phase.kind, degree, *_rungs_and_others(phase, 0))
 
 
 def at_ends(phase: PhaseFunction, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """p where a weight is 0, and how much that changes until it is 1: [*cosine.shape] each."""
-    none, whole = (phase.with_cells(cosine.new_tensor(end)).value(cosine)[0] for end in (0.0, 1.0))
+    """p where a weight is 0, and its change until that is 1: [1 or 3, *cosine.shape] each."""
+    none, whole = (phase.with_cells(cosine.new_tensor(end)).value(cosine) for end in (0.0, 1.0))
     return none, whole - none
 
 
 def end_table(phase: PhaseFunction) -> Tensor:
-    """The two of `at_ends` over the angle, as `look_up` has them, [1, steps + 1, 2, 2]."""
-    return _end_table(type(phase), *others_of(phase))
+    """The two of `at_ends` over the angle, as `look_up` has them, [1 or 3, steps + 1, 2, 2]."""
+    return _end_table(phase.kind, *others_of(phase))
 
 
 @remember
-def _end_table(kind: type[PhaseFunction], *others: Tensor) -> Tensor:
+def _end_table(kind: PhaseKind, *others: Tensor) -> Tensor:
     cosines = even_angles(STEPS).to(others[0].device).cos()
     phase = kind(*(each.double() for each in others), cosines.new_zeros(()))
-    return torch.cat([with_slopes(end[None]) for end in at_ends(phase, cosines)], -1)
+    return torch.cat([with_slopes(end) for end in at_ends(phase, cosines)], -1)
 
 
 def turned_in_cells(medium: Medium, turns: int, angle: Tensor) -> Tensor:
     """What `turned_phase` is of each cell, [C, z, y, x] at `angle` [z, y, x] (E21)."""
-    phase, kind = medium.seen.phase, type(medium.seen.phase)
+    phase, kind = medium.seen.phase, medium.seen.phase.kind
     assert phase.cells is not None
     backward = STEEP_STEPS
-    table = _turned_tables(kind, medium.seen.degree, turns, *_rungs_and_others(phase, backward))
-    place, angle = torch.broadcast_tensors(_place(kind, phase.cells, backward), angle)
-    return look_up_between(table.to(phase.cells), place, angle.double())[..., 0]
+    tables = _turned_tables(kind, medium.seen.degree, turns, *_rungs_and_others(phase, backward))
+    return _look_up(tables.to(phase.cells), _place(kind, phase.cells, backward), angle)[..., 0]
 
 
 def _rungs_and_others(phase: PhaseFunction, backward: int) -> list[Tensor]:
@@ -116,15 +123,27 @@ def _rungs_and_others(phase: PhaseFunction, backward: int) -> list[Tensor]:
 
     Of g so many of them are `backward`.
     """
-    return [_rungs(type(phase), backward, phase.numbers[0].device), *others_of(phase)]
+    return [_rungs(phase.kind, backward, phase.numbers[0].device), *others_of(phase)]
 
 
 def others_of(phase: PhaseFunction) -> list[Tensor]:
-    """All numbers of `phase` but that which differs from cell to cell, in their order."""
-    return [getattr(phase, one.name) for one in fields(phase) if one.name != phase.CELLWISE]
+    """All numbers of `phase` but the last, which may differ from cell to cell."""
+    return list(phase.numbers[:-1])
 
 
-def _place(kind: type[PhaseFunction], number: Tensor, backward: int) -> Tensor:
+def _look_up(tables: Tensor, place: Tensor, angle: Tensor) -> Tensor:
+    """Values [C, *angle.shape, K] of the `tables` [1 or C, ...] at `place` [1 or C, ...].
+
+    Each is as `look_up_between` has it; `angle` is the same for all colors.
+    """
+    colors = max(len(tables), len(place))
+    place, angle = place.expand(colors, *angle.shape), angle.double()
+    if len(tables) == 1:
+        return look_up_between(tables[0], place, angle.expand(place.shape))
+    return torch.stack([look_up_between(*each, angle) for each in zip(tables, place, strict=True)])
+
+
+def _place(kind: PhaseKind, number: Tensor, backward: int) -> Tensor:
     """Between which of the rungs `number` is, counted from the first."""
     if not is_steep(kind):
         return number * EVEN_STEPS
@@ -133,7 +152,7 @@ def _place(kind: type[PhaseFunction], number: Tensor, backward: int) -> Tensor:
 
 @functools.cache
 @torch.inference_mode(False)
-def _rungs(kind: type[PhaseFunction], backward: int, device: torch.device) -> Tensor:
+def _rungs(kind: PhaseKind, backward: int, device: torch.device) -> Tensor:
     """The numbers at which tables are kept, [n]: even steps of artanh g, or of a weight."""
     if is_steep(kind):
         steps = torch.arange(-backward, STEEP_STEPS + 1, dtype=torch.float64, device=device)
@@ -142,8 +161,8 @@ def _rungs(kind: type[PhaseFunction], backward: int, device: torch.device) -> Te
 
 
 @remember
-def _peak_tables(kind: type[PhaseFunction], degree: int, rungs: Tensor, *others: Tensor) -> Tensor:
-    """Polynomials of S at all `rungs`, and their slopes, [n, 2, steps + 1, 2, K].
+def _peak_tables(kind: PhaseKind, degree: int, rungs: Tensor, *others: Tensor) -> Tensor:
+    """Polynomials of S at all `rungs`, and their slopes, [1 or 3, n, 2, steps + 1, 2, K].
 
     `others` are the numbers of the phase function in front of the one that has the rungs.
     """
@@ -153,18 +172,21 @@ def _peak_tables(kind: type[PhaseFunction], degree: int, rungs: Tensor, *others:
 
 @remember
 def _turned_tables(
-    kind: type[PhaseFunction], degree: int, turns: int, rungs: Tensor, *others: Tensor
+    kind: PhaseKind, degree: int, turns: int, rungs: Tensor, *others: Tensor
 ) -> Tensor:
     """How turned light scatters towards a camera at all `rungs`, as `_peak_tables`."""
     return _with_slopes([turned_table(kind, degree, turns, *others, rung) for rung in rungs])
 
 
 def _with_slopes(tables: Sequence[Tensor]) -> Tensor:
-    """Tables [1, steps + 1, 2, K] of all rungs, and their slopes from one to the next."""
-    values = torch.cat(list(tables))
+    """Tables [C, steps + 1, 2, K] of all rungs, and their slopes from one to the next.
+
+    They are [C, n, 2, steps + 1, 2, K].
+    """
+    values = torch.stack(list(tables))
     wide = _extended(_extended(values))
     near, far = wide[3:-1] - wide[1:-3], wide[4:] - wide[:-4]
-    return torch.stack([values, (8 * near - far) / 12], 1)
+    return torch.stack([values, (8 * near - far) / 12], 1).movedim(2, 0).contiguous()
 
 
 def _extended(tables: Tensor) -> Tensor:

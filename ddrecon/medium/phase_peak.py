@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase import PhaseFunction, PhaseKind
 from ddrecon.numerics.angle_table import STEPS, angle_of, look_up, with_slopes
 from ddrecon.numerics.chebyshev import evaluate_positive, extrema
 from ddrecon.numerics.decay import decay_mean
@@ -78,7 +78,7 @@ class SeenPhase:
 
         At even angles, with slopes by the angle (`numerics.angle_table`), in double precision.
         """
-        kind, numbers = type(self.phase), self.phase.numbers
+        kind, numbers = self.phase.kind, self.phase.numbers
         return peak_table(kind, self.degree, *numbers) if has_peak else _plain_table(kind, *numbers)
 
 
@@ -102,13 +102,13 @@ def peaked_series(phase: PhaseFunction, degree: int, depth: Tensor) -> Tensor:
 
 
 @remember
-def _plain_table(kind: type[PhaseFunction], *numbers: Tensor) -> Tensor:
+def _plain_table(kind: PhaseKind, *numbers: Tensor) -> Tensor:
     cosines = even_angles(STEPS).to(numbers[0].device).cos()
     return with_slopes(kind(*(each.double() for each in numbers)).value(cosines))
 
 
 @remember
-def peak_table(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+def peak_table(kind: PhaseKind, degree: int, *numbers: Tensor) -> Tensor:
     """The polynomials of S, [C, steps + 1, 2, COEFFICIENTS], of the phase function of `numbers`."""
     depths, inverse = (each.to(numbers[0].device) for each in extrema())
     # At the depths of the fit, and from these to coefficients: [C, count, COEFFICIENTS].

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.medium.coefficients import P1_DEGREE, Medium
-from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase import PhaseKind
 from ddrecon.numerics.angle_table import STEPS
 from ddrecon.numerics.legendre import legendre_at_even_angles, series_weights
 from ddrecon.numerics.remember import is_any_nonzero, remember
@@ -19,7 +19,7 @@ def remaining_moments(medium: Medium) -> Tensor:
     that differs from cell to cell they are [L + 1, C or 1, z, y, x].
     """
     phase = medium.seen.phase
-    return _remaining(type(phase), medium.forward_fraction, medium.seen.degree, *phase.numbers)
+    return _remaining(phase.kind, medium.forward_fraction, medium.seen.degree, *phase.numbers)
 
 
 def unturned_moments(medium: Medium) -> Tensor:
@@ -39,7 +39,7 @@ def backward_fraction(medium: Medium) -> Tensor:
     It is [C or 1, z, y, x] where the phase function differs from cell to cell.
     """
     phase = medium.seen.phase
-    return _backward_fraction(type(phase), medium.seen.degree, *phase.numbers)
+    return _backward_fraction(phase.kind, medium.seen.degree, *phase.numbers)
 
 
 def has_backward_peak(medium: Medium) -> bool:
@@ -55,26 +55,24 @@ def turned_phase(medium: Medium, turns: int) -> Tensor:
     backward peak's; less the forward peak's, which counts as not scattered.
     """
     phase = medium.seen.phase
-    return turned_table(type(phase), medium.seen.degree, turns, *phase.numbers)
+    return turned_table(phase.kind, medium.seen.degree, turns, *phase.numbers)
 
 
 @remember
-def _remaining(
-    kind: type[PhaseFunction], fraction: Tensor, degree: int, *numbers: Tensor
-) -> Tensor:
+def _remaining(kind: PhaseKind, fraction: Tensor, degree: int, *numbers: Tensor) -> Tensor:
     moments = kind(*numbers).moments(degree + 1).transpose(0, 1)
     moments = moments if moments.ndim == 5 else moments[..., None, None, None]
     return (moments - fraction) / (1 - fraction)
 
 
 @remember
-def _backward_fraction(kind: type[PhaseFunction], degree: int, *numbers: Tensor) -> Tensor:
+def _backward_fraction(kind: PhaseKind, degree: int, *numbers: Tensor) -> Tensor:
     fraction = kind(*numbers).backward_fraction(degree)
     return fraction + 0 if fraction.ndim == 4 else fraction.view(-1, 1, 1, 1) + 0
 
 
 @remember
-def turned_table(kind: type[PhaseFunction], degree: int, turns: int, *numbers: Tensor) -> Tensor:
+def turned_table(kind: PhaseKind, degree: int, turns: int, *numbers: Tensor) -> Tensor:
     """What `turned_phase` returns, of the phase function of `numbers`."""
     phase = kind(*numbers)
     count = phase.length()

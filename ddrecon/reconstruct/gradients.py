@@ -19,7 +19,7 @@ from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
 from ddrecon.slabs.slab import Slab
-from ddrecon.variables.kinds import VOLUME
+from ddrecon.variables.kinds import is_of_volume
 from ddrecon.variables.values import with_values
 
 
@@ -49,7 +49,7 @@ def differentiate(
     # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
     cut = _Cut()
     light_field = cut.cut(solve_light(with_values(scene, values), memory))
-    outside = {name: value for name, value in values.items() if name not in VOLUME}
+    outside = {name: value for name, value in values.items() if not is_of_volume(name)}
     inputs = [*values.values(), *cut.leaves]
     own, has_slabs = own_views(scene, names), isinstance(light_field.medium.grid, Slab)
     # Views share what is made of values: so that each has a graph of its own, it is made anew.

@@ -10,6 +10,7 @@ from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interp
 
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.mixture import mix_media
 from ddrecon.ranks import cells_are_shared
 from ddrecon.scene import Scene, View
 
@@ -42,19 +43,28 @@ def scene_at_level(scene: Scene, factor: int) -> Scene:
     if factor == 1:
         return scene
     volume, grid = scene.volume, scene.volume.grid.coarsen(factor)
-    sigma_a, sigma_s = (
-        _resample_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s)
-    )
-    phase = volume.phase
-    if phase.cells is not None:
-        phase = phase.with_cells(resample(phase.cells, grid))
-    coarse = Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, phase)
+    coarse = _volume_at_level(volume, grid)
     starts = {
         name: resample(start, grid) if start.shape[-3:] == volume.grid.shape else start
         for name, start in scene.starts.items()
     }
     views = [_view_at_level(view, factor) for view in scene.views]
     return replace(scene, volume=coarse, views=views, starts=starts)
+
+
+def _volume_at_level(volume: Volume, grid: Grid) -> Volume:
+    """`volume` on a coarser `grid`, each medium by itself."""
+    if volume.media is not None:
+        return mix_media(
+            {name: _volume_at_level(medium, grid) for name, medium in volume.media.items()}
+        )
+    sigma_a, sigma_s = (
+        _resample_cross_section(sigma, grid) for sigma in (volume.sigma_a, volume.sigma_s)
+    )
+    phase = volume.phase
+    if phase.cells is not None:
+        phase = phase.with_cells(resample(phase.cells, grid))
+    return Volume(grid, resample(volume.density, grid), sigma_a, sigma_s, phase)
 
 
 def resample(field: Tensor, grid: Grid) -> Tensor:

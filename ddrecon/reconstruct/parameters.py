@@ -24,6 +24,11 @@ EPSILON = 1e-15
 
 That of a mean over pixels with respect to one cell is far smaller than the customary 1e-8.
 """
+FLOOR = 0.3
+"""What is added to the size of a cell's derivative, as a part of the root mean square of all.
+
+So cells that no picture says much of are not moved as far as any by what noise says.
+"""
 HALVED = 1 << 20
 """Of fields of so many numbers, what a run goes back to has moments in half the bits."""
 
@@ -33,10 +38,11 @@ class Parameter:
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
-    is Adam (Kingma and Ba 2015, arXiv:1412.6980). While a field `is_even`, all its cells change
-    alike; that ends after the part `even_until` of a run. `rate` is one number or one for each
-    entry. `view` is the name of the view that it belongs to, None for what all views see. One that
-    `is_fitted` is solved for instead; `curvature` is the second derivative of the loss by it.
+    is Adam (Kingma and Ba 2015, arXiv:1412.6980); of fields with Nesterov's momentum and a `FLOOR`
+    (E53), begun anew at each resolution. While a field `is_even`, all its cells change alike; that
+    ends after the part `even_until` of a run. `rate` is one number or one for each entry. `view` is
+    the name of the view that it belongs to, None for what all views see. One that `is_fitted` is
+    solved for instead; `curvature` is the second derivative of the loss by it.
     """
 
     def __init__(
@@ -91,7 +97,7 @@ class Parameter:
 
         `rate` is the part of its learning rate that counts now. With m and v the running means of
         the derivative and of its square, each divided by the part of 1 that their weights sum to,
-        Adam moves the value by -rate m / (sqrt(v) + epsilon).
+        Adam moves the value by -rate m / (sqrt(v) + epsilon), and a field as E53 says.
         """
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
@@ -112,17 +118,30 @@ class Parameter:
         if current_engine() == "warp" and isinstance(rate, float):
             from ddrecon.reconstruct.fused.passes import step_adam
 
-            bounds = self.low, self.high
+            bounds, ahead = (self.low, self.high), BETAS[0] if self.is_field else 1.0
+            smallest = self._smallest_size(gradient)
             return step_adam(
-                before, gradient, self.moments, BETAS, self.steps, rate, EPSILON, bounds
+                before, gradient, self.moments, BETAS, self.steps, rate, smallest, ahead, bounds
             )
         first, second = self.moments
         weights = [1 - beta ** float(self.steps) for beta in BETAS]
         first = first.lerp(gradient, 1 - BETAS[0])
         second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-        size = (second.sqrt() / weights[1] ** 0.5).add_(EPSILON)
-        value = before - first / size * (rate / weights[0])
+        size = (second.sqrt() / weights[1] ** 0.5).add_(self._smallest_size(gradient))
+        onward = gradient.lerp(first, BETAS[0]) if self.is_field else first
+        value = before - onward / size * (rate / weights[0])
         return value.clamp_(self.low, self.high), (first, second)
+
+    def _smallest_size(self, gradient: Tensor) -> Tensor:
+        """What is added to the size of each entry's derivative, `gradient` among them: one number.
+
+        It is a tensor, so that no device has to be waited for.
+        """
+        if not self.is_field:
+            return gradient.new_tensor(EPSILON)
+        # Of the mean of the new second moments, before there are any.
+        mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - BETAS[1])
+        return FLOOR * (mean / (1 - BETAS[1] ** float(self.steps))).sqrt() + EPSILON
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""
@@ -130,17 +149,15 @@ class Parameter:
         return (resample(value, grid) if self.is_field else value).clone()
 
     def refine(self, grid: Grid) -> None:
-        """Carries field and moments to `grid`.
+        """Carries a field to `grid`, where its optimizer begins anew.
 
-        A derivative with respect to a cell shrinks with the cell's volume.
+        The sizes of derivatives that it remembers are those of an emptier volume: with them it
+        would hardly move.
         """
-        volume_ratio = self.grid.cells / grid.cells
         self.grid = grid
-        if not self.is_field:
-            return
-        self.value = self.value_on(grid).requires_grad_()
-        first, second = (resample(moment, grid) for moment in self.moments)
-        self.moments = first * volume_ratio, second * volume_ratio**2
+        if self.is_field:
+            self.value = self.value_on(grid).requires_grad_()
+            self.forget()
 
     def forget(self) -> None:
         """Has its optimizer begin anew where the value is."""

@@ -12,7 +12,8 @@ from dataclasses import fields, replace
 from torch import Tensor
 
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
-from ddrecon.medium.phase import PhaseFunction, TwoLobe
+from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.scene import Scene
 
 
@@ -34,13 +35,17 @@ def pick_color(scene: Scene, color: int) -> Scene:
 def _pick_phase(phase: PhaseFunction, color: int) -> PhaseFunction:
     if phase.colors == 1:
         return phase
-    numbers = {field.name: getattr(phase, field.name) for field in fields(phase)}
-    lobes = {"g"} if isinstance(phase, TwoLobe) else set()
-    picked = {
-        name: number if name in lobes or number.ndim == 0 else _pick(number, color)
-        for name, number in numbers.items()
-    }
-    return replace(phase, **picked)
+    if isinstance(phase, Blend):
+        first, second = (_pick_phase(part, color) for part in phase.parts)
+        return replace(phase, first=first, second=second, weight=_pick_number(phase.weight, color))
+    shared = "g" if isinstance(phase, TwoLobe) else ""
+    names = [field.name for field in fields(phase) if field.name != shared]
+    return replace(phase, **{name: _pick_number(getattr(phase, name), color) for name in names})
+
+
+def _pick_number(number: Tensor, color: int) -> Tensor:
+    """Of a `number` by color [3] or [3, z, y, x] that one's; else the number as it is."""
+    return number if number.ndim in (0, 3) else _pick(number, color)
 
 
 def _pick_light(light: Light, color: int) -> Light:

@@ -8,7 +8,8 @@ import torch
 
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import Mixture
 from ddrecon.reference.mitsuba_volume import grid_volume
 
 COSINES = 1 << 15
@@ -26,14 +27,14 @@ def mitsuba_phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
     if isinstance(phase, HenyeyGreenstein) and phase.cells is not None:
         raise SceneError(
             "volume.g: differs from cell to cell, and Mitsuba's hg has one g;"
-            " it knows two_lobe with a weight per cell"
+            " it knows two_lobe and blend with a weight per cell"
         )
     if isinstance(phase, HenyeyGreenstein):
         return {"type": "hg", "g": phase.g.item()}
     if isinstance(phase, Rayleigh):
         return {"type": "rayleigh"}
-    if isinstance(phase, TwoLobe):
-        first, second = (mitsuba_phase(lobe, grid) for lobe in phase.lobes)
+    if isinstance(phase, Mixture):
+        first, second = (mitsuba_phase(part, grid) for part in phase.parts)
         return {
             "type": "blendphase",
             "weight": _rest(phase, grid),
@@ -41,12 +42,12 @@ def mitsuba_phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
             "second": second,
         }
     cosines = torch.linspace(-1, 1, COSINES + 1, dtype=torch.float64)
-    values = type(phase)(*(each.detach().cpu().double() for each in phase.numbers)).value(cosines)
+    values = phase.kind(*(each.detach().cpu().double() for each in phase.numbers)).value(cosines)
     return {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values[0].tolist())}
 
 
-def _rest(phase: TwoLobe, grid: Grid) -> Any:
-    """The weight of the second lobe: a number or a volume."""
+def _rest(phase: Mixture, grid: Grid) -> Any:
+    """The weight of the second part: a number or a volume."""
     if phase.cells is None:
         return 1 - phase.weight.item()
     return grid_volume(1 - phase.cells.detach().cpu(), grid)

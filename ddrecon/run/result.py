@@ -10,7 +10,7 @@ from ddrecon.lenses import MODELS
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import PAIRS, PHASE, VOLUME
+from ddrecon.variables.kinds import PAIRS, PHASE, is_of_volume, split_name
 
 LENS = ("focal", "principal_point", "distortion")
 RESULT = "result.yaml"
@@ -22,7 +22,13 @@ def result_names(parameters: list[str]) -> list[str]:
 
     These, and what is left of a pair of them.
     """
-    partners = [name for pair in PAIRS if set(pair) & set(parameters) for name in pair]
+    partners = [
+        medium + name
+        for medium, last in map(split_name, parameters)
+        for pair in PAIRS
+        if last in pair
+        for name in pair
+    ]
     return list(dict.fromkeys([*parameters, *partners]))
 
 
@@ -49,13 +55,17 @@ def describe_result(
         "bounds": {"min": list(low), "max": list(high)},
         "resolution": list(reversed(scene.volume.grid.shape)),
     }
-    volume = {name: value for name, value in values.items() if name in VOLUME}
-    replaced = {
-        name for pair in PAIRS if set(pair) & set(volume) for name in (*PAIRS[0], *PAIRS[1])
+    described["volume"] |= box
+    media = {"": described["volume"]} | {
+        f"media.{name}.": section for name, section in described["volume"].get("media", {}).items()
     }
-    kept = {name: value for name, value in described["volume"].items() if name not in replaced}
-    numbers = {name: volume.pop(name) for name in [*volume] if name == "g" or PHASE in name}
-    described["volume"] = _with_phase(kept | box | volume, numbers)
+    for medium, section in media.items():
+        of_medium = {
+            split_name(name)[1]: value
+            for name, value in values.items()
+            if is_of_volume(name) and split_name(name)[0] == medium
+        }
+        _put_medium(section, of_medium)
     # The lights, an attribute at a time: `lights.0.irradiance`.
     for name, value in values.items():
         if name.startswith("lights."):
@@ -75,16 +85,31 @@ def describe_result(
     return described
 
 
-def _with_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> dict[str, Any]:
-    """The section `volume` with reconstructed `numbers` of its phase function."""
-    if "phase" not in volume or not numbers:
-        return {**volume, **numbers}
-    found = {name.removeprefix(PHASE): number for name, number in numbers.items()}
-    if "coefficients" in found:
-        # They count from chi_1 on, and replace those of a file.
-        found["coefficients"] = [1.0, *found["coefficients"]]
-        volume["phase"].pop("file", None)
-    return volume | {"phase": volume["phase"] | found}
+def _put_medium(section: dict[str, Any], values: dict[str, Any]) -> None:
+    """Puts what was found of a medium into its `section`."""
+    if any(set(pair) & set(values) for pair in PAIRS):
+        for name in (*PAIRS[0], *PAIRS[1]):
+            section.pop(name, None)
+    numbers = {name: values.pop(name) for name in [*values] if name == "g" or PHASE in name}
+    section.update(values)
+    _put_phase(section, numbers)
+
+
+def _put_phase(volume: dict[str, Any], numbers: Mapping[str, Any]) -> None:
+    """Puts reconstructed `numbers` of its phase function into the section `volume`."""
+    if "phase" not in volume:
+        volume.update(numbers)
+        return
+    for name, number in numbers.items():
+        *path, key = name.removeprefix(PHASE).split(".")
+        section = volume["phase"]
+        for step in path:
+            section = section[int(step)] if isinstance(section, list) else section[step]
+        section[key] = number
+        if key == "coefficients":
+            # They count from chi_1 on, and replace those of a file.
+            section[key] = [1.0, *number]
+            section.pop("file", None)
 
 
 def _lens(values: Mapping[str, Any], camera: dict[str, Any]) -> dict[str, Any]:

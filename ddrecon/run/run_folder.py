@@ -28,7 +28,7 @@ from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, FIELDS, PHASE, VOLUME
+from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, is_of_volume, kind_of, split_name
 from ddrecon.variables.values import fields_of, value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
@@ -115,7 +115,8 @@ class RunFolder:
         self.save(run)
         scene = run.current_scene()
         names = result_names([parameter.name for parameter in run.parameters])
-        values = {name: self._store(scene, name) for name in dict.fromkeys(["density", *names])}
+        densities = [name for name in variable_names(scene) if split_name(name)[1] == "density"]
+        values = {name: self._store(scene, name) for name in dict.fromkeys([*densities, *names])}
         write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         light_field = solve(scene)
@@ -139,11 +140,13 @@ class RunFolder:
         value = value_of(scene, name)
         if value.ndim < 3:
             return _plain(value)
-        if name not in FIELDS and value.ndim == 3:
+        if not kind_of(name).is_cellwise and value.ndim == 3:
             return self._write_map(name, value)
         array = value if value.ndim == 3 else value.permute(1, 2, 3, 0).squeeze(-1)
-        called = name.removeprefix(PHASE)
-        file, box = Path("volumes", f"{called}.npz"), np.array(scene.volume.grid.bounds_xyz)
+        medium, last = split_name(name)
+        called = last.removeprefix(PHASE)
+        stem = medium.removeprefix("media.") + called
+        file, box = Path("volumes", f"{stem}.npz"), np.array(scene.volume.grid.bounds_xyz)
         write_field(self.path / file, called, array.float().cpu().numpy(), box)
         return {"file": str(file)}
 
@@ -154,7 +157,10 @@ class RunFolder:
         """
         parameters: dict[str, Any] = {}
         for name in variable_names(scene):
-            is_told = name in VOLUME and name not in ("density", *EXTINCTION_AND_ALBEDO)
+            is_told = is_of_volume(name) and split_name(name)[1] not in (
+                "density",
+                *EXTINCTION_AND_ALBEDO,
+            )
             if is_told and (value := value_of(scene, name)).ndim < 2:
                 parameters[name] = value.tolist()
         for name in variable_names(scene):

@@ -17,7 +17,7 @@ from ddrecon.scene_file.files import read_referenced, require
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import PHASE, kind_of
+from ddrecon.variables.kinds import PHASE, kind_of, split_name
 from ddrecon.variables.values import component_names, value_of, variable_names
 
 
@@ -87,7 +87,7 @@ def _read_cells(
     scene_file: SceneFile, key: str, name: str, init: FieldFile, value: Tensor
 ) -> Tensor:
     """The file's values per cell, [C, z, y, x] or, where there are no colors, [z, y, x]."""
-    read = partial(read_field, name=init.name or name.removeprefix(PHASE))
+    read = partial(read_field, name=init.name or split_name(name)[1].removeprefix(PHASE))
     field = torch.from_numpy(read_referenced(scene_file, key, init.file, read).values).to(value)
     has_colors = field.ndim == 4
     if kind_of(name).is_color:

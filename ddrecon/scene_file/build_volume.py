@@ -6,6 +6,7 @@ The scene and every field file must agree on the grid.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,19 +20,25 @@ from ddrecon.grid import Grid, Triple
 from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, make_room
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, TwoLobeSection
+from ddrecon.scene_file.phase_schema import (
+    BlendSection,
+    HenyeyGreensteinSection,
+    TwoLobeSection,
+)
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.rounds import choose_rounds
-from ddrecon.scene_file.schema import VolumeSection
+from ddrecon.scene_file.schema import AnyVolume, MediumSection, VolumeSection
 from ddrecon.settings import FieldFile, ParameterSettings
-from ddrecon.variables.kinds import FIELDS, KINDS, PHASE, kind_of
+from ddrecon.variables.kinds import FIELDS, PHASE, kind_of, split_name
 from ddrecon.variables.values import cross_sections
 
 Fields = Mapping[str, Field]
@@ -44,51 +51,109 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
 
     Raises SceneError with all its problems, or FormatError.
     """
-    section = scene_file.tree.volume
     fields = _read_fields(scene_file)
     grid = _agree_on_grid(scene_file, fields)
-    cells = next((_channels_first(fields[name]) for name in _BY_ANGLE if name in fields), None)
-    phase = build_phase(scene_file, cells, dtype, device)
-    if too_much := make_room(_needs(scene_file, fields, grid, phase, dtype), device):
+    media = {
+        medium: _Medium(section, {name: fields[medium + name] for name in _names(medium, fields)})
+        for medium, section in _media(scene_file.tree.volume).items()
+    }
+    phases = {
+        medium: build_phase(
+            scene_file, each.section, f"volume.{medium}".strip("."), each.cells, dtype, device
+        )
+        for medium, each in media.items()
+    }
+    if too_much := make_room(_needs(scene_file, media, grid, phases, dtype), device):
         raise scene_file.refused("volume.resolution", too_much)
+    volumes = {
+        medium.removeprefix("media.").strip("."): each.build(grid, phases[medium], dtype, device)
+        for medium, each in media.items()
+    }
+    return volumes[""] if "" in volumes else mix_media(volumes)
 
-    def quantity(name: str) -> Tensor:
-        if name in fields:
-            return _channels_first(fields[name])
-        value: Color = getattr(section, name)
+
+@dataclass(frozen=True)
+class _Medium:
+    """What the scene says of one medium, and the `fields` of its files by variable."""
+
+    section: VolumeSection | MediumSection
+    fields: Fields
+
+    @property
+    def cells(self) -> Tensor | None:
+        """The number of the phase function that a file gives cell by cell."""
+        names = (name for name in _BY_ANGLE if name in self.fields)
+        return next((_channels_first(self.fields[name]) for name in names), None)
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether one of its quantities differs by color."""
+        given = _quantities_of(self.section).items()
+        return any(
+            self.fields[name].values.ndim == 4 if name in self.fields else isinstance(value, tuple)
+            for name, (_, value) in given
+        )
+
+    def build(
+        self, grid: Grid, phase: PhaseFunction, dtype: torch.dtype, device: torch.device
+    ) -> Volume:
+        """The medium as tensors."""
+        if self.section.sigma_t is None:
+            sigma_a, sigma_s = self._quantity("sigma_a"), self._quantity("sigma_s")
+        else:
+            sigma_a, sigma_s = cross_sections(self._quantity("sigma_t"), self._quantity("albedo"))
+        sigma_a, sigma_s = _same_colors(sigma_a, sigma_s)
+        if phase.colors > 1:
+            sigma_a, sigma_s = (sigma.expand(3, *sigma.shape[1:]) for sigma in (sigma_a, sigma_s))
+        density = self._quantity("density")
+        density = (
+            density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
+        )
+        density, sigma_a, sigma_s = (
+            tensor.to(device, dtype) for tensor in (density, sigma_a, sigma_s)
+        )
+        return Volume(grid, density, sigma_a, sigma_s, phase)
+
+    def _quantity(self, name: str) -> Tensor:
+        if name in self.fields:
+            return _channels_first(self.fields[name])
+        value: Color = getattr(self.section, name)
         return torch.tensor([value] if isinstance(value, float) else value, dtype=torch.float64)
 
-    if section.sigma_t is None:
-        sigma_a, sigma_s = quantity("sigma_a"), quantity("sigma_s")
-    else:
-        sigma_a, sigma_s = cross_sections(quantity("sigma_t"), quantity("albedo"))
-    sigma_a, sigma_s = _same_colors(sigma_a, sigma_s)
-    if phase.colors > 1:
-        sigma_a, sigma_s = (sigma.expand(3, *sigma.shape[1:]) for sigma in (sigma_a, sigma_s))
-    density = quantity("density")
-    density = (
-        density[0] if density.ndim == 4 else torch.full(grid.shape, density.item(), dtype=dtype)
-    )
-    density, sigma_a, sigma_s = (tensor.to(device, dtype) for tensor in (density, sigma_a, sigma_s))
-    return Volume(grid, density, sigma_a, sigma_s, phase)
+
+def _media(volume: AnyVolume) -> dict[str, VolumeSection | MediumSection]:
+    """The sections of media, by what names of their variables begin with."""
+    if isinstance(volume, VolumeSection):
+        return {"": volume}
+    return {f"media.{name}.": section for name, section in volume.media.items()}
+
+
+def _names(medium: str, fields: Fields) -> list[str]:
+    """The names of those `fields` that are of one `medium`, within it."""
+    split = map(split_name, fields)
+    return [name for of, name in split if of == medium]
 
 
 def _needs(
-    scene_file: SceneFile, fields: Fields, grid: Grid, phase: PhaseFunction, dtype: torch.dtype
+    scene_file: SceneFile,
+    media: Mapping[str, _Medium],
+    grid: Grid,
+    phases: Mapping[str, PhaseFunction],
+    dtype: torch.dtype,
 ) -> Needs:
     """What the scene's memory depends on.
 
     Views that are as large as their images count as nothing, since those are not read yet.
     """
-    tree, section = scene_file.tree, scene_file.tree.volume
-    given = [
-        fields[name].values.ndim == 4 if name in fields else isinstance(value, tuple)
-        for name, (_, value) in _quantities(section).items()
-    ]
-    colors = 3 if any(given) else 1
+    tree = scene_file.tree
+    colors = 3 if any(medium.has_colors for medium in media.values()) else 1
     optimized = tree.optimize.parameters if tree.optimize else {}
     sizes = [view.camera.resolution for view in tree.views if view.camera.resolution is not None]
-    has_flux = section.g != 0 or section.phase is not None or "g" in optimized
+    first, *others = phases.values()
+    phase = Blend(first, others[0], torch.tensor(0.5, dtype=dtype)) if others else first
+    has_flux = "g" in optimized or any(
+        medium.section.g != 0 or medium.section.phase is not None for medium in media.values()
+    )
     return Needs(
         (grid.shape[2], grid.shape[1], grid.shape[0]),
         colors,
@@ -98,30 +163,33 @@ def _needs(
         has_rounds=tree.diffusion.rounds > 0,
         moments=count_harmonics(choose_rounds(tree, phase).angles) if has_flux else 1,
         is_limited=tree.diffusion.model == "flux_limited",
-        varied=sum(_varied(name, settings, fields, colors) for name, settings in optimized.items())
+        varied=sum(_varied(name, settings, media, colors) for name, settings in optimized.items())
         if tree.optimize
         else None,
     )
 
 
-def _varied(name: str, settings: ParameterSettings, fields: Fields, colors: int) -> int:
+def _varied(
+    name: str, settings: ParameterSettings, media: Mapping[str, _Medium], colors: int
+) -> int:
     """How many numbers a cell the parameter `name` has."""
-    if name == "density":
+    medium, last = split_name(name)
+    kind = kind_of(name)
+    if last == "density":
         return 1
-    per_cell = colors if kind_of(name).is_color else 1
     is_field = (
-        name in fields or isinstance(settings.init, FieldFile)
+        (medium in media and last in media[medium].fields) or isinstance(settings.init, FieldFile)
         if settings.field is None
         else settings.field
     )
-    return per_cell if name in FIELDS and is_field else 0
+    return (colors if kind.is_color else 1) if kind.is_cellwise and is_field else 0
 
 
 def _read_fields(scene_file: SceneFile) -> Fields:
     problems, fields = Problems(), {}
     for name, (key, value) in _quantities(scene_file.tree.volume).items():
         if isinstance(value, FieldFile):
-            called = value.name or name.removeprefix(PHASE)
+            called = value.name or split_name(name)[1].removeprefix(PHASE)
             with problems.collecting():
                 fields[name] = read_referenced(
                     scene_file,
@@ -133,21 +201,29 @@ def _read_fields(scene_file: SceneFile) -> Fields:
     return fields
 
 
-def _quantities(section: VolumeSection) -> dict[str, tuple[str, Any]]:
+def _quantities(volume: AnyVolume) -> dict[str, tuple[str, Any]]:
     """The key and the value of each quantity that a file may give cell by cell, by variable."""
-    names = [name for name in FIELDS if hasattr(section, name)]
-    found = {name: (f"volume.{name}", getattr(section, name)) for name in names}
+    return {
+        medium + name: (f"volume.{medium}{key}", value)
+        for medium, section in _media(volume).items()
+        for name, (key, value) in _quantities_of(section).items()
+    }
+
+
+def _quantities_of(section: VolumeSection | MediumSection) -> dict[str, tuple[str, Any]]:
+    """The same of one medium."""
+    found = {name: (name, getattr(section, name)) for name in FIELDS if hasattr(section, name)}
     if isinstance(section.phase, HenyeyGreensteinSection):
-        found["g"] = "volume.phase.g", section.phase.g
-    elif isinstance(section.phase, TwoLobeSection):
-        found["phase.weight"] = "volume.phase.weight", section.phase.weight
+        found["g"] = "phase.g", section.phase.g
+    elif isinstance(section.phase, TwoLobeSection | BlendSection):
+        found["phase.weight"] = "phase.weight", section.phase.weight
     return found
 
 
 def _read_quantity(path: Path, name: str, called: str) -> Field:
     """The quantity `name`, which the file has as `called`."""
     field = read_field(path, called)
-    kind = KINDS[name]
+    kind = kind_of(name)
     if not kind.is_color and field.values.ndim != 3:
         raise FormatError(
             path,

@@ -10,7 +10,7 @@ import torch
 from ddrecon.cameras import Camera
 from ddrecon.grid import Grid
 from ddrecon.scene import Scene
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import extinction_of, with_values
 
 THICKEST, THINNEST = 3e3, 1e-3
 """Optical depths beyond these look like a wall, or like nothing."""
@@ -33,7 +33,7 @@ def _doubt_depth(scene: Scene) -> list[str]:
     where = "through the densest part"
     if not bool(density.any()):
         density, where = torch.ones_like(density), "at a density of 1"
-    extinction = value_of(scene, "sigma_t").amax(0) * density
+    extinction = extinction_of(scene.volume).amax(0) * density
     # The thickest line of cells along each axis.
     depths = [float(extinction.sum(axis).max()) * size for axis, size in enumerate(grid.spacing)]
     if min(depths) > THICKEST or max(depths) < THINNEST:

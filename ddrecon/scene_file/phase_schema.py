@@ -94,12 +94,31 @@ class MieSection:
     effective_variance: float = limited(above=0, below=0.5)
 
 
-PhaseSection = (
+PartSection = (
     HenyeyGreensteinSection
-    | TwoLobeSection
     | RayleighSection
     | DraineSection
     | LegendreSection
     | TableSection
     | MieSection
 )
+Parts = tuple[PartSection, ...]
+
+
+@dataclass(frozen=True)
+class BlendSection:
+    """`weight` of the first of two phase functions, the rest of the second."""
+
+    type: ClassVar[str] = "blend"
+
+    phases: Parts
+    weight: Quantity = limited(minimum=0, maximum=1)
+
+    def problems(self) -> Iterator[Problem]:
+        if len(self.phases) != 2:
+            yield "phases", f"expected two phase functions, found {len(self.phases)}"
+        if any(isinstance(getattr(part, "g", None), FieldFile) for part in self.phases):
+            yield "phases", "of a blend the weight may differ from cell to cell, and no g"
+
+
+PhaseSection = PartSection | TwoLobeSection | BlendSection

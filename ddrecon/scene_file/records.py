@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import reduce
-from itertools import product
 from operator import or_
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -26,7 +25,17 @@ from ddrecon.scene_file.leaves import (
 from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.ring import ring_views
-from ddrecon.scene_file.schema import Constant, Density, Quantity, ViewSection, ViewSource
+from ddrecon.scene_file.schema import (
+    AnyVolume,
+    Constant,
+    Density,
+    MediumSection,
+    MixtureSection,
+    Quantity,
+    ViewSection,
+    ViewSource,
+    VolumeSection,
+)
 from ddrecon.scene_file.transforms import read_transforms
 from ddrecon.settings import (
     AUTO,
@@ -41,7 +50,9 @@ from ddrecon.variables.kinds import (
     EXTINCTION_AND_ALBEDO,
     KINDS,
     Kind,
+    kind_of,
     pattern_of,
+    split_name,
 )
 
 R = TypeVar("R")
@@ -171,12 +182,26 @@ def _read_quantity(node: Node, rule: Rule) -> Any:
     )
 
 
+def _read_volume(node: Node, rule: Rule) -> VolumeSection | MixtureSection:
+    """A volume of one medium, or of two where it has `media`."""
+    if "media" in _mapping(node):
+        return read_record(node, MixtureSection, rule.folder)
+    return read_record(node, VolumeSection, rule.folder)
+
+
+def _read_media(node: Node, rule: Rule) -> dict[str, MediumSection]:
+    """Media by name."""
+    names, nodes = zip(*_mapping(node).items(), strict=True) if node.value else ((), ())
+    media = read_each(nodes, Rule(MediumSection, {}, rule.folder), read_value)
+    return dict(zip(names, media, strict=True))
+
+
 def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
     """Settings by name of a variable, of one pair of cross sections at most."""
     problems, parameters = Problems(), {}
     for name, child in _mapping(node).items():
         with problems.collecting():
-            if (kind := KINDS.get(pattern_of(name))) is None:
+            if pattern_of(name) not in KINDS:
                 raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
             settings = read_record(child, ParameterSettings, rule.folder)
             for key, is_given in (
@@ -187,14 +212,16 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
                     raise _mapping(child)[key].refused(
                         f"{describe_found(_mapping(child)[key])} is for density alone"
                     )
-            parameters[name] = _require_legal(child, settings, kind)
+            parameters[name] = _require_legal(child, settings, kind_of(name))
     problems.raise_any()
     if not parameters:
         raise node.refused(f"names no parameter; known: {', '.join(KINDS)}")
-    for name, other in product(EXTINCTION_AND_ALBEDO, CROSS_SECTIONS):
-        if name in parameters and other in parameters:
+    for name in parameters:
+        medium, last = split_name(name)
+        others = [medium + other for other in CROSS_SECTIONS if medium + other in parameters]
+        if last in EXTINCTION_AND_ALBEDO and others:
             raise _mapping(node)[name].key_refused(
-                f"cannot be optimized beside {other}:"
+                f"cannot be optimized beside {others[0]}:"
                 " take sigma_a and sigma_s, or sigma_t and albedo"
             )
     return parameters
@@ -282,6 +309,8 @@ def _require_unique(entries: list[Node], names: list[str]) -> None:
 
 READERS: dict[Any, Callable[[Node, Rule], Any]] = {
     **LEAVES,
+    AnyVolume: _read_volume,
+    Mapping[str, MediumSection]: _read_media,
     Density: _read_density,
     Quantity: _read_quantity,
     Start: _read_start,

@@ -9,7 +9,7 @@ are here and in `ddrecon.settings`, and nowhere else.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
@@ -17,7 +17,12 @@ from typing import ClassVar
 from ddrecon.grid import Triple
 from ddrecon.scene_file.camera_schema import CameraSection, Size
 from ddrecon.scene_file.light_schema import Color, LightSection
-from ddrecon.scene_file.phase_schema import HenyeyGreensteinSection, PhaseSection, Quantity
+from ddrecon.scene_file.phase_schema import (
+    HenyeyGreensteinSection,
+    PartSection,
+    PhaseSection,
+    Quantity,
+)
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
@@ -39,6 +44,10 @@ Backdrop = Color | Path
 MAX_CELLS = 2**30
 TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
 """Endings of the names of output files, which a view's name must not have."""
+
+
+BOTH = "g is the short form of a phase function: give only one of g or phase"
+"""What is wrong where both are given."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +91,50 @@ class VolumeSection:
 
     def problems(self) -> Iterator[Problem]:
         if self.phase is not None and self.g != 0:
-            yield "phase", "g is the short form of a phase function: give only one of g or phase"
+            yield "phase", BOTH
         x, y, z = self.resolution or (1, 1, 1)
         if x * y * z > MAX_CELLS:
             yield "resolution", f"{x * y * z:.2g} cells are too many; at most 2^30 fit"
+
+
+@dataclass(frozen=True)
+class MediumSection:
+    """One of the two media of a mixture; its phase function is the same in all cells."""
+
+    ALTERNATIVES: ClassVar = PAIRS
+
+    density: Density = limited(minimum=0)
+    sigma_a: Quantity | None = optional(minimum=0)
+    sigma_s: Quantity | None = optional(minimum=0)
+    sigma_t: Quantity | None = optional(minimum=0)
+    albedo: Quantity | None = optional(minimum=0, maximum=1)
+    g: float = bounded(0.0, above=-1, below=1)
+    phase: PartSection | None = None
+
+    def problems(self) -> Iterator[Problem]:
+        if self.phase is not None and self.g != 0:
+            yield "phase", BOTH
+        if isinstance(getattr(self.phase, "g", None), FieldFile):
+            yield "phase", "the g of a medium is the same in all cells where there are two"
+
+
+@dataclass(frozen=True)
+class MixtureSection:
+    """Two media in the same box, by name; `bounds` and `resolution` as of `VolumeSection`."""
+
+    media: Mapping[str, MediumSection]
+    bounds: Bounds | None = None
+    resolution: Count | None = optional(minimum=1, maximum=4096)
+
+    def problems(self) -> Iterator[Problem]:
+        if len(self.media) != 2:
+            yield "media", f"expected two media, found {len(self.media)}"
+        for name in self.media:
+            if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+                yield "media", f"{name!r} is no name; use letters, digits, '_' and '-'"
+
+
+AnyVolume = VolumeSection | MixtureSection
 
 
 @dataclass(frozen=True)
@@ -180,7 +229,7 @@ class SceneTree:
     A ring of views is already the views it stands for, and paths are absolute.
     """
 
-    volume: VolumeSection
+    volume: AnyVolume
     lights: tuple[LightSection, ...]
     views: tuple[ViewSection, ...]
     render: RenderSettings = field(default_factory=RenderSettings)
@@ -196,7 +245,10 @@ class SceneTree:
     @property
     def _has_one_g(self) -> bool:
         """Whether `g` and `phase.g` are the same number, that of Henyey and Greenstein."""
-        return isinstance(self.volume.phase, HenyeyGreensteinSection | None)
+        volume = self.volume
+        return isinstance(volume, VolumeSection) and isinstance(
+            volume.phase, HenyeyGreensteinSection | None
+        )
 
     def problems(self) -> Iterator[Problem]:
         parameters = self.optimize.parameters if self.optimize else {}

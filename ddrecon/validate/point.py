@@ -38,9 +38,9 @@ def starting_point(
     """
     point = {
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
-        for name in dict.fromkeys([*scene.starts, *names, "density"])
+        for name in dict.fromkeys([*scene.starts, *names, *_density(scene)])
     }
-    if point["density"].ndim == 3:
+    if "density" in point and point["density"].ndim == 3:
         of_scene = scene.volume.density
         random = (2 * random_like(of_scene, generator) - 1).clamp(min=0)
         point["density"] = next(
@@ -54,6 +54,11 @@ def starting_point(
                 2 * random_like(value, generator) - 1
             )
     return point
+
+
+def _density(scene: Scene) -> list[str]:
+    """The name of the density; of two media nothing, as each has one."""
+    return ["density"] if scene.volume.media is None else []
 
 
 def loss_at(

@@ -1,7 +1,8 @@
 """The table of variables: all that is known of each kind of number that can be optimized.
 
-A kind is named by a pattern: N is a light's place in the list, counted from 0, and NAME a view's
-name, or `*` for all training views. `ddrecon.variables.values` reads and replaces the values.
+A kind is named by a pattern: N is the place in a list, counted from 0, and NAME a view's name, or
+`*` for all training views. Where there are two media, `media.cloud.density` is of the same kind as
+`density`. `ddrecon.variables.values` reads and replaces the values.
 """
 
 from __future__ import annotations
@@ -68,6 +69,8 @@ _MEAN_COSINE = Kind(
     fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
 _LOBE_WEIGHT = Kind(fixed_rate(0.05), low=0, high=1, is_color=True, is_cellwise=True)
+_ALPHA = Kind(fixed_rate(0.05), low=0, is_color=True)
+_MOMENTS = Kind(fixed_rate(0.02), low=-1, high=1)
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, is_fitted=True)
 
 KINDS: Mapping[str, Kind] = {
@@ -79,8 +82,12 @@ KINDS: Mapping[str, Kind] = {
     "g": replace(_MEAN_COSINE, is_cellwise=True),
     "phase.g": replace(_MEAN_COSINE, is_color=True),
     "phase.weight": _LOBE_WEIGHT,
-    "phase.alpha": Kind(fixed_rate(0.05), low=0, is_color=True),
-    "phase.coefficients": Kind(fixed_rate(0.02), low=-1, high=1),
+    "phase.alpha": _ALPHA,
+    "phase.coefficients": _MOMENTS,
+    # of one of the two that a blend has, counted from 0
+    "phase.phases.N.g": replace(_MEAN_COSINE, is_color=True),
+    "phase.phases.N.alpha": _ALPHA,
+    "phase.phases.N.coefficients": _MOMENTS,
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
@@ -113,9 +120,7 @@ KINDS: Mapping[str, Kind] = {
 }
 """Every kind of variable, by its pattern."""
 
-VOLUME = tuple(pattern for pattern in KINDS if not pattern.startswith(("lights.", "views.")))
-"""The variables of the volume."""
-FIELDS = tuple(name for name in VOLUME if KINDS[name].is_cellwise)
+FIELDS = tuple(name for name, kind in KINDS.items() if kind.is_cellwise)
 """Those that may differ from cell to cell."""
 PHASE = "phase."
 """What variables of a phase function begin with; `phase.g` of Henyey and Greenstein's is `g`."""
@@ -125,13 +130,32 @@ PAIRS = (CROSS_SECTIONS, EXTINCTION_AND_ALBEDO)
 """Two ways to say the same: a scene gives and varies one pair, and the other follows."""
 
 
+def is_of_volume(name: str) -> bool:
+    """Whether the variable `name` is the volume's, and not of a light or a view."""
+    return not name.startswith(("lights.", "views."))
+
+
 def kind_of(name: str) -> Kind:
     """The kind of the variable `name`; raises KeyError for a name of none."""
     return KINDS[pattern_of(name)]
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """The medium that the variable `name` is of, as `media.cloud.`, and the rest of its name.
+
+    The first is empty where it is of no medium.
+    """
+    match = re.fullmatch(r"(media\.[^.]+\.)?(.*)", name)
+    assert match is not None
+    return match[1] or "", match[2]
 
 
 def pattern_of(name: str) -> str:
     """The pattern in `KINDS` that `name` follows, or `name` itself where it follows none."""
     if match := re.fullmatch(r"views\..+\.([a-z_]+)", name):
         return f"views.NAME.{match[1]}"
-    return re.sub(r"^lights\.[0-9]{1,9}\.", "lights.N.", name)
+    medium, name = split_name(name)
+    if medium and name == "g":
+        # two media are a blend: its weight differs from cell to cell, and no number of its parts
+        return "phase.phases.N.g"
+    return re.sub(r"^(lights|phase\.phases)\.[0-9]{1,9}\.", r"\1.N.", name)

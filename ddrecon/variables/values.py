@@ -18,9 +18,17 @@ from torch import Tensor
 from ddrecon.cameras import twist
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.scene import Scene, View
-from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, FIELDS, PHASE, VOLUME, kind_of
+from ddrecon.variables.kinds import (
+    CROSS_SECTIONS,
+    EXTINCTION_AND_ALBEDO,
+    PHASE,
+    is_of_volume,
+    kind_of,
+    split_name,
+)
 
 RESPONSE = {"exposure": 1.0, "offset": 0.0}
 """What a camera does to radiance, and what it is where a view has none (E28)."""
@@ -42,8 +50,8 @@ def fields_of(scene: Scene) -> dict[str, Tensor]:
 
     Each is [z, y, x], or [C, z, y, x] where colors may differ.
     """
-    names = [name for name in FIELDS if name in _volume_names(scene.volume)]
-    values = {name: value_of(scene, name) for name in names}
+    names = [name for name in _volume_names(scene.volume) if kind_of(name).is_cellwise]
+    values = {name: _volume_value(scene.volume, name) for name in names}
     return {name: value for name, value in values.items() if value.ndim >= 3}
 
 
@@ -58,7 +66,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
     if (known := _own_name(scene.volume, name)) not in variable_names(scene):
         names = [known for known in variable_names(scene) if not known.startswith("views.")]
         raise KeyError(f"no variable {name!r}; besides views, the scene has {', '.join(names)}")
-    if known in VOLUME:
+    if is_of_volume(known):
         return _volume_value(scene.volume, known)
     section, _, path = name.partition(".")
     if section == "views":
@@ -87,7 +95,7 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
     ]
     views = [_replace_view(view, values, scene) for view in scene.views]
     volume = _replace_volume(
-        scene.volume, {name: values[name] for name in VOLUME if name in values}
+        scene.volume, {name: value for name, value in values.items() if is_of_volume(name)}
     )
     return replace(scene, volume=volume, lights=lights, views=views)
 
@@ -109,6 +117,12 @@ def cross_sections(sigma_t: Tensor, albedo: Tensor) -> tuple[Tensor, Tensor]:
     return sigma_t * (1 - albedo), sigma_t * albedo
 
 
+def extinction_of(volume: Volume) -> Tensor:
+    """sigma_t [1/u] of `volume`, `[C]` or `[C, z, y, x]`."""
+    sigma_a, sigma_s = _same_axes(volume.sigma_a, volume.sigma_s)
+    return sigma_a + sigma_s
+
+
 def _same_axes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
     """Both as [C, z, y, x] if either is; a constant then has one cell."""
     if one.ndim == other.ndim:
@@ -123,33 +137,55 @@ def _tensors(light: Light) -> list[str]:
 
 def _volume_names(volume: Volume) -> list[str]:
     """The variables of `volume`: its phase function has its own numbers, or g alone."""
-    known = [name for name in VOLUME if name != "g" and not name.startswith(PHASE)]
+    if volume.media is not None:
+        return [
+            f"media.{medium}.{name}"
+            for medium, part in volume.media.items()
+            for name in _volume_names(part)
+        ]
+    known = ["density", *CROSS_SECTIONS, *EXTINCTION_AND_ALBEDO]
     if isinstance(volume.phase, HenyeyGreenstein):
         return [*known, "g"]
-    return [*known, *(PHASE + name for name in volume.phase.VARIABLES)]
+    return [*known, *(PHASE + name for name in volume.phase.variables)]
 
 
 def _own_name(volume: Volume, name: str) -> str:
     """`name`, or `g` for `phase.g` where both are the same."""
-    is_short = name == f"{PHASE}g" and isinstance(volume.phase, HenyeyGreenstein)
-    return "g" if is_short else name
+    medium, last = split_name(name)
+    if last != f"{PHASE}g":
+        return name
+    part = (
+        volume
+        if volume.media is None
+        else volume.media.get(medium.removeprefix("media.").strip("."), volume)
+    )
+    return f"{medium}g" if isinstance(part.phase, HenyeyGreenstein) else name
 
 
 def _volume_value(volume: Volume, name: str) -> Tensor:
+    if volume.media is not None:
+        _, medium, rest = name.split(".", 2)
+        return _volume_value(volume.media[medium], rest)
     if name.startswith(PHASE):
-        number: Tensor = getattr(volume.phase, name.removeprefix(PHASE))
-        return number
+        return volume.phase.variables[name.removeprefix(PHASE)]
     if name not in EXTINCTION_AND_ALBEDO:
         value: Tensor = getattr(volume, name)
         return value
-    sigma_a, sigma_s = _same_axes(volume.sigma_a, volume.sigma_s)
-    sigma_t = sigma_a + sigma_s
+    sigma_t = extinction_of(volume)
     if name == "sigma_t":
         return sigma_t
+    _, sigma_s = _same_axes(volume.sigma_a, volume.sigma_s)
     return sigma_s / sigma_t.clamp(min=torch.finfo(sigma_t.dtype).tiny)
 
 
 def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
+    if volume.media is not None:
+        return mix_media(
+            {
+                medium: _replace_volume(part, _values_of(f"media.{medium}.", values))
+                for medium, part in volume.media.items()
+            }
+        )
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
         sigma_t, albedo = (
@@ -164,10 +200,20 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
         phase = HenyeyGreenstein(stored.pop("g"))
     numbers = {name: stored.pop(name) for name in [*stored] if name.startswith(PHASE)}
     if numbers:
-        parts = {name.removeprefix(PHASE): number for name, number in numbers.items()}
-        phase = replace(phase, **parts)
+        phase = phase.with_variables(
+            {name.removeprefix(PHASE): number for name, number in numbers.items()}
+        )
     changed: Volume = replace(volume, phase=phase, **stored)  # type: ignore[arg-type]
     return changed
+
+
+def _values_of(medium: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Those of `values` that are of one `medium`, by what they are called in it."""
+    return {
+        name.removeprefix(medium): value
+        for name, value in values.items()
+        if name.startswith(medium)
+    }
 
 
 def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Light:

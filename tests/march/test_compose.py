@@ -39,7 +39,7 @@ def test_values_and_derivatives_are_those_of_torch(bits, near, case):
     out, masses, *rest = integrals(bits, *case)
     bar = torch.rand(2 * case[0], out.shape[1], dtype=out.dtype)
     found = []
-    for function in (compose, lambda *given: _compose(case[0], *given)):
+    for function in (compose, lambda *given: _compose(case[0], *given, given[3])):
         leaves = out.clone().requires_grad_(), masses.clone().requires_grad_()
         value = function(*leaves, *rest)
         found.append((value.detach(), *torch.autograd.grad(value, leaves, bar)))

@@ -17,7 +17,8 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.light.lights import PointLight
-from ddrecon.medium.phase import TwoLobe
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.validate.hard import run_case
@@ -59,6 +60,13 @@ def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: in
         outside = density.new_tensor([0.9, 0.7, 0.2]), density.new_tensor([1.0, 2.0, 0.5])
         scene.lights.append(PointLight(*outside))
         return scene
+    if "by cell" in kind:
+        scene = make_scene(density, camera=camera)
+        scene.volume.phase = cellwise_phase(kind, density)
+        if kind == "weight by cell":
+            place = density.new_tensor([0.9, 0.7, 0.2])
+            scene.lights.append(PointLight(place, density.new_tensor([1.0, 2.0, 0.5])))
+        return scene
     fields = {
         name: factor * (0.5 + random_values(3, *SHAPE, seed=seed, dtype=dtype))
         for seed, (name, factor) in enumerate((("sigma_a", 1.0), ("sigma_s", 6.0)), 1)
@@ -72,6 +80,20 @@ def scene_of(kind: str, view: dict, dtype: torch.dtype = torch.float64, size: in
     inside = PointLight(density.new_tensor([0.1, 0.05, -0.1]), density.new_tensor([0.3]))
     scene.lights += [outside, inside]
     return scene
+
+
+def cellwise_phase(kind: str, density: Tensor) -> PhaseFunction:
+    """Both signs of g; two lobes, by color or backward; or weights that colors share."""
+    numbers = random_values(*SHAPE, seed=7, dtype=density.dtype)
+    if kind == "g by cell":
+        return HenyeyGreenstein(1.6 * numbers - 0.7)
+    if kind == "weight by cell":
+        colors = random_values(3, *SHAPE, seed=8, dtype=density.dtype)
+        return TwoLobe(density.new_tensor([0.6, -0.4]), colors)
+    if kind == "blend by cell":
+        air = Rayleigh(density.new_zeros(()))
+        return Blend(HenyeyGreenstein(density.new_tensor([0.6, 0.5, -0.3])), air, numbers)
+    return TwoLobe(density.new_tensor([-0.2, -0.5]), numbers)
 
 
 def images(scene: Scene, values: dict[str, Tensor], engine: str) -> list[Tensor]:
@@ -103,7 +125,6 @@ def assert_near(found: Tensor, known: Tensor, error: float) -> None:
 EMISSIONS = [
     ("gray", OUTSIDE, [*LIGHT, "sigma_t", *POSE]),
     ("backward", OUTSIDE, [*LIGHT, "albedo"]),
-    ("peaked", OUTSIDE, [*LIGHT, "sigma_s", *POSE]),
     ("fields", OUTSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
     ("fields", INSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
     # With all rays where they are, packets of them are marched back.
@@ -114,6 +135,13 @@ EMISSIONS = [
     ("fields", OUTSIDE, ["density", "g", "sigma_a", "sigma_s", "lights.1.intensity"]),
     ("lobes by color", OUTSIDE, ["density", "phase.g", "phase.weight", *POINT, *POSE]),
     ("lobes by color", OUTSIDE, ["density", "phase.g", "phase.weight"]),
+    # Where the phase function differs from cell to cell.
+    ("g by cell", OUTSIDE, ["density", "g", *POSE]),
+    ("g by cell", OUTSIDE, [*LIGHT, "sigma_s"]),
+    ("weight by cell", OUTSIDE, ["density", "phase.g", "phase.weight", *POINT]),
+    ("weight by cell", OUTSIDE, ["density", "phase.g", "phase.weight"]),
+    ("blend by cell", OUTSIDE, ["density", "phase.phases.0.g", "phase.weight"]),
+    ("backward weight by cell", OUTSIDE, [LIGHT[0], "phase.g", "phase.weight", LIGHT[-1]]),
 ]
 each_case = pytest.mark.parametrize(
     ("kind", "view", "names"),
@@ -228,14 +256,15 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 
 def kernels_for(architecture: int) -> list:
     """Some of all kernels: no text depends on the architecture, and each takes seconds."""
-    one, several = (
-        Layout(1, 1, 1, (False, True), 0, 0, 1, 32),
-        Layout(3, 3, 3, (False, True), 3, 3, 3, 64),
-    )
     if architecture == 80:
+        one = Layout(1, 1, 1, (False, True), 0, 0, 1, 32)
+        several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 1, 3, 3)
         walks = [tangent_kernel(one, True), adjoint_kernel(one, True, True)]
         return [*walks, packet_integral_kernel(several), packet_adjoint_kernel(one)]
-    walks = [integral_kernel(one), adjoint_kernel(one, False, True)]
+    one = Layout(1, 1, 1, (True,), 0, 0, 1, 32)
+    several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64)
+    steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1, 1, 1)
+    walks = [integral_kernel(steep), adjoint_kernel(one, False, True)]
     return [*walks, packet_integral_kernel(one), packet_adjoint_kernel(several)]
 
 

@@ -21,7 +21,8 @@ from ddrecon.march.box import cross_box
 from ddrecon.march.emission import Channels, Emission
 from ddrecon.march.plain import march_plainly
 from ddrecon.march.samplers import choose_way, make_sampler
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction
+from ddrecon.medium.phase_blend import TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.third_order import ThirdOrder
 from ddrecon.renderer import _emission, solve_light

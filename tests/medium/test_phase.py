@@ -11,7 +11,8 @@ from media import box_grid, random_values
 from torch import Tensor
 
 from ddrecon.medium.coefficients import Volume, keep_medium, scale_medium
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.medium.phase_series import Legendre, Tabulated
 from ddrecon.numerics.angle_table import STEPS
@@ -45,6 +46,7 @@ PHASES: dict[str, PhaseFunction] = {
     "draine backward": Draine(tensor(-0.6, 0.1, 0.0), tensor(1.0, 0.0, 2.0)),
     "series": Legendre(tensor(0.5, 0.3, 0.1, 0.05)),
     "series by color": Legendre(tensor(0.5, 0.3, 0.1, 0.2, 0.1, 0.05, 0.3, 0.15, 0.02).view(3, 3)),
+    "blend": Blend(Draine(tensor(0.7, 0.5, -0.6), scalar(1.5)), Rayleigh(scalar(0.0)), scalar(0.3)),
     "table": Tabulated(bump()),
 }
 each_phase = pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES.keys())
@@ -82,6 +84,10 @@ def test_moments_of_henyey_and_greenstein_are_powers_of_the_mean_cosine(g: float
         (Draine(scalar(0.6), scalar(0.0)), HenyeyGreenstein(scalar(0.6))),
         (TwoLobe(tensor(0.6, -0.9), scalar(1.0)), HenyeyGreenstein(scalar(0.6))),
         (TwoLobe(tensor(0.6, -0.9), scalar(0.0)), HenyeyGreenstein(scalar(-0.9))),
+        (
+            Blend(*TwoLobe(tensor(0.6, -0.3), scalar(0.0)).parts, scalar(0.4)),
+            TwoLobe(tensor(0.6, -0.3), scalar(0.4)),
+        ),
         (Legendre(tensor(0.0, 0.1)), Rayleigh(scalar(0.0))),
         (Tabulated(1 + even_angles(STEPS).cos()[None] ** 2), Rayleigh(scalar(0.0))),
         (Legendre(0.6 ** torch.arange(1, 200).double()), HenyeyGreenstein(scalar(0.6))),
@@ -99,7 +105,7 @@ def test_special_cases_are_each_other(one: PhaseFunction, other: PhaseFunction):
 
 @pytest.mark.parametrize("phase", [*PHASES.values()][:-1], ids=[*PHASES][:-1])
 def test_values_and_moments_have_both_derivatives(phase: PhaseFunction):
-    kind, cosine = type(phase), tensor(-0.95, 0.2, 0.9).requires_grad_()
+    kind, cosine = phase.kind, tensor(-0.95, 0.2, 0.9).requires_grad_()
     numbers = [number.clone().requires_grad_() for number in phase.numbers]
 
     def found(cosine: Tensor, *numbers: Tensor) -> tuple[Tensor, ...]:

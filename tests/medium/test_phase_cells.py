@@ -12,7 +12,8 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.angle_table import angle_of
@@ -22,10 +23,12 @@ from ddrecon.validate.balance import balance_of
 
 SHAPE = (5, 4, 6)
 LOBES = torch.tensor([0.8, -0.4], dtype=torch.float64)
+HAZE = Draine(torch.tensor([0.7, 0.6, -0.5], dtype=torch.float64), LOBES[0])
+AIR = Rayleigh(LOBES[0])
 FIELDS: dict[str, PhaseFunction] = {
     "g": HenyeyGreenstein(1.7 * random_values(*SHAPE, seed=3) - 0.8),
     "weight": TwoLobe(LOBES, random_values(*SHAPE, seed=4)),
-    "weight by color": TwoLobe(LOBES, random_values(3, *SHAPE, seed=5)),
+    "blend by color": Blend(HAZE, AIR, random_values(3, *SHAPE, seed=5)),
 }
 each_field = pytest.mark.parametrize("phase", FIELDS.values(), ids=FIELDS.keys())
 
@@ -48,15 +51,16 @@ def scene_of(phase: PhaseFunction, **changes: Any) -> Scene:
         (HenyeyGreenstein(torch.tensor(-0.5, dtype=torch.float64)), False),
         (TwoLobe(LOBES, torch.tensor(0.3, dtype=torch.float64)), False),
         (TwoLobe(LOBES.abs(), torch.tensor(0.3, dtype=torch.float64)), True),
+        (Blend(HAZE, AIR, torch.tensor([0.3, 0.8, 0.5], dtype=torch.float64)), False),
     ],
-    ids=["forward", "isotropic", "backward", "two lobes", "two forward lobes"],
+    ids=["forward", "isotropic", "backward", "two lobes", "two forward lobes", "blend by color"],
 )
 def test_the_same_in_every_cell_is_one_number(
     phase: PhaseFunction, is_looked_up: bool, rounds: int
 ):
     """To rounding, or as closely as functions are looked up by their number."""
-    number = phase.g if isinstance(phase, HenyeyGreenstein) else phase.weight
-    cells = phase.with_cells(number.expand(SHAPE))
+    number = phase.numbers[-1]
+    cells = phase.with_cells(number.view(*number.shape, 1, 1, 1).expand(*number.shape, *SHAPE))
     # along an axis: on their way across the grid pairs of cells are interpolated otherwise
     changes = {"transport_rounds": rounds, "travel": (0.0, -1.0, 0.0)}
     one, other = (render(scene_of(each, **changes)) for each in (phase, cells))

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from media import box_grid
-from slab_cases import CASES, FUSED
+from slab_cases import GROUPS
 
 from ddrecon.slabs.slab import HALO, THINNEST, Slab, cut_evenly
 
@@ -21,37 +21,43 @@ Errors = dict[str, dict[str, float]]
 
 
 @pytest.fixture(scope="module")
-def errors(tmp_path_factory: pytest.TempPathFactory) -> Errors:
-    return find_errors(tmp_path_factory.mktemp("slabs") / "errors.json", "torch")
+def errors(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Errors:
+    """Those of a group of cases."""
+    return find_errors(tmp_path_factory.mktemp("slabs") / "errors.json", request.param)
 
 
-@pytest.fixture(scope="module")
-def fused_errors(tmp_path_factory: pytest.TempPathFactory) -> Errors:
-    return find_errors(tmp_path_factory.mktemp("slabs") / "fused.json", "warp")
-
-
-def find_errors(file: Path, engine: str) -> Errors:
+def find_errors(file: Path, group: str) -> Errors:
     script = Path(__file__).with_name("slab_cases.py")
     paths = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
-    subprocess.run([sys.executable, str(script), str(file), engine], env=environment, check=True)
+    subprocess.run([sys.executable, str(script), str(file), group], env=environment, check=True)
     found: Errors = json.loads(file.read_text())
     return found
 
 
-@pytest.mark.parametrize("case", CASES)
+def require_less(errors: dict[str, float], limit: float) -> None:
+    assert errors
+    assert {what: error for what, error in errors.items() if not error < limit} == {}
+
+
+@pytest.mark.parametrize("errors", ["few"], indirect=True)
+@pytest.mark.parametrize("case", GROUPS["few"])
 def test_slabs_find_what_one_process_finds(errors: Errors, case: str) -> None:
-    assert errors[case]
-    assert {what: error for what, error in errors[case].items() if not error < 1e-12} == {}
+    require_less(errors[case], 1e-12)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", FUSED)
-def test_fused_slabs_find_what_operations_of_one_process_find(
-    fused_errors: Errors, case: str
-) -> None:
-    assert fused_errors[case]
-    assert {what: e for what, e in fused_errors[case].items() if not e < 1e-11} == {}
+@pytest.mark.parametrize("errors", ["others"], indirect=True)
+@pytest.mark.parametrize("case", GROUPS["others"])
+def test_slabs_find_whatever_one_process_finds(errors: Errors, case: str) -> None:
+    require_less(errors[case], 1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("errors", ["fused"], indirect=True)
+@pytest.mark.parametrize("case", GROUPS["fused"])
+def test_fused_slabs_find_what_operations_of_one_process_find(errors: Errors, case: str) -> None:
+    require_less(errors[case], 1e-11)
 
 
 @given(st.integers(1, 9), st.integers(0, 400))

@@ -66,7 +66,9 @@ def test_bounds_may_be_without_end():
     value = random_values(40)
     zeros = torch.zeros_like(value), torch.zeros_like(value)
     ends = -math.inf, math.inf
-    moved, _ = passes.step_adam(value, value, zeros, (0.9, 0.99), 1, 0.5, 1e-15, ends)
+    moved, _ = passes.step_adam(
+        value, value, zeros, (0.9, 0.99), 1, 0.5, torch.tensor(1e-15), 1.0, ends
+    )
     torch.testing.assert_close(moved, value - 0.5)
 
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.medium.phase import Draine, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
 from ddrecon.scene import Scene
@@ -180,6 +181,14 @@ def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time() -> None:
         lobes = [{"type": "hg", "g": pytest.approx(g)} for g in (0.6, -0.3)]
         assert phase["type"] == "blendphase" and [phase["first"], phase["second"]] == lobes
         assert phase["weight"] == pytest.approx(1 - float(weight[color]))
+    scene.volume.phase = Blend(
+        Draine(weight, weight), HenyeyGreenstein(weight), random_values(*SHAPE)
+    )
+    phases = [described(pick_color(scene, color))["medium"]["phase"] for color in range(3)]
+    assert [one["second"]["g"] for one in phases] == pytest.approx(weight.tolist())
+    assert len({one["first"]["values"] for one in phases}) == 3
+    for one in phases:
+        np.testing.assert_array_equal(one["weight"]["grid"], phases[0]["weight"]["grid"])
 
 
 def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused() -> None:

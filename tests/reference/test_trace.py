@@ -15,7 +15,8 @@ from torch import Tensor
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh, TwoLobe
+from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
 from ddrecon.renderer import render
@@ -157,8 +158,11 @@ def test_light_scattered_once_is_ours_to_4_percent(light: str, is_perspective: b
 
 PHASES: dict[str, PhaseFunction] = {
     "two lobes": TwoLobe(CENTER.new_tensor([0.7, -0.5]), CENTER.new_tensor(0.6)),
-    "rayleigh": Rayleigh(CENTER),
-    "draine": Draine(CENTER.new_tensor(0.5), CENTER.new_tensor(1.0)),
+    "blend": Blend(
+        Rayleigh(CENTER),
+        Draine(CENTER.new_tensor(0.7), CENTER.new_tensor(1.0)),
+        torch.linspace(0, 1, 12).expand(12, 12, 12),
+    ),
     "by color": HenyeyGreenstein(CENTER.new_tensor([0.5, 0.0, -0.5])),
 }
 

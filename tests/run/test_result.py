@@ -126,7 +126,11 @@ def test_a_result_renders_as_what_was_found(
             "phase.g: {}, phase.weight: {}",
         ),
         ("{type: draine, g: 0.3, alpha: 0.5}", "phase.g: {}, phase.alpha: {}"),
-        ("{type: legendre, coefficients: [1, 0.4, 0.2]}", "phase.coefficients: {}"),
+        (
+            "{type: blend, weight: 0.4, phases: ["
+            "{type: legendre, coefficients: [1, 0.4, 0.2]}, {type: henyey_greenstein, g: 0.3}]}",
+            "phase.weight: {}, phase.phases.0.coefficients: {}, phase.phases.1.g: {}",
+        ),
     ],
 )
 def test_a_result_has_the_phase_function_that_was_found(

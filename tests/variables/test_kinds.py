@@ -12,7 +12,7 @@ from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings
-from ddrecon.variables.kinds import KINDS, PAIRS, VOLUME, kind_of, pattern_of
+from ddrecon.variables.kinds import KINDS, PAIRS, is_of_volume, kind_of, pattern_of
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
 
 CONFIG = Path(__file__).parents[2] / "configs" / "gradcheck_all.yaml"
@@ -28,11 +28,18 @@ SMALL = [
 DRAINE = "{type: draine, g: [0.5, 0.3, -0.2], alpha: [1, 0.5, 0.2]}"
 LOBES = "{type: two_lobe, g: [0.6, -0.3], weight: [0.7, 0.6, 0.5]}"
 SERIES = "{type: legendre, coefficients: [1, 0.4, 0.2, 0.1]}"
+BLENDS = [
+    f"{{type: blend, weight: [0.7, 0.6, 0.5], phases: [{part}, {{type: rayleigh}}]}}"
+    for part in (DRAINE, SERIES)
+]
 PHASES = {
     "phase.g": DRAINE,
     "phase.weight": LOBES,
     "phase.alpha": DRAINE,
     "phase.coefficients": SERIES,
+    "phase.phases.N.g": BLENDS[0],
+    "phase.phases.N.alpha": BLENDS[0],
+    "phase.phases.N.coefficients": BLENDS[1],
 }
 """Phase functions that have numbers other than g."""
 
@@ -128,5 +135,5 @@ def test_differences_are_taken_by_ever_shorter_steps(pattern: str) -> None:
 
 def test_pairs_are_of_the_volume_and_of_the_same_axes() -> None:
     for pair in PAIRS:
-        assert set(pair) <= set(VOLUME)
+        assert set(pair) <= set(filter(is_of_volume, KINDS))
         assert len({(kind_of(name).is_color, kind_of(name).is_cellwise) for name in pair}) == 1

@@ -131,28 +131,33 @@ def sweep(medium: Medium, source: Tensor, inflow: Tensor | None, degree: int) ->
     return add_halo(moments, slab) if isinstance(slab, Slab) else moments
 
 
-def sweep_scattered(
+def sweep_change(
     medium: Medium, light: Moments, source: Moments, inflow: Tensor | None, degree: int
 ) -> Moments:
-    """The moments of the radiance that `light` and `source` scatter, p_l phi_k + Q_k (E17).
+    """By how much the first two moments of light change in a sweep, and those of higher degree.
 
-    `inflow` and `degree` as of `sweep`.
+    It scatters `light` and `source`, p_l phi_k + Q_k (E17). `inflow` and `degree` as of `sweep`.
     """
     factors = remaining_moments(medium)
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    if is_fused() and not isinstance(medium.grid, Slab):
+    runs_fused = is_fused() and not isinstance(medium.grid, Slab)
+    if runs_fused and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
-        if medium.is_cellwise:
-            # the kernels' factors are the same everywhere: what scatters is summed here
-            summed = light.weighted(factors).plus(source).harmonics(medium.degree)
-            whole, ones = Moments.of_harmonics(summed), torch.ones_like(factors[..., :1, :1, :1])
-            return sweep_fused(medium, None, ones, whole, inflow, DIRECTIONS[degree])
         return sweep_fused(medium, light, factors, source, inflow, DIRECTIONS[degree])
     scatters = light.weighted(factors).plus(source).harmonics(medium.degree)
-    return Moments.of_harmonics(sweep(medium, scatters, inflow, degree))
+    if runs_fused:
+        from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
+
+        # the kernels' factors are the same everywhere: what scatters was summed
+        whole, ones = Moments.of_harmonics(scatters), torch.ones_like(factors[..., :1, :1, :1])
+        swept = sweep_fused(medium, None, ones, whole, inflow, DIRECTIONS[degree])
+    else:
+        swept = Moments.of_harmonics(sweep(medium, scatters, inflow, degree))
+    less = replace(light, higher=None).scaled(-1.0, -1.0)
+    return swept.plus(less)
 
 
 class _Sweep(torch.autograd.Function):

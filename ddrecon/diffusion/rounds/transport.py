@@ -18,9 +18,9 @@ from ddrecon.diffusion.conservative import DiffusionProblem
 from ddrecon.diffusion.implicit import SolverWithMemory
 from ddrecon.diffusion.operator import AXES, Operator, accumulate, difference
 from ddrecon.diffusion.rounds.characteristics import Course
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_scattered
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_change
 from ddrecon.grid import Grid
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.light.moments import Moments, Vector, add_vectors
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
@@ -76,22 +76,22 @@ def _round(
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
     # E11 along every direction, of all light that scatters: the sum of Y_k (p_l phi_k + Q_k)
     inflow = outside if is_lit_from_outside else None
-    swept = sweep_scattered(medium, light, problem.source, inflow, degree)
-    # Light begins as diffusion's, L0 with 3 F(L0), where S - A L0 is zero.
-    diffuse, imbalance = light, None
+    change = sweep_change(medium, light, problem.source, inflow, degree)
+    # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
+    off = None
     if round_index > 1:
-        diffuse = Moments(light.mean, problem.flux(light.mean))
         imbalance = recompute(_imbalance, operator, right, light.mean)
-    gain, source, turned = _gain(medium, swept, light, diffuse, imbalance, degree)
+        off = Moments(imbalance, _difference(light.flux, problem.flux(light.mean)))
+    gain, source, turned = _gain(medium, change, off, degree)
     if turned is not None:
         source = source + problem.spread(turned)
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
     mean = problem.solved(solve_round, right + source)
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
     new = Moments(mean, problem.flux(mean, turned))
-    if swept.higher is None or factor is None:
+    if change.higher is None or factor is None:
         return new.plus(gain)
-    return _blend(medium, light, new, gain, swept.higher, factor, degree)
+    return _blend(medium, light, new, gain, change.higher, factor, degree)
 
 
 def _blend(
@@ -136,37 +136,39 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 
 
 def _gain(
-    medium: Medium,
-    swept: Moments,
-    light: Moments,
-    diffuse: Moments,
-    imbalance: Tensor | None,
-    degree: int,
+    medium: Medium, change: Moments, off: Moments | None, degree: int
 ) -> tuple[Moments, Tensor, Vector | None]:
     """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E12, and what they add to S.
 
-    That is kappa_s theta (L0' - L0) - theta (S - A L0); `imbalance` is S - A L0, None for zero.
-    And theta p_1 (L1' - L1), by how much the flux that scatters changes (E17).
+    That is kappa_s theta (L0' - L0) - theta (S - A L0). And theta p_1 (L1' - L1), by how much the
+    flux that scatters changes (E17). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and
+    L1 - 3 F(L0), None for zero.
     """
     cosine = remaining_moments(medium)[1]
     if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
-        length = _share_length(medium, degree)
-        return gain_fused(medium, swept, light, diffuse, imbalance, cosine, length)
+        return gain_fused(medium, change, off, cosine, _share_length(medium, degree))
     share = recompute(_transport_share, medium, degree)
-    swept = replace(swept, higher=None)
-    gain = swept.plus(diffuse.scaled(-1.0, -1.0)).scaled(share, share)
+    flux = change.flux if off is None else add_vectors(change.flux, off.flux)
+    gain = Moments(change.mean, flux).scaled(share, share)
     source = medium.remaining_scattering * gain.mean
-    source = source if imbalance is None else source - share * imbalance
-    if swept.flux is None or light.flux is None:
+    source = source if off is None else source - share * off.mean
+    if change.flux is None:
         return gain, source, None
-    return gain, source, recompute(_turned, share, cosine, swept.flux, light.flux)
+    return gain, source, recompute(_turned, share, cosine, change.flux)
 
 
-def _turned(share: Tensor, cosine: Tensor, swept: Vector, light: Vector) -> Vector:
+def _turned(share: Tensor, cosine: Tensor, change: Vector) -> Vector:
     """theta p_1 (L1' - L1)."""
-    z, y, x = (share * cosine * (new - old) for new, old in zip(swept, light, strict=True))
+    z, y, x = (share * cosine * along for along in change)
+    return z, y, x
+
+
+def _difference(one: Vector | None, other: Vector | None) -> Vector | None:
+    if one is None or other is None:
+        return None
+    z, y, x = (a - b for a, b in zip(one, other, strict=True))
     return z, y, x
 
 

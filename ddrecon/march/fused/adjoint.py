@@ -75,6 +75,9 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
             b = a
             b_bar = a_bar
             behind = m
+        if bars.fronts.shape[1] > 0:
+            for k in range(wp.static(layout.extinction)):
+                bars.fronts[k, r] = m_bar[k]
         store(ray_bar, bars, numbers_bar)
 
     return transpose

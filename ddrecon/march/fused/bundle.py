@@ -15,7 +15,7 @@ from ddrecon.march.emission import Emission, is_field
 from ddrecon.march.fused.cellwise import find_along_rays, table_of_cells
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.lattice import Lattice
-from ddrecon.medium.phase import PhaseFunction
+from ddrecon.medium.phase import PhaseKind
 from ddrecon.medium.phase_cells import others_of
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.chebyshev import COEFFICIENTS
@@ -109,11 +109,11 @@ def see_beams(emission: Emission, layout: Layout, packed: Packed) -> Along:
     def see(*towards: Tensor) -> Along:
         if layout.form is not None:
             others = others_of(phase)
-            given = type(phase), layout.form, len(others)
+            given = phase.kind, layout.form, len(others)
             return _see_cellwise(packed.direction, *given, *others, *towards)
         numbers = len(phase.numbers)
         return _see_directional(
-            packed.direction, type(phase), degree, has_peak, numbers, *phase.numbers, *towards
+            packed.direction, phase.kind, degree, has_peak, numbers, *phase.numbers, *towards
         )
 
     towards = [beam.direction for beam in emission.beams if isinstance(beam, Beam)]
@@ -138,7 +138,7 @@ def see_beams(emission: Emission, layout: Layout, packed: Packed) -> Along:
 @remember
 def _see_directional(
     direction: Tensor,
-    kind: type[PhaseFunction],
+    kind: PhaseKind,
     degree: int,
     has_peak: bool,
     numbers: int,
@@ -165,7 +165,7 @@ def _see_directional(
 
 @remember
 def _see_cellwise(
-    direction: Tensor, kind: type[PhaseFunction], form: str, others: int, *tensors: Tensor
+    direction: Tensor, kind: PhaseKind, form: str, others: int, *tensors: Tensor
 ) -> Along:
     """Beams along rays, scattered by a phase function `kind` that differs from cell to cell.
 

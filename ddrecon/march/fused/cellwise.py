@@ -7,7 +7,8 @@ A node holds the number that differs. How p depends on it is the layout's `form`
 - `steep`: g. Where it is positive, and there is a forward peak, by tables at even steps of
   artanh g; else p by its formula.
 
-Kernels know nothing else of a phase function than these tables and the number.
+Kernels know nothing else of a phase function than the number and these tables, of which each color
+may have its own.
 """
 
 from __future__ import annotations
@@ -19,8 +20,16 @@ import torch
 from torch import Tensor
 
 from ddrecon.march.emission import Emission
-from ddrecon.medium.phase import PhaseFunction
-from ddrecon.medium.phase_cells import at_ends, end_table, is_steep, peak_tables
+from ddrecon.march.fused.layout import Layout
+from ddrecon.medium.phase import PhaseKind
+from ddrecon.medium.phase_cells import (
+    EVEN_STEPS,
+    STEEP_STEPS,
+    at_ends,
+    end_table,
+    is_steep,
+    peak_tables,
+)
 from ddrecon.numerics.angle_table import STEPS, angle_of
 from ddrecon.numerics.remember import remember
 
@@ -30,21 +39,21 @@ def form_of(emission: Emission) -> str | None:
     phase = emission.seen.phase
     if phase.cells is None:
         return None
-    if is_steep(type(phase)):
+    if is_steep(phase.kind):
         return "steep"
     return "linear" if emission.peak is None else "even"
 
 
-def find_along_rays(
-    cosine: Tensor, form: str, kind: type[PhaseFunction], others: Sequence[Tensor]
-) -> Tensor:
+def find_along_rays(cosine: Tensor, form: str, kind: PhaseKind, others: Sequence[Tensor]) -> Tensor:
     """What rays are given of p for a beam seen at `cosine` [R]: `Layout.ray_terms` rows [., R].
 
-    Both of `at_ends`, of the phase function `kind` with its `others` (`others_of`); or the cosine, and between which angles of tables it is: the first of them,
-    and the part of the way to the second.
+    Both of `at_ends` for each color, of the phase function `kind` with its `others` (`others_of`); or the cosine,
+    and between which angles of tables it is: the first of them, and the part of the way to the
+    second.
     """
     if form == "linear":
-        return torch.stack(at_ends(kind(*others, cosine.new_zeros(())), cosine))
+        ends = at_ends(kind(*others, cosine.new_zeros(())), cosine)
+        return torch.stack(ends, 1).flatten(0, 1)
     place = angle_of(cosine) * (STEPS / math.pi)
     first = place.detach().long().clamp(0, STEPS - 1)
     return torch.stack([cosine, first.to(cosine), (place - first).to(cosine)])
@@ -53,7 +62,7 @@ def find_along_rays(
 def table_of_cells(emission: Emission) -> Tensor:
     """The tables that kernels read, [rows, terms]: of `linear` those of `at_ends` by angle.
 
-    Of others with a forward peak, by rung and angle; and a row more, as kernels read terms of
+    Of others with a forward peak, by color, rung and angle; and a row more, as kernels read terms of
     several rows at once. None of the others has rows.
     """
     phase, like = emission.seen.phase, emission.diffuse
@@ -64,7 +73,17 @@ def table_of_cells(emission: Emission) -> Tensor:
     return _flatten(peak_tables(phase, emission.seen.degree), like.dtype)
 
 
+def last_rung(layout: Layout) -> int:
+    """The number of the last rung of tables, from 0 on."""
+    return STEEP_STEPS if layout.form == "steep" else EVEN_STEPS
+
+
+def table_rows(layout: Layout) -> int:
+    """Rows of the table of a color: values and slopes by angle, of all rungs if it has them."""
+    return 2 * (STEPS + 1) * (2 * (last_rung(layout) + 1) if layout.has_rungs else 1)
+
+
 @remember
 def _flatten(tables: Tensor, dtype: torch.dtype) -> Tensor:
-    rows = tables.to(dtype).flatten(0, 3)
+    rows = tables.to(dtype).flatten(0, 4)
     return torch.cat([rows, rows.new_zeros(1, rows.shape[1])])

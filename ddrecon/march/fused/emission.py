@@ -156,7 +156,7 @@ def _beam_adjoint(layout: Layout) -> Any:
         )
         here_bar.held += held_bar
         if wp.static(layout.form is not None):
-            of_number = wp.static(layout.first_number) + c * wp.static(layout.phase_step)
+            of_number = wp.static(layout.first_number) + c * wp.static(layout.number_step)
             here_bar.v[of_number] += number_bar
         if wp.static(layout.peak is not None):
             mass_bar += depth_bar * light.peak_of(here.v, ray.peak, c)

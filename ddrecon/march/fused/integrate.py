@@ -42,11 +42,12 @@ class Integrate(torch.autograd.Function):
         coefficients: Tensor,
         numbers: Tensor,
         table: Tensor,
+        fronts: Tensor,
         *fields: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         out = rays.new_empty(layout.outputs, len(rays))
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
-        varied = rays, angles, coefficients, numbers, table
+        varied = rays, angles, coefficients, numbers, table, fronts
         if cells.is_sliced:
             given, made = _packets(cells, varied, fields), {"out": out, "masses": masses}
             packet_integral_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
@@ -73,7 +74,7 @@ class Integrate(torch.autograd.Function):
         needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
         varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))
         if ctx.cells.is_sliced and not varies_rays:
-            needs = needs_polynomials, ctx.needs_input_grad[6], ctx.needs_input_grad[7:]
+            needs = needs_polynomials, ctx.needs_input_grad[6], ctx.needs_input_grad[8:]
             found = _transpose_packets(ctx, needs, out_bar, masses_bar)
         else:
             varies_rays = varies_rays or needs_angles or needs_polynomials
@@ -104,7 +105,7 @@ def _change(
         for value, change in zip(values, d_values, strict=True)
     ]
     bundles = [
-        _bundle(layout, cells.planes, cells.pack(part[5:]), *part[:5]) for part in (values, whole)
+        _bundle(layout, cells.planes, cells.pack(part[6:]), *part[:6]) for part in (values, whole)
     ]
     arguments = [*bundles, array(d_out), array(d_masses)]
     launch(tangent_kernel(layout, cells.is_sliced), len(d_out[0]), arguments, d_out)
@@ -115,15 +116,15 @@ def _change_packets(
     layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
 ) -> tuple[Tensor, Tensor]:
     """The same in packets, of rays that do not change themselves."""
-    rays, fields = values[0], values[5:]
+    rays, fields = values[0], values[6:]
     d_out, d_masses = _empty(layout, rays)
-    d_coefficients, d_numbers, d_table, *d_fields = d_values[2:]
-    given = _packets(cells, values[:5], fields)
+    d_coefficients, d_numbers, d_table, d_fronts, *d_fields = d_values[2:]
+    given = _packets(cells, values[:6], fields)
     nothing = torch.zeros_like(fields[0][0])
     of_changes = _channels(d_fields, fields)
     channels = [nothing if one is None else one for one in of_changes]
     given["all_fields"] = [*given.pop("fields"), *channels]
-    given |= {"d_coefficients": d_coefficients, "d_table": d_table}
+    given |= {"d_coefficients": d_coefficients, "d_table": d_table, "d_fronts": d_fronts}
     given["d_numbers"] = torch.zeros_like(values[3]) if d_numbers is None else d_numbers
     made = {"d_out": d_out, "d_masses": d_masses}
     packet_tangent_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
@@ -141,9 +142,10 @@ def _transpose(
 ) -> list[Tensor | None]:
     """Cotangents of all tensors, a ray a thread; those of rays only where it `varies_rays`."""
     layout, cells = ctx.layout, ctx.cells
-    masses, rays, angles, coefficients, numbers, table, *fields = ctx.saved_tensors
-    packed = cells.pack(fields)
-    given = _bundle(layout, cells.planes, packed, rays, angles, coefficients, numbers, table)
+    masses, rays, angles, coefficients, numbers, table, fronts, *fields = ctx.saved_tensors
+    varied = rays, angles, coefficients, numbers, table, fronts
+    packed, fronts_bar = cells.pack(fields), torch.zeros_like(fronts)
+    given = _bundle(layout, cells.planes, packed, *varied)
     bars = [torch.zeros_like(x if varies_rays else x[:0]) for x in (rays, angles, coefficients)]
     numbers_bar = rays.new_empty(len(numbers), len(rays))
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
@@ -151,7 +153,7 @@ def _transpose(
     fixed = [given, *map(array, (masses, out_bar, masses_bar))]
     tables = [torch.zeros_like(table if ctx.needs_input_grad[6] else table[:0]) for _ in shares]
     bundles = [
-        _bundle(layout, cells.planes, share, *bars, numbers, own)
+        _bundle(layout, cells.planes, share, *bars, numbers, own, fronts_bar)
         for share, own in zip(shares, tables, strict=True)
     ]
     kernel = adjoint_kernel(layout, cells.is_sliced, varies_rays)
@@ -159,7 +161,7 @@ def _transpose(
     found = bars if varies_rays else [None, None, None]
     fields_bar = cells.unpack(functools.reduce(Tensor.add_, shares), fields)
     table_bar = functools.reduce(Tensor.add_, tables) if ctx.needs_input_grad[6] else None
-    return [*found, numbers_bar.sum(1), table_bar, *fields_bar]
+    return [*found, numbers_bar.sum(1), table_bar, fronts_bar, *fields_bar]
 
 
 def _transpose_packets(
@@ -167,7 +169,7 @@ def _transpose_packets(
 ) -> list[Tensor | None]:
     """The same in packets, but of rays; of polynomials, table and fields those it `needs`."""
     layout, cells, (needs_polynomials, needs_table, needs_fields) = ctx.layout, ctx.cells, needs
-    masses, rays, angles, coefficients, numbers, table, *fields = ctx.saved_tensors
+    masses, rays, angles, coefficients, numbers, table, fronts, *fields = ctx.saved_tensors
     packets, _ = cut(len(rays), LANES, rays)
     polynomials_bar = rays.new_empty(coefficients.shape) if needs_polynomials else None
     numbers_bar = masses.new_empty(len(numbers), packets)
@@ -177,9 +179,11 @@ def _transpose_packets(
         [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
         for _ in range(thread_count(rays))
     ]
-    given = _packets(cells, (rays, angles, coefficients, numbers, table), fields)
+    fronts_bar = fronts.new_empty(fronts.shape) if fronts.numel() else None
+    given = _packets(cells, (rays, angles, coefficients, numbers, table, fronts), fields)
     given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
     made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar}
+    made["fronts_bar"] = fronts_bar
     tables = [torch.zeros_like(table if needs_table else table[:0]) for _ in shares]
     own = [
         {"bars": _channels(share, fields), "table_bar": table_bar if needs_table else None}
@@ -193,13 +197,15 @@ def _transpose_packets(
     numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
     found = [table_bar for table_bar in tables if table_bar is not None]
     table_bar = functools.reduce(torch.add, found) if found else None
-    return [None, None, polynomials_bar, numbers_bar, table_bar, *shares[0]]
+    return [None, None, polynomials_bar, numbers_bar, table_bar, fronts_bar, *shares[0]]
 
 
 def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -> dict[str, Any]:
     """What kernels of packets are given, by name."""
+    *varied, fronts = varied
     names = "planes", "slices", "rays", "angles", "coefficients", "numbers", "table"
     given: dict[str, Any] = dict(zip(names, (cells.planes, cells.order, *varied), strict=True))
+    given["fronts"] = fronts if fronts.numel() else None
     given |= cells.strides(fields[0].shape)
     given |= {"ray_count": len(varied[0]), "node_count": len(cells.planes)}
     return given | {"fields": _channels(fields, fields)}
@@ -217,7 +223,7 @@ def _channels(tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[
 def _bundle(layout: Layout, *tensors: Tensor) -> Any:
     """`tensors`, in the order of its fields, as the record that kernels are given."""
     bundle = ray_types(layout).Bundle()
-    names = "planes", "cells", "rays", "angles", "coefficients", "numbers", "table"
+    names = "planes", "cells", "rays", "angles", "coefficients", "numbers", "table", "fronts"
     for name, tensor in zip(names, tensors, strict=True):
         setattr(bundle, name, array(tensor))
     return bundle

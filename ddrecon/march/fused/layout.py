@@ -18,8 +18,8 @@ class Layout:
     colors have phase functions of their own. `bits` of a number: 32 or 64.
 
     Where the phase function differs from cell to cell, `form` is how it depends on the number that
-    does (`cellwise`): a node holds as many of these as there are `phases`, and 1 or C channels
-    of what `remaining` scatters of diffuse light; else None and 0.
+    does (`cellwise`): a node holds these `numbers` (1 or C), of which there are so many `tables` (1
+    or C), and 1 or C channels of what `remaining` scatters of diffuse light. Else None, 0 and 1.
     """
 
     colors: int
@@ -31,6 +31,8 @@ class Layout:
     phases: int
     bits: int
     form: str | None = None
+    numbers: int = 0
+    tables: int = 1
     remaining: int = 0
 
     @property
@@ -91,7 +93,7 @@ class Layout:
     @property
     def first_remaining(self) -> int:
         """Where what scatters diffuse light begins, if it is not what scatters beams."""
-        return self.first_number + (self.phases if self.form else 0)
+        return self.first_number + self.numbers
 
     @property
     def diffusing_from(self) -> int:
@@ -109,6 +111,21 @@ class Layout:
         return self.form in ("even", "steep") and self.peak is not None
 
     @property
+    def number_step(self) -> int:
+        """From the number of a color to that of the next one."""
+        return int(self.numbers > 1)
+
+    @property
+    def table_step(self) -> int:
+        """From the table of a color to that of the next one."""
+        return int(self.tables > 1) if self.form else self.phase_step
+
+    @property
+    def curve_step(self) -> int:
+        """From coefficients of p that a ray is given to those of the next color."""
+        return self.table_step * (COEFFICIENTS if self.form is None else 2)
+
+    @property
     def terms(self) -> int:
         """Coefficients of p over the depth of the peak, or where there is none over the number."""
         if self.peak is not None:
@@ -120,7 +137,7 @@ class Layout:
         """Numbers of each beam that a ray is given: coefficients of p, or where to find them."""
         if self.form is None:
             return self.phases * COEFFICIENTS
-        return 2 if self.form == "linear" else 3
+        return 2 * self.tables if self.form == "linear" else 3
 
     @property
     def channels(self) -> int:

@@ -20,11 +20,12 @@ from ddrecon.march.fused.bundle import (
     table_of,
 )
 from ddrecon.march.fused.cells import cells_of
+from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.fused.compose import compose
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.cellwise import form_of
 from ddrecon.march.lattice import Lattice
+from ddrecon.medium.phase_cells import count_tables
 
 
 def march_rays(
@@ -44,13 +45,20 @@ def march_rays(
 
 
 def integrate_rays(
-    emission: Emission, sampler: Bands | Equidistant, rays: Rays, crossing: Crossing
+    emission: Emission,
+    sampler: Bands | Equidistant,
+    rays: Rays,
+    crossing: Crossing,
+    fronts: Tensor | None = None,
 ) -> Tensor:
-    """Radiance [C] and mass [K] along those of `rays` that are in `crossing`: [C + K, P]."""
+    """Radiance [C] and mass [K] along those of `rays` that are in `crossing`: [C + K, P].
+
+    Behind the mass `fronts` [K, P], which counts as mass along them.
+    """
     axis = sampler.axis if isinstance(sampler, Bands) else None
     ends = crossing.hit, crossing.near, crossing.far
     packed = pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
-    composed, masses = _integrate(emission, sampler, packed)
+    composed, masses = _integrate(emission, sampler, packed, fronts)
     return torch.cat([composed[: emission.colors], masses])
 
 
@@ -61,7 +69,10 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
 
 
 def _integrate(
-    emission: Emission, sampler: Bands | Equidistant, packed: Packed
+    emission: Emission,
+    sampler: Bands | Equidistant,
+    packed: Packed,
+    fronts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Scattered radiance and opacity [2 C, R] along rays, and mass [K, R]."""
     layout, (cells, fields) = layout_of(emission), cells_of(sampler)
@@ -75,6 +86,7 @@ def _integrate(
         along.polynomials,
         numbers,
         table_of(emission),
+        packed.bundle.new_empty(layout.extinction, 0) if fronts is None else fronts,
         *fields,
     )
     irradiances = [beam.irradiance for beam in emission.beams]
@@ -86,7 +98,7 @@ def _integrate(
 def layout_of(emission: Emission) -> Layout:
     """How the fields of `emission` stand in a node."""
     extinction, scattering, peak = emission.extinction, emission.scattering, emission.peak
-    remaining = emission.remaining
+    remaining, phase = emission.remaining, emission.seen.phase
     return Layout(
         emission.colors,
         extinction.field.shape[0],
@@ -97,5 +109,7 @@ def layout_of(emission: Emission) -> Layout:
         emission.seen.colors,
         torch.finfo(emission.diffuse.dtype).bits,
         form_of(emission),
+        0 if phase.cells is None else len(phase.cells),
+        count_tables(phase),
         0 if remaining is None else remaining.field.shape[0],
     )

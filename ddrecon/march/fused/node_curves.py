@@ -2,8 +2,8 @@
 
 Over the depth of the peak p is a polynomial (E13), or constant without a peak. Its coefficients are
 the ray's, for light from one direction; for light from a point they come from a table, by the angle
-at the node. Where p differs from cell to cell (`cellwise`), all come from tables by angle and by the
-number there, or are those over a weight.
+at the node. Where p differs from cell to cell (`cellwise`), all come from tables by angle and by
+the number there, or are those over a weight.
 """
 
 import functools
@@ -13,11 +13,11 @@ from typing import Any
 
 import warp as wp
 
+from ddrecon.march.fused.cellwise import last_rung, table_rows
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.rays import ray_types, vectors
-from ddrecon.medium.phase_cells import EVEN_STEPS, STEEP_STEP, STEEP_STEPS
+from ddrecon.medium.phase_cells import EVEN_STEPS, STEEP_STEP
 from ddrecon.numerics.angle_table import STEPS
-from ddrecon.numerics.chebyshev import COEFFICIENTS
 
 ROWS = 2 * (STEPS + 1)
 """Of a table over the angle: value and slope at each."""
@@ -80,7 +80,6 @@ def spots(layout: Layout) -> SimpleNamespace:
     @wp.func
     def spot_of(ray: records.Ray, b: int, c: int, held: t.F, given: records.Bundle) -> Spot:
         spot = Spot()
-        first = int(0)
         part = t.F(0.0)
         if wp.static(IS_POINT)[b] == 1:
             apart = wp.sqrt(ray.across[b])
@@ -92,15 +91,14 @@ def spots(layout: Layout) -> SimpleNamespace:
             spot.cosine = -away / wp.sqrt(square)
             spot.bend = -t.F(wp.static(step)) * apart / wp.sqrt(square)
             place = wp.atan2(apart, -away) * per
-            first = cubic.first_of(place, wp.static(STEPS))
-            part = place - t.F(first)
+            spot.row = cubic.first_of(place, wp.static(STEPS))
+            part = place - t.F(spot.row)
         else:
             at = b * wp.static(layout.ray_terms)
             spot.cosine = given.coefficients[at, ray.index]
-            first = int(given.coefficients[at + 1, ray.index])
+            spot.row = int(given.coefficients[at + 1, ray.index])
             part = given.coefficients[at + 2, ray.index]
-        color = c * wp.static(0 if layout.form else layout.phase_step)
-        spot.row = color * wp.static(ROWS) + 2 * first
+        spot.row = c * wp.static(layout.table_step * table_rows(layout)) + 2 * spot.row
         spot.weights = cubic.weights(part, t.F(wp.static(step)))
         spot.slopes = cubic.slopes(part, t.F(wp.static(step)))
         return spot
@@ -112,8 +110,7 @@ def spots(layout: Layout) -> SimpleNamespace:
 def rungs(layout: Layout) -> SimpleNamespace:
     """The same of the number there: four tables from `first` on, and `slopes` by the number."""
     t, cubic = vectors(layout), _cubics(layout)
-    is_steep = layout.form == "steep"
-    last = STEEP_STEPS if is_steep else EVEN_STEPS
+    is_steep, last = layout.form == "steep", last_rung(layout)
 
     @wp.struct
     class Rung:
@@ -173,11 +170,10 @@ def curves(layout: Layout) -> SimpleNamespace:
     """
     t, records, table = vectors(layout), ray_types(layout), weighing(layout)
     spot_of, rung_of, IS_POINT = spots(layout).spot_of, rungs(layout).rung_of, is_point(layout)
-    step = 0 if layout.form else layout.phase_step * COEFFICIENTS
 
     @wp.func
     def first(b: int, c: int) -> int:
-        return b * wp.static(layout.ray_terms) + c * wp.static(step)
+        return b * wp.static(layout.ray_terms) + c * wp.static(layout.curve_step)
 
     @wp.func
     def curve(
@@ -193,9 +189,7 @@ def curves(layout: Layout) -> SimpleNamespace:
         if wp.static(layout.has_rungs):
             rung = rung_of(number)
             spot = spot_of(ray, b, c, held, places)
-            return table.weigh_rungs(
-                given.table, rung.first, rung.weights, spot.row, spot.weights
-            )
+            return table.weigh_rungs(given.table, rung.first, rung.weights, spot.row, spot.weights)
         if wp.static(IS_POINT)[b] == 1:
             spot = spot_of(ray, b, c, held, places)
             return table.weigh(given.table, spot.row, spot.weights)

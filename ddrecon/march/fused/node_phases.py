@@ -49,7 +49,7 @@ def node_phase(layout: Layout) -> SimpleNamespace:
     @wp.func
     def number_of(v: t.Node, c: int) -> t.F:
         if wp.static(layout.form is not None):
-            return v[wp.static(layout.first_number) + c * wp.static(layout.phase_step)]
+            return v[wp.static(layout.first_number) + c * wp.static(layout.number_step)]
         return t.F(0.0)
 
     @wp.func
@@ -159,7 +159,7 @@ def _slopes(layout: Layout) -> SimpleNamespace:
     t, records, which = vectors(layout), ray_types(layout), _choices(layout)
     spot_of, rung_of, table = spots(layout).spot_of, rungs(layout).rung_of, weighing(layout)
     curve_of, over_depth, plain = curves(layout).curve, _polynomial(layout), _plain(layout)
-    IS_POINT, has_spots = is_point(layout), layout.has_rungs or any(layout.beams)
+    IS_POINT = is_point(layout)
 
     @wp.struct
     class Slopes:
@@ -204,11 +204,10 @@ def _slopes(layout: Layout) -> SimpleNamespace:
                 given.table, rung.first, rung.weights, spot.row, spot.slopes
             )
             slopes.angle = over_depth.value(turning, place)
-        elif wp.static(has_spots):
-            if wp.static(IS_POINT)[b] == 1:
-                spot = spot_of(ray, b, c, held, given)
-                turning = table.weigh(given.table, spot.row, spot.slopes)
-                slopes.angle = over_depth.value(turning, place)
+        elif wp.static(IS_POINT)[b] == 1:
+            spot = spot_of(ray, b, c, held, given)
+            turning = table.weigh(given.table, spot.row, spot.slopes)
+            slopes.angle = over_depth.value(turning, place)
         return slopes
 
     @wp.func

@@ -137,7 +137,7 @@ auto angle_of = [&](const Node& node, int b, V& cosine) -> Cubic {
     angle.part = given[2];
     return angle;
 };
-auto number_of = [&](const Node& node, int h) -> V { return node.v[FIRST_NUMBER + h]; };
+auto number_of = [&](const Node& node, int h) -> V { return node.v[FIRST_NUMBER + h * NUMBER_STEP]; };
 // p of beam b at a node, by the number there; its change with the angle if that `turns`.
 auto see_number = [&](Node& node, int b, bool turns) {
     V cosine;
@@ -149,8 +149,8 @@ auto see_number = [&](Node& node, int b, bool turns) {
             V *curve = node.curve + i * TERMS, *by_number = HAS_SLOPES ? node.by_number + i * TERMS
                                                                        : nullptr;
             const Cubic rung = Cubic::at(Rungs::place(number), LAST_RUNG);
-            Rungs::read(
-                table, rung, angle, curve, by_number, turns ? node.by_angle + i * TERMS : nullptr);
+            V* const by_angle = turns ? node.by_angle + i * TERMS : nullptr;
+            Rungs::read(table + h * TABLE_STEP, rung, angle, curve, by_number, by_angle);
             if (HAS_SLOPES) {
                 const V slope = Rungs::slope(number);
                 for (int k = 0; k < TERMS; ++k) by_number[k] *= slope;

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from ddrecon.kernels.packets import packet_program
 from ddrecon.kernels.text import TextKernel
+from ddrecon.march.fused.cellwise import table_rows
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
 from ddrecon.march.fused.packet_cellwise import RUNGS, SEE
 from ddrecon.march.fused.packet_optics import CUBICS, DECAYS, POINTS, POLYNOMIALS
-from ddrecon.numerics.angle_table import STEPS
 
 GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers, *table; int *slices;
+F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices;
 int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride;
 """
-"""As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells."""
+"""As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells. Without `fronts`
+there is no mass before the rays.
+"""
 
 _RECORDS = """
 struct Ray {
@@ -65,6 +67,9 @@ if (HAS_PEAK || HAS_NUMBERS)
     for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         ray.coefficients[k] = P::load(coefficients + k * (last + 1), begin, 1, last);
 auto distance = [&](int n) -> V { return (planes[n] - ray.o0) / ray.d0; };
+auto front_of = [&](const F* masses, int k) -> V {
+    return masses ? P::load(masses + (long long)k * (last + 1), begin, 1, last) : P::all(F(0));
+};
 // Nodes before the box and behind it are held at its faces: between them nothing is added.
 int first_node = 0, last_node = node_count - 1;
 while (first_node < last_node && P::every(distance(first_node + 1) <= ray.near)) ++first_node;
@@ -175,7 +180,7 @@ auto peak_of = [&](const Node& node, int c) -> V {
     return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : P::all(peaks[c]);
 };
 auto first_of = [&](int b, int c) -> int {
-    return b * RAY_TERMS + (HAS_NUMBERS ? 0 : c * PHASE_STEP * COEFFICIENTS);
+    return b * RAY_TERMS + c * CURVE_STEP;
 };
 // Of p of beam b in color c: coefficients over the depth of the peak.
 auto curve_of = [&](const Node& node, int b, int c) -> const V* {
@@ -258,7 +263,8 @@ def packet_kernel(
 ) -> TextKernel:
     """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`.
 
-    It `has_slopes` of p at nodes, which the integral itself does not need. With `changes` it is given `all_fields`: `fields`, from which it samples, and their changes.
+    It `has_slopes` of p at nodes, which the integral itself does not need. With `changes` it is
+    given `all_fields`: `fields`, from which it samples, and their changes.
     """
     optics = DECAYS + POLYNOMIALS + CUBICS + POINTS + RUNGS
     structs = PLACES + RUNS + ROWS + VALUES + optics + _RECORDS
@@ -294,11 +300,13 @@ def _constants(layout: Layout, has_slopes: bool) -> str:
         "PHASE_STEP": layout.phase_step,
         "TERMS": layout.terms,
         "CURVES": len(layout.beams) * layout.phases * layout.terms,
-        "TABLE_STEP": 0 if layout.form else 2 * (STEPS + 1) * layout.terms,
+        "TABLE_STEP": layout.table_step * table_rows(layout) * layout.terms,
+        "CURVE_STEP": layout.curve_step,
         "RAY_TERMS": layout.ray_terms,
         "FIRST_DIFFUSING": layout.diffusing_from,
         "DIFFUSING_STEP": layout.diffusing_step,
         "FIRST_NUMBER": layout.first_number,
+        "NUMBER_STEP": layout.number_step,
     }
     answers = {
         "HAS_NUMBERS": layout.form is not None,

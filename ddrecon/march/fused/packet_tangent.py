@@ -53,7 +53,8 @@ auto changing_curve = [&](const Node& node, int b, int c, V* d_curve) -> const V
         const Cubic angle = angle_of(node, b, cosine);
         const V place = Rungs::place(number_of(node, c * PHASE_STEP));
         const Cubic rung = Cubic::at(place, LAST_RUNG);
-        Rungs::read(d_table, rung, angle, d_curve, nullptr, nullptr);
+        const F* const changes_of_table = d_table + c * PHASE_STEP * TABLE_STEP;
+        Rungs::read(changes_of_table, rung, angle, d_curve, nullptr, nullptr);
     } else {
         Point::curve(node.point[b], d_table + c * PHASE_STEP * TABLE_STEP, d_curve);
     }
@@ -62,7 +63,7 @@ auto changing_curve = [&](const Node& node, int b, int c, V* d_curve) -> const V
 // The change of p on the way `way` to the light, of which the depth of its peak changes.
 auto change_of_p = [&](const Node& node, const Node& change, int b, int c, V way, V d_depth) -> V {
     const int phase = b * PHASES + c * PHASE_STEP;
-    const V d_number = HAS_NUMBERS ? change.v[FIRST_NUMBER + c * PHASE_STEP] : none;
+    const V d_number = HAS_NUMBERS ? change.v[FIRST_NUMBER + c * NUMBER_STEP] : none;
     V d_p = none, d_plain = none;
     if (has_curve(b)) {
         V d_curve[TERMS];
@@ -120,7 +121,10 @@ auto emit_change = [&](int n, Node& node, Node& change, const W* m, const V* d_m
 V total[OUT], d_m[EXTINCTION];
 W m[EXTINCTION];
 for (int i = 0; i < OUT; ++i) total[i] = none;
-for (int k = 0; k < EXTINCTION; ++k) d_m[k] = none, m[k] = P::wide(none);
+for (int k = 0; k < EXTINCTION; ++k) {
+    d_m[k] = front_of(d_fronts, k);
+    m[k] = P::wide(front_of(fronts, k));
+}
 Node nodes[2], changes[2];
 Node *a = nodes, *b = nodes + 1, *d_a = changes, *d_b = changes + 1;
 locate(first_node, *a);
@@ -169,7 +173,7 @@ for (int l = 0; l < LANES && begin + l <= last; ++l) {
 def packet_tangent_kernel(layout: Layout) -> TextKernel:
     """The kernel of the changes `d_out` [outputs, R] and `d_masses` [K, R] of packets of rays.
 
-    `d_coefficients` and `d_table`, as what they are changes of, may be left out.
+    `d_coefficients`, `d_table` and `d_fronts`, as what they are changes of, may be left out.
     """
-    given = "F *d_coefficients, *d_numbers, *d_table, *d_out, *d_masses"
+    given = "F *d_coefficients, *d_numbers, *d_table, *d_fronts, *d_out, *d_masses"
     return packet_kernel("integrate_tangent", layout, _WALK, given, changes=True)

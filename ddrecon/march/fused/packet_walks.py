@@ -17,7 +17,7 @@ _INTEGRATE = """
 V total[OUT];
 W m[EXTINCTION];
 for (int i = 0; i < OUT; ++i) total[i] = P::all(F(0));
-for (int k = 0; k < EXTINCTION; ++k) m[k] = P::wide(total[0]);
+for (int k = 0; k < EXTINCTION; ++k) m[k] = P::wide(front_of(fronts, k));
 Node nodes[2];
 Node* a = nodes;
 Node* b = nodes + 1;
@@ -69,7 +69,7 @@ for (int k = 0; k < BEAMS * RAY_TERMS; ++k) polynomial_bar[k] = none;
 // Of p in tables by number and angle, the bars of both.
 auto finish_rungs = [&](const Node& node, int b, int c, V p_bar, V place, V* v_bar) {
     const int first = (b * PHASES + c * PHASE_STEP) * TERMS;
-    v_bar[FIRST_NUMBER + c * PHASE_STEP] += p_bar * Polynomial::at(node.by_number + first, place);
+    v_bar[FIRST_NUMBER + c * NUMBER_STEP] += p_bar * Polynomial::at(node.by_number + first, place);
     if (!IS_POINT[b] && varies_polynomials)
         polynomial_bar[b * RAY_TERMS + 2] += p_bar * Polynomial::at(node.by_angle + first, place);
 };
@@ -77,7 +77,8 @@ auto spread_to_rungs = [&](const Node& node, int b, int c, const V* curve_bar) {
     V cosine;
     const Cubic angle = angle_of(node, b, cosine);
     const V place = Rungs::place(number_of(node, c * PHASE_STEP));
-    Rungs::spread(table_bar, Cubic::at(place, LAST_RUNG), angle, curve_bar);
+    F* const bar = table_bar + c * PHASE_STEP * TABLE_STEP;
+    Rungs::spread(bar, Cubic::at(place, LAST_RUNG), angle, curve_bar);
 };
 // What node b emits, and its values go back to the cells. Its mass is that behind it, `m_b`.
 auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_bar, const V* u_bar,
@@ -108,7 +109,7 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
                 const M counts = (node.p[i] > none) & is_peaked(node, c);
                 V power = HAS_PEAK ? P::pick(counts, p_bar, none) : p_bar;
                 if (HAS_PEAK) depth_bar = power * Polynomial::slope(curve, place);
-                if (IS_LINEAR) v_bar[FIRST_NUMBER + c * PHASE_STEP] += power * curve[TERMS - 1];
+                if (IS_LINEAR) v_bar[FIRST_NUMBER + c * NUMBER_STEP] += power * curve[TERMS - 1];
                 if (HAS_RUNGS) finish_rungs(node, b, c, power, place, v_bar);
                 V powers[TERMS];
                 for (int k = 0; k < TERMS; ++k) {
@@ -125,7 +126,7 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
             if (IS_STEEP) {
                 const Plain& plain = node.plain[b * PHASES + c * PHASE_STEP];
                 const V plain_bar = HAS_PEAK ? P::pick(is_peaked(node, c), none, p_bar) : p_bar;
-                v_bar[FIRST_NUMBER + c * PHASE_STEP] += plain_bar * plain.by_g;
+                v_bar[FIRST_NUMBER + c * NUMBER_STEP] += plain_bar * plain.by_g;
                 if (!IS_POINT[b] && varies_polynomials)
                     polynomial_bar[b * RAY_TERMS] += plain_bar * plain.by_cosine;
             }
@@ -206,6 +207,10 @@ for (int c = 0; c < C; ++c) {
     numbers_bar[(C + c) * packets + item] = P::sum(peak_bar[c]);
 }
 numbers_bar[2 * C * packets + item] = P::sum(bound_bar);
+if (fronts_bar)
+    for (int k = 0; k < EXTINCTION; ++k)
+        for (int l = 0; l < LANES && begin + l <= last; ++l)
+            fronts_bar[(long long)k * (last + 1) + begin + l] = P::lane(m_bar[k], l);
 if (varies_polynomials)
     for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
@@ -229,6 +234,6 @@ def packet_adjoint_kernel(layout: Layout) -> TextKernel:
     """
     given = f"""
     double *masses, *numbers_bar; int packets;
-    F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *bars[{layout.channels}]
+    F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *fronts_bar, *bars[{layout.channels}]
     """
     return packet_kernel("transpose", layout, SPREAD + _TRANSPOSE, given)

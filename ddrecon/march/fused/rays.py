@@ -48,7 +48,8 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         [n, h, w, channels]; `angles` [2 beams, R]: the cosine to directional light, or the foot of
         a point light, then its square distance; `coefficients` [beams * phases * COEFFICIENTS, R]:
         the polynomials of E13; `numbers`: scale and peak by color, bound of third-order
-        corrections; `table` [phases * (steps + 1) * 2, terms]: those of point lights by angle.
+        corrections; `table` [phases * (steps + 1) * 2, terms]: those of point lights by angle;
+        `fronts` [K, R]: the mass before the rays begin, of none where R is 0.
         """
 
         planes: wp.array(dtype=t.F)
@@ -58,6 +59,7 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         coefficients: wp.array2d(dtype=t.F)
         numbers: wp.array(dtype=t.F)
         table: wp.array2d(dtype=t.F)
+        fronts: wp.array2d(dtype=t.F)
 
     @wp.struct
     class Ray:
@@ -147,7 +149,24 @@ def places(layout: Layout, is_sliced: bool) -> SimpleNamespace:
 @functools.cache
 def masses(layout: Layout) -> SimpleNamespace:
     """Masses along rays of `layout` (E1)."""
-    t = vectors(layout)
+    t, Bundle = vectors(layout), ray_types(layout).Bundle
+
+    @wp.func
+    def front_of(given: Bundle, r: int) -> t.Mass:
+        """The mass before ray `r` begins."""
+        m = t.Mass()
+        if given.fronts.shape[1] > 0:
+            for k in range(wp.static(layout.extinction)):
+                m[k] = given.fronts[k, r]
+        return m
+
+    @wp.func
+    def widen(m: t.Mass) -> t.Total:
+        """Masses in double precision."""
+        total = t.Total()
+        for k in range(wp.static(layout.extinction)):
+            total[k] = wp.float64(m[k])
+        return total
 
     @wp.func
     def add_mass(total: t.Total, v0: t.Node, v1: t.Node, length: t.F) -> t.Total:
@@ -168,4 +187,4 @@ def masses(layout: Layout) -> SimpleNamespace:
             m[k] = t.F(total[k])
         return m
 
-    return SimpleNamespace(add_mass=add_mass, mass_of=mass_of)
+    return SimpleNamespace(front_of=front_of, widen=widen, add_mass=add_mass, mass_of=mass_of)

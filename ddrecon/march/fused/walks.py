@@ -34,7 +34,8 @@ def integral_kernel(layout: Layout) -> Any:
     ):
         r = first + wp.tid()
         ray = load_ray(given, r)
-        total, m, before = t.Out(), t.Total(), records.Stop()
+        total, before = t.Out(), records.Stop()
+        m = passed.widen(passed.front_of(given, r))
         for n in range(given.planes.shape[0]):
             here = stop(given, ray, n)
             # The mass passed on the way to it, and what it emits behind that.
@@ -72,8 +73,8 @@ def tangent_kernel(layout: Layout, is_sliced: bool) -> Any:
         r = first + wp.tid()
         ray = load_ray(given, r)
         d_ray = load_ray(d_given, r)
-        total, m, before = t.Out(), t.Total(), records.Stop()
-        d_m, d_before = t.Mass(), records.Stop()
+        total, before, d_before = t.Out(), records.Stop(), records.Stop()
+        m, d_m = passed.widen(passed.front_of(given, r)), passed.front_of(d_given, r)
         for n in range(given.planes.shape[0]):
             here = stop(given, ray, n)
             d_here = change_stop(given, d_given, ray, d_ray, here, n)

@@ -25,10 +25,12 @@ F* __restrict new_v = new_value + begin;
 F* __restrict new_m = new_first + begin;
 F* __restrict new_s = new_second + begin;
 const int count = end - begin;
+const F least = smallest[0];
 for (int i = 0; i < count; ++i) {
     const F mean = m[i] + forget_first * (g[i] - m[i]);
     const F square = s[i] + forget_second * (g[i] * g[i] - s[i]);
-    const F moved = v[i] - rate * mean / (root_of(square) * root + epsilon);
+    const F onward = g[i] + ahead * (mean - g[i]);
+    const F moved = v[i] - rate * onward / (root_of(square) * root + least);
     const F held = moved < low ? low : moved;
     new_m[i] = mean;
     new_s[i] = square;
@@ -85,7 +87,7 @@ totals[item] = total;
 def step_kernel(bits: int) -> TextKernel:
     """The kernel of a step of Adam: new value, first and second moment, each a flat array."""
     given = """
-    int length, total; F forget_first, forget_second, root, epsilon, rate, low, high;
+    int length, total; F forget_first, forget_second, root, ahead, rate, low, high, *smallest;
     F *value, *gradient, *first_moment, *second_moment, *new_value, *new_first, *new_second
     """
     return TextKernel("step", bits, BLOCK + _ROOT + _STEP, given)

@@ -29,10 +29,15 @@ def step_adam(
     betas: tuple[float, float],
     steps: int,
     rate: float,
-    epsilon: float,
+    smallest: Tensor,
+    ahead: float,
     bounds: tuple[float, float],
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """The new value, within its bounds, and the new moments, after `steps` with this one."""
+    """The new value, within its bounds, and the new moments, after `steps` with this one.
+
+    `smallest`, one number, is added to the size of each derivative. The value moves along the part
+    `ahead` of the mean derivative, and for the rest along the newest (E53).
+    """
     new = [value.new_empty(value.shape) for _ in range(3)]
     weights = [1 - beta**steps for beta in betas]
     items, length = cut(value.numel(), LENGTH, value)
@@ -46,7 +51,8 @@ def step_adam(
         "forget_first": 1 - betas[0],
         "forget_second": 1 - betas[1],
         "root": weights[1] ** -0.5,
-        "epsilon": epsilon,
+        "ahead": ahead,
+        "smallest": smallest,
         "rate": rate / weights[0],
         "low": bounds[0],
         "high": bounds[1],

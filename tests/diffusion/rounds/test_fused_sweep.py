@@ -13,7 +13,7 @@ from media import half_empty, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_scattered
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep_change
 from ddrecon.diffusion.rounds.transport import _blend, _gain
 from ddrecon.engine import use_engine
 from ddrecon.grid import Grid
@@ -101,7 +101,7 @@ def moments_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tenso
     use_engine(engine)
     medium = case.medium(values)
     light, source = (Moments.of_harmonics(values[name]) for name in ("light", "source"))
-    swept = sweep_scattered(medium, light, source, values.get("inflow"), case.degree)
+    swept = sweep_change(medium, light, source, values.get("inflow"), case.degree)
     return [swept.harmonics(medium.degree)]
 
 
@@ -164,6 +164,7 @@ CASES = {
     "cell": Case((1, 1, 1), CUBES),
     "opaque": Case(depth=1e4, spacing=CUBES),
     "empty": Case(depth=0.0),
+    "shallow": Case((6, 5, 37), CUBES, colors=1, moments=4, depth=0.1),
     "island": Case((7, 8, 70), CUBES, colors=1, is_island=True),
     "island-slanted": Case((7, 8, 70), FLAT, colors=1, is_island=True),
     "island-high": Case((25, 40, 7), colors=1, moments=1, is_island=True),
@@ -233,16 +234,15 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 
 
 def gains_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]:
-    """The source, and the gains from `light` to what was swept, `source`.
+    """The source, and the gains where light changes by `source`.
 
-    In the first round the balance is off by nothing; `inflow` stands for a later one.
+    In the first round it is off by nothing; `light` stands for a later one, where it is lit.
     """
     use_engine(engine)
-    medium, inflow = case.medium(values), values.get("inflow")
-    swept, light = (Moments.of_harmonics(values[name]) for name in ("source", "light"))
-    imbalance = None if inflow is None else inflow * light.mean
-    diffuse = light.scaled(1.5, 0.5)
-    gain, source, turned = _gain(medium, swept, light, diffuse, imbalance, case.degree)
+    medium = case.medium(values)
+    change, light = (Moments.of_harmonics(values[name]) for name in ("source", "light"))
+    off = light.scaled(values["inflow"], 0.5) if "inflow" in values else None
+    gain, source, turned = _gain(medium, change, off, case.degree)
     return [source, gain.mean, *(gain.flux or ()), *(turned or ())]
 
 
@@ -301,8 +301,8 @@ def test_light_after_rounds_is_that_of_torch(g: float):
 def test_kernels_compile_for_graphics_cards(architecture: int, tmp_path: Path):
     """For those that are not here as well."""
     kernels = [*cell_kernels(32, False, True)]
-    for is_diffuse in (True, False):
-        case = GainCase(True, False, True, is_diffuse)
+    for is_off in (True, False):
+        case = GainCase(True, False, is_off)
         kernels += [gain_kernel(case, 32), gain_adjoint_kernel(case, 32)]
     kernels += [blend_kernel(32), blend_adjoint_kernel(32)]
     for kernel in kernels:

@@ -151,7 +151,7 @@ def test_a_white_furnace_is_exact_after_any_rounds(g: float):
 
 
 def test_no_rounds_are_no_work(monkeypatch):
-    monkeypatch.setattr("ddrecon.diffusion.rounds.transport.sweep_scattered", None)
+    monkeypatch.setattr("ddrecon.diffusion.rounds.transport.sweep_change", None)
     memory = SolveMemory()
     render(make_scene(ball(6), directional=(3.0,)), memory=memory)
     assert len(memory.records) == 1

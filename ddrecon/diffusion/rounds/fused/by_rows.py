@@ -56,9 +56,10 @@ class Rows:
         self.channels = [len(field) for field in swept.fields]
 
     def follow(self, is_saved: bool) -> tuple[Tensor, Tensor | None]:
-        """The moments of radiance [K, C, z, y, x]; and what `transpose` needs, if it `is_saved`.
+        """Moments of radiance less those of light; and what `transpose` needs, if it `is_saved`.
 
-        That is I before slabs of slices, [C, directions, slabs, y, x].
+        Moments are [K, C, z, y, x], and of light only the first two are taken. `transpose` needs
+        I before slabs of slices, [C, directions, slabs, y, x].
         """
         shape = self.colors, self.swept.directions, self.slabs, self.height, self.width
         saved = self.like.new_empty(shape) if is_saved else None
@@ -133,7 +134,8 @@ class Rows:
             "slab": self.slab, "slabs": self.slabs, "directions": swept.directions,
             "extinction": self.fields[0], "scattering": self.fields[-1],
             "scales": swept.scales, "parts": tables.parts, "matrices": tables.matrices,
-            "ranges": self.ranges, "densest": self.densest, "groups": tables.groups, "points": tables.points,
+            "ranges": self.ranges, "densest": self.densest,
+            "groups": tables.groups, "points": tables.points,
             "pairs": tables.pairs, "order": tables.moments, "depth": self.depth,
             "height": self.height, "width": self.width, "pitch": self.pitch,
             "colors": self.colors, "count": self.count, "even": tables.even, "most": tables.most,

@@ -249,8 +249,17 @@ for (int t = 0; t < height; ++t) {
     F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
     to_moments(to_weighted_sums, found_row, light_of, is_adding, 0, width);
-    if (!is_adding && piece == 0)
-        for (int c = 0; c < width; ++c) found_row[c] += inflow;
+    if (is_adding || piece > 0) continue;
+    for (int c = 0; c < width; ++c) found_row[c] += inflow;
+    // the change of the first two moments of light
+    for (int k = 0; k < 4 && k < count; ++k) {
+        const F* light = part_of(light_parts, k);
+        F* change = found_row + k * all;
+        if (!light) continue;
+        light += color * cells + at;
+        INDEPENDENT
+        for (int c = 0; c < width; ++c) change[c] -= light[c];
+    }
 }
 }
 """

@@ -73,7 +73,7 @@ for (int cells = 1; cells <= 2; ++cells) {
 
 
 def surround(fields: Sequence[Tensor], pitch: int) -> tuple[list[Tensor], Tensor, Tensor]:
-    """One or two `fields` [K, z, y, x] with empty cells around them, `ranges` and `densest` of rows.
+    """`fields` [K, z, y, x] with empty cells around them; `ranges` and `densest` of their rows.
 
     They are flat: MARGIN zeros and [K, z + 2, y + 2, pitch]. `ranges` [z, y, 4]: from and to where
     steps to the cells of a row meet a medium, and where those meet one that begin at these cells.

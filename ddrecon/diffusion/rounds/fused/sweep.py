@@ -31,8 +31,9 @@ def sweep_fused(
 ) -> Moments:
     """The moments of the radiance that `light`, by `factors`, and `source` scatter (E17).
 
-    As `sweep_scattered` has it. `directions`: how many the quadrature has; `by_cells`: whether a
-    thread does a cell of a slice, not rows of directions; None: on a GPU.
+    The first two less those of `light`, where there is one, as `sweep_change` has it.
+    `directions`: how many the quadrature has; `by_cells`: whether a thread does a cell of a slice,
+    not rows of directions; None: on a GPU.
     """
     colors = len(medium.extinction.value) if light is None else len(light.mean)
     shares_field = medium.remaining.field is medium.extinction.field
@@ -83,7 +84,7 @@ class _Sweep(torch.autograd.Function):
     def forward(by_cells: bool, may_save: bool, *given: Any) -> tuple[Any, ...]:
         swept, threads = Swept.of(*given), thread_count(Swept.of(*given).like)
         if by_cells:
-            return *split(Cells(swept).follow()), None
+            return *split(swept.less_light(Cells(swept).follow())), None
         is_saved = may_save and any(
             isinstance(each, Tensor) and each.requires_grad for each in given
         )
@@ -120,7 +121,7 @@ class _Sweep(torch.autograd.Function):
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
             swept.factor_bar(moments_bar) if needs_factors else None,
-            *swept.light_bars(moments_bar, needs_parts[:PARTS]),
+            *swept.light_bars(moments_bar, parts, needs_parts[:PARTS]),
             *choose(moments_bar, needs_parts[PARTS:]),
         )
 
@@ -130,8 +131,11 @@ class _Sweep(torch.autograd.Function):
             values, d_values = halve(tensors)
             swept = Swept.of(*ctx.of, *values)
             d_swept = changes_of(swept, *d_values)
-            if ctx.by_cells:
-                return split(CellTangents(swept, d_swept).change())
-            return split(RowTangents(swept, d_swept, ctx.threads).change())
+            tangents = (
+                CellTangents(swept, d_swept)
+                if ctx.by_cells
+                else RowTangents(swept, d_swept, ctx.threads)
+            )
+            return split(d_swept.less_light(tangents.change()))
 
         return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None

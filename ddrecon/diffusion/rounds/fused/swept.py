@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
+from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments
 from ddrecon.numerics.harmonics import count_harmonics
 
@@ -106,12 +109,29 @@ class Swept:
                 total += source
         return found
 
-    def light_bars(self, bar: Tensor, needs: Sequence[bool]) -> Parts:
-        """Cotangents of those parts of light that need them, of `bar` of moments."""
+    def less_light(self, moments: Tensor) -> Tensor:
+        """`moments` [K, C, z, y, x] less the mean and the flux of light, in place."""
+        for k in range(min(4, len(moments))):
+            if (light := moment_of(self.light, k)) is not None:
+                moments[k] -= light
+        return moments
+
+    def light_bars(self, found: Tensor, bars: Parts, needs: Sequence[bool]) -> Parts:
+        """Cotangents of those parts of light that need them.
+
+        `found`: of the moments that scatter; `bars`: of what was swept, which light is taken from.
+        """
         if not any(needs):
             return (None,) * PARTS
-        count = len(bar) if needs[PARTS - 1] else min(4, len(bar))
-        return choose(self.factors[:count, :, None, None, None] * bar[:count], needs)
+        first = found.new_empty(min(4, len(found)), *found.shape[1:])
+        given: dict[str, Any] = {f"bar_{k}": moment_of(bars, k) for k in range(len(first))}
+        given |= {"factors": self.factors, "found": found}
+        given |= {"colors": len(found[0]), "count": len(first)}
+        launch_rows(light_bar_kernel, self.grid, len(found[0]), given, {"light": first})
+        higher = self.factors[4:, :, None, None, None] * found[4:] if needs[PARTS - 1] else None
+        parts = (*split(first), *[None] * PARTS)[: PARTS - 1]
+        kept = (part if need else None for part, need in zip(parts, needs, strict=False))
+        return *kept, higher
 
     def factor_bar(self, bar: Tensor) -> Tensor:
         """The cotangent of `factors`, of `bar` of moments."""
@@ -121,6 +141,27 @@ class Swept:
                 terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
                 found[k] = torch.stack([torch.dot(*each) for each in terms])
         return found.to(bar.dtype)
+
+
+_LIGHT_BARS = """
+const F* const bars[4] = {bar_0, bar_1, bar_2, bar_3};
+const long long all = colors * size, at = c * size + start;
+for (int k = 0; k < count; ++k) {
+    const F *row = found + k * all + at, factor = factors[k * colors + c];
+    const F* taken = bars[k] ? bars[k] + at : row;
+    const F sign = bars[k] ? F(-1) : F(0);
+    F* light_row = light + k * all + at;
+    INDEPENDENT
+    for (int i = begin; i < end; ++i) light_row[i] = factor * row[i] + sign * taken[i];
+}
+"""
+
+
+@functools.cache
+def light_bar_kernel(bits: int) -> Any:
+    """The kernel of cotangents of light's mean and flux, of which the same were taken away."""
+    arrays = "factors found bar_0 bar_1 bar_2 bar_3 light"
+    return row_kernel("light_bars", bits, _LIGHT_BARS, arrays, "colors count")
 
 
 def choose(bar: Tensor, needs: Sequence[bool]) -> Parts:
