@@ -56,14 +56,20 @@ for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
 V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], bound_bar = none;
 V polynomial_bar[BEAMS * RAY_TERMS + 1];
 const bool varies_polynomials = polynomials_bar;
-for (int i = 0; i < OUT; ++i)
+bool is_asked = false;
+for (int i = 0; i < OUT; ++i) {
     bar[i] = inside * P::load(out_bar + (long long)i * (last + 1), begin, 1, last);
+    is_asked = is_asked || !P::every(bar[i] == none);
+}
 W m[EXTINCTION];
 for (int k = 0; k < EXTINCTION; ++k) {
     const long long row = (long long)k * (last + 1);
     m_bar[k] = inside * P::load(masses_bar + row, begin, 1, last);
     m[k] = P::load_wide(masses + row, begin, last);
+    is_asked = is_asked || !P::every(m_bar[k] == none);
 }
+// Pixels that nothing is asked of, masked ones for instance, need no walk.
+if (!is_asked) last_node = first_node;
 for (int c = 0; c < C; ++c) scale_bar[c] = peak_bar[c] = none;
 for (int k = 0; k < BEAMS * RAY_TERMS; ++k) polynomial_bar[k] = none;
 // Of p in tables by number and angle, the bars of both.
