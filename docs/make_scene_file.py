@@ -378,12 +378,13 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "transport_rounds": (
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
                 "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
-                "where there are none: without model `p1` or scheme `conservative`."
+                "where there are none: without model `p1` or scheme `conservative`. It is 1 as "
+                "well where a cell is thicker than 2 optical depths and a given g is above 0."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 18 directions for 1, 26 "
                 "for 3, then 50 and 86. Left out, it is 3, or 1 where g is not sought and at most "
-                "0.32."
+                "0.32 in size, or above 0 in cells thicker than 2 optical depths."
             ),
         },
     ),
@@ -437,7 +438,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density and 0 for others. `auto` finds it by leaving a view out."
+                " density, of which it is that of log(1 + 10 density) / 3, and 0 for others."
+                " `auto` finds it by leaving a view out."
             ),
             "l1": "Weight of its mean, which empties what no picture needs.",
             "field": (
