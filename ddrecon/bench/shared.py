@@ -15,7 +15,7 @@ from ddrecon.progress import Progress
 from ddrecon.ranks import alone, exchanged, is_first, own_rank, rank_count, sum_numbers
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.scene import Scene, View
-from ddrecon.variables.values import value_of
+from ddrecon.variables.values import density_names, value_of
 
 TURNS = 3
 
@@ -39,7 +39,7 @@ def measure_shared(scene: Scene, progress: Progress) -> list[Iteration]:
 
     It differentiates the images of all views of `scene` by what it optimizes, or by density.
     """
-    names = scene.optimize.parameters if scene.optimize else ["density"]
+    names = scene.optimize.parameters if scene.optimize else density_names(scene)
     values = {name: value_of(scene, name).detach().requires_grad_() for name in names}
     turns = dict[int, list[Iteration]]()
     # The first of each is not counted: a process's first work takes longer.

@@ -185,6 +185,8 @@ def _bench_speed(
 
     load = None if path is None else lambda dtype: replace(session, dtype=dtype).load(path)
     scene, double = load_pair(load, session.device, is_quick)
+    if scene.volume.media is not None:
+        raise click.UsageError("the derivative by the density is measured; name a scene of one")
     tracer = None
     try:
         tracer = PathTracer(scene, has_gradient=not is_quick)

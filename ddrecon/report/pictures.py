@@ -53,19 +53,30 @@ def comparison(target: Tensor, image: Tensor) -> np.ndarray:
 def slices(field: Tensor, white: float | None = None) -> np.ndarray:
     """The middle slices of `field` [z, y, x] or [C, z, y, x] across z, x and y.
 
-    y (or z) is up; the largest value is white, unless another is.
+    y (or z) is up; the largest value is white, unless another is. A field with negative values is
+    as `diverge` shows it.
     """
     array = _cells_of(field)
     z, y, x = (size // 2 for size in array.shape[:3])
-    white = white or max(float(np.quantile(array, 0.999)), 1e-6)
-    return _three_sides([array[z], array[:, :, x], array[:, y]], white)
+    white = white or find_high(np.abs(array))
+    shown = _show(array, white)
+    return _three_sides([shown[z], shown[:, :, x], shown[:, y]])
 
 
 def projections(field: Tensor) -> np.ndarray:
-    """The means of `field` along z, x and y, placed as `slices` are; the largest mean is white."""
+    """The means of `field` along z, x and y, placed as `slices` are; the largest mean is white.
+
+    With negative values it is as `slices` shows such a field.
+    """
     array = _cells_of(field)
     means = [array.mean(axis) for axis in (0, 2, 1)]
-    return _three_sides(means, max(*(float(side.max()) for side in means), 1e-6))
+    white = max(*(float(np.abs(side).max()) for side in means), 1e-6)
+    return _three_sides([_show(side, white) for side in means])
+
+
+def _show(values: np.ndarray, white: float) -> np.ndarray:
+    """`values` [..., 3] as colors; their mean as `diverge` has it where some are below 0."""
+    return diverge(values.mean(-1) / white) if values.min() < 0 else values / white
 
 
 def _cells_of(field: Tensor) -> np.ndarray:
@@ -76,12 +87,12 @@ def _cells_of(field: Tensor) -> np.ndarray:
     return array
 
 
-def _three_sides(sides: list[np.ndarray], white: float) -> np.ndarray:
+def _three_sides(sides: list[np.ndarray]) -> np.ndarray:
     """Sides [y, x], [z, y] and [z, x], each with colors, as pictures in a row.
 
     y is up, or z where there is no y.
     """
-    across_z, across_x, across_y = (side / white for side in sides)
+    across_z, across_x, across_y = sides
     return place_beside([across_z[::-1], across_x[:, ::-1].transpose(1, 0, 2), across_y[::-1]])
 
 
@@ -101,9 +112,14 @@ def diverging(image: Tensor) -> tuple[np.ndarray, float]:
     """
     values = pixels(image).mean(-1)
     full = max(float(np.quantile(np.abs(values), 0.999)), float(np.finfo(np.float32).tiny))
-    part = np.clip(values / full, -1, 1)[..., None]
+    return diverge(values / full), full
+
+
+def diverge(parts: np.ndarray) -> np.ndarray:
+    """Colors [..., 3] of numbers between -1, which is blue, and 1, which is red; 0 is white."""
+    part = np.clip(parts, -1, 1)[..., None]
     strong = np.where(part < 0, np.array(BLUE, np.float32), np.array(RED, np.float32))
-    return decode((1 - np.abs(part)) + np.abs(part) * strong), full
+    return decode((1 - np.abs(part)) + np.abs(part) * strong)
 
 
 def place_beside(pictures: list[np.ndarray]) -> np.ndarray:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from ddrecon.io.images import srgb
-from ddrecon.report.pictures import find_high
+from ddrecon.report.pictures import diverge, find_high
 
 MOST_CELLS = 1_000_000
 """A field of more is made coarser, by whole factors."""
@@ -42,8 +42,11 @@ class Shown:
 
 
 def find_white_value(values: Tensor) -> float:
-    """The value of a field that is shown as white: all but one cell in a thousand are below."""
-    return find_high(values.detach().float().cpu().numpy())
+    """The size of the values of a field that are shown as white, or in full color where signed.
+
+    All but one cell in a thousand are below.
+    """
+    return find_high(values.detach().abs().float().cpu().numpy())
 
 
 def volume_viewer(
@@ -98,6 +101,8 @@ def _data(field: Shown) -> str:
     values = field.values.detach()
     values = _coarsen(values if values.ndim == 4 else values[None])
     cells = (values.permute(1, 2, 3, 0) / field.white).float().cpu().numpy()
+    if cells.min() < 0:
+        cells = diverge(cells.mean(-1))
     packed = gzip.compress(srgb.encode_bytes(cells).tobytes(), mtime=0)
     longest = max(field.sides)
     content = {
@@ -106,7 +111,7 @@ def _data(field: Shown) -> str:
         "size": list(values.shape[:0:-1]),
         "box": [side / longest for side in field.sides],
         "white": field.white,
-        "channels": values.shape[0],
+        "channels": cells.shape[-1],
         "data": base64.b64encode(packed).decode("ascii"),
     }
     return f'<script type="application/json" class="field">{json.dumps(content)}</script>'

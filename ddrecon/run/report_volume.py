@@ -64,11 +64,14 @@ def _stills(fields: dict[str, Tensor]) -> str:
     """Slices and projections of every field."""
     parts = [
         paragraph(
-            "Across z, x and y from left to right; y, or z, is up. The largest value is white."
+            "Across z, x and y from left to right; y, or z, is up. The largest value is white;"
+            " where some are below 0, these are blue, 0 is white, and above is red."
         )
     ]
     for name, value in fields.items():
         largest = f"(the largest value of a cell is {float(value.max()):.4g})"
+        if bool((value < 0).any()):
+            largest = f"(values from {float(value.min()):.4g} to {float(value.max()):.4g})"
         cut = picture(png_of(slices(value)), f"{name}, middle slices {largest}")
         means = picture(png_of(projections(value)), f"{name}, means along the axes {largest}")
         parts.append(side_by_side(cut, means))

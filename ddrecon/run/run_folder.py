@@ -29,7 +29,7 @@ from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import write_described
 from ddrecon.scene_file.load import SceneFile
 from ddrecon.variables.kinds import EXTINCTION_AND_ALBEDO, PHASE, is_of_volume, kind_of, split_name
-from ddrecon.variables.values import fields_of, value_of, variable_names
+from ddrecon.variables.values import density_names, fields_of, value_of, variable_names
 
 CHECKPOINTS = "checkpoints"
 """Where a run folder keeps its checkpoints."""
@@ -115,8 +115,8 @@ class RunFolder:
         self.save(run)
         scene = run.current_scene()
         names = result_names([parameter.name for parameter in run.parameters])
-        densities = [name for name in variable_names(scene) if split_name(name)[1] == "density"]
-        values = {name: self._store(scene, name) for name in dict.fromkeys([*densities, *names])}
+        stored = dict.fromkeys([*density_names(scene), *names])
+        values = {name: self._store(scene, name) for name in stored}
         write_described(describe_result(self.scene_file, scene, values), self.path / RESULT)
         write_json(self.path / "parameters.json", self._parameters(scene, values))
         light_field = solve(scene)

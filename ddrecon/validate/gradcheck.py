@@ -27,7 +27,7 @@ from ddrecon.validate.point import (
     starting_point,
     steps_of,
 )
-from ddrecon.variables.values import variable_names
+from ddrecon.variables.values import density_names, variable_names
 
 AGREE_MODES = 1e-10
 AGREE_DIFFERENCES = 1e-6
@@ -119,7 +119,7 @@ def check_parameters(
     entries of each are looked at one by one. Raises UsageError for a name the scene does not have.
     """
     names = _require_known(scene, names) or tuple(
-        scene.optimize.parameters if scene.optimize else ("density",)
+        scene.optimize.parameters if scene.optimize else density_names(scene)
     )
     generator = torch.Generator().manual_seed(seed)
     point = starting_point(scene, names, generator)

@@ -20,7 +20,7 @@ from ddrecon.losses import image_loss
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import kind_of
-from ddrecon.variables.values import component_names, value_of, with_values
+from ddrecon.variables.values import component_names, density_names, value_of, with_values
 
 TOLERANCE = 1e-13
 """Relative residual of the solves."""
@@ -38,7 +38,7 @@ def starting_point(
     """
     point = {
         name: scene.starts[name] if name in scene.starts else value_of(scene, name)
-        for name in dict.fromkeys([*scene.starts, *names, *_density(scene)])
+        for name in dict.fromkeys([*scene.starts, *names, *density_names(scene)])
     }
     if "density" in point and point["density"].ndim == 3:
         of_scene = scene.volume.density
@@ -54,11 +54,6 @@ def starting_point(
                 2 * random_like(value, generator) - 1
             )
     return point
-
-
-def _density(scene: Scene) -> list[str]:
-    """The name of the density; of two media nothing, as each has one."""
-    return ["density"] if scene.volume.media is None else []
 
 
 def loss_at(

@@ -45,6 +45,11 @@ def variable_names(scene: Scene) -> list[str]:
     return [*_volume_names(scene.volume), *lights, *views]
 
 
+def density_names(scene: Scene) -> list[str]:
+    """The names of the density of `scene`, or of those of its two media."""
+    return [name for name in _volume_names(scene.volume) if split_name(name)[1] == "density"]
+
+
 def fields_of(scene: Scene) -> dict[str, Tensor]:
     """The variables of `scene` that differ from cell to cell, by name.
 

@@ -13,7 +13,8 @@ import torch
 
 from ddrecon.io.images import srgb
 from ddrecon.report import volumes
-from ddrecon.report.volumes import Shown, volume_viewer
+from ddrecon.report.pictures import slices
+from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
 
 
 def embedded(*fields: Shown) -> list[dict]:
@@ -48,3 +49,16 @@ def test_a_large_field_is_embedded_coarser(monkeypatch: pytest.MonkeyPatch) -> N
     assert found["size"] == [3, 2, 3]
     expected = 255 * srgb.encode(float(values[4:, 2:, 2:4].mean()))
     assert abs(found["cells"][2, 1, 1, 0] - expected) <= 0.501
+
+
+def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
+    """Blue below, red above, as strong as far from zero: in pages and in pictures alike."""
+    values = torch.tensor([-0.6, -0.3, 0.0, 0.3, 0.6]).expand(4, 4, 5)
+    (found,) = embedded(Shown("g", "result", values, (1.0, 1.0, 1.0), find_white_value(values)))
+    page = found["cells"][0, 0].astype(float)
+    picture = srgb.encode_bytes(slices(values)[0, :5]).astype(float)
+    for blue, light_blue, white, light_red, red in (page, picture):
+        assert (white == 255).all()
+        assert blue[2] > blue[0] and red[0] > red[2]
+        np.testing.assert_allclose(light_blue, (blue + white) / 2, atol=1)
+        np.testing.assert_allclose(light_red, (red + white) / 2, atol=1)
