@@ -12,13 +12,18 @@ Where a step meets no medium, nothing returns to what scatters.
 
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.rows import (
+    ACROSS,
     BEGINNINGS,
     DECAYED,
     DIRECTION,
     ENDS,
     FOLLOW_ROWS,
     GROUP,
+    PASS,
+    PASS_ALL,
     PLACES,
+    RANGE,
+    ROW,
     SLOPES,
     UPSTREAM,
 )
@@ -57,9 +62,9 @@ for (int g = group_to - 1; g >= group_from; --g) {"""
     + MULTIPLY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
-for (int t = height - 1; t >= 0; --t) {
-    const int r = y_way > 0 ? t : height - 1 - t;
-    const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
+for (int t = height - 1; t >= 0; --t) {"""
+    + ROW
+    + """
     auto line = [&](int slice, int turn, int which, int j) -> const F* {
         const long long place = (slice - slice_from + 1LL) * height + turn;
         return own_lines + place * stride + (LINES * (before + j) + which) * (long long)pitch;
@@ -81,10 +86,9 @@ for (int t = height - 1; t >= 0; --t) {
         for (int c = from; c < to; ++c) row[c] = moment[c];
         ask_for(moment, from, to);
     };
-    to_directions(to_weighted_light, read, bar_of, 0, width);
-    const int* range = ranges + 4 * (k * height + r);
-    const int from = range[0], to = range[1];
-    const F deepest = scale * densest[k * height + r];
+    to_directions(to_weighted_light, read, bar_of, 0, width);"""
+    + RANGE
+    + """
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
     F *__restrict source_bars = scratch_row(own + 0), *__restrict passing = scratch_row(own + 1);
     F *__restrict scale_bar = scratch_row(own + 2), *__restrict strength_bar = scratch_row(own + 3);
@@ -124,12 +128,9 @@ for (int t = height - 1; t >= 0; --t) {
             const bool is_inside = place && back_lines[place];
             back_from[i] = (is_inside ? back_lines[place] + own_back_line : empty_row)
                 + point[3 * i + 2] * x_way;
-        }
-        auto pass = [&](auto points, auto along, auto matter, int from, int to) {
-            constexpr bool is_empty = decltype(matter)::is_empty;
-            constexpr bool is_all_thin = decltype(matter)::is_thin;
-            INDEPENDENT
-            for (int c = from; c < to; ++c) {"""
+        }"""
+    + PASS
+    + """"""
     + ENDS
     + DECAYED
     + """
@@ -154,13 +155,9 @@ for (int t = height - 1; t >= 0; --t) {
                     inflow_bar[c] += radiance_bar - source_bar * lost;
                 }
             }
-        };
-        auto pass_all = [&](auto points, auto along) {
-            pass(points, along, Empty(), 0, from);
-            if (is_thin_row) pass(points, along, Thin(), from, to);
-            else pass(points, along, Thick(), from, to);
-            pass(points, along, Empty(), to, width);
-        };
+        };"""
+    + PASS_ALL
+    + """
         if (is_along) {
             INDEPENDENT
             for (int c = 0; c < width; ++c) {
@@ -175,9 +172,9 @@ for (int t = height - 1; t >= 0; --t) {
                 last = passing[c] * source_bars[c];
             }
             pass_all(Four(), Along());
-        }
-        else if (point_count == 1) pass_all(One(), Across());
-        else pass_all(Four(), Across());
+        }"""
+    + ACROSS
+    + """
         // By q and by the fields where steps begin.
         F* __restrict e_bar_row = e_bars + at;
         F* __restrict sc_bar_row = sc_bars + at;

@@ -150,6 +150,37 @@ const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * pas
 const F scattering_depth_bar = source_bar * line_mean;
 const F scattered = half_step * (scattering_depth_bar * strength);
 """
+# A turn of the loop over rows: where row t lies, in fields and in those with a layer around them.
+ROW = """
+    const int r = y_way > 0 ? t : height - 1 - t;
+    const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
+"""
+# Where steps to its cells meet a medium, and how deep that is at most.
+RANGE = """
+    const int* range = ranges + 4 * (k * height + r);
+    const int from = range[0], to = range[1];
+    const F deepest = scale * densest[k * height + r];
+"""
+# A loop over cells of a row: steps that begin at so many `points`, in a stretch of such `matter`.
+PASS = """
+        auto pass = [&](auto points, auto along, auto matter, int from, int to) {
+            constexpr bool is_empty = decltype(matter)::is_empty;
+            constexpr bool is_all_thin = decltype(matter)::is_thin;
+            INDEPENDENT
+            for (int c = from; c < to; ++c) {"""
+# All cells of a row. Where they are not `is_along`, one loop does each stretch.
+PASS_ALL = """
+        auto pass_all = [&](auto points, auto along) {
+            pass(points, along, Empty(), 0, from);
+            if (is_thin_row) pass(points, along, Thin(), from, to);
+            else pass(points, along, Thick(), from, to);
+            pass(points, along, Empty(), to, width);
+        };
+"""
+ACROSS = """
+        else if (point_count == 1) pass_all(One(), Across());
+        else pass_all(Four(), Across());
+"""
 FOLLOW_ROWS = (
     """
 enum { NEAR, LIGHT, LINES };
@@ -163,9 +194,9 @@ for (int s = slice_before; s < slice_to; ++s) for (int g = group_from; g < group
     + MULTIPLY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
-for (int t = 0; t < height; ++t) {
-    const int r = y_way > 0 ? t : height - 1 - t;
-    const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
+for (int t = 0; t < height; ++t) {"""
+    + ROW
+    + """
     auto line = [&](int slice, int turn, int which, int j) -> F* {
         const long long place = KEEPS
             ? (slice - slice_from + 1LL) * height + turn
@@ -174,10 +205,9 @@ for (int t = 0; t < height; ++t) {
     };
     auto near_of = [&](int j) -> F* { return line(s, t, NEAR, j); };
     auto light_of = [&](int j) -> F* { return line(s, t, LIGHT, j); };
-    // Where steps meet a medium, and where what scatters is asked for.
-    const int* range = ranges + 4 * (k * height + r);
-    const int from = range[0], to = range[1];
-    const F deepest = scale * densest[k * height + r];
+    // Where steps meet a medium, and where what scatters is asked for."""
+    + RANGE
+    + """
     const int near_begin = KEEPS ? 0 : range[2], near_end = KEEPS ? width : range[3];
     auto read = [&](int k, F* row, int from, int to) {
         read_scattering(color * cells + at, k, row, from, to);
@@ -200,12 +230,8 @@ for (int t = 0; t < height; ++t) {
             continue;
         }"""
     + UPSTREAM
+    + PASS
     + """
-        auto pass = [&](auto points, auto along, auto matter, int from, int to) {
-            constexpr bool is_empty = decltype(matter)::is_empty;
-            constexpr bool is_all_thin = decltype(matter)::is_thin;
-            INDEPENDENT
-            for (int c = from; c < to; ++c) {
                 const F arriving = gather(points, light_from, part, c);
                 if constexpr (is_empty) {
                     light_row[c] = arriving;
@@ -220,13 +246,9 @@ for (int t = 0; t < height; ++t) {
                     if (decltype(along)::value) carried[c] = part[0] * passed;
                 }
             }
-        };
-        auto pass_all = [&](auto points, auto along) {
-            pass(points, along, Empty(), 0, from);
-            if (is_thin_row) pass(points, along, Thin(), from, to);
-            else pass(points, along, Thick(), from, to);
-            pass(points, along, Empty(), to, width);
-        };
+        };"""
+    + PASS_ALL
+    + """
         if (is_along) {
             // What comes along the row itself is carried on cell by cell.
             for (int i = 0; i < 4; ++i)
@@ -237,9 +259,9 @@ for (int t = 0; t < height; ++t) {
                 const int c = x_way > 0 ? n : width - 1 - n;
                 last = light_row[c] = light_row[c] + carried[c] * last;
             }
-        }
-        else if (point_count == 1) pass_all(One(), Across());
-        else pass_all(Four(), Across());
+        }"""
+    + ACROSS
+    + """
         if (!KEEPS && saved && s + 1 < depth && slab_of(s + 1) == s + 1) {
             F* row = saved + save_of(s + 1, t, begin + j);
             for (int c = 0; c < width; ++c) row[c] = light_row[c];

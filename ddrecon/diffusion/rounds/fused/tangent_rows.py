@@ -10,13 +10,18 @@ import functools
 
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.rows import (
+    ACROSS,
     BEGINNINGS,
     DECAYED,
     DIRECTION,
     ENDS,
     GIVEN,
     GROUP,
+    PASS,
+    PASS_ALL,
     PLACES,
+    RANGE,
+    ROW,
     UPSTREAM,
 )
 from ddrecon.diffusion.rounds.fused.share import constants
@@ -84,9 +89,9 @@ for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_t
     + _READ_CHANGE
     + """
 const int k = way > 0 ? s : depth - 1 - s;
-for (int t = 0; t < height; ++t) {
-    const int r = y_way > 0 ? t : height - 1 - t;
-    const long long at = k * plane + (long long)r * width, row = k * sheet + (long long)r * pitch;
+for (int t = 0; t < height; ++t) {"""
+    + ROW
+    + """
     auto line = [&](int slice, int turn, int which, int j) -> F* {
         const long long place = (turn + 2LL * (depth - slice)) % (height + 2);
         return own_lines + place * stride + (LINES * (before + j) + which) * (long long)pitch;
@@ -94,10 +99,9 @@ for (int t = 0; t < height; ++t) {
     auto near_of = [&](int j) -> F* { return line(s, t, NEAR, j); };
     auto d_near_of = [&](int j) -> F* { return line(s, t, D_NEAR, j); };
     auto d_light_of = [&](int j) -> F* { return line(s, t, D_LIGHT, j); };
-    // Where steps meet a medium or its change, and where what scatters is asked for.
-    const int* range = ranges + 4 * (k * height + r);
-    const int from = range[0], to = range[1];
-    const F deepest = scale * densest[k * height + r];
+    // Where steps meet a medium or its change, and where what scatters is asked for."""
+    + RANGE
+    + """
     auto read = [&](int k, F* row, int from, int to) {
         read_scattering(color * cells + at, k, row, from, to);
     };
@@ -122,12 +126,8 @@ for (int t = 0; t < height; ++t) {
         else near_row[width] = near_row[width - 1], d_near_row[width] = d_near_row[width - 1];"""
     + UPSTREAM
     + _CHANGES_UPSTREAM
+    + PASS
     + """
-        auto pass = [&](auto points, auto along, auto matter, int from, int to) {
-            constexpr bool is_empty = decltype(matter)::is_empty;
-            constexpr bool is_all_thin = decltype(matter)::is_thin;
-            INDEPENDENT
-            for (int c = from; c < to; ++c) {
                 const F arriving = gather(points, light_from, part, c);
                 const F d_arriving = gather(points, d_light_from, part, c);
                 if constexpr (is_empty) {
@@ -143,13 +143,9 @@ for (int t = 0; t < height; ++t) {
                         carried[c] = part[0] * passed, d_carried[c] = part[0] * d_passed;
                 }
             }
-        };
-        auto pass_all = [&](auto points, auto along) {
-            pass(points, along, Empty(), 0, from);
-            if (is_thin_row) pass(points, along, Thin(), from, to);
-            else pass(points, along, Thick(), from, to);
-            pass(points, along, Empty(), to, width);
-        };
+        };"""
+    + PASS_ALL
+    + """
         if (is_along) {
             // What comes along the row itself is carried on cell by cell.
             for (int i = 0; i < 4; ++i)
@@ -162,9 +158,9 @@ for (int t = 0; t < height; ++t) {
                     + d_carried[c] * last;
                 last = light_row[c] = light_row[c] + carried[c] * last;
             }
-        }
-        else if (point_count == 1) pass_all(One(), Across());
-        else pass_all(Four(), Across());
+        }"""
+    + ACROSS
+    + """
     }
     F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
