@@ -26,7 +26,7 @@ from ddrecon.variables.values import with_values
 
 TOLERANCE = 0.1
 """How small a step's residual is to be, of what it was."""
-MOST = 12
+MOST = 24
 """Products with J^T W J that a step may take."""
 LENGTHS = (1.0, 0.5, 0.25, 0.125)
 """Parts of a step that are tried until the objective falls."""
