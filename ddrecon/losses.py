@@ -18,7 +18,7 @@ ROUNDING = 1e-2
 rather than as total variation.
 """
 KNEE = 0.1
-"""Total variation is that of densities far below this, and of the logarithm of those above (E54)."""
+"""Total variation is that of densities far below it, and of the logarithm of those above (E54)."""
 HUBER = 0.05
 """Errors above this part of the targets' root mean square count linearly in the Huber loss."""
 RELATIVE = 0.05

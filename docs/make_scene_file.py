@@ -441,7 +441,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 " density, of which it is that of log(1 + 10 density) / 3, and 0 for others."
                 " `auto` finds it by leaving a view out."
             ),
-            "l1": "Weight of its mean, which empties what no picture needs.",
+            "l1": (
+                "Weight of its mean, which empties what no picture needs; for density that of"
+                " log(1 + 10 density) / 3."
+            ),
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "
                 "always does."

@@ -81,12 +81,13 @@ class Parameter:
         That is of `factor` times the value. See `ParameterSettings` for the weights.
         """
         value, total = self.value * factor, self.value.new_zeros(())
+        if self.is_compressed:
+            value = compress(value)
         if self.tv:
             variation = total_variation
             if current_engine() == "warp":
                 from ddrecon.reconstruct.fused.passes import total_variation as variation
-            seen = compress(value) if self.is_compressed else value
-            total = total + self.tv * variation(seen, self.grid)
+            total = total + self.tv * variation(value, self.grid)
         return total + self.l1 * value.abs().mean() if self.l1 else total
 
     @property

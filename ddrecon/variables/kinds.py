@@ -46,7 +46,7 @@ class Kind:
     may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components` are
     the names of a vector's entries, which change one at a time. `is_direction`: only the way a
     vector points matters, and a step keeps its length. `tv` is the default weight of total
-    variation, which is of what `losses.compress` makes of a field that `is_compressed`;
+    variation, taken of what `losses.compress` makes of one that `is_compressed`;
     `difference_steps` are those of finite differences. `release` is the part of a run after which
     the variable begins to move; one that `is_fitted` is solved for rather than moved along its
     derivative, unless a scene gives its learning rate.
