@@ -47,7 +47,7 @@ PARAMETERS = 20
 
 @dataclass(frozen=True)
 class Case:
-    """A run on n x 1.5 n x n cells, in slabs across the long axis.
+    """A run on n x 1.5 n x n cells, or of another `length` over n, in slabs across that axis.
 
     Light is solved for to `tolerance`, in so many `cycles`, forward and adjoint together.
     """
@@ -58,17 +58,19 @@ class Case:
     ranks: int
     tolerance: float = 1e-3
     cycles: int = 0
+    length: float = 1.5
 
     @property
     def distances(self) -> float:
         """Cells of the coarse grid of distances, if they were as thin as those of the grid."""
-        grid = Grid.from_xyz((self.n, self.n * 3 // 2, self.n), (0, 0, 0), (1, 1, 1))
-        return coarse_grid(grid).shape[0] ** 2 * 1.5 * self.n
+        length = int(self.length * self.n)
+        grid = Grid.from_xyz((self.n, length, self.n), (0, 0, 0), (1, 1, 1))
+        return coarse_grid(grid).shape[0] ** 2 * length
 
     @property
     def cells(self) -> float:
         """How many cells there are."""
-        return 1.5 * self.n**3
+        return self.length * self.n**3
 
     @property
     def face(self) -> int:
@@ -193,15 +195,15 @@ def count(case: Case) -> tuple[Case, dict[str, list[int]]]:
 class Law:
     """Bytes that a rank hands to exchanges of one kind, for one purpose, and how often it does.
 
-    `factors` are bytes a unit of what they grow with; `error` is that of the fit. Calls are so many
-    a cycle, and as many again.
+    `factors` are bytes a unit of what they grow with; `error` is that of the fit. `calls` are how
+    many there are a cycle, a view, and once.
     """
 
     kind: str
     purpose: str
     factors: tuple[float, ...]
     error: float
-    calls: tuple[float, float]
+    calls: tuple[float, ...]
 
     def seconds(self, case: Case, link: float) -> float:
         """How long they take in `case` by links of so many bytes a second."""
@@ -210,7 +212,7 @@ class Law:
         # Neighbors swap at the same time; a ring hands on all parts, or each sum twice.
         others = case.ranks - 1
         often = {SWAP: 1.0, GATHER: others, SUM: 2 * others / case.ranks}
-        calls = self.calls[0] * case.cycles + self.calls[1]
+        calls = sum(a * b for a, b in zip(self.calls, (case.cycles, case.views, 1), strict=True))
         steps = 1 if self.kind == SWAP else math.log2(case.ranks)
         return often.get(self.kind, 1.0) * part / link + calls * CALL * steps
 
@@ -226,15 +228,15 @@ def fit(counted: list[tuple[Case, dict[str, list[int]]]]) -> list[Law]:
             np.array([found.get(key, [0, 0])[i] for _, found in counted], float) for i in (0, 1)
         )
         bytes_ *= sides
-        cycles = np.array([[case.cycles, 1.0] for case, _ in counted])
-        often = np.linalg.lstsq(cycles, calls, rcond=None)[0]
+        steps = np.array([[case.cycles, case.views, 1.0] for case, _ in counted])
+        often = np.linalg.lstsq(steps, calls, rcond=None)[0]
         factors, error = np.zeros(0), 0.0
         if law_of := LAWS.get((kind, purpose)):
             matrix = np.array([[law(case) for law in law_of.values()] for case, _ in counted])
             scale = 1 / np.maximum(bytes_, 1)[:, None]
             factors = np.linalg.lstsq(matrix * scale, bytes_ * scale[:, 0], rcond=None)[0]
             error = float(np.abs((matrix @ factors) * scale[:, 0] - 1).max())
-        laws.append(Law(kind, purpose, tuple(factors), error, (often[0], often[1])))
+        laws.append(Law(kind, purpose, tuple(factors), error, tuple(often)))
     return laws
 
 
@@ -244,8 +246,63 @@ def print_laws(laws: list[Law]) -> None:
     for law in laws:
         grown = LAWS.get((law.kind, law.purpose), {})
         shown = " + ".join(f"{f:.3g} x {name}" for f, name in zip(law.factors, grown, strict=True))
-        calls = f"{law.calls[0]:.1f} a cycle + {law.calls[1]:.1f}"
+        calls = "{:.1f} a cycle + {:.1f} a view + {:.1f}".format(*law.calls)
         print(f"| {law.kind} | {law.purpose} | {shown} | {calls} | {100 * law.error:.0f} % |")
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Seconds of a GPU: `light` of a cell, and `look` of a cell for each view; `sent` bytes a cell.
+
+    The last are those that ranks exchange who share views.
+    """
+
+    light: float
+    look: float
+    sent: float
+
+    def of_shared_views(self, side: int, views: int, ranks: int, link: float) -> float:
+        """Seconds of an iteration of side^3 cells, where each rank has some of the views."""
+        ring = 2 * (ranks - 1) / ranks * self.sent / link
+        return (self.light + -(-views // ranks) * self.look + ring) * side**3
+
+    def of_slabs(self, side: int, views: int, thickness: float) -> float:
+        """The same without exchanges, where each rank has a slab of so many layers.
+
+        It computes its halo as well; grids from the second on, a seventh of all, are everybody's.
+        """
+        coarse = self.light / 7
+        own = self.light - coarse + views * self.look
+        return (own * part_of(side, thickness) + coarse) * side**3
+
+
+def part_of(side: int, thickness: float) -> float:
+    """The part of all cells that a slab has with its halo."""
+    return min(1.0, (thickness + 2 * HALO) / side)
+
+
+def print_table(laws: list[Law], parts: Parts) -> None:
+    """Prints what is computed for GPUs."""
+    print("| cells | views | GPUs | views shared [s] | cells shared [s] | exchanged | GB each |")
+    print("|---|---|---|---|---|---|---|")
+    for side in (256, 512, 1024):
+        room = memory_of(Needs((side,) * 3, 3, 4, 0, has_rounds=False, varied=1.0))
+        whole = PARAMETERS * side**3
+        for views in (10, 50, 200):
+            for ranks, link in LINKS.items():
+                shared = parts.of_shared_views(side, views, ranks, link)
+                told, thickness = f"{side}^3 | {views} | {ranks} | {shared:.2f}", side / ranks
+                if ranks == 1:
+                    print(f"| {told} | | | {room / 1e9:.0f} |")
+                elif thickness < THINNEST:
+                    print(f"| {told} | too thin | | |")
+                else:
+                    case = Case(side, 3, views, ranks, cycles=CYCLES, length=1.0)
+                    exchanges = sum(law.seconds(case, link) for law in laws)
+                    seconds = parts.of_slabs(side, views, thickness) + exchanges
+                    each = (room - whole) * part_of(side, thickness) + whole
+                    note = "" if each < GPU_ROOM else ", too much"
+                    print(f"| {told} | {seconds:.2f} | {exchanges:.2f} | {each / 1e9:.0f}{note} |")
 
 
 def main() -> None:
@@ -256,40 +313,11 @@ def main() -> None:
     print_laws(laws)
     use_engine("auto")
     rows = [parts_of(size, rounds=0) for size in (48, 64)]
-    fixed, view, cells, sent = (sum(column) for column in zip(*rows, strict=True))
-    speed = memory_speed()
-    faster = GPU_MEMORY / speed
-    print(f"\na cell: {1e9 * fixed / cells:.1f} ns and {1e9 * view / cells:.1f} a view", end=" ")
-    print(f"on this thread; a GPU counts as {faster:.0f} of it\n")
-    print(
-        "| cells | views | GPUs | views shared [s] | cells shared [s] | exchanges [s] | GB each |"
-    )
-    print("|---|---|---|---|---|---|---|")
-    for side in (256, 512, 1024):
-        room = memory_of(Needs((side,) * 3, 3, 4, 0, has_rounds=False, varied=1.0))
-        for views in (10, 50, 200):
-            for ranks, link in LINKS.items():
-                light, looking = (part / cells * side**3 / faster for part in (fixed, view))
-                ring = 2 * (ranks - 1) / ranks * sent / cells * side**3 / link
-                shared = light + -(-views // ranks) * looking + ring
-                told = f"| {side}^3 | {views} | {ranks} | {shared:.2f} |"
-                thick = side / ranks
-                if ranks == 1 or thick < THINNEST:
-                    each = room if ranks == 1 else math.nan
-                    note = "" if ranks == 1 else "too thin"
-                    print(f"{told} {note} | | {each / 1e9:.0f} |")
-                    continue
-                # A slab computes its halo as well; coarse grids, a seventh, are everybody's.
-                own = (thick + 2 * HALO) / thick / ranks
-                coarse = light / 7
-                # A cube has one and a half times less than what is fitted has along the long axis.
-                case = replace(Case(side, 3, views, ranks, CYCLES))
-                exchanges = sum(law.seconds(case, link) for law in laws)
-                total = (light - coarse + views * looking) * own + coarse + exchanges
-                whole = PARAMETERS * side**3
-                each = (room - whole) * own + whole
-                mark = "" if each < GPU_ROOM else " (too much)"
-                print(f"{told} {total:.2f} | {exchanges:.2f} | {each / 1e9:.0f}{mark} |")
+    light, look, cells, sent = (sum(column) for column in zip(*rows, strict=True))
+    faster = GPU_MEMORY / memory_speed()
+    print(f"\nOn this thread a cell takes {1e9 * light / cells:.0f} ns of light", end=" ")
+    print(f"and {1e9 * look / cells:.0f} a view; a GPU counts as {faster:.0f} threads\n")
+    print_table(laws, Parts(light / cells / faster, look / cells / faster, sent / cells))
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ ROUNDING = 1e-2
 """Gradients below this, in units of one over the box's shortest side, are penalized quadratically
 rather than as total variation.
 """
-
-
+KNEE = 0.1
+"""Total variation is that of densities far below this, and of the logarithm of those above (E54)."""
 HUBER = 0.05
 """Errors above this part of the targets' root mean square count linearly in the Huber loss."""
 RELATIVE = 0.05
@@ -204,3 +204,16 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
         slope = (field.diff(dim=axis) * (side / spacing)) ** 2
         square = square + torch.cat([slope, torch.zeros_like(field.narrow(axis, 0, 1))], axis)
     return (square.sqrt() - ROUNDING).mean()
+
+
+def compress(field: Tensor) -> Tensor:
+    """What of the density `field` total variation is taken of: log(1 + field / `KNEE`) / 3 (E54).
+
+    Density below 0 counts as 0.
+    """
+    return torch.log1p(field.clamp(min=0) / KNEE) / 3
+
+
+def compressed_slope(field: Tensor) -> Tensor:
+    """The derivative of `compress` at `field`."""
+    return (field >= 0) / (3 * (field.clamp(min=0) + KNEE))

@@ -8,6 +8,7 @@ Keys, kinds, limits and defaults are those the program checks. Run it after each
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from types import NoneType, UnionType
@@ -24,6 +25,8 @@ KIND_NAMES = {
     schema.Quantity: "number, [r, g, b] or {file: ...}",
     schema.Density: "number or {file: ...}",
     phase_schema.PhaseSection: "{type: ...}",
+    phase_schema.PartSection: "{type: ...}",
+    Mapping[str, schema.MediumSection]: "two media by name",
     phase_schema.Parts: "list of two {type: ...}",
     settings.Start: "number, list or {file: ...}",
     settings.Weight: "number or `auto`",
@@ -84,6 +87,32 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "A file gives it cell by cell."
             ),
             "phase": "How light is scattered by angle, in place of `g`; see below.",
+        },
+    ),
+    (
+        "volume: {media: ...}",
+        schema.MixtureSection,
+        "Two media in the same box, in place of `density`, sections and `phase`.\n"
+        "Their parameters are `media.NAME.density` and so on.",
+        {
+            "media": "Two media by names of your choice; see below.",
+            "bounds": "As of one medium.",
+            "resolution": "As of one medium.",
+        },
+    ),
+    (
+        "volume.media.NAME",
+        schema.MediumSection,
+        "One of them, as a volume of one medium is.\n"
+        "Give either `sigma_a` and `sigma_s`, or `sigma_t` and `albedo`.",
+        {
+            "density": "Per cell, or the same everywhere.",
+            "sigma_a": "Absorption coefficient per unit of density [1/u].",
+            "sigma_s": "Scattering coefficient per unit of density [1/u].",
+            "sigma_t": "Extinction coefficient per unit of density [1/u].",
+            "albedo": "The part of the extinction that scatters.",
+            "g": "The short form of `phase`.",
+            "phase": "Any but `two_lobe` and `blend`; its numbers are the same in all cells.",
         },
     ),
     (
@@ -349,12 +378,13 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "transport_rounds": (
                 "Sweeps along rays that take diffusion towards the transport equation. Left out, "
                 "it is 1, or where g is beyond 0.55 in size, or sought, 2 and beyond 0.77 3, or 0 "
-                "where there are none: without model `p1` or scheme `conservative`."
+                "where there are none: without model `p1` or scheme `conservative`. It is 1 as "
+                "well where a cell is thicker than 2 optical depths and a given g is above 0."
             ),
             "degree": (
                 "Degree to which such sweeps keep light's angles, along 18 directions for 1, 26 "
                 "for 3, then 50 and 86. Left out, it is 3, or 1 where g is not sought and at most "
-                "0.32."
+                "0.32 in size, or above 0 in cells thicker than 2 optical depths."
             ),
         },
     ),
@@ -408,7 +438,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density and 0 for others. `auto` finds it by leaving a view out."
+                " density, of which it is that of log(1 + 10 density) / 3, and 0 for others."
+                " `auto` finds it by leaving a view out."
             ),
             "l1": "Weight of its mean, which empties what no picture needs.",
             "field": (
@@ -523,6 +554,7 @@ def _parameters() -> str:
             "What can be found.",
             "N is the place of a light, or of a blend's part, in its list, counted from 0.",
             "NAME is a view's name, or `*` for all training views.",
+            "Where there are two media, `media.cloud.density` is as `density` is, and so on.",
             "[Commands](cli.md#names-of-parameters) has the same names, by light.",
             "",
             "| name | kept within | by color | from cell to cell |",

@@ -8,7 +8,16 @@ import torch
 
 from ddrecon.grid import Grid
 from ddrecon.io.images import srgb
-from ddrecon.losses import HUBER, LOSSES, Target, image_loss, psnr, total_variation
+from ddrecon.losses import (
+    HUBER,
+    LOSSES,
+    Target,
+    compress,
+    compressed_slope,
+    image_loss,
+    psnr,
+    total_variation,
+)
 from ddrecon.pictures.noise import Noise
 from ddrecon.settings import OptimizeSettings
 
@@ -151,7 +160,20 @@ def test_total_variation_does_not_depend_on_world_scale() -> None:
     )
 
 
-def test_total_variation_has_a_finite_derivative_where_flat() -> None:
+@pytest.mark.parametrize("of", [torch.clone, compress])
+def test_total_variation_has_a_finite_derivative_where_flat(of) -> None:
     field = torch.zeros(4, 4, 4, requires_grad=True)
-    total_variation(field, box(4)).backward()
+    total_variation(of(field), box(4)).backward()
     assert torch.isfinite(field.grad).all()
+
+
+def test_total_variation_of_compressed_density_has_its_derivative() -> None:
+    field = torch.rand(3, 4, 5, dtype=torch.float64, requires_grad=True)
+    grid = Grid((3, 4, 5), (0, 0, 0), (1, 1, 1))
+    assert torch.autograd.gradcheck(lambda x: total_variation(compress(x), grid), field)
+
+
+def test_the_slope_of_compression_is_its_derivative() -> None:
+    field = torch.tensor([-1.0, 0.0, 0.01, 0.3, 20.0], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(compress(field).sum(), field)
+    torch.testing.assert_close(compressed_slope(field), slope)

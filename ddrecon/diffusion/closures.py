@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -69,11 +69,12 @@ def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
     It is computed on a coarse grid and interpolated. Outside a sphere this is
     1 / (distance to its center), exactly: Newton's shell theorem.
     """
+    inverse = _inverse_distance(coarse_mean(weight, grid), whole_of(grid))
     if isinstance(grid, Slab):
-        return _inverse_distance_in_slab(weight, grid)
-    coarse = coarse_grid(grid)
-    mean = adaptive_avg_pool3d(weight, coarse.shape)
-    return _interpolate(_inverse_distance(mean, grid), grid.shape)
+        # Axis by axis; that along the slab's is of the whole grid.
+        whole = _with_entry(inverse.shape[1:], grid.axis, grid.whole.shape[grid.axis])
+        inverse = grid.cut(_interpolate(inverse, whole))
+    return _interpolate(inverse, grid.shape)
 
 
 def _inverse_distance(mean: Tensor, grid: Grid) -> Tensor:
@@ -82,20 +83,16 @@ def _inverse_distance(mean: Tensor, grid: Grid) -> Tensor:
     return potential(mass, coarse_grid(grid)) / mass.sum((1, 2, 3), keepdim=True)
 
 
-def _inverse_distance_in_slab(weight: Tensor, slab: Slab) -> Tensor:
-    """`inverse_distance` to all ranks' weight together, in one's `slab`.
-
-    Averages and interpolation go axis by axis; that along the slab's axis is of the whole grid.
-    """
-    coarse, axis = coarse_grid(slab.whole), slab.axis
-    own, whole = (_with_entry(coarse.shape, axis, n) for n in (slab.size, slab.whole.shape[axis]))
-    layers = adaptive_avg_pool3d(slab.own(weight), own)
-    mean = adaptive_avg_pool3d(gather_own(layers, slab), coarse.shape)
-    inverse = _inverse_distance(mean, slab.whole)
-    return _interpolate(slab.cut(_interpolate(inverse, whole)), slab.shape)
+def coarse_mean(weight: Tensor, grid: Grid) -> Tensor:
+    """The mean `weight` of the cells of the coarse grid; in slabs of all ranks' together."""
+    coarse = coarse_grid(whole_of(grid))
+    if isinstance(grid, Slab):
+        own = _with_entry(coarse.shape, grid.axis, grid.size)
+        weight = gather_own(adaptive_avg_pool3d(grid.own(weight), own), grid)
+    return adaptive_avg_pool3d(weight, coarse.shape)
 
 
-def _with_entry(shape: Shape, axis: int, cells: int) -> Shape:
+def _with_entry(shape: Sequence[int], axis: int, cells: int) -> Shape:
     z, y, x = (cells if a == axis else n for a, n in enumerate(shape))
     return z, y, x
 

@@ -49,8 +49,7 @@ class DiffusionProblem:
     @cached_property
     def diffusion(self) -> Tensor:
         """D [u], `[C, z, y, x]`."""
-        is_whole = not isinstance(self.medium.grid, Slab)
-        if is_whole and is_fused() and isinstance(self.closure, Closure):
+        if is_fused() and isinstance(self.closure, Closure):
             from ddrecon.diffusion.fused.closure import close_medium
 
             return close_medium(self.medium, self.closure)

@@ -71,7 +71,8 @@ class SeenNodes:
         if depth is None:
             return plain
         tables = peak_tables(self.phase, self.degree).to(number)
-        coefficients = _look_up(tables, _place(kind, number.clamp(min=0), 0), angle)
+        place = _place(kind, number.clamp(min=0) if is_steep(kind) else number, 0)
+        coefficients = _look_up(tables, place, angle)
         seen = evaluate_positive(coefficients.permute(3, 1, 0, 2), depth)
         return torch.where(self.number > 0, seen, plain) if is_steep(kind) else seen
 

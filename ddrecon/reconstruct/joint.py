@@ -142,7 +142,7 @@ def _penalties(parameters: Sequence[Parameter], levels: Mapping[str, Tensor]) ->
     total = torch.zeros(())
     for p in parameters:
         factor = levels[p.name] / _level(p.value) if p.tv else 1.0
-        total = total + factor * p.penalty()
+        total = total + p.penalty(factor)
     return total
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.losses import total_variation
+from ddrecon.losses import compress, total_variation
 from ddrecon.reconstruct.levels import resample
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
@@ -68,24 +68,26 @@ class Parameter:
         self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
+        self.is_compressed = kind.is_compressed
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
         self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
-    def penalty(self) -> Tensor:
+    def penalty(self, factor: Tensor | float = 1.0) -> Tensor:
         """What its regularizers add to the loss, in units of the targets' mean square.
 
-        See `ParameterSettings` for the weights.
+        That is of `factor` times the value. See `ParameterSettings` for the weights.
         """
-        total = self.value.new_zeros(())
+        value, total = self.value * factor, self.value.new_zeros(())
         if self.tv:
             variation = total_variation
             if current_engine() == "warp":
                 from ddrecon.reconstruct.fused.passes import total_variation as variation
-            total = total + self.tv * variation(self.value, self.grid)
-        return total + self.l1 * self.value.abs().mean() if self.l1 else total
+            seen = compress(value) if self.is_compressed else value
+            total = total + self.tv * variation(seen, self.grid)
+        return total + self.l1 * value.abs().mean() if self.l1 else total
 
     @property
     def largest_rate(self) -> float:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.losses import ROUNDING
+from ddrecon.losses import ROUNDING, compress, compressed_slope
 
 AXES = (-3, -2, -1)
 
@@ -27,10 +27,18 @@ class Roughness:
     stiffness: Tensor
 
     @staticmethod
-    def about(field: Tensor, grid: Grid, weight: float) -> Roughness:
-        """That of `weight` times `losses.total_variation`, about `field` [..., z, y, x]."""
-        square = torch.stack([slope.square() for slope in slopes(field, grid)]).sum(0)
-        return Roughness(grid, weight / field.numel() / (square + ROUNDING**2).sqrt())
+    def about(field: Tensor, grid: Grid, weight: float, is_compressed: bool = False) -> Roughness:
+        """That of `weight` times `losses.total_variation`, about `field` [..., z, y, x].
+
+        Where that is of a field that `is_compressed` (E54), its slopes are those of the field times
+        the slope of the compression there.
+        """
+        seen = compress(field) if is_compressed else field
+        square = torch.stack([slope.square() for slope in slopes(seen, grid)]).sum(0)
+        stiffness = weight / field.numel() / (square + ROUNDING**2).sqrt()
+        return Roughness(
+            grid, stiffness * compressed_slope(field) ** 2 if is_compressed else stiffness
+        )
 
     def times(self, factor: float) -> Roughness:
         """That of `factor` times the weight."""

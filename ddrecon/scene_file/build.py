@@ -61,7 +61,7 @@ def build_scene(
     optimize = tree.optimize
     if optimize is not None:
         optimize = replace(optimize, parameters=name_each(optimize.parameters, views))
-    diffusion = choose_rounds(tree, volume.phase)
+    diffusion = choose_rounds(tree, volume.phase, volume)
     render = tree.render
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))

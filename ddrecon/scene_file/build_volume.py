@@ -1,7 +1,4 @@
-"""The volume section as tensors: its grid, its density and its cross sections.
-
-The scene and every field file must agree on the grid.
-"""
+"""The volume section as tensors: density, cross sections and phase function of each medium."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.errors import FormatError
-from ddrecon.grid import Grid, Triple
+from ddrecon.grid import Grid
 from ddrecon.io.volumes.field import Field
 from ddrecon.io.volumes.table import read_field
 from ddrecon.medium.coefficients import Volume
@@ -25,6 +22,7 @@ from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend
 from ddrecon.memory import Needs, make_room
 from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.scene_file.agree import agree_on_grid
 from ddrecon.scene_file.build_phase import build_phase
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.light_schema import Color
@@ -52,7 +50,8 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
     Raises SceneError with all its problems, or FormatError.
     """
     fields = _read_fields(scene_file)
-    grid = _agree_on_grid(scene_file, fields)
+    keys = {name: f"{key}.file" for name, (key, _) in _quantities(scene_file.tree.volume).items()}
+    grid = agree_on_grid(scene_file, {keys[name]: field for name, field in fields.items()})
     media = {
         medium: _Medium(section, {name: fields[medium + name] for name in _names(medium, fields)})
         for medium, section in _media(scene_file.tree.volume).items()
@@ -243,70 +242,6 @@ def _read_quantity(path: Path, name: str, called: str) -> Field:
                 f"(the {'lowest' if side == 'below' else 'highest'} is {worst:g})",
             )
     return field
-
-
-def _agree_on_grid(scene_file: SceneFile, fields: Fields) -> Grid:
-    section, problems = scene_file.tree.volume, Problems()
-    keys = {name: key for name, (key, _) in _quantities(section).items()}
-    sizes: dict[str, tuple[int, int, int]] = {
-        f"{keys[name]}.file": field.resolution for name, field in fields.items()
-    }
-    boxes = {
-        f"{keys[name]}.file": _corners(field.bounds)
-        for name, field in fields.items()
-        if field.bounds is not None
-    }
-    if section.resolution is not None:
-        sizes = {"volume.resolution": section.resolution} | sizes
-    if section.bounds is not None:
-        boxes = {"volume.bounds": (section.bounds.min, section.bounds.max)} | boxes
-    for key, size in sizes.items():
-        first = next(iter(sizes))
-        if size != sizes[first]:
-            problems.note(
-                scene_file.refused(
-                    key, f"has {_by(size)} cells in x, y, z, but {first} has {_by(sizes[first])}"
-                )
-            )
-    for key, box in boxes.items():
-        first = next(iter(boxes))
-        if not _same_box(box, boxes[first]):
-            problems.note(
-                scene_file.refused(
-                    key, f"its bounds are {_box(box)}, but {first} says {_box(boxes[first])}"
-                )
-            )
-    for name, known in (("resolution", sizes), ("bounds", boxes)):
-        if not known:
-            problems.note(
-                scene_file.refused(
-                    "volume", f"missing key {name!r}, which no field file gives either"
-                )
-            )
-    problems.raise_any()
-    return Grid.from_xyz(next(iter(sizes.values())), *next(iter(boxes.values())))
-
-
-def _corners(bounds: np.ndarray) -> tuple[Triple, Triple]:
-    (lx, ly, lz), (ux, uy, uz) = bounds.tolist()
-    return (lx, ly, lz), (ux, uy, uz)
-
-
-def _same_box(one: tuple[Triple, Triple], other: tuple[Triple, Triple]) -> bool:
-    """Whether the corners agree to a hundred-thousandth of the box's sides.
-
-    Files may hold them in single precision.
-    """
-    tolerance = 1e-5 * (np.array(other[1]) - np.array(other[0]))
-    return bool((np.abs(np.array(one) - np.array(other)) <= tolerance).all())
-
-
-def _by(size: tuple[int, int, int]) -> str:
-    return " x ".join(map(str, size))
-
-
-def _box(box: tuple[Triple, Triple]) -> str:
-    return " to ".join(f"({', '.join(f'{side:g}' for side in corner)})" for corner in box)
 
 
 def _channels_first(field: Field) -> Tensor:

@@ -6,12 +6,13 @@ There is one function per shape of type; `Node`s are those of the YAML.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from functools import reduce
 from operator import or_
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
+from ddrecon.scene_file.absences import find_absences
 from ddrecon.scene_file.colmap import read_colmap
 from ddrecon.scene_file.leaves import (
     LEAVES,
@@ -68,7 +69,7 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
     declared: dict[str, Field[Any]] = {field.name: field for field in all_fields}
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
     hints, problems, values = get_type_hints(kind), Problems(), {}
-    for what in _absences(kind, declared, entries):
+    for what in find_absences(kind, declared, entries):
         problems.note(node.refused(what))
     for name, child in entries.items():
         with problems.collecting():
@@ -108,37 +109,6 @@ def _mapping(node: Node) -> dict[str, Node]:
     if not isinstance(node.value, dict):
         raise node.refused(f"expected a mapping, found {describe_found(node)}")
     return node.value
-
-
-def _absences(
-    kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]
-) -> list[str]:
-    """What is wrong with the set of keys given.
-
-    Required keys must be there, and exactly one group of alternatives.
-    """
-    required = [
-        name
-        for name, field in declared.items()
-        if field.default is MISSING and field.default_factory is MISSING
-    ]
-    groups: tuple[tuple[str, ...], ...] = getattr(kind, "ALTERNATIVES", ())
-    filled = {name for name, child in entries.items() if child.value is not None}
-    given = [group for group in groups if any(name in filled for name in group)]
-    wrong = [f"missing key {name!r}" for name in required if name not in entries]
-    if len(given) == 1:
-        wrong += [
-            f"missing key {name!r}"
-            for name in given[0]
-            if declared[name].default is None and name not in filled
-        ]
-    if groups and len(given) != 1:
-        names = " or ".join(
-            " and ".join(name for name in group if declared[name].default is None)
-            for group in groups
-        )
-        wrong.append(f"{'give only one of' if given else 'missing'} {names}")
-    return wrong
 
 
 def _require_rules(node: Node, record: R) -> R:

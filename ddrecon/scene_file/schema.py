@@ -35,7 +35,7 @@ from ddrecon.settings import (
     one_of,
     optional,
 )
-from ddrecon.variables.kinds import PAIRS
+from ddrecon.variables.kinds import PAIRS, split_name
 
 Count = tuple[int, int, int]
 Paths = tuple[Path, ...]
@@ -238,19 +238,22 @@ class SceneTree:
 
     def __post_init__(self) -> None:
         parameters = self.optimize.parameters if self.optimize else {}
-        if self.optimize and self._has_one_g and "phase.g" in parameters and "g" not in parameters:
-            named = {"g" if name == "phase.g" else name: what for name, what in parameters.items()}
+        named = {self._own_name(name): what for name, what in parameters.items()}
+        if self.optimize and len(named) == len(parameters):
             object.__setattr__(self, "optimize", replace(self.optimize, parameters=named))
 
-    @property
-    def _has_one_g(self) -> bool:
-        """Whether `g` and `phase.g` are the same number, that of Henyey and Greenstein."""
-        volume = self.volume
-        return isinstance(volume, VolumeSection) and isinstance(
-            volume.phase, HenyeyGreensteinSection | None
+    def _own_name(self, name: str) -> str:
+        """`name`, or `g` for `phase.g` where both are that of Henyey and Greenstein."""
+        medium, last = split_name(name)
+        section: VolumeSection | MediumSection | MixtureSection | None = self.volume
+        if isinstance(section, MixtureSection):
+            section = section.media.get(medium.removeprefix("media.").strip("."))
+        has_one = isinstance(section, VolumeSection | MediumSection) and isinstance(
+            section.phase, HenyeyGreensteinSection | None
         )
+        return f"{medium}g" if last == "phase.g" and has_one else name
 
     def problems(self) -> Iterator[Problem]:
         parameters = self.optimize.parameters if self.optimize else {}
-        if self._has_one_g and {"g", "phase.g"} <= set(parameters):
+        if len(set(map(self._own_name, parameters))) < len(parameters):
             yield "optimize", "g and phase.g are the same number: name it once"

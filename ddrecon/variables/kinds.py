@@ -46,9 +46,10 @@ class Kind:
     may differ by color, the leading axis; `is_cellwise`: by cell, the last three. `components` are
     the names of a vector's entries, which change one at a time. `is_direction`: only the way a
     vector points matters, and a step keeps its length. `tv` is the default weight of total
-    variation, and `difference_steps` are those of finite differences. `release` is the part of a
-    run after which the variable begins to move; one that `is_fitted` is solved for rather than
-    moved along its derivative, unless a scene gives its learning rate.
+    variation, which is of what `losses.compress` makes of a field that `is_compressed`;
+    `difference_steps` are those of finite differences. `release` is the part of a run after which
+    the variable begins to move; one that `is_fitted` is solved for rather than moved along its
+    derivative, unless a scene gives its learning rate.
     """
 
     rate: Rate
@@ -59,6 +60,7 @@ class Kind:
     components: tuple[str, ...] = ()
     is_direction: bool = False
     tv: float = 0.0
+    is_compressed: bool = False
     difference_steps: tuple[float, ...] = LONG_STEPS
     release: float = 0.0
     is_fitted: bool = False
@@ -74,7 +76,7 @@ _MOMENTS = Kind(fixed_rate(0.02), low=-1, high=1)
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, is_fitted=True)
 
 KINDS: Mapping[str, Kind] = {
-    "density": Kind(density_rate, low=0, is_cellwise=True, tv=3e-3),
+    "density": Kind(density_rate, low=0, is_cellwise=True, tv=3e-3, is_compressed=True),
     "sigma_a": _CROSS_SECTION,
     "sigma_s": _CROSS_SECTION,
     "sigma_t": _CROSS_SECTION,
@@ -137,7 +139,9 @@ def is_of_volume(name: str) -> bool:
 
 def kind_of(name: str) -> Kind:
     """The kind of the variable `name`; raises KeyError for a name of none."""
-    return KINDS[pattern_of(name)]
+    kind = KINDS[pattern_of(name)]
+    # A thin medium's share of scattering bends within small changes of the other medium.
+    return replace(kind, difference_steps=SHORT_STEPS) if split_name(name)[0] else kind
 
 
 def split_name(name: str) -> tuple[str, str]:

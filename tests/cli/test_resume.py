@@ -140,6 +140,7 @@ def wait_for_rows(process: subprocess.Popen[str], log: Path, count: int) -> None
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_terminal(folder: Path, succeed: Run) -> None:
     command = [
         sys.executable,

@@ -17,7 +17,7 @@ from ddrecon.reconstruct.posterior import Posterior
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
 FREE = "-D optimize.parameters={density: {init: 0.2}, g: {}, lights.0.irradiance: {}}"
-FAST = ["-D", "diffusion.transport_rounds=0", "-D", "volume.sigma_s=5", "-D", "lights.1.radiance=0"]
+FAST = ["-D", "diffusion.model=none", "-D", "volume.sigma_s=5", "-D", "lights.1.radiance=0"]
 QUICK = ["-q", "--tolerance", "0.3"]
 KNOWN = [*QUICK, "--noise", "0.05"]
 
@@ -70,7 +70,7 @@ def test_one_that_stops_goes_on_to_the_same_bits(
         assert run("uncertainty", "run", "-o", "half", "--samples", "3", *KNOWN).exit_code == 130
     succeed("uncertainty", "run", "-o", "half", "--samples", "3", "--resume", *KNOWN)
     assert np.array_equal(volume("whole", "density_std"), volume("half", "density_std"))
-    succeed("uncertainty", "run", "-o", "other", "--samples", "3", "--seed", "1", *KNOWN)
+    succeed("uncertainty", "run", "-o", "other", "--samples", "2", "--seed", "1", *KNOWN)
     assert not np.array_equal(volume("whole", "density_std"), volume("other", "density_std"))
 
 

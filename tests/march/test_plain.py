@@ -49,7 +49,7 @@ LIGHTS: dict[str, list[Light]] = {
         DirectionalLight(tensor(-2, -2, -1), tensor(3)),
         AmbientLight(tensor(0.5, 0.4, 0.3)),
     ],
-    "a sky": [EnvironmentLight(random_values(3, 8, 16), tensor(20)[0], tensor(1)[0])],
+    "a sky": [EnvironmentLight(random_values(3, 8, 16), tensor(20)[0], tensor(1)[0], 8)],
 }
 VIEWS: dict[str, dict[str, Any]] = {
     "perspective": {},

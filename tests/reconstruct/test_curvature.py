@@ -10,7 +10,7 @@ from media import half_empty, make_camera, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.engine import use_engine
-from ddrecon.losses import LOSSES, Target, total_variation
+from ddrecon.losses import LOSSES, Target, compress, total_variation
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.roughness import Roughness
@@ -120,6 +120,18 @@ def test_roughness_touches_total_variation_from_above() -> None:
     step = other - field.detach()
     parabola = variation + (slope * step).sum() + (step * roughness.product(step)).sum() / 2
     assert 0.7 * total_variation(other, grid) <= parabola
+
+
+@pytest.mark.parametrize("density", [0.0, 0.05, 2.0])
+def test_roughness_is_the_curvature_of_an_even_density(density: float) -> None:
+    field = torch.full((3, 4, 5), density, dtype=torch.float64)
+    grid, change = make_scene(field).volume.grid, random_values(3, 4, 5)
+    # From an even field outward, so that the kink of densities below 0 is not met.
+    _, curved = torch.autograd.functional.hvp(
+        lambda x: 0.7 * total_variation(compress(x), grid), field, change
+    )
+    roughness = Roughness.about(field, grid, 0.7, is_compressed=True)
+    torch.testing.assert_close(roughness.product(change), curved)
 
 
 def test_roughness_is_the_square_of_its_root_and_has_its_diagonal() -> None:

@@ -22,7 +22,8 @@ BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
 @pytest.fixture
 def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     monkeypatch.setattr(smoothing, "ITERATIONS", 2)
-    return load_scene(BALL, overrides=["optimize.parameters.density={tv: auto}"])
+    small = ["volume.resolution=[8, 8, 8]", "optimize.refine_at=[]"]
+    return load_scene(BALL, overrides=[*small, "optimize.parameters.density={tv: auto}"])
 
 
 def test_the_best_weight_is_taken(scene: Scene) -> None:

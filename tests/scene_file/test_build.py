@@ -65,6 +65,22 @@ def test_constants(write: Write):
     assert scene.path is not None and scene.path.name == "scene.yaml" and scene.optimize is None
 
 
+@pytest.mark.parametrize(
+    "g, sigma_s, expected",
+    [(0.3, 12, (1, 1)), (0.8, 12, (3, 3)), (0.8, 70, (1, 1)), (-0.8, 70, (3, 3))],
+    ids=str,
+)
+def test_rounds_and_degree_follow_from_the_phase_function_and_from_thick_cells(
+    write: Write, g: float, sigma_s: float, expected: tuple[int, int]
+):
+    """Cells of density 0.1 are 0.42 long in the mean: 70 makes them 2.9 optical depths thick."""
+    text = volume(g=g, sigma_s=sigma_s)
+    found = load_scene(write(text)).diffusion
+    assert (found.rounds, found.angles) == expected
+    chosen = load_scene(write(text), overrides=("diffusion.degree=5",)).diffusion
+    assert (chosen.rounds, chosen.angles) == (expected[0], 5)
+
+
 def test_lights_keep_their_own_number_of_colors(write: Write):
     sun, sky = load_scene(write(SCENE)).lights
     assert (

@@ -12,9 +12,15 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d
 
-from ddrecon.diffusion.closures import Closure, coarse_grid, haze, least_extinction, potential
+from ddrecon.diffusion.closures import (
+    Closure,
+    coarse_grid,
+    coarse_mean,
+    haze,
+    least_extinction,
+    potential,
+)
 from ddrecon.diffusion.fused.closure_kernels import (
     geometric_adjoint_kernel,
     geometric_kernel,
@@ -27,6 +33,7 @@ from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.rows import launch_rows
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
+from ddrecon.slabs.slab import Slab, whole_of
 
 _TERMS = "scale", "field", "other_scale", "other_field"
 
@@ -57,19 +64,17 @@ def _extinction_terms(medium: Medium) -> tuple[Tensor, ...]:
 
 def _inverse_distance(grid: Grid, *terms: Tensor) -> Tensor:
     """`inverse_distance` of kappa_tr, `[C, z, y, coarse]`: interpolated along z and y only."""
-    coarse = coarse_grid(grid)
+    box = whole_of(grid)
+    coarse = coarse_grid(box)
     # The masses of kappa_tr's terms and of the haze, and their potentials, which add up as they do.
-    masses = [adaptive_avg_pool3d(field, coarse.shape) for field in terms[1::2]]
-    potentials = haze(grid) * _even(coarse, masses[0])
-    whole = potentials.new_tensor(haze(grid) * coarse.cells)
+    masses = [coarse_mean(field, grid) for field in terms[1::2]]
+    potentials = haze(box) * _even(coarse, masses[0])
+    whole = potentials.new_tensor(haze(box) * coarse.cells)
     for scale, mass in zip(terms[::2], masses, strict=True):
         whole = whole + scale * mass.sum((1, 2, 3), keepdim=True)
         potentials = potentials + scale * potential(mass, coarse)
     inverse = potentials / whole
-    z, y, _ = (
-        _weights(cells, few, inverse.dtype, inverse.device)
-        for cells, few in zip(grid.shape, coarse.shape, strict=True)
-    )
+    z, y = (_weights_along(axis, grid, coarse.shape[axis], inverse) for axis in (0, 1))
     return (z @ (y @ inverse).flatten(2)).unflatten(2, (grid.shape[1], -1))
 
 
@@ -108,6 +113,19 @@ def _weights(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> 
     return weights.to(device, dtype)
 
 
+def _weights_along(axis: int, grid: Grid, few: int, like: Tensor) -> Tensor:
+    """The matrix [cells, few] that interpolates linearly to the cells of `grid` along `axis`."""
+    weights = _weights(whole_of(grid).shape[axis], few, like.dtype, like.device)
+    return weights[_part(axis, grid)]
+
+
+def _part(axis: int, grid: Grid) -> slice:
+    """Those of the whole's cells along `axis` that `grid` has."""
+    if isinstance(grid, Slab) and grid.axis == axis:
+        return slice(grid.first, grid.last)
+    return slice(None)
+
+
 class _Geometric(torch.autograd.Function):
     """D by `geometric` from 1 / distance `[C, z, y, coarse]`, scales and fields."""
 
@@ -130,7 +148,7 @@ class _Geometric(torch.autograd.Function):
         given = _distances(ctx.grid, inverse) | {"diffusion_bar": diffusion_bar}
         made = {"inverse_distance_bar": inverse_bar}
         terms_bars = _run_adjoint(kernel, ctx, terms, given, made)
-        weights = _weights(ctx.grid.shape[2], inverse.shape[3], inverse.dtype, inverse.device)
+        weights = _weights_along(2, ctx.grid, inverse.shape[3], inverse)
         return None, inverse_bar @ weights, *terms_bars
 
     @staticmethod
@@ -244,6 +262,7 @@ def _given(
 
 def _distances(grid: Grid, inverse: Tensor) -> dict[str, Any]:
     """1 / distance, and how it is interpolated along x, by the names that kernels have for it."""
-    coarse = inverse.shape[3]
-    lower, part = _places(grid.shape[2], coarse, inverse.dtype, inverse.device)
+    coarse, own = inverse.shape[3], _part(2, grid)
+    places = _places(whole_of(grid).shape[2], coarse, inverse.dtype, inverse.device)
+    lower, part = (one[own] for one in places)
     return {"coarse": coarse, "inverse_distance": inverse, "lower": lower, "part": part}

@@ -8,5 +8,7 @@ A ray a thread, in Warp's own language, are equal steps, derivatives by the rays
 forward mode: `lines`, `planes` and `sampling` find values among cells, `stops` those at a node,
 `emission` what it emits (by `node_phases` and the formulas of `optics`), and `segments` what
 arrives from between two; `walks` and `adjoint` are the kernels.
+Phase functions that differ from cell to cell are tables and a number of the cell: `cellwise` says
+which, `packet_cellwise` and `node_curves` read them.
 `integrate` makes of all that one function of tensors, and `march` calls it for an `Emission`.
 """

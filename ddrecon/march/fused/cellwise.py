@@ -47,9 +47,9 @@ def form_of(emission: Emission) -> str | None:
 def find_along_rays(cosine: Tensor, form: str, kind: PhaseKind, others: Sequence[Tensor]) -> Tensor:
     """What rays are given of p for a beam seen at `cosine` [R]: `Layout.ray_terms` rows [., R].
 
-    Both of `at_ends` for each color, of the phase function `kind` with its `others` (`others_of`); or the cosine,
-    and between which angles of tables it is: the first of them, and the part of the way to the
-    second.
+    Both of `at_ends` for each color, of the phase function `kind` with its `others` (`others_of`);
+    or the cosine, and between which angles of tables it is: the first of them, and the part of the
+    way to the second.
     """
     if form == "linear":
         ends = at_ends(kind(*others, cosine.new_zeros(())), cosine)
@@ -62,8 +62,8 @@ def find_along_rays(cosine: Tensor, form: str, kind: PhaseKind, others: Sequence
 def table_of_cells(emission: Emission) -> Tensor:
     """The tables that kernels read, [rows, terms]: of `linear` those of `at_ends` by angle.
 
-    Of others with a forward peak, by color, rung and angle; and a row more, as kernels read terms of
-    several rows at once. None of the others has rows.
+    Of others with a forward peak, by color, rung and angle; and a row more, as kernels read terms
+    of several rows at once. The rest have no rows.
     """
     phase, like = emission.seen.phase, emission.diffuse
     if form_of(emission) == "linear":

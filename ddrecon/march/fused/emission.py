@@ -49,7 +49,7 @@ def _channels(layout: Layout) -> SimpleNamespace:
 def emission(layout: Layout) -> Any:
     """The function that adds to a stop behind the mass `m` what it emits, through how much."""
     t, records = vectors(layout), ray_types(layout)
-    at, light = _channels(layout), node_phase(layout)
+    at, at_node = _channels(layout), node_phase(layout)
     C, BEAMS = layout.colors, len(layout.beams)
 
     @wp.func
@@ -64,8 +64,7 @@ def emission(layout: Layout) -> Any:
                 i = wp.static(C) + b * wp.static(C) + c
                 k = c * wp.static(layout.mass_step)
                 mass = m[k] + here.v[at.to_light(b, k)]
-                depth = light.depth_of(here.v, ray.peak, c, mass)
-                p = light.phase(ray, here.v, depth, b, c, here.held, given)
+                p = at_node.phase(ray, at_node.light_of(ray, here.v, here.held, mass, b, c), given)
                 here.p[i] = p
                 here.w[i] = here.v[at.scattering(c)] * p
                 here.u[i] = ray.scale[c] * mass
@@ -81,7 +80,7 @@ def emission_adjoint(layout: Layout) -> Any:
     """The function that adds to bars of ray, stop and mass `m` what those of emission are."""
     t, records, at = vectors(layout), ray_types(layout), _channels(layout)
     Ray, Stop, beam_adjoint = records.Ray, records.Stop, _beam_adjoint(layout)
-    light, Bundle = node_phase(layout), records.Bundle
+    at_node, Bundle = node_phase(layout), records.Bundle
 
     @wp.func
     def emit_adjoint(
@@ -108,9 +107,10 @@ def emission_adjoint(layout: Layout) -> Any:
             for c in range(wp.static(layout.colors)):
                 k = c * wp.static(layout.mass_step)
                 mass = m[k] + here.v[at.to_light(b, k)]
-                depth = light.depth_of(here.v, ray.peak, c, mass)
+                light = at_node.light_of(ray, here.v, here.held, mass, b, c)
+                light.p = here.p[(b + 1) * wp.static(layout.colors) + c]
                 ray_bar, found, found_m = beam_adjoint(
-                    ray, here, mass, depth, given, b, c, ray_bar, found, found_m, bars
+                    ray, here, light, given, ray_bar, found, found_m, bars
                 )
         here_bar.v += found.v
         here_bar.held += found.held
@@ -123,48 +123,45 @@ def emission_adjoint(layout: Layout) -> Any:
 def _beam_adjoint(layout: Layout) -> Any:
     """The function that adds what the bars of beam b's emission and depth in color c are."""
     t, records, at = vectors(layout), ray_types(layout), _channels(layout)
-    Ray, Stop, Bundle = records.Ray, records.Stop, records.Bundle
-    light, phase_adjoint = node_phase(layout), node_phase_adjoint(layout)
+    Ray, Stop, Bundle, Light = records.Ray, records.Stop, records.Bundle, records.Light
+    at_node, phase_adjoint = node_phase(layout), node_phase_adjoint(layout)
 
     @wp.func
     def beam_adjoint(
         ray: Ray,
         here: Stop,
-        mass: t.F,
-        depth: t.F,
+        light: Light,
         given: Bundle,
-        b: int,
-        c: int,
         ray_bar: Ray,
         here_bar: Stop,
         m_bar: t.Mass,
         bars: Bundle,
     ):
+        b, c = light.b, light.c
         i = (b + 1) * wp.static(layout.colors) + c
         k = c * wp.static(layout.mass_step)
         s = at.scattering(c)
         # u = scale mass
         mass_bar = here_bar.u[i] * ray.scale[c]
-        ray_bar.scale[c] += here_bar.u[i] * mass
+        ray_bar.scale[c] += here_bar.u[i] * light.mass
         # w = kappa_s p
-        here_bar.v[s] += here_bar.w[i] * here.p[i]
+        here_bar.v[s] += here_bar.w[i] * light.p
         p_bar = here_bar.w[i] * here.v[s]
         # p of E13 by depth = kappa_peak mass
-        number = light.number_of(here.v, c)
         depth_bar, number_bar, held_bar, ray_bar = phase_adjoint(
-            ray, number, depth, b, c, here.held, given, here.p[i], p_bar, ray_bar, bars
+            ray, light, given, p_bar, ray_bar, bars
         )
         here_bar.held += held_bar
         if wp.static(layout.form is not None):
             of_number = wp.static(layout.first_number) + c * wp.static(layout.number_step)
             here_bar.v[of_number] += number_bar
         if wp.static(layout.peak is not None):
-            mass_bar += depth_bar * light.peak_of(here.v, ray.peak, c)
+            mass_bar += depth_bar * at_node.peak_of(here.v, ray.peak, c)
             if wp.static(bool(layout.peak)):
                 peak = wp.static(layout.first_peak) + c * wp.static(layout.peak_step)
-                here_bar.v[peak] += depth_bar * mass
+                here_bar.v[peak] += depth_bar * light.mass
             else:
-                ray_bar.peak[c] += depth_bar * mass
+                ray_bar.peak[c] += depth_bar * light.mass
         m_bar[k] += mass_bar
         here_bar.v[at.to_light(b, k)] += mass_bar
         return ray_bar, here_bar, m_bar
@@ -177,7 +174,7 @@ def emission_tangent(layout: Layout) -> Any:
     """The function that adds to the change of a stop those of its emission and depth."""
     t, records, at = vectors(layout), ray_types(layout), _channels(layout)
     Ray, Stop, beam_tangent = records.Ray, records.Stop, _beam_tangent(layout)
-    light, Bundle = node_phase(layout), records.Bundle
+    at_node, Bundle = node_phase(layout), records.Bundle
 
     @wp.func
     def emit_tangent(
@@ -201,10 +198,12 @@ def emission_tangent(layout: Layout) -> Any:
                 k = c * wp.static(layout.mass_step)
                 mass = m[k] + here.v[at.to_light(b, k)]
                 d_mass = d_m[k] + d_here.v[at.to_light(b, k)]
-                depth = light.depth_of(here.v, ray.peak, c, mass)
-                d_here = beam_tangent(
-                    ray, here, mass, depth, given, b, c, d_ray, d_here, d_mass, d_given
+                light = at_node.light_of(ray, here.v, here.held, mass, b, c)
+                light.p = here.p[(b + 1) * wp.static(layout.colors) + c]
+                d_light = at_node.change_light(
+                    ray, here.v, light, d_ray, d_here.v, d_here.held, d_mass
                 )
+                d_here = beam_tangent(ray, here, light, given, d_ray, d_here, d_light, d_given)
         return d_here
 
     return emit_tangent
@@ -213,37 +212,27 @@ def emission_tangent(layout: Layout) -> Any:
 @functools.cache
 def _beam_tangent(layout: Layout) -> Any:
     """The function of the changes of beam b's emission and depth in color c."""
-    t, records, at = vectors(layout), ray_types(layout), _channels(layout)
-    Ray, Stop, Bundle = records.Ray, records.Stop, records.Bundle
-    light, phase_tangent = node_phase(layout), node_phase_tangent(layout)
+    records, at = ray_types(layout), _channels(layout)
+    Ray, Stop, Bundle, Light = records.Ray, records.Stop, records.Bundle, records.Light
+    phase_tangent = node_phase_tangent(layout)
 
     @wp.func
     def beam_tangent(
         ray: Ray,
         here: Stop,
-        mass: t.F,
-        depth: t.F,
+        light: Light,
         given: Bundle,
-        b: int,
-        c: int,
         d_ray: Ray,
         d_here: Stop,
-        d_mass: t.F,
+        d_light: Light,
         d_given: Bundle,
     ) -> Stop:
-        i = (b + 1) * wp.static(layout.colors) + c
+        c = light.c
+        i = (light.b + 1) * wp.static(layout.colors) + c
         s = at.scattering(c)
-        d_depth = t.F(0.0)
-        if wp.static(layout.peak is not None):
-            peak = light.peak_of(here.v, ray.peak, c)
-            d_depth = light.peak_of(d_here.v, d_ray.peak, c) * mass + peak * d_mass
-        number, d_number = light.number_of(here.v, c), light.number_of(d_here.v, c)
-        p, held, d_held = here.p[i], here.held, d_here.held
-        d_p = phase_tangent(
-            ray, number, depth, b, c, held, given, p, d_ray, d_number, d_depth, d_held, d_given
-        )
-        d_here.w[i] = d_here.v[s] * here.p[i] + here.v[s] * d_p
-        d_here.u[i] = d_ray.scale[c] * mass + ray.scale[c] * d_mass
+        d_p = phase_tangent(ray, light, given, d_ray, d_light, d_given)
+        d_here.w[i] = d_here.v[s] * light.p + here.v[s] * d_p
+        d_here.u[i] = d_ray.scale[c] * light.mass + ray.scale[c] * d_light.mass
         return d_here
 
     return beam_tangent

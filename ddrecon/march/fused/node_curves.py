@@ -78,12 +78,12 @@ def spots(layout: Layout) -> SimpleNamespace:
         bend: t.F
 
     @wp.func
-    def spot_of(ray: records.Ray, b: int, c: int, held: t.F, given: records.Bundle) -> Spot:
-        spot = Spot()
+    def spot_of(ray: records.Ray, light: records.Light, given: records.Bundle) -> Spot:
+        spot, b = Spot(), light.b
         part = t.F(0.0)
         if wp.static(IS_POINT)[b] == 1:
             apart = wp.sqrt(ray.across[b])
-            away = ray.foot[b] + held
+            away = ray.foot[b] + light.held
             square = ray.across[b] + away * away
             per = t.F(wp.static(1.0 / step))
             spot.along = per * apart / square
@@ -98,7 +98,7 @@ def spots(layout: Layout) -> SimpleNamespace:
             spot.cosine = given.coefficients[at, ray.index]
             spot.row = int(given.coefficients[at + 1, ray.index])
             part = given.coefficients[at + 2, ray.index]
-        spot.row = c * wp.static(layout.table_step * table_rows(layout)) + 2 * spot.row
+        spot.row = light.c * wp.static(layout.table_step * table_rows(layout)) + 2 * spot.row
         spot.weights = cubic.weights(part, t.F(wp.static(step)))
         spot.slopes = cubic.slopes(part, t.F(wp.static(step)))
         return spot
@@ -177,25 +177,19 @@ def curves(layout: Layout) -> SimpleNamespace:
 
     @wp.func
     def curve(
-        ray: records.Ray,
-        number: t.F,
-        b: int,
-        c: int,
-        held: t.F,
-        places: records.Bundle,
-        given: records.Bundle,
+        ray: records.Ray, light: records.Light, places: records.Bundle, given: records.Bundle
     ) -> t.Curve:
         """`places` has where rays look tables up."""
         if wp.static(layout.has_rungs):
-            rung = rung_of(number)
-            spot = spot_of(ray, b, c, held, places)
+            rung = rung_of(light.number)
+            spot = spot_of(ray, light, places)
             return table.weigh_rungs(given.table, rung.first, rung.weights, spot.row, spot.weights)
-        if wp.static(IS_POINT)[b] == 1:
-            spot = spot_of(ray, b, c, held, places)
+        if wp.static(IS_POINT)[light.b] == 1:
+            spot = spot_of(ray, light, places)
             return table.weigh(given.table, spot.row, spot.weights)
         own = t.Curve()
         for k in range(wp.static(layout.terms)):
-            own[k] = given.coefficients[first(b, c) + k, ray.index]
+            own[k] = given.coefficients[first(light.b, light.c) + k, ray.index]
         return own
 
     return SimpleNamespace(first=first, curve=curve)
@@ -223,10 +217,7 @@ def spreading_curves(layout: Layout) -> Any:
     @wp.func
     def spread_curve(
         ray: records.Ray,
-        number: t.F,
-        b: int,
-        c: int,
-        held: t.F,
+        light: records.Light,
         given: records.Bundle,
         place: t.F,
         p_bar: t.F,
@@ -234,19 +225,19 @@ def spreading_curves(layout: Layout) -> Any:
     ):
         if wp.static(layout.has_rungs):
             if bars.table.shape[0] > 0:
-                rung = rung_of(number)
-                spot = spot_of(ray, b, c, held, given)
+                rung = rung_of(light.number)
+                spot = spot_of(ray, light, given)
                 for i in range(4):
                     row = (rung.first + i) * wp.static(ROWS) + spot.row
                     spread_row(bars.table, row, spot.weights, place, rung.weights[i] * p_bar)
-        elif wp.static(IS_POINT)[b] == 1:
+        elif wp.static(IS_POINT)[light.b] == 1:
             if bars.table.shape[0] > 0:
-                spot = spot_of(ray, b, c, held, given)
+                spot = spot_of(ray, light, given)
                 spread_row(bars.table, spot.row, spot.weights, place, p_bar)
         elif bars.coefficients.shape[0] > 0:
             power = p_bar
             for k in range(wp.static(layout.terms)):
-                row = first(b, c) + k
+                row = first(light.b, light.c) + k
                 bars.coefficients[row, ray.index] = bars.coefficients[row, ray.index] + power
                 power = power * place
 

@@ -26,9 +26,9 @@ from ddrecon.numerics.chebyshev import SCALE
 
 @functools.cache
 def node_phase(layout: Layout) -> SimpleNamespace:
-    """`peak_of` color c: kappa_peak per unit of mass; `depth_of` a mass; `phase`, p behind that.
+    """`peak_of` color c: kappa_peak per unit of mass; `phase`: p of light at a node.
 
-    `number_of` color c: that of the phase function there, 0 where none differs.
+    `light_of` a beam behind a mass, all but p, and its change by `change_light`.
     """
     t, records, which = vectors(layout), ray_types(layout), _choices(layout)
     curve_of, over_depth = curves(layout).curve, _polynomial(layout)
@@ -41,33 +41,59 @@ def node_phase(layout: Layout) -> SimpleNamespace:
         return peak[c]
 
     @wp.func
-    def depth_of(v: t.Node, peak: t.Color, c: int, mass: t.F) -> t.F:
-        if wp.static(layout.peak is not None):
-            return peak_of(v, peak, c) * mass
-        return t.F(0.0)
-
-    @wp.func
     def number_of(v: t.Node, c: int) -> t.F:
         if wp.static(layout.form is not None):
             return v[wp.static(layout.first_number) + c * wp.static(layout.number_step)]
         return t.F(0.0)
 
     @wp.func
-    def phase(
-        ray: records.Ray, v: t.Node, depth: t.F, b: int, c: int, held: t.F, given: records.Bundle
-    ) -> t.F:
-        number = number_of(v, c)
-        if which.is_plain(number):
-            return plain.value(number, spot_of(ray, b, c, held, given).cosine)
-        if which.has_curve(b):
-            curve = curve_of(ray, number, b, c, held, given, given)
-            p = over_depth.value(curve, over_depth.place(depth, number))
+    def phase(ray: records.Ray, light: records.Light, given: records.Bundle) -> t.F:
+        if which.is_plain(light.number):
+            return plain.value(light.number, spot_of(ray, light, given).cosine)
+        if which.has_curve(light.b):
+            curve = curve_of(ray, light, given, given)
+            p = over_depth.value(curve, over_depth.place(light.depth, light.number))
             if wp.static(layout.peak is None):
                 return p
             return wp.max(p, t.F(0.0))
         return t.F(1.0)
 
-    return SimpleNamespace(peak_of=peak_of, depth_of=depth_of, number_of=number_of, phase=phase)
+    @wp.func
+    def light_of(
+        ray: records.Ray, v: t.Node, held: t.F, mass: t.F, b: int, c: int
+    ) -> records.Light:
+        light = records.Light()
+        light.b = b
+        light.c = c
+        light.mass = mass
+        if wp.static(layout.peak is not None):
+            light.depth = peak_of(v, ray.peak, c) * mass
+        light.number = number_of(v, c)
+        light.held = held
+        return light
+
+    @wp.func
+    def change_light(
+        ray: records.Ray,
+        v: t.Node,
+        light: records.Light,
+        d_ray: records.Ray,
+        d_v: t.Node,
+        d_held: t.F,
+        d_mass: t.F,
+    ) -> records.Light:
+        d_light, c = records.Light(), light.c
+        d_light.mass = d_mass
+        if wp.static(layout.peak is not None):
+            d_peak = peak_of(d_v, d_ray.peak, c)
+            d_light.depth = d_peak * light.mass + peak_of(v, ray.peak, c) * d_mass
+        d_light.number = number_of(d_v, c)
+        d_light.held = d_held
+        return d_light
+
+    return SimpleNamespace(
+        peak_of=peak_of, light_of=light_of, change_light=change_light, phase=phase
+    )
 
 
 @functools.cache
@@ -173,29 +199,28 @@ def _slopes(layout: Layout) -> SimpleNamespace:
         cosine: t.F
 
     @wp.func
-    def turn(slopes: Slopes, ray: records.Ray, b: int, c: int, held: t.F, given: records.Bundle):
+    def turn(slopes: Slopes, ray: records.Ray, light: records.Light, given: records.Bundle):
         """Hands the slope by a point's angle on to the ray's way past it."""
-        spot = spot_of(ray, b, c, held, given)
+        spot = spot_of(ray, light, given)
         by_place = slopes.angle + slopes.cosine * spot.bend
         slopes.along = by_place * spot.along
         slopes.across = by_place * spot.across
         return slopes
 
     @wp.func
-    def by_curve(
-        ray: records.Ray, number: t.F, b: int, c: int, held: t.F, given: records.Bundle, place: t.F
-    ) -> Slopes:
+    def by_curve(ray: records.Ray, light: records.Light, given: records.Bundle) -> Slopes:
         slopes = Slopes()
+        place = over_depth.place(light.depth, light.number)
         slopes.place = place
         slopes.is_lit = True
-        curve = curve_of(ray, number, b, c, held, given, given)
+        curve = curve_of(ray, light, given, given)
         if wp.static(layout.peak is not None):
             slopes.depth = over_depth.slope(curve, place)
         if wp.static(layout.form == "linear"):
             slopes.number = curve[wp.static(layout.terms - 1)]
         if wp.static(layout.has_rungs):
-            spot = spot_of(ray, b, c, held, given)
-            rung = rung_of(number)
+            spot = spot_of(ray, light, given)
+            rung = rung_of(light.number)
             climbing = table.weigh_rungs(
                 given.table, rung.first, rung.slopes, spot.row, spot.weights
             )
@@ -204,32 +229,23 @@ def _slopes(layout: Layout) -> SimpleNamespace:
                 given.table, rung.first, rung.weights, spot.row, spot.slopes
             )
             slopes.angle = over_depth.value(turning, place)
-        elif wp.static(IS_POINT)[b] == 1:
-            spot = spot_of(ray, b, c, held, given)
+        elif wp.static(IS_POINT)[light.b] == 1:
+            spot = spot_of(ray, light, given)
             turning = table.weigh(given.table, spot.row, spot.slopes)
             slopes.angle = over_depth.value(turning, place)
         return slopes
 
     @wp.func
-    def find(
-        ray: records.Ray,
-        number: t.F,
-        depth: t.F,
-        b: int,
-        c: int,
-        held: t.F,
-        given: records.Bundle,
-        p: t.F,
-    ) -> Slopes:
+    def find(ray: records.Ray, light: records.Light, given: records.Bundle) -> Slopes:
         slopes = Slopes()
-        if which.is_plain(number):
-            cosine = spot_of(ray, b, c, held, given).cosine
-            slopes.number = plain.by_g(number, cosine)
-            slopes.cosine = plain.by_cosine(number, cosine)
-        elif which.has_curve(b) and (wp.static(layout.peak is None) or p > t.F(0.0)):
-            slopes = by_curve(ray, number, b, c, held, given, over_depth.place(depth, number))
-        if wp.static(IS_POINT)[b] == 1:
-            slopes = turn(slopes, ray, b, c, held, given)
+        if which.is_plain(light.number):
+            cosine = spot_of(ray, light, given).cosine
+            slopes.number = plain.by_g(light.number, cosine)
+            slopes.cosine = plain.by_cosine(light.number, cosine)
+        elif which.has_curve(light.b) and (wp.static(layout.peak is None) or light.p > t.F(0.0)):
+            slopes = by_curve(ray, light, given)
+        if wp.static(IS_POINT)[light.b] == 1:
+            slopes = turn(slopes, ray, light, given)
         return slopes
 
     return SimpleNamespace(Slopes=Slopes, find=find)
@@ -242,28 +258,19 @@ def node_phase_adjoint(layout: Layout) -> Any:
     Those of coefficients are added to arrays; arrays without rows take none.
     """
     t, records, slopes = vectors(layout), ray_types(layout), _slopes(layout)
-    Ray, Bundle, IS_POINT = records.Ray, records.Bundle, is_point(layout)
+    Ray, Light, Bundle = records.Ray, records.Light, records.Bundle
+    IS_POINT = is_point(layout)
     spread_curve = spreading_curves(layout)
 
     @wp.func
     def phase_adjoint(
-        ray: Ray,
-        number: t.F,
-        depth: t.F,
-        b: int,
-        c: int,
-        held: t.F,
-        given: Bundle,
-        p: t.F,
-        p_bar: t.F,
-        ray_bar: Ray,
-        bars: Bundle,
+        ray: Ray, light: Light, given: Bundle, p_bar: t.F, ray_bar: Ray, bars: Bundle
     ):
-        by = slopes.find(ray, number, depth, b, c, held, given, p)
+        by, b = slopes.find(ray, light, given), light.b
         ray_bar.foot[b] += p_bar * by.along
         ray_bar.across[b] += p_bar * by.across
         if by.is_lit:
-            spread_curve(ray, number, b, c, held, given, by.place, p_bar, bars)
+            spread_curve(ray, light, given, by.place, p_bar, bars)
         if wp.static(layout.form in ("even", "steep")):  # noqa: SIM102 - static conditions alone
             if wp.static(IS_POINT)[b] == 0 and bars.coefficients.shape[0] > 0:
                 r, at = ray.index, b * wp.static(layout.ray_terms)
@@ -278,30 +285,19 @@ def node_phase_adjoint(layout: Layout) -> Any:
 def node_phase_tangent(layout: Layout) -> Any:
     """The function of the change of p with those of all its arguments."""
     t, records, slopes = vectors(layout), ray_types(layout), _slopes(layout)
-    Ray, Bundle, IS_POINT = records.Ray, records.Bundle, is_point(layout)
+    Ray, Light, Bundle = records.Ray, records.Light, records.Bundle
+    IS_POINT = is_point(layout)
     curve_of, over_depth = curves(layout).curve, _polynomial(layout)
 
     @wp.func
     def phase_tangent(
-        ray: Ray,
-        number: t.F,
-        depth: t.F,
-        b: int,
-        c: int,
-        held: t.F,
-        given: Bundle,
-        p: t.F,
-        d_ray: Ray,
-        d_number: t.F,
-        d_depth: t.F,
-        d_held: t.F,
-        d_given: Bundle,
+        ray: Ray, light: Light, given: Bundle, d_ray: Ray, d_light: Light, d_given: Bundle
     ) -> t.F:
-        by = slopes.find(ray, number, depth, b, c, held, given, p)
-        d_p = by.depth * d_depth + by.number * d_number
-        d_p += by.along * (d_ray.foot[b] + d_held) + by.across * d_ray.across[b]
+        by, b = slopes.find(ray, light, given), light.b
+        d_p = by.depth * d_light.depth + by.number * d_light.number
+        d_p += by.along * (d_ray.foot[b] + d_light.held) + by.across * d_ray.across[b]
         if by.is_lit:
-            d_p += over_depth.value(curve_of(ray, number, b, c, held, given, d_given), by.place)
+            d_p += over_depth.value(curve_of(ray, light, given, d_given), by.place)
         if wp.static(layout.form in ("even", "steep")):  # noqa: SIM102 - static conditions alone
             if wp.static(IS_POINT)[b] == 0:
                 at = b * wp.static(layout.ray_terms)

@@ -137,7 +137,9 @@ auto angle_of = [&](const Node& node, int b, V& cosine) -> Cubic {
     angle.part = given[2];
     return angle;
 };
-auto number_of = [&](const Node& node, int h) -> V { return node.v[FIRST_NUMBER + h * NUMBER_STEP]; };
+auto number_of = [&](const Node& node, int h) -> V {
+    return node.v[FIRST_NUMBER + h * NUMBER_STEP];
+};
 // p of beam b at a node, by the number there; its change with the angle if that `turns`.
 auto see_number = [&](Node& node, int b, bool turns) {
     V cosine;

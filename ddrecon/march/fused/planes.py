@@ -64,44 +64,43 @@ def _bends(layout: Layout) -> SimpleNamespace:
     first = layout.first_mass
 
     @wp.func
-    def bends_along_y(
-        f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, v: Pair, w: Pair
+    def cell(f: wp.array4d(dtype=t.F), n: int, k: int, at: int, c: int, along_y: bool) -> t.F:
+        if along_y:
+            return f[n, k, at, c]
+        return f[n, at, k, c]
+
+    @wp.func
+    def line_bend(
+        f: wp.array4d(dtype=t.F), n: int, on: Place, at: int, c: int, v: Pair, along_y: bool
+    ) -> t.F:
+        """Those of cells `on` a line, the one with index `at` across it."""
+        i = cell(f, n, on.i, at, c, along_y)
+        j = cell(f, n, on.j, at, c, along_y)
+        before = cell(f, n, on.m, at, c, along_y) - t.F(2.0) * i + j
+        behind = i - t.F(2.0) * j + cell(f, n, on.p, at, c, along_y)
+        return v[0] * before + v[1] * behind
+
+    @wp.func
+    def bends(
+        f: wp.array4d(dtype=t.F), n: int, on: Place, over: Place, v: Pair, w: Pair, along_y: bool
     ) -> t.Bent:
-        """Those along y."""
+        """Those along y, or x: `on` lines, by v, and `over` them from one to the next, by w."""
         out = t.Bent()
         for k in range(wp.static(layout.masses)):
             c = wp.static(first) + k
-            f00 = f[n, y.i, x.i, c]
-            f01 = f[n, y.i, x.j, c]
-            f10 = f[n, y.j, x.i, c]
-            f11 = f[n, y.j, x.j, c]
-            before = w[0] * (f[n, y.m, x.i, c] - t.F(2.0) * f00 + f10)
-            before += w[1] * (f[n, y.m, x.j, c] - t.F(2.0) * f01 + f11)
-            behind = w[0] * (f00 - t.F(2.0) * f10 + f[n, y.p, x.i, c])
-            behind += w[1] * (f01 - t.F(2.0) * f11 + f[n, y.p, x.j, c])
-            out[k] = v[0] * before + v[1] * behind
+            out[k] = w[0] * line_bend(f, n, on, over.i, c, v, along_y)
+            out[k] += w[1] * line_bend(f, n, on, over.j, c, v, along_y)
         return out
 
     @wp.func
-    def bends_along_x(
-        f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, v: Pair, w: Pair
-    ) -> t.Bent:
-        """Those along x."""
-        out = t.Bent()
-        for k in range(wp.static(layout.masses)):
-            c = wp.static(first) + k
-            f00 = f[n, y.i, x.i, c]
-            f01 = f[n, y.i, x.j, c]
-            f10 = f[n, y.j, x.i, c]
-            f11 = f[n, y.j, x.j, c]
-            before = v[0] * (f[n, y.i, x.m, c] - t.F(2.0) * f00 + f01)
-            before += v[1] * (f[n, y.j, x.m, c] - t.F(2.0) * f10 + f11)
-            behind = v[0] * (f00 - t.F(2.0) * f01 + f[n, y.i, x.p, c])
-            behind += v[1] * (f10 - t.F(2.0) * f11 + f[n, y.j, x.p, c])
-            out[k] = w[0] * before + w[1] * behind
-        return out
+    def along_y(f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, v: Pair, w: Pair) -> t.Bent:
+        return bends(f, n, y, x, v, w, True)
 
-    return SimpleNamespace(along_y=bends_along_y, along_x=bends_along_x)
+    @wp.func
+    def along_x(f: wp.array4d(dtype=t.F), n: int, y: Place, x: Place, v: Pair, w: Pair) -> t.Bent:
+        return bends(f, n, x, y, w, v, False)
+
+    return SimpleNamespace(along_y=along_y, along_x=along_x)
 
 
 @functools.cache

@@ -37,7 +37,7 @@ def vectors(layout: Layout) -> SimpleNamespace:
 
 @functools.cache
 def ray_types(layout: Layout) -> SimpleNamespace:
-    """The records `Bundle` (what a kernel is given), `Ray`, and `Stop`, a ray at a node."""
+    """The records `Bundle` (what a kernel is given), `Ray`, `Stop` at a node, and `Light`."""
     t = vectors(layout)
 
     @wp.struct
@@ -95,7 +95,23 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         decay: t.Out
         p: t.Out
 
-    return SimpleNamespace(Bundle=Bundle, Ray=Ray, Stop=Stop)
+    @wp.struct
+    class Light:
+        """Light of beam `b` in color `c` at a node; its tangent has the same fields but these two.
+
+        The `mass` on both ways, the `depth` of the peak on them, the `number` of the phase function
+        there, the distance `held`, and p.
+        """
+
+        b: int
+        c: int
+        mass: t.F
+        depth: t.F
+        number: t.F
+        held: t.F
+        p: t.F
+
+    return SimpleNamespace(Bundle=Bundle, Ray=Ray, Stop=Stop, Light=Light)
 
 
 @functools.cache

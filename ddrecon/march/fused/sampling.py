@@ -5,6 +5,7 @@ Functions of cells [n, h, w, channels] and a place q (plane, row, column) in the
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -16,15 +17,44 @@ from ddrecon.march.fused.rays import vectors
 
 @functools.cache
 def sampling(layout: Layout, is_sliced: bool) -> SimpleNamespace:
-    """`sample` for linear values, `correct` for masses' corrections, `spread` for their adjoint."""
-    return _in_slices(layout) if is_sliced else _between_slices(layout)
+    """`sample` for linear values, `correct` for masses' corrections, `spread` for their adjoint.
+
+    A node that is not in slice n lies between slices z.i and z.j.
+    """
+    t, line = vectors(layout), lines(vectors(layout).F)
+    plane, bend, over = values(layout), corrections(layout), _across(layout)
+
+    @wp.func
+    def sample(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Node:
+        y = line.at(q[1], f.shape[1])
+        x = line.at(q[2], f.shape[2])
+        if wp.static(is_sliced):
+            return plane.linear(f, n, y, x)
+        z = line.at(q[0], f.shape[0])
+        below = (t.F(1.0) - z.a) * plane.linear(f, z.i, y, x)
+        return below + z.a * plane.linear(f, z.j, y, x)
+
+    @wp.func
+    def correct(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Bent:
+        y = line.at(q[1], f.shape[1])
+        x = line.at(q[2], f.shape[2])
+        if wp.static(is_sliced):
+            return bend.correction(f, n, y, x)
+        z = line.at(q[0], f.shape[0])
+        return (
+            (t.F(1.0) - z.a) * bend.correction(f, z.i, y, x)
+            + z.a * bend.correction(f, z.j, y, x)
+            + z.excess * over.across(f, z, y, x, t.F(1.0) - z.a, z.a)
+        )
+
+    spread = _spreading_in(layout) if is_sliced else _spreading_between(layout)
+    return SimpleNamespace(sample=sample, correct=correct, spread=spread)
 
 
 @functools.cache
 def slopes(layout: Layout, is_sliced: bool) -> SimpleNamespace:
     """Derivatives of `sample` and `correct` along an axis; on a kink the mean of both sides."""
-    t, line = vectors(layout), lines(vectors(layout).F)
-    side = _slopes_in_slices(layout) if is_sliced else _slopes_between_slices(layout)
+    t, line, side = vectors(layout), lines(vectors(layout).F), _side_slopes(layout, is_sliced)
 
     @wp.func
     def any_kink(f: wp.array4d(dtype=t.F), q: t.Triple) -> bool:
@@ -52,37 +82,22 @@ def slopes(layout: Layout, is_sliced: bool) -> SimpleNamespace:
 
 
 @functools.cache
-def _in_slices(layout: Layout) -> SimpleNamespace:
-    """Slice n is that of the node."""
+def _side_slopes(layout: Layout, is_sliced: bool) -> SimpleNamespace:
+    """The same as seen from one `side` of a kink, -1 or 1."""
     t, line = vectors(layout), lines(vectors(layout).F)
-    plane, bend, scatter = values(layout), corrections(layout), spreading(layout)
-
-    @wp.func
-    def sample(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Node:
-        return plane.linear(f, n, line.at(q[1], f.shape[1]), line.at(q[2], f.shape[2]))
-
-    @wp.func
-    def correct(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Bent:
-        return bend.correction(f, n, line.at(q[1], f.shape[1]), line.at(q[2], f.shape[2]))
-
-    @wp.func
-    def spread(g: wp.array4d(dtype=t.F), n: int, q: t.Triple, bar: t.Node, bent_bar: t.Bent):
-        scatter(g, n, line.at(q[1], g.shape[1]), line.at(q[2], g.shape[2]), bar, bent_bar)
-
-    return SimpleNamespace(sample=sample, correct=correct, spread=spread)
-
-
-@functools.cache
-def _slopes_in_slices(layout: Layout) -> SimpleNamespace:
-    """As seen from one `side` of a kink, -1 or 1."""
-    t, line = vectors(layout), lines(vectors(layout).F)
-    plane, bend = values(layout), corrections(layout)
+    plane, bend, over = values(layout), corrections(layout), _across(layout)
 
     @wp.func
     def slope(f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int, side: t.F) -> t.Node:
         y = line.at_side(q[1], f.shape[1], side)
         x = line.at_side(q[2], f.shape[2], side)
-        return plane.linear_slope(f, n, y, x, axis == 1)
+        if wp.static(is_sliced):
+            return plane.linear_slope(f, n, y, x, axis == 1)
+        z = line.at_side(q[0], f.shape[0], side)
+        if axis == 0:
+            return z.live * (plane.linear(f, z.j, y, x) - plane.linear(f, z.i, y, x))
+        below = (t.F(1.0) - z.a) * plane.linear_slope(f, z.i, y, x, axis == 1)
+        return below + z.a * plane.linear_slope(f, z.j, y, x, axis == 1)
 
     @wp.func
     def correct_slope(
@@ -90,7 +105,21 @@ def _slopes_in_slices(layout: Layout) -> SimpleNamespace:
     ) -> t.Bent:
         y = line.at_side(q[1], f.shape[1], side)
         x = line.at_side(q[2], f.shape[2], side)
-        return bend.correction_slope(f, n, y, x, axis == 1)
+        if wp.static(is_sliced):
+            return bend.correction_slope(f, n, y, x, axis == 1)
+        z = line.at_side(q[0], f.shape[0], side)
+        if axis == 0:
+            return z.live * (
+                bend.correction(f, z.j, y, x)
+                - bend.correction(f, z.i, y, x)
+                + z.excess_slope * over.across(f, z, y, x, t.F(1.0) - z.a, z.a)
+                + z.excess * over.across(f, z, y, x, t.F(-1.0), t.F(1.0))
+            )
+        return (
+            (t.F(1.0) - z.a) * bend.correction_slope(f, z.i, y, x, axis == 1)
+            + z.a * bend.correction_slope(f, z.j, y, x, axis == 1)
+            + z.excess * over.across_slope(f, z, y, x, axis == 1)
+        )
 
     return SimpleNamespace(slope=slope, correct_slope=correct_slope)
 
@@ -130,35 +159,20 @@ def _across(layout: Layout) -> SimpleNamespace:
 
 
 @functools.cache
-def _between_slices(layout: Layout) -> SimpleNamespace:
-    """The node lies between slices z.i and z.j."""
-    t, line = vectors(layout), lines(vectors(layout).F)
-    plane, bend, over = values(layout), corrections(layout), _across(layout)
+def _spreading_in(layout: Layout) -> Any:
+    """The adjoint of `sample` and `correct` of a node in slice n."""
+    t, line, scatter = vectors(layout), lines(vectors(layout).F), spreading(layout)
 
     @wp.func
-    def sample(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Node:
-        z = line.at(q[0], f.shape[0])
-        y = line.at(q[1], f.shape[1])
-        x = line.at(q[2], f.shape[2])
-        below = (t.F(1.0) - z.a) * plane.linear(f, z.i, y, x)
-        return below + z.a * plane.linear(f, z.j, y, x)
+    def spread(g: wp.array4d(dtype=t.F), n: int, q: t.Triple, bar: t.Node, bent_bar: t.Bent):
+        scatter(g, n, line.at(q[1], g.shape[1]), line.at(q[2], g.shape[2]), bar, bent_bar)
 
-    @wp.func
-    def correct(f: wp.array4d(dtype=t.F), n: int, q: t.Triple) -> t.Bent:
-        z = line.at(q[0], f.shape[0])
-        y = line.at(q[1], f.shape[1])
-        x = line.at(q[2], f.shape[2])
-        return (
-            (t.F(1.0) - z.a) * bend.correction(f, z.i, y, x)
-            + z.a * bend.correction(f, z.j, y, x)
-            + z.excess * over.across(f, z, y, x, t.F(1.0) - z.a, z.a)
-        )
-
-    return SimpleNamespace(sample=sample, correct=correct, spread=_spread_between(layout))
+    return spread
 
 
-def _spread_between(layout: Layout):
-    """The adjoint of `sample` and `correct` there."""
+@functools.cache
+def _spreading_between(layout: Layout) -> Any:
+    """The adjoint of `sample` and `correct` of a node between two slices."""
     t, line, scatter = vectors(layout), lines(vectors(layout).F), spreading(layout)
 
     @wp.func
@@ -186,42 +200,3 @@ def _spread_between(layout: Layout):
         scatter(g, z.j, y, x, bar_j, z.a * bent_bar)
 
     return spread
-
-
-@functools.cache
-def _slopes_between_slices(layout: Layout) -> SimpleNamespace:
-    """As seen from one `side` of a kink, -1 or 1."""
-    t, line = vectors(layout), lines(vectors(layout).F)
-    plane, bend, over = values(layout), corrections(layout), _across(layout)
-
-    @wp.func
-    def slope(f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int, side: t.F) -> t.Node:
-        z = line.at_side(q[0], f.shape[0], side)
-        y = line.at_side(q[1], f.shape[1], side)
-        x = line.at_side(q[2], f.shape[2], side)
-        if axis == 0:
-            return z.live * (plane.linear(f, z.j, y, x) - plane.linear(f, z.i, y, x))
-        below = (t.F(1.0) - z.a) * plane.linear_slope(f, z.i, y, x, axis == 1)
-        return below + z.a * plane.linear_slope(f, z.j, y, x, axis == 1)
-
-    @wp.func
-    def correct_slope(
-        f: wp.array4d(dtype=t.F), n: int, q: t.Triple, axis: int, side: t.F
-    ) -> t.Bent:
-        z = line.at_side(q[0], f.shape[0], side)
-        y = line.at_side(q[1], f.shape[1], side)
-        x = line.at_side(q[2], f.shape[2], side)
-        if axis == 0:
-            return z.live * (
-                bend.correction(f, z.j, y, x)
-                - bend.correction(f, z.i, y, x)
-                + z.excess_slope * over.across(f, z, y, x, t.F(1.0) - z.a, z.a)
-                + z.excess * over.across(f, z, y, x, t.F(-1.0), t.F(1.0))
-            )
-        return (
-            (t.F(1.0) - z.a) * bend.correction_slope(f, z.i, y, x, axis == 1)
-            + z.a * bend.correction_slope(f, z.j, y, x, axis == 1)
-            + z.excess * over.across_slope(f, z, y, x, axis == 1)
-        )
-
-    return SimpleNamespace(slope=slope, correct_slope=correct_slope)

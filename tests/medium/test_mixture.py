@@ -1,0 +1,107 @@
+"""Two media in the same place, against either alone and against what they are by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from media import box_grid, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.medium.coefficients import Volume, scale_medium
+from ddrecon.medium.mixture import mix_media
+from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.renderer import render
+from ddrecon.scene import Scene
+from ddrecon.variables.values import value_of, variable_names, with_values
+
+SHAPE = (4, 5, 6)
+
+
+def tensor(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def medium(seed: int, sigma_s: Tensor, g: float) -> Volume:
+    phase = HenyeyGreenstein(tensor(g)[0])
+    density = random_values(*SHAPE, seed=seed)
+    return Volume(box_grid(SHAPE), density, 0.1 * sigma_s, sigma_s, phase)
+
+
+SMOKE, DUST = medium(1, tensor(3.0), 0.6), medium(2, tensor(1.0, 2.0, 4.0), -0.3)
+
+
+def scene_of(volume: Volume) -> Scene:
+    return replace(make_scene(volume.density, transport_rounds=1, ambient=(0.2,)), volume=volume)
+
+
+def test_sections_and_mean_cosine_are_those_of_both_weighed_by_how_much_each_scatters():
+    medium = scale_medium(mix_media({"smoke": SMOKE, "dust": DUST}))
+    scattered = [one.sigma_s.view(-1, 1, 1, 1) * one.density for one in (SMOKE, DUST)]
+    torch.testing.assert_close(medium.scattering.value, sum(scattered))
+    torch.testing.assert_close(medium.absorption.value, 0.1 * sum(scattered))
+    torch.testing.assert_close(
+        medium.g * medium.scattering.value,
+        0.6 * scattered[0] - 0.3 * scattered[1],
+        atol=1e-5,
+        rtol=0,
+    )
+
+
+@pytest.mark.parametrize("one, other", [(SMOKE, DUST), (DUST, SMOKE)])
+def test_beside_nothing_a_medium_is_as_it_is_alone(one: Volume, other: Volume):
+    nothing = replace(other, density=torch.zeros(SHAPE, dtype=torch.float64))
+    images = [
+        render(scene_of(mix_media(media)))
+        for media in ({"one": one, "none": nothing}, {"none": nothing, "one": one})
+    ]
+    fields = (sigma.view(-1, 1, 1, 1) * one.density for sigma in (one.sigma_a, one.sigma_s))
+    alone = Volume(one.grid, torch.ones_like(one.density), *fields, one.phase)
+    for image in images:
+        torch.testing.assert_close(image, render(scene_of(alone)), rtol=2e-4, atol=1e-6)
+
+
+def test_the_same_medium_twice_is_one_of_both_densities():
+    thick = replace(SMOKE, density=SMOKE.density + DUST.density)
+    other = replace(SMOKE, density=DUST.density)
+    both = mix_media({"one": SMOKE, "other": other})
+    one = mix_media({"one": thick, "other": replace(SMOKE, density=0 * SMOKE.density)})
+    torch.testing.assert_close(render(scene_of(both)), render(scene_of(one)), rtol=1e-10, atol=0)
+
+
+def test_each_number_of_each_medium_is_a_variable():
+    scene = scene_of(mix_media({"smoke": SMOKE, "air": replace(DUST, phase=Rayleigh(tensor(0)))}))
+    names = [name for name in variable_names(scene) if name.startswith("media.")]
+    assert "media.smoke.g" in names and "media.air.g" not in names and "density" not in names
+    values = {name: 0.9 * value_of(scene, name) for name in ("media.smoke.g", "media.air.density")}
+    changed = with_values(scene, values)
+    for name, value in values.items():
+        assert torch.equal(value_of(changed, name), value)
+    media = changed.volume.media
+    assert media is not None and torch.equal(media["air"].density, 0.9 * DUST.density)
+    expected = mix_media(media)
+    for name in ("sigma_a", "sigma_s"):
+        assert torch.equal(getattr(changed.volume, name), getattr(expected, name))
+
+
+def test_on_a_coarser_grid_each_medium_is_coarser():
+    scene = scene_of(mix_media({"smoke": SMOKE, "dust": DUST}))
+    coarse = scene_at_level(scene, 2).volume
+    alone = scene_at_level(scene_of(SMOKE), 2).volume
+    assert coarse.media is not None
+    assert torch.equal(coarse.media["smoke"].density, alone.density)
+    assert coarse.sigma_s.shape[1:] == coarse.grid.shape == alone.grid.shape
+
+
+def test_where_both_are_empty_derivatives_are_finite():
+    density = torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True)
+    media = {"smoke": replace(SMOKE, density=density), "dust": replace(DUST, density=density)}
+    (bar,) = torch.autograd.grad(render(scene_of(mix_media(media))).sum(), density)
+    assert bool(bar.isfinite().all()) and bool(bar.any())
+
+
+def test_a_mixture_is_of_two_on_one_grid():
+    with pytest.raises(ValueError, match="two media on the same grid"):
+        mix_media({"smoke": SMOKE})
