@@ -18,7 +18,7 @@ ROUNDING = 1e-2
 rather than as total variation.
 """
 KNEE = 0.1
-"""Total variation is that of densities far below it, and of the logarithm of those above (E54)."""
+"""Total variation is that of densities far below it, and of the logarithm of those above (E47)."""
 HUBER = 0.05
 """Errors above this part of the targets' root mean square count linearly in the Huber loss."""
 RELATIVE = 0.05
@@ -207,7 +207,7 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
 
 
 def compress(field: Tensor) -> Tensor:
-    """What of the density `field` total variation is taken of: log(1 + field / `KNEE`) / 3 (E54).
+    """What of the density `field` total variation is taken of: log(1 + field / `KNEE`) / 3 (E47).
 
     Density below 0 counts as 0.
     """

@@ -174,7 +174,7 @@ class ParameterSettings:
     always does). For the part `even_until` of the iterations all its cells change alike, so that
     numbers of the whole scene are found before it.
 
-    `tv` weighs its total variation and `l1` its mean, of density by E54; 1 would weigh them as much
+    `tv` weighs its total variation and `l1` its mean, of density by E47; 1 would weigh them as much
     as the whole brightness of the targets. `tv: auto` finds the weight by leaving views out.
 
     `support`: where density may be above 0, by what pictures show, widened by `support_margin`

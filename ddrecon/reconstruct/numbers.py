@@ -1,4 +1,4 @@
-"""What pictures say of single numbers, exactly: the part of J^T W J between them (E51).
+"""What pictures say of single numbers, exactly: the part of J^T W J between them (E45).
 
 Exposures, lights and poses are few, and look alike: a camera's turn and its shift, a lamp and an
 exposure. Where equations are solved by conjugate gradients, these are solved for all at once.

@@ -39,7 +39,7 @@ class Parameter:
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
     is Adam (Kingma and Ba 2015, arXiv:1412.6980); of fields with Nesterov's momentum and a `FLOOR`
-    (E53), begun anew at each resolution. While a field `is_even`, all its cells change alike; that
+    (E46), begun anew at each resolution. While a field `is_even`, all its cells change alike; that
     ends after the part `even_until` of a run. `rate` is one number or one for each entry. `view` is
     the name of the view that it belongs to, None for what all views see. One that `is_fitted` is
     solved for instead; `curvature` is the second derivative of the loss by it.
@@ -100,7 +100,7 @@ class Parameter:
 
         `rate` is the part of its learning rate that counts now. With m and v the running means of
         the derivative and of its square, each divided by the part of 1 that their weights sum to,
-        Adam moves the value by -rate m / (sqrt(v) + epsilon), and a field as E53 says.
+        Adam moves the value by -rate m / (sqrt(v) + epsilon), and a field as E46 says.
         """
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.

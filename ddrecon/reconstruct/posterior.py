@@ -187,7 +187,7 @@ class Posterior:
         """About H^-1 `vector`, with 0 where `is_fixed`: J^T W J counts by its `information` (E38).
 
         That again is solved by conjugate gradients, to which it counts by its diagonal alone.
-        Single numbers are solved for by themselves, all together (E51).
+        Single numbers are solved for by themselves, all together (E45).
         """
         is_out = is_fixed | self.is_number
 

@@ -30,7 +30,7 @@ class Roughness:
     def about(field: Tensor, grid: Grid, weight: float, is_compressed: bool = False) -> Roughness:
         """That of `weight` times `losses.total_variation`, about `field` [..., z, y, x].
 
-        Where that is of a field that `is_compressed` (E54), its slopes are those of the field times
+        Where that is of a field that `is_compressed` (E47), its slopes are those of the field times
         the slope of the compression there.
         """
         seen = compress(field) if is_compressed else field

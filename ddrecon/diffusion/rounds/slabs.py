@@ -1,4 +1,4 @@
-"""Characteristics through slabs: light goes from one to the next, direction after direction (E56).
+"""Characteristics through slabs: light goes from one to the next, direction after direction (E48).
 
 While one rank follows a direction, the next follows that before. Half of the directions come from
 either end, so that all ranks have something to do nearly from the beginning.
@@ -39,7 +39,7 @@ def radiance_through(
     direction: Direction,
     entering: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """I in a slab's own cells, as of `radiance_along`, and what leaves it for the next (E56).
+    """I in a slab's own cells, as of `radiance_along`, and what leaves it for the next (E48).
 
     `medium` and `scatters` are of a slab with `REACH` layers of its neighbors. What is `entering`
     and leaves is a layer [C, z, y, x] of I, less the `inflow`: the last one that light has passed.

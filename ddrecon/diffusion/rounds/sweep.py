@@ -66,7 +66,7 @@ class Parts(NamedTuple):
     ) -> tuple[Tensor, Tensor]:
         """I along `direction` of what `scatters` (E11), these parts standing for the `medium`'s.
 
-        And, in slabs, what leaves this one of what is `entering` (E56).
+        And, in slabs, what leaves this one of what is `entering` (E48).
         """
         field = self.extinction_field if self.scattering_field is None else self.scattering_field
         medium = replace(

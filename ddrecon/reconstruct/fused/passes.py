@@ -36,7 +36,7 @@ def step_adam(
     """The new value, within its bounds, and the new moments, after `steps` with this one.
 
     `smallest`, one number, is added to the size of each derivative. The value moves along the part
-    `ahead` of the mean derivative, and for the rest along the newest (E53).
+    `ahead` of the mean derivative, and for the rest along the newest (E46).
     """
     new = [value.new_empty(value.shape) for _ in range(3)]
     weights = [1 - beta**steps for beta in betas]
