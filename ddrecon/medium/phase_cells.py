@@ -133,12 +133,15 @@ def others_of(phase: PhaseFunction) -> list[Tensor]:
 
 
 def _look_up(tables: Tensor, place: Tensor, angle: Tensor) -> Tensor:
-    """Values [C, *angle.shape, K] of the `tables` [1 or C, ...] at `place` [1 or C, ...].
+    """Values [C, ..., K] of the `tables` [1 or C, ...] at `place` [1 or C, ...] and `angle` [...].
 
     Each is as `look_up_between` has it; `angle` is the same for all colors.
     """
-    colors = max(len(tables), len(place))
-    place, angle = place.expand(colors, *angle.shape), angle.double()
+    colors, shape = (
+        max(len(tables), len(place)),
+        torch.broadcast_shapes(place[0].shape, angle.shape),
+    )
+    place, angle = place.expand(colors, *shape), angle.expand(shape).double()
     if len(tables) == 1:
         return look_up_between(tables[0], place, angle.expand(place.shape))
     return torch.stack([look_up_between(*each, angle) for each in zip(tables, place, strict=True)])

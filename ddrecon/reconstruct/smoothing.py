@@ -2,11 +2,13 @@
 
 A training view is held out and the others are reconstructed at the coarsest resolution, by a few
 short runs: one for each decade of weights, then one on either side of the best. That is cross
-validation (Stone 1974, doi:10.1111/j.2517-6161.1974.tb00994.x), of one fold.
+validation (Stone 1974, doi:10.1111/j.2517-6161.1974.tb00994.x), of one fold. Where pictures hardly
+tell, the weight stays near the usual one.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
@@ -19,6 +21,7 @@ from ddrecon.ranks import from_first
 from ddrecon.reconstruct.levels import factors, scene_at_level
 from ddrecon.renderer import render
 from ddrecon.scene import Scene, View
+from ddrecon.variables.kinds import kind_of
 
 DECADES = (1e-4, 1e-3, 1e-2, 1e-1)
 """Weights that are tried first,"""
@@ -28,13 +31,20 @@ ITERATIONS = 30
 """Length of each run: six of them at a quarter of the resolution take as long as about six
 iterations at full resolution.
 """
+AS_GOOD = 0.1
+"""A weight that shows the view by so many dB less than the best [dB] is as good: coarse cells show
+little of what smoothing does to fine ones.
+"""
 FEWEST = 3
 """Training views that there must be."""
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """The `weight` found, the `view` that was left out, and the PSNR [dB] of it by weight."""
+    """The `weight` found, the `view` that was left out, and the PSNR [dB] of it by weight.
+
+    Of weights as good as the best it is the one nearest to what density has by default.
+    """
 
     weight: float
     view: str
@@ -49,7 +59,8 @@ def smoothing_text(smoothing: dict[str, Any]) -> str:
     """What was found for `tv: auto`, as a line."""
     tried = ", ".join(f"{weight}: {psnr:.1f}" for weight, psnr in smoothing["tried"].items())
     return (
-        f"tv: {smoothing['weight']:.3g} shows view {smoothing['view']!r} best where it is left out"
+        f"tv: {smoothing['weight']:.3g} shows view {smoothing['view']!r} as well as any, to"
+        f" {AS_GOOD} dB, where it is left out"
         f" (PSNR in dB by weight: {tried})"
     )
 
@@ -84,12 +95,17 @@ def find_smoothing(scene: Scene, start: Callable[[Scene], Run]) -> Smoothing:
     tried: dict[float, float] = {}
     for weight in DECADES:
         tried[weight] = _quality(coarse, left_out.name, weight, start)
-    best = max(tried, key=lambda weight: tried[weight])
+    best = _pick(tried)
     for part in BESIDE:
         tried[best * part] = _quality(coarse, left_out.name, best * part, start)
-    best = max(tried, key=lambda weight: tried[weight])
     shown = {f"{weight:.3g}": tried[weight] for weight in sorted(tried)}
-    return Smoothing(best, left_out.name, shown)
+    return Smoothing(_pick(tried), left_out.name, shown)
+
+
+def _pick(tried: Mapping[float, float]) -> float:
+    """Of weights as good as the best, by the PSNR [dB] of each, that nearest to the usual one."""
+    good = [weight for weight, psnr in tried.items() if psnr >= max(tried.values()) - AS_GOOD]
+    return min(good, key=lambda weight: abs(math.log(weight / kind_of("density").tv)))
 
 
 def _middle_view(views: Sequence[View]) -> View:

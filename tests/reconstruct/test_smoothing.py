@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +28,8 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     return load_scene(BALL, overrides=[*small, "optimize.parameters.density={tv: auto}"])
 
 
-def test_the_best_weight_is_taken(scene: Scene) -> None:
-    """Whatever quality is, here a parabola over decades: its top is between two decades."""
-    quality = {1e-4: -4.0, 1e-3: -1.0, 1e-2: 0.0, 1e-1: -1.5}
+def runs_of(quality: Callable[[float], float]) -> Callable[[Scene], Any]:
+    """Begins runs that are done at once, whose view left out has the `quality` of their weight."""
 
     class Tried:
         """A run whose picture is off by as much as its weight says."""
@@ -48,7 +49,7 @@ def test_the_best_weight_is_taken(scene: Scene) -> None:
 
                 def psnr_of(self, image: torch.Tensor) -> float:
                     assert isinstance(weight, float)
-                    return quality.get(weight, 1.0 if 1e-3 < weight < 1e-2 else -9.0)
+                    return quality(weight)
 
             return {view.name: Target() for view in self.scene.views}
 
@@ -58,9 +59,19 @@ def test_the_best_weight_is_taken(scene: Scene) -> None:
         def current_scene(self) -> Scene:
             return self.scene
 
-    found = find_smoothing(scene, Tried)
-    assert found.weight == pytest.approx(10**-2.5) and len(found.tried) == 6
-    assert max(found.tried.values()) == 1.0
+    return Tried
+
+
+@pytest.mark.parametrize("best", [3e-4, 4e-2])
+def test_the_best_weight_is_taken(scene: Scene, best: float) -> None:
+    """Where quality is a parabola over decades, whose top lies between two of them."""
+    found = find_smoothing(scene, runs_of(lambda weight: -(math.log10(weight / best) ** 2)))
+    assert abs(math.log10(found.weight / best)) < 0.25 and len(found.tried) == 6
+
+
+def test_pictures_that_do_not_tell_leave_the_usual_weight(scene: Scene) -> None:
+    found = find_smoothing(scene, runs_of(lambda weight: 30 + 0.02 * math.log10(weight)))
+    assert found.weight == pytest.approx(3e-3, rel=0.1)
 
 
 def test_a_run_smooths_as_it_found_and_goes_on_so(scene: Scene) -> None:
