@@ -32,6 +32,10 @@ TOLERANCE = 1e-4
 """Relative residual of solves without a light, whose share is a difference of pictures."""
 ROUNDING = 1e-6
 """Lights that no picture tells apart better than this keep their ratio."""
+RELEASE = 0.3
+"""The part of a run for which lights wait where a field is sought: what fits a volume that is
+nearly empty is a lamp that is far too bright, and the volume then stays thin.
+"""
 ALBEDO = ("sigma_a", "sigma_s", "albedo")
 """What says how much light a medium gives back."""
 

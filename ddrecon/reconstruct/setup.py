@@ -10,7 +10,7 @@ import torch
 from ddrecon.errors import SceneError
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise, estimate_noise
-from ddrecon.reconstruct.brightness import can_solve_light
+from ddrecon.reconstruct.brightness import RELEASE, can_solve_light
 from ddrecon.reconstruct.divergence import describe_flaw
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
@@ -169,3 +169,5 @@ def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bo
     for light in parameters:
         if light.name.startswith("lights.") and light.is_fitted:
             light.is_fitted = can_solve_light(light, parameters)
+            if light.is_fitted and any(parameter.is_field for parameter in parameters):
+                light.release = RELEASE

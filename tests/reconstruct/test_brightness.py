@@ -98,3 +98,23 @@ def test_a_light_descends_where_scattering_can_be_exchanged_for_it(ball_scene: S
         )
         lamp = Reconstruction(replace(ball_scene, optimize=wanted)).parameters[0]
         assert lamp.is_fitted is is_fitted
+
+
+@pytest.mark.parametrize(("sought", "waits"), [(("density",), True), ((), False)])
+def test_a_light_waits_until_there_is_a_volume(
+    ball_scene: Scene, sought: tuple[str, ...], waits: bool
+) -> None:
+    """What fits an empty volume is a light without bounds, so that it waits where one is sought."""
+    assert ball_scene.optimize is not None
+    parameters = {name: ParameterSettings() for name in (*sought, NAMES[0])}
+    wanted = replace(ball_scene.optimize, parameters=parameters, iterations=10, refine_at=())
+    irradiance, density = value_of(ball_scene, NAMES[0]) / 2, torch.ones(16, 16, 16)
+    dim = with_values(ball_scene, {NAMES[0]: irradiance, "density": density})
+    run = Reconstruction(replace(dim, optimize=wanted))
+    lamp = next(p for p in run.parameters if p.name == NAMES[0])
+    before = lamp.value.detach().clone()
+    run.step()
+    assert torch.equal(lamp.value.detach(), before) is waits
+    while not run.is_done:
+        run.step()
+    assert not torch.equal(lamp.value.detach(), before)
