@@ -45,10 +45,11 @@ class Parameter:
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
     is Adam (Kingma and Ba 2015, arXiv:1412.6980); of fields with Nesterov's momentum and a `FLOOR`
-    (E46), as short as smoothing asks (E49), begun anew at each resolution. While a field `is_even`, all its cells change alike; that
-    ends after the part `even_until` of a run. `rate` is one number or one for each entry. `view` is
-    the name of the view that it belongs to, None for what all views see. One that `is_fitted` is
-    solved for instead; `curvature` is the second derivative of the loss by it.
+    (E46), as short as smoothing asks (E49), begun anew at each resolution. While a field `is_even`,
+    all its cells change alike; that ends after the part `even_until` of a run. `rate` is one number
+    or one for each entry. `view` is the name of the view that it belongs to, None for what all
+    views see. One that `is_fitted` is solved for instead; `curvature` is the second derivative of
+    the loss by it.
     """
 
     def __init__(
