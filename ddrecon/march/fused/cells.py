@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ddrecon.march.bands import Bands
 from ddrecon.march.equidistant import Equidistant
+from ddrecon.march.fused.stretches import find_walked
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
@@ -20,11 +21,13 @@ class Cells:
 
     `planes` [N]: nodes, across the slices [u] or as parts of the way from near to far. `order` [N]
     (int32) are the slices across `axis` in which these lie; None where rays meet no slices.
+    `walked` [packets, words] (int32) are bits of the segments that are to be walked; None: all are.
     """
 
     planes: Tensor
     axis: int = 0
     order: Tensor | None = None
+    walked: Tensor | None = None
 
     @property
     def is_sliced(self) -> bool:
@@ -67,16 +70,18 @@ def _short(order: Tensor) -> Tensor:
     return order.int()
 
 
-def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
-    """Where nodes lie for `sampler`, and the fields among whose cells that is."""
+def cells_of(sampler: Bands | Equidistant, rays: Tensor) -> tuple[Cells, list[Tensor]]:
+    """Where nodes of `rays` [R, 8] lie for `sampler`, and the fields among whose cells that is."""
     fields = list(sampler.channels.fields)
     if not isinstance(sampler, Bands):
         like = fields[0]
         planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
         return Cells(planes), fields
+    support, planes = sampler.support, sampler.planes
+    walked = None if support is None else find_walked(support, planes, rays.detach())
     if sampler.steps == 1:
-        return Cells(sampler.planes, sampler.axis, _short(sampler.order)), fields
+        return Cells(planes, sampler.axis, _short(sampler.order), walked), fields
     # Slices between those of cells are interpolated beforehand.
-    whole = sampler.slices
-    order = torch.arange(sampler.nodes, dtype=torch.int32, device=whole.planes.device)
-    return Cells(whole.planes, 0, order), [torch.cat(whole.bands, 2).transpose(0, 1)]
+    bands = torch.cat(sampler.slices.bands, 2).transpose(0, 1)
+    order = torch.arange(sampler.nodes, dtype=torch.int32, device=planes.device)
+    return Cells(planes, 0, order, walked), [bands]
