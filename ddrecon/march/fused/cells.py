@@ -21,13 +21,14 @@ class Cells:
 
     `planes` [N]: nodes, across the slices [u] or as parts of the way from near to far. `order` [N]
     (int32) are the slices across `axis` in which these lie; None where rays meet no slices.
-    `walked` [packets, words] (int32) are bits of the segments that are to be walked; None: all are.
+    `support` [N, rows, columns] is whether there may be matter in the slices of nodes; None: there
+    may be.
     """
 
     planes: Tensor
     axis: int = 0
     order: Tensor | None = None
-    walked: Tensor | None = None
+    support: Tensor | None = None
 
     @property
     def is_sliced(self) -> bool:
@@ -45,6 +46,10 @@ class Cells:
             "rows": shape[row - 3],
             "columns": shape[column - 3],
         }
+
+    def walked(self, rays: Tensor) -> Tensor | None:
+        """The segments that packets of `rays` are to walk, as `find_walked` has them; None: all."""
+        return None if self.support is None else find_walked(self.support, self.planes, rays)
 
     def pack(self, fields: Sequence[Tensor]) -> Tensor:
         """Values [n, h, w, channels] of all `fields`, in the order in which rays meet them."""
@@ -70,18 +75,17 @@ def _short(order: Tensor) -> Tensor:
     return order.int()
 
 
-def cells_of(sampler: Bands | Equidistant, rays: Tensor) -> tuple[Cells, list[Tensor]]:
-    """Where nodes of `rays` [R, 8] lie for `sampler`, and the fields among whose cells that is."""
+def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
+    """Where nodes lie for `sampler`, and the fields among whose cells that is."""
     fields = list(sampler.channels.fields)
     if not isinstance(sampler, Bands):
         like = fields[0]
         planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
         return Cells(planes), fields
     support, planes = sampler.support, sampler.planes
-    walked = None if support is None else find_walked(support, planes, rays.detach())
     if sampler.steps == 1:
-        return Cells(planes, sampler.axis, _short(sampler.order), walked), fields
+        return Cells(planes, sampler.axis, _short(sampler.order), support), fields
     # Slices between those of cells are interpolated beforehand.
     bands = torch.cat(sampler.slices.bands, 2).transpose(0, 1)
     order = torch.arange(sampler.nodes, dtype=torch.int32, device=planes.device)
-    return Cells(planes, 0, order, walked), [bands]
+    return Cells(planes, 0, order, support), [bands]

@@ -52,7 +52,7 @@ class Integrate(torch.autograd.Function):
             given, made = _packets(cells, varied, fields), {"out": out, "masses": masses}
             packet_integral_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
         else:
-            bundle = _bundle(layout, cells, cells.pack(fields), *varied)
+            bundle = _bundle(layout, cells.planes, cells.pack(fields), *varied)
             arguments = [bundle, array(out), array(masses)]
             launch(integral_kernel(layout), len(rays), arguments, rays)
         return out, masses.to(rays.dtype, copy=True), masses
@@ -104,7 +104,10 @@ def _change(
         torch.zeros_like(value) if change is None else change
         for value, change in zip(values, d_values, strict=True)
     ]
-    bundles = [_bundle(layout, cells, cells.pack(part[6:]), *part[:6]) for part in (values, whole)]
+    bundles = [
+        _bundle(layout, cells.planes, cells.pack(part[6:]), *part[:6]) for part in (values, whole)
+    ]
+    _leave_out(cells, values[0], bundles[0])
     arguments = [*bundles, array(d_out), array(d_masses)]
     launch(tangent_kernel(layout, cells.is_sliced), len(d_out[0]), arguments, d_out)
     return d_out, d_masses
@@ -143,7 +146,8 @@ def _transpose(
     masses, rays, angles, coefficients, numbers, table, fronts, *fields = ctx.saved_tensors
     varied = rays, angles, coefficients, numbers, table, fronts
     packed, fronts_bar = cells.pack(fields), torch.zeros_like(fronts)
-    given = _bundle(layout, cells, packed, *varied)
+    given = _bundle(layout, cells.planes, packed, *varied)
+    _leave_out(cells, rays, given)
     bars = [torch.zeros_like(x if varies_rays else x[:0]) for x in (rays, angles, coefficients)]
     numbers_bar = rays.new_empty(len(numbers), len(rays))
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
@@ -151,7 +155,7 @@ def _transpose(
     fixed = [given, *map(array, (masses, out_bar, masses_bar))]
     tables = [torch.zeros_like(table if ctx.needs_input_grad[6] else table[:0]) for _ in shares]
     bundles = [
-        _bundle(layout, cells, share, *bars, numbers, own, fronts_bar)
+        _bundle(layout, cells.planes, share, *bars, numbers, own, fronts_bar)
         for share, own in zip(shares, tables, strict=True)
     ]
     kernel = adjoint_kernel(layout, cells.is_sliced, varies_rays)
@@ -206,7 +210,8 @@ def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -
     given["fronts"] = fronts if fronts.numel() else None
     given |= cells.strides(fields[0].shape)
     given |= {"ray_count": len(varied[0]), "node_count": len(cells.planes)}
-    given |= {"walked": cells.walked, "words": 0 if cells.walked is None else cells.walked.shape[1]}
+    walked = cells.walked(varied[0])
+    given |= {"walked": walked, "words": 0 if walked is None else walked.shape[1]}
     return given | {"fields": _channels(fields, fields)}
 
 
@@ -219,13 +224,18 @@ def _channels(tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[
     ]
 
 
-def _bundle(layout: Layout, cells: Cells, *tensors: Tensor) -> Any:
-    """Nodes of `cells`, and `tensors` in the order of its fields, as a record for kernels."""
+def _bundle(layout: Layout, *tensors: Tensor) -> Any:
+    """`tensors`, in the order of its fields, as the record that kernels are given."""
     bundle = ray_types(layout).Bundle()
     names = "planes", "cells", "rays", "angles", "coefficients", "numbers", "table", "fronts"
-    for name, tensor in zip(names, (cells.planes, *tensors), strict=True):
+    for name, tensor in zip(names, tensors, strict=True):
         setattr(bundle, name, array(tensor))
-    bundle.lanes = 1 if cells.planes.is_cuda else LANES
-    if cells.walked is not None:
-        bundle.walked = array(cells.walked)
     return bundle
+
+
+def _leave_out(cells: Cells, rays: Tensor, bundle: Any) -> None:
+    """Tells the record `bundle` which segments of `rays` are to be walked, unless all are."""
+    walked = cells.walked(rays)
+    if walked is not None:
+        bundle.walked = array(walked)
+        bundle.lanes = cut(len(rays), LANES, rays)[1]

@@ -75,7 +75,7 @@ def _integrate(
     fronts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Scattered radiance and opacity [2 C, R] along rays, and mass [K, R]."""
-    layout, (cells, fields) = layout_of(emission), cells_of(sampler, packed.bundle)
+    layout, (cells, fields) = layout_of(emission), cells_of(sampler)
     along, third_order = see_beams(emission, layout, packed), sampler.channels.third_order
     numbers = numbers_of(emission, 0.0 if third_order is None else third_order.bound)
     out, masses, _ = Integrate.apply(
