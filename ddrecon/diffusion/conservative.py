@@ -90,6 +90,26 @@ class DiffusionProblem:
         )
         return z, y, x
 
+    def flux_off(self, light: Moments) -> Vector | None:
+        """L1 - 3 F(L0) of any `light`: by how much its flux is off diffusion's."""
+        if not self.has_flux or light.flux is None:
+            return None
+        if is_fused():
+            from ddrecon.diffusion.fused.flux import find_flux
+
+            return find_flux(
+                self.medium,
+                self.diffusion,
+                self.source.flux,
+                self.outside,
+                light.mean,
+                light.flux,
+            )
+        diffuse = self.flux(light.mean)
+        assert diffuse is not None
+        z, y, x = (a - b for a, b in zip(light.flux, diffuse, strict=True))
+        return z, y, x
+
     def spread(self, flux: Vector) -> Tensor:
         """- div(D kappa_s `flux`), what a source of that flux adds to the right side of E4."""
         if is_fused():

@@ -1,7 +1,8 @@
 """L1 = 3 F averaged over a cell's faces (E5, E6), in one pass over the cells; and its adjoint.
 
 A cell computes all six of its faces. D has as many colors as L0 or one (`own`), Q1 `sources`, the
-field of kappa_s `scattering_fields`.
+field of kappa_s `scattering_fields`. Where a kernel `is_off`, it finds by how much a flux that is
+`begun` is off that: begun - 3 F.
 """
 
 import functools
@@ -10,7 +11,9 @@ from typing import Any
 from ddrecon.diffusion.fused.faces import FACES
 from ddrecon.kernels.rows import row_kernel
 
-_GIVEN = "diffusion scattering_scale scattering outside mean flux_z flux_y flux_x "
+_GIVEN = """
+diffusion scattering_scale scattering outside mean flux_z flux_y flux_x begun_z begun_y begun_x
+"""
 _NUMBERS = "own scattering_fields sources"
 # The rows of all that is given, in color c.
 _ROWS = """
@@ -37,17 +40,19 @@ _FLUX = """
 ROWS
 F *out_z = light_z + c * size + start, *out_y = light_y + c * size + start;
 F* out_x = light_x + c * size + start;
+const long long at = OFF ? c * size + start : 0;
+const F *old_z = begun_z + at, *old_y = begun_y + at, *old_x = begun_x + at;
 each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
     const F a = d[i];
     auto along = [&](const F* flux, long long low, long long high, F h,
                      bool has_low, bool has_high) INLINE -> F {
-        return F(3) * a
+        return TIMES * a
             * (share(a, d[i + low], h, has_low) * drive_low(i, flux, low, h, has_low)
                + share(a, d[i + high], h, has_high) * drive_high(i, flux, high, h, has_high));
     };
-    out_z[i] = along(qz, to_zl, to_zh, hz, zl, zh);
-    out_y[i] = along(qy, to_yl, to_yh, hy, yl, yh);
-    out_x[i] = along(qx, to_xl, to_xh, hx, xl, xh);
+    out_z[i] = (OFF ? old_z[i] : F(0)) + along(qz, to_zl, to_zh, hz, zl, zh);
+    out_y[i] = (OFF ? old_y[i] : F(0)) + along(qy, to_yl, to_yh, hy, yl, yh);
+    out_x[i] = (OFF ? old_x[i] : F(0)) + along(qx, to_xl, to_xh, hx, xl, xh);
 });
 """
 
@@ -67,8 +72,8 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
                      bool has_low, bool has_high) INLINE -> F {
         const F t_low = share(a, d[i + low], h, has_low);
         const F t_high = share(a, d[i + high], h, has_high);
-        const F lower = F(3) * t_low * (bar[i] + (has_low ? bar[i + low] : F(0)));
-        const F upper = F(3) * t_high * (bar[i] + (has_high ? bar[i + high] : F(0)));
+        const F lower = TIMES * t_low * (bar[i] + (has_low ? bar[i + low] : F(0)));
+        const F upper = TIMES * t_high * (bar[i] + (has_high ? bar[i + high] : F(0)));
         d_bar += t_low * lower * drive_low(i, flux, low, h, has_low) * (has_low ? F(1) : h);
         d_bar +=
             t_high * upper * drive_high(i, flux, high, h, has_high) * (has_high ? F(1) : h);
@@ -92,15 +97,14 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
 
 
 @functools.cache
-def flux_kernel(is_directed: bool, bits: int) -> Any:
+def flux_kernel(is_directed: bool, is_off: bool, bits: int) -> Any:
     """The kernel of L1; without Q1 where it is not `is_directed`."""
-    return row_kernel(
-        "flux", bits, _text(_FLUX, is_directed), _GIVEN + "light_z light_y light_x", _NUMBERS
-    )
+    text = _text(_FLUX, is_directed, is_off)
+    return row_kernel("flux", bits, text, _GIVEN + "light_z light_y light_x", _NUMBERS)
 
 
 @functools.cache
-def flux_adjoint_kernel(is_directed: bool, bits: int) -> Any:
+def flux_adjoint_kernel(is_directed: bool, is_off: bool, bits: int) -> Any:
     """The kernel of the cotangents of all that L1 is made of.
 
     They have all colors. `field_bar` is that of kappa_s by its color's `scattering_factor`.
@@ -109,10 +113,11 @@ def flux_adjoint_kernel(is_directed: bool, bits: int) -> Any:
     light_z_bar light_y_bar light_x_bar scattering_factor
     mean_bar diffusion_bar field_bar flux_z_bar flux_y_bar flux_x_bar
     """
-    text = _text(_ADJOINT, is_directed)
-    return row_kernel("flux_adjoint", bits, text, _GIVEN + arrays, _NUMBERS + "")
+    text = _text(_ADJOINT, is_directed, is_off)
+    return row_kernel("flux_adjoint", bits, text, _GIVEN + arrays, _NUMBERS)
 
 
-def _text(body: str, is_directed: bool) -> str:
+def _text(body: str, is_directed: bool, is_off: bool) -> str:
     text = FACES + body.replace("ROWS", _ROWS)
-    return text.replace("DIRECTED", str(is_directed).lower())
+    text = text.replace("DIRECTED", str(is_directed).lower())
+    return text.replace("OFF", str(is_off).lower()).replace("TIMES", f"F({-3 if is_off else 3})")

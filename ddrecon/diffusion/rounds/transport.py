@@ -80,8 +80,7 @@ def _round(
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None
     if round_index > 1:
-        imbalance = recompute(_imbalance, operator, right, light.mean)
-        off = Moments(imbalance, _difference(light.flux, problem.flux(light.mean)))
+        off = Moments(_imbalance(operator, right, light.mean), problem.flux_off(light))
     gain, source, turned = _gain(medium, change, off, degree)
     if turned is not None:
         source = source + problem.spread(turned)
@@ -165,15 +164,16 @@ def _turned(share: Tensor, cosine: Tensor, change: Vector) -> Vector:
     return z, y, x
 
 
-def _difference(one: Vector | None, other: Vector | None) -> Vector | None:
-    if one is None or other is None:
-        return None
-    z, y, x = (a - b for a, b in zip(one, other, strict=True))
-    return z, y, x
-
-
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     """S - A L0."""
+    if is_fused():
+        from ddrecon.diffusion.fused.product import find_imbalance
+
+        return find_imbalance(operator, right, mean)
+    return recompute(_plain_imbalance, operator, right, mean)
+
+
+def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     imbalance = right - operator.loss * mean
     for axis, conductance in zip(AXES, operator.conductances, strict=True):
         imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)
