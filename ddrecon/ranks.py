@@ -182,6 +182,15 @@ def gather_from_ranks(part: Tensor) -> list[Tensor]:
     return parts
 
 
+def trade_with_ranks(parts: Tensor) -> Tensor:
+    """What each rank has for this one, by rank; for each of them this one has one of `parts`."""
+    parts = parts.contiguous()
+    got = torch.empty_like(parts)
+    with _exchange(parts.nbytes):
+        torch.distributed.all_to_all_single(got, parts)
+    return got
+
+
 def swap_with_neighbors(
     before: Tensor | None, after: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None]:
