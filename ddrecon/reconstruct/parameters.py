@@ -82,12 +82,12 @@ class Parameter:
         self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
-    def penalty(self, factor: Tensor | float = 1.0) -> Tensor:
+    def penalty(self) -> Tensor:
         """What its regularizers add to the loss, in units of the targets' mean square.
 
-        That is of `factor` times the value. See `ParameterSettings` for the weights.
+        See `ParameterSettings` for the weights.
         """
-        value, total = self.value * factor, self.value.new_zeros(())
+        value, total = self.value, self.value.new_zeros(())
         if self.is_compressed:
             value = compress(value)
         if self.tv:
