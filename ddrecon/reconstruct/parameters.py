@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.losses import compress, total_variation
+from ddrecon.losses import KNEE, THIN, compress, total_variation
 from ddrecon.reconstruct.levels import resample
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
@@ -42,7 +42,8 @@ class Parameter:
     (E46), begun anew at each resolution. While a field `is_even`, all its cells change alike; that
     ends after the part `even_until` of a run. `rate` is one number or one for each entry. `view` is
     the name of the view that it belongs to, None for what all views see. One that `is_fitted` is
-    solved for instead; `curvature` is the second derivative of the loss by it.
+    solved for instead; `curvature` is the second derivative of the loss by it. Of a density, `unit`
+    is what has an optical depth of 1 across the box's shortest side.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class Parameter:
         rate: float | Tensor,
         value: Tensor,
         grid: Grid,
+        unit: float = 1.0,
     ):
         kind = kind_of(name)
         self.name, self.rate, self.grid = name, rate, grid
@@ -68,7 +70,7 @@ class Parameter:
         self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
-        self.is_compressed = kind.is_compressed
+        self.knee, self.thin = (KNEE * unit, THIN * unit) if kind.is_compressed else (None, None)
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
@@ -81,14 +83,16 @@ class Parameter:
         That is of `factor` times the value. See `ParameterSettings` for the weights.
         """
         value, total = self.value * factor, self.value.new_zeros(())
-        if self.is_compressed:
-            value = compress(value)
         if self.tv:
             variation = total_variation
             if current_engine() == "warp":
                 from ddrecon.reconstruct.fused.passes import total_variation as variation
-            total = total + self.tv * variation(value, self.grid)
-        return total + self.l1 * value.abs().mean() if self.l1 else total
+            smooth = value if self.knee is None else compress(value, self.knee)
+            total = total + self.tv * variation(smooth, self.grid)
+        if self.l1:
+            size = value.abs() if self.thin is None else compress(value, self.thin)
+            total = total + self.l1 * size.mean()
+        return total
 
     @property
     def largest_rate(self) -> float:
