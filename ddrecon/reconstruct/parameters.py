@@ -70,7 +70,8 @@ class Parameter:
         self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
-        self.knee, self.thin = (KNEE * unit, THIN * unit) if kind.is_compressed else (None, None)
+        self.knee = KNEE * unit if kind.is_compressed else None
+        self.thin = THIN * unit if kind.is_compressed else None
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
