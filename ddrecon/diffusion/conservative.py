@@ -75,32 +75,53 @@ class DiffusionProblem:
                 right = right - recompute(_divergence, self.medium, self.diffusion, flux, axis)
         return Operator((z, y, x), loss), right
 
-    def flux(self, mean: Tensor, more: Vector | None = None) -> Vector | None:
-        """L1 of L0 = `mean`, with `more` flux in the source; None without directions."""
+    def flux(
+        self,
+        mean: Tensor,
+        more: Vector | None = None,
+        begun: Vector | None = None,
+        sign: int = 1,
+    ) -> Vector | None:
+        """L1 of L0 = `mean`, with `more` flux in the source; None without directions.
+
+        Times the `sign`, and added to a flux that is `begun`.
+        """
         if not self.has_flux:
             return None
-        source = add_vectors(self.source.flux, more)
         if is_fused():
             from ddrecon.diffusion.fused.flux import find_flux
 
-            return find_flux(self.medium, self.diffusion, source, self.outside, mean)
+            return find_flux(
+                self.medium,
+                self.diffusion,
+                self.source.flux,
+                self.outside,
+                mean,
+                more,
+                begun,
+                sign,
+            )
+        source = add_vectors(self.source.flux, more)
         z, y, x = (
             recompute(axis_flux, self.medium, self.diffusion, flux, self.outside, mean, axis)
             for axis, flux in zip(AXES, source or (None, None, None), strict=True)
         )
-        return z, y, x
+        return add_vectors(begun, (z, y, x) if sign > 0 else (-z, -y, -x))
 
-    def spread(self, flux: Vector) -> Tensor:
-        """- div(D kappa_s `flux`), what a source of that flux adds to the right side of E4."""
+    def right_side(self, source: Tensor, flux: Vector | None) -> Tensor:
+        """The right side of E7 with more in it: a `source`, and - div(D kappa_s `flux`)."""
+        _, right = self.system
+        if flux is None:
+            return right + source
         if is_fused():
             from ddrecon.diffusion.fused.spread import spread_flux
 
-            return spread_flux(self.medium, self.diffusion, flux)
+            return spread_flux(self.medium, self.diffusion, flux, (right, source))
         z, y, x = (
             recompute(_divergence, self.medium, self.diffusion, along, axis)
             for axis, along in zip(AXES, flux, strict=True)
         )
-        return -(z + y + x)
+        return right + (source - (z + y + x))
 
     def solved(self, solve: SolverWithMemory[Operator], right: Tensor) -> Tensor:
         """u of A u = `right`; in slabs by a solve in all ranks' own cells together."""

@@ -92,8 +92,11 @@ def problem_of(
     mean = random_values(*right.shape, seed=5, dtype=dtype).requires_grad_()
     flux = problem.flux(mean)
     assert flux is not None
-    spread = problem.spread(flux)
-    results = [*operator.conductances, operator.loss, right, *flux, spread]
+    z, y, x = flux
+    off = problem.flux(mean, more=(y, x, z), begun=(x, z, y), sign=-1)
+    assert off is not None
+    side = problem.right_side(mean, flux)
+    results = [*operator.conductances, operator.loss, right, *flux, *off, side]
     return weigh(results, [*leaves, *more, mean])
 
 
@@ -167,7 +170,12 @@ def test_adjoints_are_the_transposes_of_tangents():
             medium, Closure("geometric", medium.grid), problem.source, problem.outside, True
         )
         operator, right = problem.system
-        return [*operator.conductances, operator.loss, right, *(problem.flux(right) or ())]
+        flux = problem.flux(right)
+        assert flux is not None
+        z, y, x = flux
+        off = problem.flux(right, more=(y, x, z), begun=(x, z, y), sign=-1)
+        side = problem.right_side(z, flux)
+        return [*operator.conductances, operator.loss, right, *flux, *(off or ()), side]
 
     with forward.dual_level():
         tangents = [

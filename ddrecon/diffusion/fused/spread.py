@@ -21,7 +21,7 @@ from ddrecon.diffusion.fused.colors import (
 )
 from ddrecon.diffusion.fused.faces import FACES
 from ddrecon.grid import Grid
-from ddrecon.kernels.dual import launch_row_tangents, split
+from ddrecon.kernels.dual import launch_row_tangents
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Vector
 from ddrecon.medium.coefficients import Medium
@@ -35,6 +35,7 @@ const F *qz = flux_z + to, *qy = flux_y + to, *qx = flux_x + to, S = scattering_
 """
 _SPREAD = """
 F* out = spread + to;
+const F *one = begun + to, *other = begun_more + to;
 each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
     const F a = d[i], s = S * field[i];
     // What enters through the lower face along an axis, less what leaves through the upper one.
@@ -46,8 +47,9 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
             * (share(a, d[i + low], h, has_low) * driven(p, p_low, h, has_low)
                - share(a, d[i + high], h, has_high) * driven(p, p_high, h, has_high));
     };
-    out[i] = along(qz, to_zl, to_zh, hz, zl, zh) + along(qy, to_yl, to_yh, hy, yl, yh)
+    const F gained = along(qz, to_zl, to_zh, hz, zl, zh) + along(qy, to_yl, to_yh, hy, yl, yh)
         + along(qx, to_xl, to_xh, hx, xl, xh);
+    out[i] = one[i] + other[i] + gained;
 });
 """
 _ADJOINT = """
@@ -81,19 +83,22 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
     qx_bars[i] = s * px_bar;
 });
 """
-_TENSORS = "diffusion", "scattering_scale", "scattering", *FLUX
+_BEGUN = "begun", "begun_more"
+_TENSORS = "diffusion", "scattering_scale", "scattering", *FLUX, *_BEGUN
 _GIVEN = " ".join(_TENSORS) + " "
 
 
-def spread_flux(medium: Medium, diffusion: Tensor, flux: Vector) -> Tensor:
-    """- div(D kappa_s `flux`) [C, z, y, x]."""
+def spread_flux(
+    medium: Medium, diffusion: Tensor, flux: Vector, begun: tuple[Tensor, Tensor]
+) -> Tensor:
+    """The sum of what is `begun`, less div(D kappa_s `flux`), all [C, z, y, x]."""
     scale, field = medium.remaining.scale, medium.remaining.field
-    spread: Tensor = _Spread.apply(medium.grid, diffusion, scale, field, *flux)
+    spread: Tensor = _Spread.apply(medium.grid, diffusion, scale, field, *flux, *begun)
     return spread
 
 
 class _Spread(torch.autograd.Function):
-    """What a flux adds to the right side."""
+    """What a flux adds to what is begun of a right side."""
 
     @staticmethod
     def forward(grid: Grid, *tensors: Tensor) -> Tensor:
@@ -105,7 +110,7 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.grid, *tensors = inputs
-        keep(ctx, *tensors)
+        keep(ctx, *tensors[: -len(_BEGUN)])
 
     @staticmethod
     @differentiate_once
@@ -119,12 +124,13 @@ class _Spread(torch.autograd.Function):
         launch_rows(spread_adjoint_kernel, ctx.grid, len(bar), given, made)
         diffusion_bar = sum_colors(found["diffusion_bar"], diffusion)
         flux_bars = (found[f"{name}_bar"] for name in FLUX)
-        return None, diffusion_bar, *scattering.split(), *flux_bars
+        return None, diffusion_bar, *scattering.split(), *flux_bars, bar, bar
 
     @staticmethod
     def jvp(ctx: Any, _: None, *changes: Tensor | None) -> Tensor:
         def change(*tensors: Any) -> Tensor:
-            values, d_values = split(tensors)
+            count = len(_TENSORS) - len(_BEGUN)
+            values, d_values = tensors[:count], tensors[count:]
             d_spread = values[3].new_empty(values[3].shape)
             given, d_given = _given(*values), dict(zip(_TENSORS, d_values, strict=True))
             made = {"spread": d_spread}
@@ -135,17 +141,21 @@ class _Spread(torch.autograd.Function):
         return d_spread
 
 
-def _given(diffusion: Tensor, scale: Tensor, field: Tensor, *flux: Tensor) -> dict[str, Any]:
+def _given(diffusion: Tensor, scale: Tensor, field: Tensor, *others: Tensor) -> dict[str, Any]:
     """What both kernels are given, by its names."""
+    flux = others[: len(FLUX)]
+    # Only the values depend on what is begun: nothing else reads it.
+    begun = others[len(FLUX) :] or flux[: len(_BEGUN)]
     return {
         "own": len(diffusion), "scattering_fields": len(field), "diffusion": diffusion,
-        "scattering_scale": per_color(scale, len(flux[0])), "scattering": field, **name_flux(flux),
+        "scattering_scale": per_color(scale, len(flux[0])), "scattering": field,
+        **name_flux(flux), **dict(zip(_BEGUN, begun, strict=True)),
     }  # fmt: skip
 
 
 @functools.cache
 def spread_kernel(bits: int) -> Any:
-    """The kernel of what a flux adds."""
+    """The kernel of what a flux adds to what is begun."""
     text = FACES + _ROWS + _SPREAD
     return row_kernel("spread_flux", bits, text, _GIVEN + "spread", "own scattering_fields")
 

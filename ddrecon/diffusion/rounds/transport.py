@@ -80,40 +80,32 @@ def _round(
     # Light begins as diffusion's; later S - A L0 and L1 - 3 F(L0) are not zero.
     off = None
     if round_index > 1:
-        imbalance = recompute(_imbalance, operator, right, light.mean)
-        off = Moments(imbalance, _difference(light.flux, problem.flux(light.mean)))
+        imbalance = _imbalance(operator, right, light.mean)
+        off = Moments(imbalance, problem.flux(light.mean, begun=light.flux, sign=-1))
     gain, source, turned = _gain(medium, change, off, degree)
-    if turned is not None:
-        source = source + problem.spread(turned)
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
-    mean = problem.solved(solve_round, right + source)
+    mean = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
-    new = Moments(mean, problem.flux(mean, turned))
+    new = Moments(mean + gain.mean, problem.flux(mean, turned, gain.flux))
     if change.higher is None or factor is None:
-        return new.plus(gain)
-    return _blend(medium, light, new, gain, change.higher, factor, degree)
+        return new
+    return _blend(medium, light, new, change.higher, factor, degree)
 
 
 def _blend(
-    medium: Medium,
-    light: Moments,
-    diffuse: Moments,
-    gain: Moments,
-    swept: Tensor,
-    factor: Tensor,
-    degree: int,
+    medium: Medium, light: Moments, new: Moments, swept: Tensor, factor: Tensor, degree: int
 ) -> Moments:
     """Light by `factor` as far from what was as to what a round makes of it (E19).
 
-    That is what is now `diffuse`, plus its gain, and theta times what was `swept` of higher degree.
+    That is what is `new`, and theta times what was `swept` of higher degree.
     """
     if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.blend import blend_fused
 
         length = _share_length(medium, degree)
-        return blend_fused(medium, light, diffuse, gain, swept, factor, length)
+        return blend_fused(medium, light, new, swept, factor, length)
     share = recompute(_transport_share, medium, degree)
-    new = replace(diffuse.plus(gain), higher=share * swept)
+    new = replace(new, higher=share * swept)
     return light.plus(_times(new.plus(_times(light, -1)), factor))
 
 
@@ -165,15 +157,16 @@ def _turned(share: Tensor, cosine: Tensor, change: Vector) -> Vector:
     return z, y, x
 
 
-def _difference(one: Vector | None, other: Vector | None) -> Vector | None:
-    if one is None or other is None:
-        return None
-    z, y, x = (a - b for a, b in zip(one, other, strict=True))
-    return z, y, x
-
-
 def _imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     """S - A L0."""
+    if is_fused():
+        from ddrecon.diffusion.fused.product import find_imbalance
+
+        return find_imbalance(operator, right, mean)
+    return recompute(_plain_imbalance, operator, right, mean)
+
+
+def _plain_imbalance(operator: Operator, right: Tensor, mean: Tensor) -> Tensor:
     imbalance = right - operator.loss * mean
     for axis, conductance in zip(AXES, operator.conductances, strict=True):
         imbalance = imbalance - accumulate(conductance * difference(mean, axis), axis)

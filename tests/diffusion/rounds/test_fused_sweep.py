@@ -251,8 +251,8 @@ def blended(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]:
     use_engine(engine)
     medium, factor = case.medium(values), 0.4 + values["inflow"]
     swept, light = (Moments.of_harmonics(values[name]) for name in ("source", "light"))
-    one, other = Moments.of_harmonics(values["source"][:4]), replace(swept, higher=None)
-    new = _blend(medium, light, one, other.scaled(0.3, 0.2), swept.higher, factor, case.degree)
+    made = replace(swept.scaled(1.3, 1.2), higher=None)
+    new = _blend(medium, light, made, swept.higher, factor, case.degree)
     return [new.harmonics(medium.degree)]
 
 

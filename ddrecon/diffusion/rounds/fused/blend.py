@@ -19,14 +19,13 @@ from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 _FIRST = "mean", "z", "y", "x"
 _PARTS = *_FIRST, "higher"
-# Of the row: parts of light, of diffusion's and of gains; theta goes to `shares`.
+# Of the row: parts of light that was and of what is made of it; theta goes to `shares`.
 _ROWS = """
 const long long at = c * size + start;
 const F *e_row = extinction + color(extinction_colors, size) + start;
 const F far = numbers[colors + c];
 const F *const light[4] = {light_mean + at, light_z + at, light_y + at, light_x + at};
-const F *const diffuse[4] = {diffuse_mean + at, diffuse_z + at, diffuse_y + at, diffuse_x + at};
-const F *const gain[4] = {gain_mean + at, gain_z + at, gain_y + at, gain_x + at};
+const F *const made[4] = {made_mean + at, made_z + at, made_y + at, made_x + at};
 F* share_row = shares + at;
 """
 _BLEND = (
@@ -39,7 +38,7 @@ for (int i = begin; i < end; ++i) {"""
     + """
     share_row[i] = far * share;
     for (int a = 0; a < 4; ++a)
-        found[a][i] = light[a][i] + far * (diffuse[a][i] + gain[a][i] - light[a][i]);
+        found[a][i] = light[a][i] + far * (made[a][i] - light[a][i]);
 }
 for (int k = 0; k < higher; ++k) {
     const long long there = (long long)k * colors * size + at;
@@ -58,8 +57,8 @@ _ADJOINT = (
 const F *const bars[4] = {new_mean_bar + at, new_z_bar + at, new_y_bar + at, new_x_bar + at};
 F *const light_bars[4]
     = {light_mean_bar + at, light_z_bar + at, light_y_bar + at, light_x_bar + at};
-F *const diffuse_bars[4]
-    = {diffuse_mean_bar + at, diffuse_z_bar + at, diffuse_y_bar + at, diffuse_x_bar + at};
+F *const made_bars[4]
+    = {made_mean_bar + at, made_z_bar + at, made_y_bar + at, made_x_bar + at};
 F *e_bars = extinction_bar + at, *share_bars = share_bar + at;
 F far_sum = F(0), depth_sum = F(0);
 INDEPENDENT
@@ -69,9 +68,9 @@ for (int i = begin; i < end; ++i) {"""
     share_row[i] = share;
     share_bars[i] = F(0);
     for (int a = 0; a < 4; ++a) {
-        far_sum += bars[a][i] * (diffuse[a][i] + gain[a][i] - light[a][i]);
+        far_sum += bars[a][i] * (made[a][i] - light[a][i]);
         light_bars[a][i] = (F(1) - far) * bars[a][i];
-        diffuse_bars[a][i] = far * bars[a][i];
+        made_bars[a][i] = far * bars[a][i];
     }
 }
 for (int k = 0; k < higher; ++k) {
@@ -104,13 +103,13 @@ sums[(long long)rows * parts * colors + item] = far_sum;
 )
 _GIVEN = [
     "extinction", "numbers", "shares", "swept_higher", "light_higher",
-    *(f"{of}_{part}" for of in ("light", "diffuse", "gain") for part in _FIRST),
+    *(f"{of}_{part}" for of in ("light", "made") for part in _FIRST),
 ]  # fmt: skip
 _TENSORS = "numbers", "extinction", "light_higher", "swept_higher", *_GIVEN[5:]
 _FOUND = [f"new_{part}" for part in _PARTS]
 _BARS = [
     "extinction_bar", "share_bar", "swept_higher_bar", "light_higher_bar",
-    *(f"{of}_{part}_bar" for of in ("light", "diffuse") for part in _FIRST),
+    *(f"{of}_{part}_bar" for of in ("light", "made") for part in _FIRST),
 ]  # fmt: skip
 _NUMBERS = "extinction_colors colors higher is_begun"
 
@@ -118,19 +117,18 @@ _NUMBERS = "extinction_colors colors higher is_begun"
 def blend_fused(
     medium: Medium,
     light: Moments,
-    diffuse: Moments,
-    gain: Moments,
+    made: Moments,
     swept: Tensor,
     factor: Tensor,
     length: Tensor,
 ) -> Moments:
-    """From `light` to `diffuse` plus `gain`, and of what is higher to theta `swept`, by `factor`.
+    """From `light` to what is `made` of it, and of what is higher to theta `swept`, by `factor`.
 
     As `_blend` in `transport.py` has it; `length`: of the mean step [u], by which theta is (E14).
     """
     numbers = numbers_by_color(medium, length, [factor])
     numbers = numbers.expand(-1, len(light.mean))
-    first = (part for one in (light, diffuse, gain) for part in (one.mean, *(one.flux or ())))
+    first = (part for one in (light, made) for part in (one.mean, *(one.flux or ())))
     mean, z, y, x, higher = _Blend.apply(
         medium.grid, numbers, medium.extinction.field, light.higher, swept, *first
     )
@@ -167,10 +165,9 @@ class _Blend(torch.autograd.Function):
         given |= {f"{name}_bar": bar for name, bar in zip(_FOUND, bars, strict=True)}
         launch_rows(blend_adjoint_kernel, ctx.grid, len(mean), given, found)
         sums = found["sums"].double().view(*numbers.shape, -1).sum(-1).to(mean.dtype)
-        light_bars, diffuse_bars = (
-            [found[f"{of}_{part}_bar"] for part in _FIRST] for of in ("light", "diffuse")
+        light_bars, made_bars = (
+            [found[f"{of}_{part}_bar"] for part in _FIRST] for of in ("light", "made")
         )
-        # Gains have the cotangents of what they are added to.
         return (
             None,
             sums,
@@ -178,8 +175,7 @@ class _Blend(torch.autograd.Function):
             None if old is None else found["light_higher_bar"],
             found["swept_higher_bar"],
             *light_bars,
-            *diffuse_bars,
-            *diffuse_bars,
+            *made_bars,
         )
 
     @staticmethod
@@ -207,7 +203,7 @@ def _given(
 ) -> tuple[dict[str, Any], Tensor, Tensor]:
     """What both kernels are given; the mean of light, and what was swept."""
     mean = first[0]
-    names = (f"{of}_{part}" for of in ("light", "diffuse", "gain") for part in _FIRST)
+    names = (f"{of}_{part}" for of in ("light", "made") for part in _FIRST)
     given = {
         "numbers": numbers, "extinction": extinction, "swept_higher": swept,
         "light_higher": mean if old is None else old, "shares": mean.new_empty(mean.shape),
