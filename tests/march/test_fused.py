@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
+from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
@@ -226,6 +227,22 @@ def test_packets_read_and_write_whole_rows(eye: tuple[float, float, float], dtyp
     assert_near(image, known, 1e-5 if dtype is torch.float32 else 1e-12)
     for found, expected in zip(one, other, strict=True):
         assert_near(found, expected, 3e-5 if dtype is torch.float32 else 1e-11)
+
+
+@pytest.mark.parametrize("eye", [(0.0, 0.0, 3.0), (3.0, 0.0, 0.0), (0.3, 3.0, 0.2)], ids=str)
+def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, float]):
+    """There slopes are the mean of both sides; from all sides, by packets of rows or columns."""
+    camera = make_camera(size=(9, 7), half_width=0.3, eye=eye, is_perspective=False)
+    if eye[1]:
+        camera = make_camera(size=(9, 7), half_width=0.3, eye=eye)
+    grid = Grid((9, 7, 9), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
+    density = half_empty(*grid.shape)
+    scene = make_scene(density, sigma_a=(1.0,), sigma_s=(6.0,), camera=camera, grid=grid)
+    found, known = (gradients(scene, ["density", *POSE], engine)[1] for engine in ("warp", "torch"))
+    for one, other in zip(found, known, strict=True):
+        assert_near(one, other, 1e-11)
+    found, known = (tangent(scene, *POSE, engine) for engine in ("warp", "torch"))
+    assert_near(found, known, 1e-11)
 
 
 @pytest.mark.parametrize("name", CASES)

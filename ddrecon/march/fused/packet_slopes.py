@@ -67,8 +67,9 @@ auto slope_from = [&](const F* f, const Side& row, const Side& column, bool is_b
 // Slopes at node n, at distance s, of channels `from` to before `to`: each is handed to `take`.
 auto take_slopes = [&](int n, V s, int from, int to, auto take) {
     const V y = ray.o1 + s * ray.d1, x = ray.o2 + s * ray.d2;
-    const M is_on_kink = kink_at(y, lines.rows) | kink_at(x, lines.columns);
-    const bool has_kink = !P::every(P::pick(is_on_kink, P::all(F(1)), P::all(F(0))) == P::all(F(0)));
+    const V none = P::all(F(0)), one = P::all(F(1));
+    const V kinks = P::pick(kink_at(y, lines.rows) | kink_at(x, lines.columns), one, none);
+    const bool has_kink = !P::every(kinks == none);
     const F first = has_kink ? F(-1) : F(0);
     const Side row = at_side(y, lines.rows, first), column = at_side(x, lines.columns, first);
     const Side next_row = at_side(y, lines.rows, F(1)), next = at_side(x, lines.columns, F(1));
@@ -116,9 +117,10 @@ auto move = [&](int n, const Node& node, const V* v_bar, const V* bend_bar, V t_
 };
 auto store_ray = [&]() {
     const int y = is_turned ? 2 : 1, x = 3 - y;
-    const V all[8] = {o_bar[0], o_bar[y], o_bar[x], d_bar[0], d_bar[y], d_bar[x], near_bar, far_bar};
+    const V bars[8] = {o_bar[0], o_bar[y], o_bar[x], d_bar[0], d_bar[y], d_bar[x],
+                       near_bar, far_bar};
     for (int l = 0; l < LANES && begin + l <= last; ++l)
-        for (int k = 0; k < 8; ++k) rays_bar[8LL * (begin + l) + k] = P::lane(all[k], l);
+        for (int k = 0; k < 8; ++k) rays_bar[8LL * (begin + l) + k] = P::lane(bars[k], l);
 };
 """
 """The adjoint: before the walk back, which has `rays_bar`."""

@@ -1,7 +1,8 @@
 """The walk along packets of rays that finds the change of their integral.
 
-With those of fields, numbers, polynomials and the table of p, and of the rays themselves. A node and its change are two records of the same kind: that of the change has
-changes for values, emission and depth.
+With those of fields, numbers, polynomials and the table of p, and of the rays themselves. A node
+and its change are two records of the same kind: that of the change has changes for distances,
+values, emission and depth.
 """
 
 from __future__ import annotations

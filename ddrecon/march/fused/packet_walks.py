@@ -1,7 +1,7 @@
 """The walks along packets of rays that meet slices: the integral, and its adjoint.
 
-They compute what `walks` and `adjoint` do for one ray a thread, in vector lanes; derivatives by the
-rays themselves are left to those.
+They compute what `walks` and `adjoint` do for one ray a thread, in vector lanes; derivatives by
+rays beside light from points are left to those.
 """
 
 from __future__ import annotations
