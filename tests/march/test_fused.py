@@ -33,6 +33,7 @@ from ddrecon.march.fused.packet_walks import (  # noqa: E402
     packet_adjoint_kernel,
     packet_integral_kernel,
 )
+from ddrecon.march.fused.stretches import mark_kernel  # noqa: E402
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -284,12 +285,12 @@ def kernels_for(architecture: int) -> list:
         one = Layout(1, 1, 1, (False, True), 0, 0, 1, 32)
         several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 1, 3, 3)
         walks = [tangent_kernel(one, True), adjoint_kernel(one, True, True)]
-        return [*walks, packet_integral_kernel(several), packet_adjoint_kernel(one)]
+        return [*walks, packet_integral_kernel(several), packet_adjoint_kernel(one, True)]
     one = Layout(1, 1, 1, (True,), 0, 0, 1, 32)
     several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64)
     steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1, 1, 1)
     walks = [integral_kernel(steep), adjoint_kernel(one, False, True)]
-    return [*walks, packet_integral_kernel(one), packet_adjoint_kernel(several)]
+    return [*walks, mark_kernel(32), packet_integral_kernel(one), packet_adjoint_kernel(several)]
 
 
 @pytest.mark.parametrize("architecture", [80, 90])
