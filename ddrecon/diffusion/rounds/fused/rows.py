@@ -23,7 +23,8 @@ POINTERS = 64
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
     F *found, *saved, *returning, *e_bar, *sc_bar, *light_parts[5], *source_parts[5], *bars[5];
-    F *densest; double *sums; int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
+    F *densest, *beam_factors; double *sums;
+    int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
     int directions, extinction_channels, scattering_channels
 """

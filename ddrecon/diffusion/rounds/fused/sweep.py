@@ -9,7 +9,13 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, choose, parts_of, split
+from ddrecon.diffusion.rounds.fused.swept import (
+    PARTS,
+    Swept,
+    parts_of,
+    split,
+    units_of_parts,
+)
 from ddrecon.diffusion.rounds.fused.tangents import CellTangents, RowTangents, changes_of
 from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
@@ -36,6 +42,11 @@ def sweep_fused(
     not rows of directions; None: on a GPU.
     """
     colors = len(medium.extinction.value) if light is None else len(light.mean)
+    beam_factors = None
+    if source.beam is not None:
+        beam, each = source.beam
+        source, units = Moments(beam), _units_of(factors)
+        beam_factors = (units * each).expand(-1, colors)
     shares_field = medium.remaining.field is medium.extinction.field
     mean, *rest, _ = _Sweep.apply(
         source.mean.is_cuda if by_cells is None else by_cells,
@@ -51,6 +62,7 @@ def sweep_fused(
         medium.extinction.field,
         None if shares_field else medium.remaining.field,
         _spread_factors(factors, colors),
+        beam_factors,
         *((None,) * PARTS if light is None else parts_of(light, colors)),
         *parts_of(source, colors),
     )
@@ -71,6 +83,12 @@ def _spread_factors(factors: Tensor, colors: int) -> Tensor:
     """`factors` [L + 1, 1 or C, 1, 1, 1] by harmonic, [K, C]."""
     degrees = torch.tensor(degrees_of_harmonics(len(factors) - 1), device=factors.device)
     return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
+
+
+@remember
+def _units_of(factors: Tensor) -> Tensor:
+    """How many times the moments that have `factors` the parts of light are, [K, 1]."""
+    return units_of_parts(len(factors) - 1)[:, None].to(factors)
 
 
 class _Sweep(torch.autograd.Function):
@@ -104,7 +122,8 @@ class _Sweep(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
-        _, _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
+        _, _, _, _, needs_scales, _, _, needs_factors, *needs_more = ctx.needs_input_grad
+        needs_beam_factors, *needs_parts = needs_more
         parts = (*bars[:-1], *[None] * PARTS)[:PARTS]
         if ctx.by_cells:
             found = Cells(swept).transpose(parts, needs_scales)
@@ -121,8 +140,9 @@ class _Sweep(torch.autograd.Function):
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
             swept.factor_bar(moments_bar) if needs_factors else None,
+            swept.beam_factor_bar(moments_bar) if needs_beam_factors else None,
             *swept.light_bars(moments_bar, parts, needs_parts[:PARTS]),
-            *choose(moments_bar, needs_parts[PARTS:]),
+            *swept.source_bars(moments_bar, needs_parts[PARTS:]),
         )
 
     @staticmethod
@@ -131,6 +151,7 @@ class _Sweep(torch.autograd.Function):
             values, d_values = halve(tensors)
             swept = Swept.of(*ctx.of, *values)
             d_swept = changes_of(swept, *d_values)
+            swept = swept.spelled()
             tangents = (
                 CellTangents(swept, d_swept)
                 if ctx.by_cells
