@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 from traced import Traced, trace
 
+from ddrecon.bench.plume import fade, plume_density
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid
@@ -40,17 +41,11 @@ ROUNDS, SIZE, SAMPLES = (0, 1, 2, 4), 32, 16
 FRONT, FAR, SIDE, BELOW = (0.0, 0.3, 3.2), (-2.2, 0.9, -2.2), (-2.0, -1.2, -0.5), (1.2, -1.6, 2.4)
 
 
-def soft(distance: Tensor, outer: float, width: float) -> Tensor:
-    """1 below `outer` - `width`, falling smoothly to 0 at `outer`."""
-    part = ((outer - distance) / width).clamp(0, 1)
-    return part * part * (3 - 2 * part)
-
-
 def around(center: Vector, outer: float, width: float = 0.11) -> Field:
     """A soft ball."""
 
     def density(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        return soft(
+        return fade(
             ((x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2).sqrt(),
             outer,
             width,
@@ -71,21 +66,7 @@ def together(*fields: Field) -> Field:
 def slab(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     """A wavy layer 0.15 thick, with soft edges."""
     height = (y - 0.06 * torch.sin(9 * x) * torch.cos(7 * z)).abs()
-    return soft(height, 0.11, 0.07) * soft(x.abs(), 0.45, 0.1) * soft(z.abs(), 0.45, 0.1)
-
-
-def plume(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """A rising, widening, swaying and ragged column, denser below."""
-    rise = y + 0.5
-    across = (
-        (x - 0.1 * rise * torch.sin(7 * rise)) ** 2 + (z - 0.1 * rise * torch.cos(6 * rise)) ** 2
-    ).sqrt()
-    ragged = (
-        0.05 * torch.sin(23 * x + 11 * y) * torch.sin(19 * y + 5 * z) * torch.sin(21 * z - 9 * x)
-    )
-    return (
-        soft(across + ragged, 0.12 + 0.2 * rise, 0.1) * soft(y.abs(), 0.46, 0.08) * (1 - 0.6 * rise)
-    )
+    return fade(height, 0.11, 0.07) * fade(x.abs(), 0.45, 0.1) * fade(z.abs(), 0.45, 0.1)
 
 
 BALL, SMALL = around((0.0, 0.0, 0.0), 0.38), around((0.22, -0.18, 0.12), 0.17, 0.06)
@@ -180,7 +161,7 @@ CASES = (
     ),
     Case("thin slab", slab, 60.0, 0.99, lights=[sun((-0.5, -2.0, -0.7))], eye=(0.0, 1.6, 2.8)),
     Case("small ball off center", SMALL, 60.0, 0.99),
-    Case("plume, g 0.5", plume, 25.0, g=0.5, extent=(1.0, 1.5, 1.0), half_width=0.3),
+    Case("plume, g 0.5", plume_density, 25.0, g=0.5, extent=(1.0, 1.5, 1.0), half_width=0.3),
     Case(
         "ball, point light",
         BALL,
@@ -192,7 +173,7 @@ CASES = (
     Case("cloud in 2 x 0.5 x 1", CLOUD, 25.0, extent=(2.0, 0.5, 1.0), half_width=0.33),
     Case(
         "plume, parallel rays, from below",
-        plume,
+        plume_density,
         25.0,
         eye=BELOW,
         half_width=0.7,

@@ -1,19 +1,22 @@
 """Makes data/capture: smoke as five cameras on tripods film it, with all that cameras do to it.
 
-    python data/make_capture.py [--paths 256] [--keep TRACED.npz] [-o FOLDER]
+    python data/make_capture.py [--paths 256 | --respoil] [-o FOLDER]
 
 The smoke is that of `make_smoke.py`; Mitsuba 3 traces its pictures along ddrecon's own view rays,
-`--paths` a pixel; `--keep` is where they are kept, and taken from where they are there (with
-DRJIT_LIBLLVM_PATH Mitsuba is some ten times faster). Then each picture is spoiled: exposure, white
-balance, black level, shot noise, sRGB of 8 bits, JPEG; and each training camera is told a little
-wrong. What is true stands in truth.json and density.npz.
+`--paths` a pixel (with DRJIT_LIBLLVM_PATH it is some ten times faster). Then each picture is
+spoiled: exposure, white balance, black level, shot noise, sRGB of 8 bits, a film in H.264, of which
+one frame is taken; and each training camera is told a little wrong. What is true stands in
+truth.json and density.npz. `--respoil` takes the smoke and its pictures from the folder, where they
+are kept, and needs no Mitsuba.
+
+The film needs the extra `mp4` (imageio-ffmpeg): pip install "ddrecon[mp4]".
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import json
+import tempfile
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -52,7 +55,10 @@ TURNED, MOVED = 0.3, 0.003
 PHOTONS = 8000
 """Electrons of a pixel that is just white."""
 SUBPIXELS = 16
-QUALITY = 90
+FRAMES, TAKEN = 24, 17
+"""Frames of a film, and the one that is taken: not a first one, which alone is coded by itself."""
+QUALITY = 19
+"""The constant rate factor of H.264; 18 is hardly told from what was filmed, 23 is usual."""
 
 
 def true_cameras() -> dict[str, Camera]:
@@ -143,15 +149,29 @@ def trace(tracer: Tracer, camera: Camera, paths: int, seed: int) -> np.ndarray:
     return total / SUBPIXELS
 
 
-def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) -> bytes:
-    """The JPEG that a camera makes of the radiance `picture`."""
+def spoil(picture: np.ndarray, exposure: np.ndarray, black: float, seed: int) -> np.ndarray:
+    """The frame [h, w, 3] of 8 bits that is taken of a film of the radiance `picture`.
+
+    The smoke rises by a pixel a frame, and each frame has noise of its own.
+    """
     generator = np.random.default_rng(seed)
-    exposed = picture * exposure + black
-    noisy = generator.poisson(PHOTONS * exposed.clip(0)) / PHOTONS
-    encoded = np.round(255 * encode(noisy.clip(0, 1))).astype(np.uint8)
-    stream = io.BytesIO()
-    imageio.imwrite(stream, encoded, extension=".jpg", quality=QUALITY)
-    return stream.getvalue()
+    frames = []
+    for number in range(FRAMES):
+        exposed = np.roll(picture, TAKEN - number, axis=0) * exposure + black
+        noisy = generator.poisson(PHOTONS * exposed.clip(0)) / PHOTONS
+        frames.append(np.round(255 * encode(noisy.clip(0, 1))).astype(np.uint8))
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        # By imageio-ffmpeg, as `quality` of its own would leave the rate open.
+        imageio.imwrite(
+            film,
+            np.stack(frames),
+            codec="libx264",
+            pixelformat="yuv420p",
+            quality=None,
+            output_params=["-crf", str(QUALITY)],
+        )
+        return imageio.imread(film, index=TAKEN)
 
 
 def exposures() -> dict[str, tuple[np.ndarray, float]]:
@@ -194,12 +214,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--paths", type=int, default=256)
-    parser.add_argument("--keep", type=Path)
+    parser.add_argument("--respoil", action="store_true")
     parser.add_argument("-o", "--output", type=Path, default=FOLDER)
     given = parser.parse_args()
     folder, cameras = given.output, true_cameras()
-    if given.keep and given.keep.exists():
-        kept = dict(np.load(given.keep))
+    if given.respoil:
+        kept = {name: np.load(folder / "clean" / f"{name}.npy").astype(float) for name in cameras}
+        kept["density"] = np.load(folder / "density.npz")["density"]
     else:
         density = np.round(simulate(CELLS[::-1], STEPS, SEED) * 256) / 256
         scene = scene_of(torch.from_numpy(density), cameras)
@@ -208,8 +229,6 @@ def main() -> None:
             name: trace(tracer, camera, given.paths, seed)
             for seed, (name, camera) in enumerate(cameras.items())
         }
-        if given.keep:
-            np.savez(given.keep, **kept)
     (folder / "clean").mkdir(parents=True, exist_ok=True)
     box = np.array(BOX)
     np.savez_compressed(
@@ -217,11 +236,11 @@ def main() -> None:
     )
     told, truth, wrong = told_cameras(cameras), [], []
     for seed, (name, (exposure, black)) in enumerate(exposures().items()):
-        (folder / f"{name}.jpg").write_bytes(spoil(kept[name], exposure, black, seed))
+        imageio.imwrite(folder / f"{name}.png", spoil(kept[name], exposure, black, seed))
         np.save(folder / "clean" / f"{name}.npy", kept[name].astype(np.float16))
         known = {"exposure": exposure.tolist(), "black": black}
         truth.append(frame(cameras[name], file_path=f"clean/{name}.npy", **known))
-        wrong.append(frame(told[name], file_path=f"{name}.jpg"))
+        wrong.append(frame(told[name], file_path=f"{name}.png"))
     write_cameras(folder / "truth.json", truth, "clean")
     write_cameras(folder / "transforms.json", wrong, "")
 

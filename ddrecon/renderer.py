@@ -276,6 +276,7 @@ def _emission(light_field: LightField, bundle: Rays) -> Emission:
         medium.seen,
         medium.peak,
         medium.remaining if medium.is_cellwise else None,
+        medium.support,
     )
 
 

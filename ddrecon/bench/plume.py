@@ -21,7 +21,7 @@ def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.devic
     """A plume on `cells` x 1.5 `cells` x `cells` cells, seen by `pixels` x `pixels` pixels."""
     grid = Grid.from_xyz((cells, cells * 3 // 2, cells), (-0.5, -0.75, -0.5), (0.5, 0.75, 0.5))
     z, y, x = grid.centers(torch.zeros(()))
-    density = _plume(x, y / 1.5, z).expand(grid.shape).contiguous().to(device, dtype)
+    density = plume_density(x, y / 1.5, z).expand(grid.shape).contiguous().to(device, dtype)
     tensor = density.new_tensor
     volume = Volume(
         grid, density, tensor([SIGMA_T * (1 - ALBEDO)]), tensor([SIGMA_T * ALBEDO]), tensor(0.0)
@@ -35,7 +35,7 @@ def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.devic
     )
 
 
-def _plume(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+def plume_density(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     """Density at places from -0.5 to 0.5: a rising, widening, swaying and ragged column."""
     rise = y + 0.5
     across = (
@@ -45,12 +45,11 @@ def _plume(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         0.05 * torch.sin(23 * x + 11 * y) * torch.sin(19 * y + 5 * z) * torch.sin(21 * z - 9 * x)
     )
     return (
-        _fade(across + ragged, 0.12 + 0.2 * rise, 0.1)
-        * _fade(y.abs(), torch.tensor(0.46), 0.08)
-        * (1 - 0.6 * rise)
+        fade(across + ragged, 0.12 + 0.2 * rise, 0.1) * fade(y.abs(), 0.46, 0.08) * (1 - 0.6 * rise)
     )
 
 
-def _fade(distance: Tensor, outer: Tensor, width: float) -> Tensor:
+def fade(distance: Tensor, outer: Tensor | float, width: float) -> Tensor:
+    """1 below `outer` - `width`, falling smoothly to 0 at `outer`."""
     part = ((outer - distance) / width).clamp(0, 1)
     return part * part * (3 - 2 * part)

@@ -68,7 +68,20 @@ class Bands:
     @functools.cached_property
     def spans(self) -> list[tuple[int, int] | None]:
         """The first and the last plane where each band holds anything; None for an empty one."""
-        return _spans(self.slices.bands, self.channels.matter)
+        matter, support = self.channels.matter, self.support
+        if matter:
+            return _spans([(band[:, :matter].detach() != 0) for band in self.slices.bands])
+        if support is not None:
+            return _spans(support.split(BAND, 1))
+        return [(0, self.nodes - 1)] * len(self.slices.bands)
+
+    @property
+    def support(self) -> Tensor | None:
+        """Where matter may be in all planes, bool [N, rows, columns]; None: anywhere."""
+        support = self.channels.support
+        if support is None:
+            return None
+        return support_of_planes(support, self.axis, self.is_reversed, self.steps)
 
     @property
     def nodes(self) -> int:
@@ -162,15 +175,17 @@ def planes_across(
     return subdivide(planes.flip(0) if is_reversed else planes, steps)
 
 
-def _spans(bands: tuple[Tensor, ...], matter: int) -> list[tuple[int, int] | None]:
-    """The first and last plane where each of `bands` holds anything in its first `matter` channels.
+@remember
+def support_of_planes(support: Tensor, axis: int, is_reversed: bool, steps: int) -> Tensor:
+    """Where `support` [z, y, x] is not 0 in planes across `axis`: bool [N, rows, columns]."""
+    row, column = across(axis)
+    order = _order(support.shape[axis], is_reversed, support.device)
+    slices = (support != 0).permute(axis, row, column).index_select(0, order)
+    return subdivide(slices[:, None].float(), steps)[:, 0] > 0
 
-    All planes where `matter` is 0.
-    """
-    if not matter:
-        return [(0, len(band) - 1) for band in bands]
-    is_full = torch.stack(
-        [(band[:, :matter].detach() != 0).flatten(1).any(1) for band in bands]
-    ).tolist()
+
+def _spans(bands: Sequence[Tensor]) -> list[tuple[int, int] | None]:
+    """The first and last plane where each of `bands` [N, ...] is true anywhere."""
+    is_full = torch.stack([band.flatten(1).any(1) for band in bands]).tolist()
     planes = [[plane for plane, full in enumerate(row) if full] for row in is_full]
     return [(full[0], full[-1]) if full else None for full in planes]

@@ -26,7 +26,8 @@ class Emission:
     `diffuse` [C, z, y, x] is the radiance that scatters into the camera's rays from all light but
     beams; `seen` is p. Point lights have E = I / r^2. `peak` is the medium's: what its forward peak
     does to p (E13). `remaining`, where given, scatters diffuse light in place of kappa_s: where the
-    phase function differs from cell to cell, that is interpolated as the extinction is.
+    phase function differs from cell to cell, that is interpolated as the extinction is. Where
+    `support` [z, y, x], if given, is 0, nothing scatters, and no derivative is asked for.
     """
 
     grid: Grid
@@ -37,6 +38,7 @@ class Emission:
     seen: SeenPhase
     peak: Tensor | None
     remaining: Coefficient | None = None
+    support: Tensor | None = None
 
     @property
     def colors(self) -> int:
@@ -122,12 +124,13 @@ class Channels:
     """Fields to interpolate, each [channels, z, y, x], linearly or to `third_order`.
 
     Where the first `matter` channels are zero nothing is to be seen, and slices leave that out; 0:
-    something may be anywhere.
+    something may be anywhere, but where `support` [z, y, x] is 0.
     """
 
     fields: Sequence[Tensor]
     third_order: ThirdOrder | None = None
     matter: int = 0
+    support: Tensor | None = None
 
     @functools.cached_property
     def values(self) -> Tensor:
@@ -139,11 +142,12 @@ def pack_channels(emission: Emission) -> Channels:
     """The fields of `emission` as `Channels`: masses to third order, the others linearly.
 
     Nothing is left out as empty where the medium is varied: derivatives by the density of empty
-    cells are wanted, and must be those of what is rendered.
+    cells are wanted, and must be those of what is rendered. But for those outside of a support.
     """
     cells = Sampled.in_cells(emission)
     first = cells.extinction.shape[0] + cells.diffuse.shape[0]
     last = first + sum(mass.shape[0] for mass in cells.masses)
     third_order = ThirdOrder(first, last, emission.extinction.mass_bound) if cells.masses else None
     is_fixed = not (is_varied(cells.extinction) or is_varied(cells.scattering))
-    return Channels(cells.fields(), third_order, cells.extinction.shape[0] if is_fixed else 0)
+    matter = cells.extinction.shape[0] if is_fixed else 0
+    return Channels(cells.fields(), third_order, matter, emission.support)

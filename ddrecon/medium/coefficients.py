@@ -33,8 +33,9 @@ class Volume(Displayed):
     `density`: [z, y, x], >= 0; `sigma_a`, `sigma_s`: absorption and scattering [1/u], >= 0, each
     [C] or per cell [C, z, y, x] with C = 1 or 3; `phase`: the phase function; or in its place `g`
     in (-1, 1), the mean cosine of Henyey and Greenstein's. Tensors may be replaced or require
-    gradients. `media`: what the volume was mixed from, by name (`mixture`). Raises ValueError where
-    shapes disagree.
+    gradients. `media`: what the volume was mixed from, by name (`mixture`). `support` [z, y, x]:
+    where it is 0 the volume counts as empty, and derivatives by density are 0; None: it is 1
+    everywhere. Raises ValueError where shapes disagree.
     """
 
     grid: Grid
@@ -43,6 +44,7 @@ class Volume(Displayed):
     sigma_s: Tensor
     phase: PhaseFunction
     media: Mapping[str, Volume] | None = None
+    support: Tensor | None = None
 
     def __init__(
         self,
@@ -53,12 +55,13 @@ class Volume(Displayed):
         phase: PhaseFunction | Tensor | None = None,
         g: Tensor | None = None,
         media: Mapping[str, Volume] | None = None,
+        support: Tensor | None = None,
     ):
         phase = phase if g is None else g
         if phase is None:
             raise TypeError("a volume needs a phase function, or g")
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
-        self.media = media
+        self.media, self.support = media, support
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
         if tuple(self.density.shape) != self.grid.shape:
             raise ValueError(
@@ -120,7 +123,7 @@ class Medium:
     remains. f, g and g' are scalars, [3, 1, 1, 1] where colors differ, or [C, z, y, x] where the
     phase function does from cell to cell. `peak` is f kappa_s per unit of the extinction's field:
     times a mass, it is the depth x of E13. It is [C, 1, 1, 1], or [C, z, y, x] where anything of it
-    varies, and None without a peak.
+    varies, and None without a peak. `support` is the volume's.
     """
 
     grid: Grid
@@ -133,6 +136,7 @@ class Medium:
     forward_fraction: Tensor
     peak: Tensor | None
     seen: SeenPhase
+    support: Tensor | None = None
 
     @property
     def remaining_scattering(self) -> Tensor:
@@ -195,9 +199,8 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
     if max(sigma_a[0].numel(), sigma_s[0].numel()) > 1:
         # Of what varies from cell to cell nothing is kept that is made on the way.
         find = functools.partial(recompute, find)
-    extinction, scattering, remaining, absorption, peak = find(
-        sigma_a, sigma_s, fraction, volume.density
-    )
+    density = volume.density if volume.support is None else volume.density * volume.support
+    extinction, scattering, remaining, absorption, peak = find(sigma_a, sigma_s, fraction, density)
     return Medium(
         volume.grid,
         extinction=extinction,
@@ -209,6 +212,7 @@ def _medium(volume: Volume, seen: SeenPhase, fraction: Tensor | None) -> Medium:
         forward_fraction=fraction,
         peak=peak,
         seen=seen,
+        support=volume.support,
     )
 
 

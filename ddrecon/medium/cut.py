@@ -18,4 +18,5 @@ def cut_volume(volume: Volume) -> Volume:
     phase = volume.phase
     if phase.cells is not None:
         phase = phase.with_cells(slab.cut(phase.cells))
-    return Volume(slab, density, sigma_a, sigma_s, phase)
+    support = None if volume.support is None else slab.cut(volume.support)
+    return Volume(slab, density, sigma_a, sigma_s, phase, support=support)

@@ -1,13 +1,14 @@
 """All that is sought, moved together: steps of Gauss and Newton over cells and numbers (E43).
 
 A volume learns what is wrong with its cameras, exposures and lights, and then holds them there:
-moved in turn, each finds that the others are right. Together they go to the least of the objective
-as it is to first order in the pictures, within bounds and without what no picture shows.
+moved in turn, each finds that the others are right. Together they go to what fits the pictures
+best, to first order, within bounds and without what no picture shows. Smoothing then moves cells
+alone (E55): a dim lamp, thick smoke and tilted exposures look like what is true, and are smoother.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -26,8 +27,8 @@ from ddrecon.variables.values import with_values
 
 TOLERANCE = 0.1
 """How small a step's residual is to be, of what it was."""
-MOST = 24
-"""Products with J^T W J that a step may take."""
+MOST = 12
+"""Products with J^T W J that each of its two parts may take."""
 LENGTHS = (1.0, 0.5, 0.25, 0.125)
 """Parts of a step that are tried until the objective falls."""
 
@@ -49,28 +50,46 @@ def step_together(
     gauges: Sequence[Gauge],
     solutions: Mapping[tuple[str, int], Tensor],
 ) -> None:
-    """Takes `parameters` part of the way, or all, to the least of the objective's quadratic.
+    """Takes `parameters` part of the way, or all, to what fits best, and fields to the least there.
 
     `targets` are those of the views of `scene`, `power` is the unit of penalties; `solutions` are
-    near to the light. Nothing moves where the objective would not fall.
+    near to the light. Nothing moves by pictures where these would not be fitted better.
     """
     curvature = Curvature(scene, parameters, targets, power, solutions)
     objective = _Objective(curvature, targets, power)
-    change = curvature.split(_find_change(curvature, objective))
-    before, now = {p.name: p.value for p in parameters}, objective.at(curvature.images)
+    of_all, of_fields = (curvature.split(change) for change in _find_changes(curvature, objective))
+    fit = objective.misfit(curvature.images)
+    images = _descend(curvature, of_all, gauges, objective.misfit, fit) or curvature.images
+    _descend(curvature, of_fields, [], objective.at, objective.at(images))
+
+
+def _descend(
+    curvature: Curvature,
+    change: Mapping[str, Tensor],
+    gauges: Sequence[Gauge],
+    value_of: Callable[[Mapping[str, Tensor]], float],
+    now: float,
+) -> dict[str, Tensor] | None:
+    """Moves parameters by the largest part of `change` for which `value_of` images is below `now`.
+
+    Returns their images [3, h, w] by view; None where there is no such part, and nothing moves.
+    """
+    before = {p.name: p.value.detach() for p in curvature.parameters}
     for length in LENGTHS:
-        for p in parameters:
-            _move(p, before[p.name].detach(), length * change[p.name])
+        for p in curvature.parameters:
+            _move(p, before[p.name], length * change[p.name])
         for gauge in gauges:
             gauge.hold()
-        if objective.at(_render(curvature)) < now:
-            return
-    for p in parameters:
-        p.value = before[p.name]
+        images = _render(curvature)
+        if value_of(images) < now:
+            return images
+    for p in curvature.parameters:
+        p.value = before[p.name].requires_grad_()
+    return None
 
 
 class _Objective:
-    """What a step makes less: the loss of all views, penalties, and how far cameras are moved.
+    """What a step makes less: the loss of all views, how far cameras are moved, and penalties.
 
     The views are those of `curvature`, and so are the parameters; `targets` are by view, `power` is
     the unit of penalties. `held` [6, 6] is how strongly each camera's calibration counts, by name.
@@ -79,11 +98,10 @@ class _Objective:
     def __init__(self, curvature: Curvature, targets: Mapping[str, Target], power: float):
         self.curvature, self.targets, self.power = curvature, targets, power
         self.parameters = curvature.parameters
-        self.levels = {p.name: _level(p.value.detach()) for p in self.parameters if p.tv}
         self.held = _weigh_calibrations(curvature)
 
-    def at(self, images: Mapping[str, Tensor]) -> float:
-        """Its value where the parameters are now, which the `images` [3, h, w] by view are of."""
+    def misfit(self, images: Mapping[str, Tensor]) -> float:
+        """Its value but for penalties, with parameters as they are and their `images` by view."""
         views = self.curvature.scene.views
         total = sum(view.weight for view in views)
         with torch.no_grad():
@@ -91,37 +109,56 @@ class _Objective:
                 view.weight / total * self.targets[view.name].loss_of(images[view.name])
                 for view in views
             ]
-            parts.append(self.power * _penalties(self.parameters, self.levels))
             cameras = [p for p in self.parameters if p.name in self.held]
             parts += [p.value @ self.held[p.name] @ p.value / 2 for p in cameras]
         return float(sum(parts))
 
-    def gradient(self) -> Tensor:
-        """Its derivative [n] where `curvature` is."""
+    def at(self, images: Mapping[str, Tensor]) -> float:
+        """Its value, with parameters as they are and their `images` [3, h, w] by view."""
+        return self.misfit(images) + float(self._penalties().detach())
+
+    def misfit_gradient(self) -> Tensor:
+        """The derivative [n] of `misfit` where `curvature` is."""
         curvature, views = self.curvature, list(self.curvature.scene.views)
         leaves, memory = {p.name: p.value for p in self.parameters}, curvature.new_memory()
         compared, names = Comparison(views, self.targets), [view.name for view in views]
         found = differentiate(curvature.scene, names, leaves, compared, memory).gradients
-        penalties = self.power * _penalties(self.parameters, self.levels)
-        if penalties.requires_grad:
-            bars = torch.autograd.grad(penalties, list(leaves.values()), allow_unused=True)
-            found = {
-                n: found[n] if bar is None else found[n] + bar
-                for n, bar in zip(leaves, bars, strict=True)
-            }
         told = {n: held @ leaves[n].detach() for n, held in self.held.items()}
         return curvature.join(found) + curvature.join(told)
 
+    def penalty_gradient(self) -> Tensor:
+        """The derivative [n] of all penalties where `curvature` is."""
+        penalties, leaves = self._penalties(), {p.name: p.value for p in self.parameters}
+        if not penalties.requires_grad:
+            return self.curvature.join({})
+        bars = torch.autograd.grad(penalties, list(leaves.values()), allow_unused=True)
+        found = zip(leaves, bars, strict=True)
+        return self.curvature.join({name: bar for name, bar in found if bar is not None})
 
-def _find_change(curvature: Curvature, objective: _Objective) -> Tensor:
-    """How all parameters are to move [n], to the least of the quadratic of `objective`."""
-    gradient, misfit = objective.gradient(), _misfit(curvature, objective.targets)
-    posterior = Posterior(curvature, gradient, misfit, seed=0)
+    def _penalties(self) -> Tensor:
+        return self.power * sum((p.penalty() for p in self.parameters), torch.zeros(()))
+
+
+def _find_changes(curvature: Curvature, objective: _Objective) -> tuple[Tensor, Tensor]:
+    """How all parameters are to move by pictures alone, and then fields by all [n] (E55).
+
+    To the least of the quadratic of the misfit, and with numbers as they then are to that of
+    `objective`. Smoothing counts as its curvature in both.
+    """
+    gradient, penalty = objective.misfit_gradient(), objective.penalty_gradient()
+    posterior = Posterior(curvature, gradient, _misfit(curvature, objective.targets), seed=0)
     # Cameras err from where a calibration put them; all else is held only about where it is.
     posterior.prior.held.update(objective.held)
-    posterior.tolerance = TOLERANCE * posterior.size(-gradient, posterior.is_kept)
     posterior.most = MOST
-    return posterior.minimize(torch.zeros_like(gradient), -gradient)[0]
+
+    def minimize(change: Tensor, lacking: Tensor) -> Tensor:
+        posterior.tolerance = TOLERANCE * posterior.size(lacking, posterior.is_kept)
+        return posterior.minimize(change, lacking)[0]
+
+    fitted = minimize(torch.zeros_like(gradient), -gradient)
+    posterior.is_kept = posterior.is_kept | posterior.is_number
+    smoothed = minimize(fitted, -gradient - penalty - posterior.product(fitted))
+    return fitted, smoothed - fitted
 
 
 def _move(parameter: Parameter, start: Tensor, change: Tensor) -> None:
@@ -130,24 +167,6 @@ def _move(parameter: Parameter, start: Tensor, change: Tensor) -> None:
     if parameter.is_direction:
         value = value * (start.norm() / value.norm())
     parameter.value = value.clamp(parameter.low, parameter.high).requires_grad_()
-
-
-def _penalties(parameters: Sequence[Parameter], levels: Mapping[str, Tensor]) -> Tensor:
-    """What regularizers add, of smoothed fields as if their means were still `levels`, by name.
-
-    A dim lamp and thick smoke look like a bright one and thin smoke, which is the smoother: what
-    lamp and smoke are is for pictures to say (after Krishnan et al. 2011,
-    doi:10.1109/CVPR.2011.5995521).
-    """
-    total = torch.zeros(())
-    for p in parameters:
-        factor = levels[p.name] / _level(p.value) if p.tv else 1.0
-        total = total + p.penalty(factor)
-    return total
-
-
-def _level(field: Tensor) -> Tensor:
-    return field.mean().clamp(min=torch.finfo(field.dtype).tiny)
 
 
 def _weigh_calibrations(curvature: Curvature) -> dict[str, Tensor]:

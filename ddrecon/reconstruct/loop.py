@@ -235,12 +235,16 @@ class Reconstruction:
         )
         self.noise_targets = setup.noise_targets(self.train_level, self.train, self.noises)
         grid = self.train_level.volume.grid
+        support = None if self.support is None else self.support.on(grid)
+        if support is not None:
+            for level in (self.train_level, self.test_level):
+                level.volume = replace(level.volume, support=support)
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
             parameter.curvature = None
-            if parameter.name == "density" and self.support is not None:
-                parameter.restrict(self.support.on(grid))
+            if parameter.name == "density" and support is not None:
+                parameter.restrict(support)
         self.memory.last = resample_solutions(self.memory.last, grid)
 
     def _views(self) -> list[View]:
@@ -278,7 +282,7 @@ class Reconstruction:
         values = {name: value.detach() for name, value in self._values().items()}
         names = {view.name for view in compared.views}
         seen = [p for p in self.parameters if p.view is None or p.view in names]
-        solved = step_parameters(seen, gradients, self.schedule, self.iteration)
+        solved = step_parameters(seen, gradients, self.schedule, self.iteration, self.power)
         about = self.train_level, values, self.targets, self.memory.last
         solve_numbers(solved, gradients, compared, *about, self.iteration)
         for gauge in self.gauges:

@@ -20,6 +20,7 @@ from ddrecon.ranks import (
     rank_count,
     sum_over_ranks,
     swap_with_neighbors,
+    trade_with_ranks,
 )
 from ddrecon.slabs.slab import Slab
 
@@ -55,6 +56,15 @@ def gather_parts(part: Tensor) -> Tensor:
 def sum_slabs(part: Tensor) -> Tensor:
     """The sum over ranks of `part`, any shape, differentiable (E40)."""
     total: Tensor = _Sum.apply(part)
+    return total
+
+
+def sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
+    """The sum of `part` [K, R] over the ranks before this one, differentiable (E40).
+
+    Those are the ranks below where ray R `is_upwards`, else the ranks above.
+    """
+    total: Tensor = _SumBefore.apply(part, is_upwards)
     return total
 
 
@@ -163,6 +173,43 @@ class _Sum(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, d_part: Tensor) -> Tensor:
         return sum_over_ranks([d_part])[0]
+
+
+class _SumBefore(torch.autograd.Function):
+    """The sum over the ranks before; its transpose is that over the ranks after."""
+
+    @staticmethod
+    def forward(part: Tensor, is_upwards: Tensor) -> Tensor:
+        return _sum_before(part, is_upwards)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.is_upwards = inputs[1]
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor, None]:
+        return _sum_before(total_bar, ~ctx.is_upwards), None
+
+    @staticmethod
+    def jvp(ctx: Any, d_part: Tensor, _: None) -> Tensor:
+        return _sum_before(d_part, ctx.is_upwards)
+
+
+def _sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
+    """Each rank adds up some of the rays for all ranks: so bytes do not grow with their number."""
+    ranks, (fields, rays) = rank_count(), part.shape
+    share = -(-rays // ranks)
+
+    def of_all(values: Tensor) -> Tensor:
+        return pad(values, (0, share * ranks - rays)).unflatten(-1, (ranks, share))
+
+    parts = trade_with_ranks(of_all(part).transpose(0, 1))
+    nothing = torch.zeros_like(parts[:1])
+    up = torch.cat([nothing, parts[:-1]]).cumsum(0)
+    down = torch.cat([nothing, parts[1:].flip(0)]).cumsum(0).flip(0)
+    before = trade_with_ranks(torch.where(of_all(is_upwards)[own_rank()], up, down))
+    return before.transpose(0, 1).reshape(fields, -1)[:, :rays]
 
 
 class _Swap(torch.autograd.Function):

@@ -92,6 +92,17 @@ def test_nothing_moves_at_the_optimum(scene: Scene) -> None:
         torch.testing.assert_close(p.value, before[p.name], rtol=1e-6, atol=1e-9)
 
 
+def test_smoothing_moves_cells_alone(scene: Scene) -> None:
+    """Where pictures are shown perfectly, numbers stay, however strongly fields are smoothed."""
+    parameters = parameters_of(scene, scene.volume.density, 1.3)
+    parameters[0].tv = 0.01
+    before = {p.name: (p.value.detach(), float(p.penalty().detach())) for p in parameters}
+    step(scene, parameters)
+    assert float(parameters[0].penalty().detach()) < 0.99 * before["density"][1]
+    for p in parameters[1:]:
+        torch.testing.assert_close(p.value.detach(), before[p.name][0], rtol=1e-6, atol=0)
+
+
 def test_only_runs_that_seek_cameras_and_a_field_take_them(scene: Scene) -> None:
     field, *gains = parameters_of(scene, scene.volume.density, 1.0)
     assert moves_together([field, *gains], "display")

@@ -29,7 +29,7 @@ from ddrecon.slabs.slab import Slab
 REACH = 1
 """Layers of a neighbor from which a step may begin."""
 Work = Callable[[int, Tensor], Tensor]
-"""What is done for a direction, by its number and what enters the slab; it returns what leaves."""
+"""What is done for directions, by their number and what enters the slab; it returns what leaves."""
 
 
 def radiance_through(
@@ -69,18 +69,16 @@ def radiance_through(
     return (gained if inflow is None else gained + inflow), leaving
 
 
-def pass_on(
-    grid: Grid,
-    directions: Sequence[Direction],
-    nothing: Tensor,
-    work: Work,
-    is_backward: bool = False,
-) -> None:
-    """Does the `work` of all `directions`; in slabs, as what leaves one has entered the next.
+def ways_through(grid: Grid, directions: Sequence[Direction]) -> list[int]:
+    """1 for those `directions` that go from the slab to the next, -1 to the last, 0 to none."""
+    return [_way(grid, direction) if isinstance(grid, Slab) else 0 for direction in directions]
+
+
+def pass_on(ways: Sequence[int], nothing: Tensor, work: Work, is_backward: bool = False) -> None:
+    """Does the `work` of what goes `ways_through` slabs, as what leaves one has entered the next.
 
     `nothing` enters the first; with `is_backward`, all goes the other way.
     """
-    ways = [_way(grid, direction) if isinstance(grid, Slab) else 0 for direction in directions]
     for number, way in enumerate(ways):
         if way == 0:
             work(number, nothing)
@@ -92,13 +90,15 @@ def pass_on(
     )
     below, above = nothing, nothing
     rank, last = own_rank(), rank_count() - 1
-    for turn in range(max(len(upwards), len(downwards)) + last):
+    turns = max(len(upwards), len(downwards)) + last
+    for turn in range(turns):
         # Its turn comes to a rank as many turns later as ranks are before it.
         to_above = _at(upwards, turn - rank, below, work)
         to_below = _at(downwards, turn - (last - rank), above, work)
-        below, above = swap_layers(
-            nothing if to_below is None else to_below, nothing if to_above is None else to_above
-        )
+        if turn + 1 < turns:
+            below, above = swap_layers(
+                nothing if to_below is None else to_below, nothing if to_above is None else to_above
+            )
 
 
 def _at(numbers: Sequence[int], place: int, entering: Tensor, work: Work) -> Tensor | None:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
-from ddrecon.diffusion.rounds.slabs import REACH, pass_on, radiance_through
+from ddrecon.diffusion.rounds.slabs import REACH, pass_on, radiance_through, ways_through
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
@@ -142,7 +142,8 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    runs_fused = is_fused() and not isinstance(medium.grid, Slab)
+    # On a GPU, fused kernels go through whole grids alone.
+    runs_fused = is_fused() and not (isinstance(medium.grid, Slab) and light.mean.is_cuda)
     if runs_fused and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
@@ -207,8 +208,8 @@ class _Sweep(torch.autograd.Function):
             return nothing if bars[0] is None else bars[0]
 
         nothing = parts.nothing(ctx.medium.grid).detach()
-        directions = [ray.direction for ray in rays]
-        pass_on(ctx.medium.grid, directions, nothing, send_back, is_backward=True)
+        ways = ways_through(ctx.medium.grid, [ray.direction for ray in rays])
+        pass_on(ways, nothing, send_back, is_backward=True)
         remaining = iter(totals)
         part_bars = (
             None if leaf is None or not leaf.requires_grad else next(remaining) for leaf in leaves
@@ -231,7 +232,7 @@ def _sum_over_directions(
         add_outer(moments, ray.weight * ray.harmonics, radiance)
         return leaving
 
-    pass_on(grid, [ray.direction for ray in rays], parts.nothing(grid), add)
+    pass_on(ways_through(grid, [ray.direction for ray in rays]), parts.nothing(grid), add)
     return moments, entered
 
 

@@ -11,7 +11,7 @@ import warp as wp
 
 from ddrecon.march.fused.emission import emission, emission_adjoint
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.rays import loading, masses, ray_types, vectors
+from ddrecon.march.fused.rays import loading, masses, ray_types, vectors, walking
 from ddrecon.march.fused.sampling import sampling, slopes
 from ddrecon.march.fused.segments import arrival_adjoint
 from ddrecon.march.fused.stops import stops
@@ -28,7 +28,7 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
     load_ray, stop, emit = loading(layout), stops(layout, is_sliced), emission(layout)
     arrive_adjoint, emit_adjoint = arrival_adjoint(layout), emission_adjoint(layout)
     mass_adjoint, store = _mass_adjoint(layout), _storing(layout, varies_rays)
-    leave = _leaving(layout, is_sliced, varies_rays)
+    leave, walks = _leaving(layout, is_sliced, varies_rays), walking(layout)
 
     @wp.kernel(enable_backward=False, module="unique")
     def transpose(
@@ -54,22 +54,23 @@ def adjoint_kernel(layout: Layout, is_sliced: bool, varies_rays: bool) -> Any:
         count = given.planes.shape[0]
         for step in range(count + 1):
             n = count - 1 - step
+            has_a, has_b = walks(given, r, n), walks(given, r, n + 1)
             a, a_bar = records.Stop(), records.Stop()
             m = behind
-            if n >= 0:
+            if has_a:
                 # As on the walk out.
                 a = stop(given, ray, n)
-                if step > 0:
+                if has_b:
                     m = passed.add_mass(behind, a.v, b.v, a.held - b.held)
                 a = emit(ray, a, passed.mass_of(m), given)
-            if step > 0:
-                if n >= 0:
+            if has_b:
+                if has_a:
                     ray_bar, a_bar, b_bar = arrive_adjoint(ray, a, b, bar, ray_bar, a_bar, b_bar)
                 mass = passed.mass_of(behind)
                 ray_bar, b_bar, m_bar = emit_adjoint(
                     ray, b, mass, given, ray_bar, b_bar, m_bar, bars
                 )
-                if n >= 0:
+                if has_a:
                     a_bar, b_bar = mass_adjoint(a, b, m_bar, a_bar, b_bar)
                 ray_bar = leave(given, ray, b, n + 1, ray_bar, b_bar, bars)
             b = a

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ddrecon.march.bands import Bands
 from ddrecon.march.equidistant import Equidistant
+from ddrecon.march.fused.stretches import find_walked
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
@@ -20,11 +21,14 @@ class Cells:
 
     `planes` [N]: nodes, across the slices [u] or as parts of the way from near to far. `order` [N]
     (int32) are the slices across `axis` in which these lie; None where rays meet no slices.
+    `support` [N, rows, columns] is whether there may be matter in the slices of nodes; None: there
+    may be.
     """
 
     planes: Tensor
     axis: int = 0
     order: Tensor | None = None
+    support: Tensor | None = None
 
     @property
     def is_sliced(self) -> bool:
@@ -42,6 +46,10 @@ class Cells:
             "rows": shape[row - 3],
             "columns": shape[column - 3],
         }
+
+    def walked(self, rays: Tensor) -> Tensor | None:
+        """The segments that packets of `rays` are to walk, as `find_walked` has them; None: all."""
+        return None if self.support is None else find_walked(self.support, self.planes, rays)
 
     def pack(self, fields: Sequence[Tensor]) -> Tensor:
         """Values [n, h, w, channels] of all `fields`, in the order in which rays meet them."""
@@ -74,9 +82,10 @@ def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
         like = fields[0]
         planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
         return Cells(planes), fields
+    support, planes = sampler.support, sampler.planes
     if sampler.steps == 1:
-        return Cells(sampler.planes, sampler.axis, _short(sampler.order)), fields
+        return Cells(planes, sampler.axis, _short(sampler.order), support), fields
     # Slices between those of cells are interpolated beforehand.
-    whole = sampler.slices
-    order = torch.arange(sampler.nodes, dtype=torch.int32, device=whole.planes.device)
-    return Cells(whole.planes, 0, order), [torch.cat(whole.bands, 2).transpose(0, 1)]
+    bands = torch.cat(sampler.slices.bands, 2).transpose(0, 1)
+    order = torch.arange(sampler.nodes, dtype=torch.int32, device=planes.device)
+    return Cells(planes, 0, order, support), [bands]

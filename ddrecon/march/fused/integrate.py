@@ -107,6 +107,7 @@ def _change(
     bundles = [
         _bundle(layout, cells.planes, cells.pack(part[6:]), *part[:6]) for part in (values, whole)
     ]
+    _leave_out(cells, values[0], bundles[0])
     arguments = [*bundles, array(d_out), array(d_masses)]
     launch(tangent_kernel(layout, cells.is_sliced), len(d_out[0]), arguments, d_out)
     return d_out, d_masses
@@ -146,6 +147,7 @@ def _transpose(
     varied = rays, angles, coefficients, numbers, table, fronts
     packed, fronts_bar = cells.pack(fields), torch.zeros_like(fronts)
     given = _bundle(layout, cells.planes, packed, *varied)
+    _leave_out(cells, rays, given)
     bars = [torch.zeros_like(x if varies_rays else x[:0]) for x in (rays, angles, coefficients)]
     numbers_bar = rays.new_empty(len(numbers), len(rays))
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
@@ -208,6 +210,8 @@ def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -
     given["fronts"] = fronts if fronts.numel() else None
     given |= cells.strides(fields[0].shape)
     given |= {"ray_count": len(varied[0]), "node_count": len(cells.planes)}
+    walked = cells.walked(varied[0])
+    given |= {"walked": walked, "words": 0 if walked is None else walked.shape[1]}
     return given | {"fields": _channels(fields, fields)}
 
 
@@ -227,3 +231,11 @@ def _bundle(layout: Layout, *tensors: Tensor) -> Any:
     for name, tensor in zip(names, tensors, strict=True):
         setattr(bundle, name, array(tensor))
     return bundle
+
+
+def _leave_out(cells: Cells, rays: Tensor, bundle: Any) -> None:
+    """Tells the record `bundle` which segments of `rays` are to be walked, unless all are."""
+    walked = cells.walked(rays)
+    if walked is not None:
+        bundle.walked = array(walked)
+        bundle.lanes = cut(len(rays), LANES, rays)[1]

@@ -13,10 +13,11 @@ from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
 from ddrecon.march.fused.packet_cellwise import RUNGS, SEE
 from ddrecon.march.fused.packet_layout import layout_constants
 from ddrecon.march.fused.packet_optics import CUBICS, DECAYS, POINTS, POLYNOMIALS
+from ddrecon.march.fused.stretches import WALKS
 
 GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices;
-int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride;
+F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked;
+int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride, words;
 """
 """As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells. Without `fronts`
 there is no mass before the rays.
@@ -75,6 +76,18 @@ int first_node = 0, last_node = node_count - 1;
 while (first_node < last_node && P::every(distance(first_node + 1) <= ray.near)) ++first_node;
 while (last_node > first_node && P::every(distance(last_node - 1) >= ray.far)) --last_node;
 if (P::every(ray.near >= ray.far)) last_node = first_node;
+// The next stretch of segments to be walked behind node `to`, and the one before node `from`: nodes
+// `from` to `to`; whether there is one.
+auto next_stretch = [&](int& from, int& to) -> bool {
+    for (from = to; from < last_node && !walks(from + 1);) ++from;
+    for (to = from; to < last_node && walks(to + 1);) ++to;
+    return from < to;
+};
+auto stretch_before = [&](int& from, int& to) -> bool {
+    for (to = from; to > first_node && !walks(to);) --to;
+    for (from = to; from > first_node && walks(from);) --from;
+    return from < to;
+};
 // Along y the packet's rays are closer together than along x.
 Lines lines = {rows, columns, row_stride, column_stride};
 if (LANES > 1) {
@@ -270,7 +283,7 @@ def packet_kernel(
     structs = PLACES + RUNS + ROWS + VALUES + optics + _RECORDS
     chosen = "const F* const* fields = all_fields;" if changes else ""
     constants = layout_constants(layout, has_slopes)
-    text = constants + structs + chosen + _BEGIN + SEE + _EMIT + walk
+    text = constants + structs + chosen + WALKS + _BEGIN + SEE + _EMIT + walk
     fields = f"all_fields[{2 * layout.channels}]" if changes else f"fields[{layout.channels}]"
     declared = f"{GIVEN} F *{fields}; {given}"
     return TextKernel(name, layout.bits, text, declared, packet_program)

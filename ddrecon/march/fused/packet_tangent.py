@@ -127,38 +127,40 @@ for (int k = 0; k < EXTINCTION; ++k) {
 }
 Node nodes[2], changes[2];
 Node *a = nodes, *b = nodes + 1, *d_a = changes, *d_b = changes + 1;
-locate(first_node, *a);
-locate_change(first_node, *a, *d_a);
-a->is_lit = false;
-for (int n = first_node + 1; n <= last_node; ++n) {
-    locate(n, *b);
-    locate_change(n, *b, *d_b);
-    b->is_lit = !(a->is_empty && b->is_empty);
-    if (b->is_lit) {
-        if (!a->is_lit) {
-            emit(n - 1, *a, m, turns);
-            emit_change(n - 1, *a, *d_a, m, d_m);
+for (int from, to = first_node; next_stretch(from, to);) {
+    locate(from, *a);
+    locate_change(from, *a, *d_a);
+    a->is_lit = false;
+    for (int n = from + 1; n <= to; ++n) {
+        locate(n, *b);
+        locate_change(n, *b, *d_b);
+        b->is_lit = !(a->is_empty && b->is_empty);
+        if (b->is_lit) {
+            if (!a->is_lit) {
+                emit(n - 1, *a, m, turns);
+                emit_change(n - 1, *a, *d_a, m, d_m);
+            }
+            // The mass passed on the way to the next node, and what it emits behind that.
+            for (int k = 0; k < EXTINCTION; ++k) {
+                m[k] += mass_between(*a, *b, k);
+                d_m[k] += F(0.5) * (d_a->v[k] + d_b->v[k]) * (b->t - a->t);
+            }
+            emit(n, *b, m, turns);
+            emit_change(n, *b, *d_b, m, d_m);
+            // E2, E3: what arrives from the segment between both.
+            for (int i = 0; i < OUT; ++i) {
+                V by_a, by_b;
+                const V decay
+                    = Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
+                const V brighter = (d_a->w[i] + d_b->w[i]) * decay;
+                const V deeper = (a->w[i] + b->w[i]) * (by_a * d_a->u[i] + by_b * d_b->u[i]);
+                total[i] += F(0.5) * measure(*a, *b, i) * (brighter + deeper);
+            }
         }
-        // The mass passed on the way to the next node, and what it emits behind that.
-        for (int k = 0; k < EXTINCTION; ++k) {
-            m[k] += mass_between(*a, *b, k);
-            d_m[k] += F(0.5) * (d_a->v[k] + d_b->v[k]) * (b->t - a->t);
-        }
-        emit(n, *b, m, turns);
-        emit_change(n, *b, *d_b, m, d_m);
-        // E2, E3: what arrives from the segment between both.
-        for (int i = 0; i < OUT; ++i) {
-            V by_a, by_b;
-            const V decay
-                = Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
-            const V brighter = (d_a->w[i] + d_b->w[i]) * decay;
-            const V deeper = (a->w[i] + b->w[i]) * (by_a * d_a->u[i] + by_b * d_b->u[i]);
-            total[i] += F(0.5) * measure(*a, *b, i) * (brighter + deeper);
-        }
+        Node *passed = a, *d_passed = d_a;
+        a = b, d_a = d_b;
+        b = passed, d_b = d_passed;
     }
-    Node *passed = a, *d_passed = d_a;
-    a = b, d_a = d_b;
-    b = passed, d_b = d_passed;
 }
 for (int l = 0; l < LANES && begin + l <= last; ++l) {
     for (int i = 0; i < OUT; ++i)

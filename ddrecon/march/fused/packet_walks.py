@@ -21,26 +21,28 @@ for (int k = 0; k < EXTINCTION; ++k) m[k] = P::wide(front_of(fronts, k));
 Node nodes[2];
 Node* a = nodes;
 Node* b = nodes + 1;
-locate(first_node, *a);
-a->is_lit = false;
-for (int n = first_node + 1; n <= last_node; ++n) {
-    locate(n, *b);
-    b->is_lit = !(a->is_empty && b->is_empty);
-    // Between empty nodes nothing is added: what light there is does not matter.
-    if (b->is_lit) {
-        if (!a->is_lit) emit(n - 1, *a, m);
-        // The mass passed on the way to the next node, and what it emits behind that.
-        for (int k = 0; k < EXTINCTION; ++k) m[k] += mass_between(*a, *b, k);
-        emit(n, *b, m);
-        // E2, E3: what arrives from the segment between both.
-        for (int i = 0; i < OUT; ++i) {
-            const V decay = Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i]);
-            total[i] += F(0.5) * (a->w[i] + b->w[i]) * measure(*a, *b, i) * decay;
+for (int from, to = first_node; next_stretch(from, to);) {
+    locate(from, *a);
+    a->is_lit = false;
+    for (int n = from + 1; n <= to; ++n) {
+        locate(n, *b);
+        b->is_lit = !(a->is_empty && b->is_empty);
+        // Between empty nodes nothing is added: what light there is does not matter.
+        if (b->is_lit) {
+            if (!a->is_lit) emit(n - 1, *a, m);
+            // The mass passed on the way to the next node, and what it emits behind that.
+            for (int k = 0; k < EXTINCTION; ++k) m[k] += mass_between(*a, *b, k);
+            emit(n, *b, m);
+            // E2, E3: what arrives from the segment between both.
+            for (int i = 0; i < OUT; ++i) {
+                const V decay = Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i]);
+                total[i] += F(0.5) * (a->w[i] + b->w[i]) * measure(*a, *b, i) * decay;
+            }
         }
+        Node* passed = a;
+        a = b;
+        b = passed;
     }
-    Node* passed = a;
-    a = b;
-    b = passed;
 }
 for (int l = 0; l < LANES && begin + l <= last; ++l) {
     for (int i = 0; i < OUT; ++i)
@@ -159,54 +161,52 @@ Node nodes[2];
 Node* a = nodes;
 Node* b = nodes + 1;
 V a_bar[CHANNELS], b_bar[CHANNELS], wa_bar[OUT], wb_bar[OUT], ua_bar[OUT], ub_bar[OUT];
-for (int c = 0; c < CHANNELS; ++c) b_bar[c] = none;
-for (int i = 0; i < OUT; ++i) wb_bar[i] = ub_bar[i] = none;
-if (first_node < last_node) {
-    locate(last_node, *b);
-    emit(last_node, *b, m, varies_polynomials);
-}
-// Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
-for (int n = last_node - 1; n >= first_node; --n) {
-    W m_b[EXTINCTION];
-    locate(n, *a);
-    for (int k = 0; k < EXTINCTION; ++k) {
-        m_b[k] = m[k];
-        m[k] -= mass_between(*a, *b, k);
+for (int from = last_node, to; stretch_before(from, to);) {
+    for (int c = 0; c < CHANNELS; ++c) b_bar[c] = none;
+    for (int i = 0; i < OUT; ++i) wb_bar[i] = ub_bar[i] = none;
+    locate(to, *b);
+    emit(to, *b, m, varies_polynomials);
+    // Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
+    for (int n = to - 1; n >= from; --n) {
+        W m_b[EXTINCTION];
+        locate(n, *a);
+        for (int k = 0; k < EXTINCTION; ++k) {
+            m_b[k] = m[k];
+            m[k] -= mass_between(*a, *b, k);
+        }
+        emit(n, *a, m, varies_polynomials);
+        const bool is_empty = a->is_empty && b->is_empty;
+        for (int i = 0; i < OUT; ++i) {
+            V by_a = none, by_b = none;
+            const V decay = is_empty
+                ? Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i])
+                : Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
+            const V half = F(0.5) * bar[i] * measure(*a, *b, i);
+            const V both = half * (a->w[i] + b->w[i]);
+            wa_bar[i] = half * decay;
+            wb_bar[i] += wa_bar[i];
+            ua_bar[i] = both * by_a;
+            ub_bar[i] += both * by_b;
+        }
+        finish(n + 1, *b, m_b, b_bar, wb_bar, ub_bar, m_bar);
+        // Its mass is that of node a and half the sum of extinctions, by the length.
+        for (int c = 0; c < CHANNELS; ++c) a_bar[c] = none;
+        for (int k = 0; k < EXTINCTION; ++k) {
+            a_bar[k] = F(0.5) * m_bar[k] * (b->t - a->t);
+            b_bar[k] += a_bar[k];
+        }
+        spread(n + 1, *b, b_bar);
+        for (int c = 0; c < CHANNELS; ++c) b_bar[c] = a_bar[c];
+        for (int i = 0; i < OUT; ++i) {
+            wb_bar[i] = wa_bar[i];
+            ub_bar[i] = ua_bar[i];
+        }
+        Node* passed = b;
+        b = a;
+        a = passed;
     }
-    emit(n, *a, m, varies_polynomials);
-    const bool is_empty = a->is_empty && b->is_empty;
-    for (int i = 0; i < OUT; ++i) {
-        V by_a = none, by_b = none;
-        const V decay = is_empty
-            ? Decay::mean(a->u[i], b->u[i], a->decay[i], b->decay[i])
-            : Decay::slopes(a->u[i], b->u[i], a->decay[i], b->decay[i], by_a, by_b);
-        const V half = F(0.5) * bar[i] * measure(*a, *b, i);
-        const V both = half * (a->w[i] + b->w[i]);
-        wa_bar[i] = half * decay;
-        wb_bar[i] += wa_bar[i];
-        ua_bar[i] = both * by_a;
-        ub_bar[i] += both * by_b;
-    }
-    finish(n + 1, *b, m_b, b_bar, wb_bar, ub_bar, m_bar);
-    // Its mass is that of node a and half the sum of extinctions, by the length.
-    for (int c = 0; c < CHANNELS; ++c) a_bar[c] = none;
-    for (int k = 0; k < EXTINCTION; ++k) {
-        a_bar[k] = F(0.5) * m_bar[k] * (b->t - a->t);
-        b_bar[k] += a_bar[k];
-    }
-    spread(n + 1, *b, b_bar);
-    for (int c = 0; c < CHANNELS; ++c) b_bar[c] = a_bar[c];
-    for (int i = 0; i < OUT; ++i) {
-        wb_bar[i] = wa_bar[i];
-        ub_bar[i] = ua_bar[i];
-    }
-    Node* passed = b;
-    b = a;
-    a = passed;
-}
-if (first_node < last_node) {
-    finish(first_node, *b, m, b_bar, wb_bar, ub_bar, m_bar);
-    spread(first_node, *b, b_bar);
+    finish(from, *b, m, b_bar, wb_bar, ub_bar, m_bar);
+    spread(from, *b, b_bar);
 }
 for (int c = 0; c < C; ++c) {
     numbers_bar[c * packets + item] = P::sum(scale_bar[c]);

@@ -49,7 +49,8 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         a point light, then its square distance; `coefficients` [beams * phases * COEFFICIENTS, R]:
         the polynomials of E13; `numbers`: scale and peak by color, bound of third-order
         corrections; `table` [phases * (steps + 1) * 2, terms]: those of point lights by angle;
-        `fronts` [K, R]: the mass before the rays begin, of none where R is 0.
+        `fronts` [K, R]: the mass before the rays begin, of none where R is 0; `walked` [packets,
+        words]: bits of the segments to be walked, of packets of so many `lanes`, or of none.
         """
 
         planes: wp.array(dtype=t.F)
@@ -60,6 +61,8 @@ def ray_types(layout: Layout) -> SimpleNamespace:
         numbers: wp.array(dtype=t.F)
         table: wp.array2d(dtype=t.F)
         fronts: wp.array2d(dtype=t.F)
+        walked: wp.array2d(dtype=int)
+        lanes: int
 
     @wp.struct
     class Ray:
@@ -138,6 +141,26 @@ def loading(layout: Layout) -> Any:
         return ray
 
     return load_ray
+
+
+@functools.cache
+def walking(layout: Layout) -> Any:
+    """The function that says whether ray `r` stops at node n: at an end of a segment it walks."""
+    Bundle = ray_types(layout).Bundle
+
+    @wp.func
+    def walks(given: Bundle, r: int, n: int) -> bool:
+        if n < 0 or n >= given.planes.shape[0]:
+            return False
+        if given.walked.shape[0] == 0:
+            return True
+        packet, behind = r // given.lanes, n + 1
+        is_end = (given.walked[packet, n // 32] >> (n % 32)) & 1
+        if behind < given.planes.shape[0]:
+            is_end |= (given.walked[packet, behind // 32] >> (behind % 32)) & 1
+        return is_end != 0
+
+    return walks
 
 
 @functools.cache

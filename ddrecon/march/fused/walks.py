@@ -10,7 +10,7 @@ import warp as wp
 
 from ddrecon.march.fused.emission import emission, emission_tangent
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.rays import loading, masses, ray_types, vectors
+from ddrecon.march.fused.rays import loading, masses, ray_types, vectors, walking
 from ddrecon.march.fused.segments import arrival, arrival_tangent
 from ddrecon.march.fused.stops import moving_stops, stops
 
@@ -61,6 +61,7 @@ def tangent_kernel(layout: Layout, is_sliced: bool) -> Any:
     load_ray, stop = loading(layout), stops(layout, is_sliced)
     emit, change_stop = emission(layout), moving_stops(layout, is_sliced)
     emit_tangent, arrive_tangent = emission_tangent(layout), arrival_tangent(layout)
+    walks = walking(layout)
 
     @wp.kernel(enable_backward=False, module="unique")
     def change(
@@ -76,21 +77,24 @@ def tangent_kernel(layout: Layout, is_sliced: bool) -> Any:
         total, before, d_before = t.Out(), records.Stop(), records.Stop()
         m, d_m = passed.widen(passed.front_of(given, r)), passed.front_of(d_given, r)
         for n in range(given.planes.shape[0]):
-            here = stop(given, ray, n)
-            d_here = change_stop(given, d_given, ray, d_ray, here, n)
-            # The mass on the way to it: half the sum of both, by the length.
-            if n > 0:
-                for k in range(wp.static(layout.extinction)):
-                    longer = (before.v[k] + here.v[k]) * (d_here.held - d_before.held)
-                    denser = (d_before.v[k] + d_here.v[k]) * (here.held - before.held)
-                    d_m[k] = d_m[k] + t.F(0.5) * (denser + longer)
-                m = passed.add_mass(m, before.v, here.v, here.held - before.held)
-            here = emit(ray, here, passed.mass_of(m), given)
-            d_here = emit_tangent(ray, here, passed.mass_of(m), given, d_ray, d_here, d_m, d_given)
-            if n > 0:
-                total += arrive_tangent(ray, before, here, d_ray, d_before, d_here)
-            before = here
-            d_before = d_here
+            if walks(given, r, n):
+                is_behind = walks(given, r, n - 1)
+                here = stop(given, ray, n)
+                d_here = change_stop(given, d_given, ray, d_ray, here, n)
+                # The mass on the way to it: half the sum of both, by the length.
+                if is_behind:
+                    for k in range(wp.static(layout.extinction)):
+                        longer = (before.v[k] + here.v[k]) * (d_here.held - d_before.held)
+                        denser = (d_before.v[k] + d_here.v[k]) * (here.held - before.held)
+                        d_m[k] = d_m[k] + t.F(0.5) * (denser + longer)
+                    m = passed.add_mass(m, before.v, here.v, here.held - before.held)
+                mass = passed.mass_of(m)
+                here = emit(ray, here, mass, given)
+                d_here = emit_tangent(ray, here, mass, given, d_ray, d_here, d_m, d_given)
+                if is_behind:
+                    total += arrive_tangent(ray, before, here, d_ray, d_before, d_here)
+                before = here
+                d_before = d_here
         for i in range(wp.static(layout.outputs)):
             d_out[i, r] = total[i]
         for k in range(wp.static(layout.extinction)):

@@ -86,7 +86,12 @@ for (int t = height - 1; t >= 0; --t) {"""
         for (int c = from; c < to; ++c) row[c] = moment[c];
         ask_for(moment, from, to);
     };
-    to_directions(to_weighted_light, read, bar_of, 0, width);"""
+    to_directions(to_weighted_light, read, bar_of, 0, width);
+    for (int j = 0; leaving_bar && s == last - 1 && j < members; ++j) {
+        const F* row = leaving_bar + face_of(t, begin + j);
+        F* bar = bar_of(j);
+        for (int c = 0; c < width; ++c) bar[c] += row[c];
+    }"""
     + RANGE
     + """
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
@@ -100,7 +105,7 @@ for (int t = height - 1; t >= 0; --t) {"""
     F* back_lines[4];
     for (int i = 0; i < 4; ++i) {
         const int to_s = s + i / 2, to_t = t + i % 2;
-        back_lines[i] = to_s < depth && to_t < height ? back(to_s, to_t, RETURNING, 0) : nullptr;
+        back_lines[i] = to_s < last && to_t < height ? back(to_s, to_t, RETURNING, 0) : nullptr;
     }"""
     + BEGINNINGS
     + """
@@ -158,7 +163,17 @@ for (int t = height - 1; t >= 0; --t) {"""
         };"""
     + PASS_ALL
     + """
-        if (is_along) {
+        if (s < entered) {
+            // I is what has entered: no step ends here.
+            F* __restrict entered_bar = entering_bar + face_of(t, begin + j);
+            for (int c = 0; c < width; ++c) {
+                F returned = F(0);
+                for (int i = 0; i < used; ++i)
+                    returned += (used > 1 ? part[i] : F(1)) * back_from[i][c];
+                entered_bar[c] = returned;
+                bar[c] = returning_row[c] = far_row[c] = mass_row[c] = scattered_row[c] = F(0);
+            }
+        } else if (is_along) {
             INDEPENDENT
             for (int c = 0; c < width; ++c) {
                 const F mass = half_step * (e[c] + gather(Four(), e_from, part, c));

@@ -8,6 +8,9 @@ direction goes, they were done already. Of a row and a direction there are two l
 are kept, each in the place of one that no step needs any more. I before each slab of slices is
 saved: for the adjoint, light goes through a slab once more, and lines of all its slices are kept.
 
+Where cells are shared out, the slices of a way may begin with one of another rank: there I is what
+that rank has found, `entering`; that of the last slice of one's own is `leaving` (E48).
+
 Behind each row there are at least two cells that hold what is beyond its ends. Where a step meets
 no medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row. In
 `Thin` ones no step is half an optical depth, and what passes needs no exponential.
@@ -23,7 +26,8 @@ POINTERS = 64
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
     F *found, *saved, *returning, *e_bar, *sc_bar, *light_parts[5], *source_parts[5], *bars[5];
-    F *densest, *beam_factors; double *sums;
+    F *densest, *beam_factors, *entering, *leaving, *entering_bar, *leaving_bar;
+    double *sums; int layers_below, layers_above;
     int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
     int directions, extinction_channels, scattering_channels
@@ -49,6 +53,12 @@ const F* sc_cells = scattering + inner + (scattering_channels > 1 ? color * padd
 const F scale = scales[color], strength = scales[colors + color];
 const F inflow = scales[2 * colors + color];
 const F* empty_row = nothing + MARGIN;
+// Slices of other ranks, before those that are one's own on this way and after them.
+const int entered = way > 0 ? layers_below : layers_above;
+const int last = depth - (way > 0 ? layers_above : layers_below);
+auto face_of = [&](int t, int direction) -> long long {
+    return ((color * (long long)directions + direction) * height + t) * width;
+};
 // Slabs of slices begin anew in the middle, where the ways meet; of those but the first I is saved.
 auto slab_of = [&](int s) { return s - (s < middle ? s : s - middle) % slab; };
 auto save_of = [&](int s, int t, int direction) -> long long {
@@ -225,8 +235,9 @@ for (int t = 0; t < height; ++t) {"""
         light_row[-1] = light_row[width] = F(0);
         if (x_way > 0) near_row[-1] = near_row[0];
         else near_row[width] = near_row[width - 1];
-        if (KEEPS && s < slice_from) {
-            const F* row = saved + save_of(s + 1, t, begin + j);
+        if (s < entered || (KEEPS && s < slice_from)) {
+            const F* row = s < entered ? entering + face_of(t, begin + j)
+                                       : saved + save_of(s + 1, t, begin + j);
             for (int c = 0; c < width; ++c) light_row[c] = row[c];
             continue;
         }"""
@@ -265,6 +276,10 @@ for (int t = 0; t < height; ++t) {"""
     + """
         if (!KEEPS && saved && s + 1 < depth && slab_of(s + 1) == s + 1) {
             F* row = saved + save_of(s + 1, t, begin + j);
+            for (int c = 0; c < width; ++c) row[c] = light_row[c];
+        }
+        if (!KEEPS && leaving && s == last - 1) {
+            F* row = leaving + face_of(t, begin + j);
             for (int c = 0; c < width; ++c) row[c] = light_row[c];
         }
     }

@@ -78,11 +78,22 @@ class Step:
         return self.signs > (0, 0, 0)
 
 
+def turn(direction: Direction, axis: int) -> Direction:
+    """`direction` where z and the array `axis` have changed places."""
+    turned = list(direction)
+    turned[0], turned[axis] = turned[axis], turned[0]
+    z, y, x = turned
+    return z, y, x
+
+
 @functools.cache
-def steps_of(grid: Grid, count: int) -> tuple[tuple[Step, float], ...]:
-    """The step along each of `count` directions, and the quadrature's weight."""
+def steps_of(grid: Grid, count: int, axis: int = 0) -> tuple[tuple[Step, float], ...]:
+    """The step along each of `count` directions, and the quadrature's weight.
+
+    Of `grid`, z is the array `axis` of the grid that directions are of, and that axis is z.
+    """
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
-    steps = (Step.of(grid, (z, y, x)) for z, y, x in points.tolist())
+    steps = (Step.of(grid, turn(tuple(point), axis)) for point in points.tolist())
     return tuple(zip(steps, weights.tolist(), strict=True))
 
 
@@ -111,15 +122,22 @@ class Tables:
 
 @functools.cache
 def make_tables(
-    grid: Grid, count: int, moments: int, most: int, pieces: int, dtype: torch.dtype
+    grid: Grid,
+    count: int,
+    moments: int,
+    most: int,
+    pieces: int,
+    dtype: torch.dtype,
+    axis: int = 0,
 ) -> Tables:
     """The tables of `count` directions through `grid`, of light with so many `moments`.
 
-    On each way the directions are cut into chunks of about `most` at most, in `pieces`.
+    On each way the directions are cut into chunks of about `most` at most, in `pieces`. `axis` as
+    of `steps_of`.
     """
-    made = _Maker(moments)
+    made = _Maker(moments, axis)
     chunks = []
-    steps = steps_of(grid, count)
+    steps = steps_of(grid, count, axis)
     for is_up in (True, False):
         units = _pairs([each for each in steps if each[0].is_up == is_up], made.odd > 0)
         chunks.append(made.add_way(units, most, pieces))
@@ -157,12 +175,11 @@ def _pairs(steps: list[tuple[Step, float]], is_paired: bool) -> list[Unit]:
 class _Maker:
     """Tables while they are made, as lists."""
 
-    def __init__(self, moments: int):
-        self.degree = round(moments**0.5) - 1
+    def __init__(self, moments: int, axis: int):
+        self.degree, self.axis = round(moments**0.5) - 1, axis
         # A direction and its mirror image tell which harmonics are odd in x.
-        point = torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
-        image = point * point.new_tensor([1, 1, -1])
-        is_odd = (harmonics(point, self.degree) * harmonics(image, self.degree) < 0).tolist()
+        odd = self._harmonics([(0.48, 0.6, 0.64)]) * self._harmonics([(0.48, 0.6, -0.64)])
+        is_odd = (odd[:, 0] < 0).tolist()
         self.units = units_of_parts(self.degree)
         self.order = sorted(range(moments), key=lambda k: is_odd[k])
         self.odd, self.most = sum(is_odd), 0
@@ -213,14 +230,19 @@ class _Maker:
         group = y_way, first, members, first_pair, len(units), sum(has_odd), at, before
         self.groups.append(list(group))
         # Y_k of pairs as sums over moments, and as sums over pairs; the same with weights.
-        ways = torch.tensor([unit[0][0].direction for unit in units], dtype=torch.float64)
-        values, of_parts = harmonics(ways, self.degree)[self.order].T, self.units[self.order]
+        values = self._harmonics([unit[0][0].direction for unit in units])[self.order].T
+        of_parts = self.units[self.order]
         weights = values.new_tensor([unit[0][1] for unit in units])[:, None]
         even = len(self.order) - self.odd
         for matrix in (values / of_parts, values * of_parts * weights):
             parts = matrix[:, :even], matrix[: sum(has_odd), even:]
             self.matrices += [part.reshape(-1) for part in parts]
             self.matrices += [part.T.reshape(-1) for part in parts]
+
+    def _harmonics(self, directions: list[Direction]) -> Tensor:
+        """Y_k [K, N] of `directions` as steps have them."""
+        points = [turn(direction, self.axis) for direction in directions]
+        return harmonics(torch.tensor(points, dtype=torch.float64), self.degree)
 
     def _add_step(self, step: Step) -> None:
         fill = POINTS - len(step.points)

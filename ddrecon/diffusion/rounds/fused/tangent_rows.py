@@ -27,7 +27,9 @@ from ddrecon.diffusion.rounds.fused.rows import (
 from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.kernels.text import TextKernel
 
-_GIVEN = "F *d_light_parts[5], *d_source_parts[5], *d_factors, *d_scales"
+_GIVEN = """
+F *d_light_parts[5], *d_source_parts[5], *d_factors, *d_scales, *d_entering, *d_leaving
+"""
 # The change of one of the moments that scatter, from a cell on.
 _READ_CHANGE = """
 auto read_change = [&](long long at, int k, F* __restrict row, int from, int to) {
@@ -123,7 +125,13 @@ for (int t = 0; t < height; ++t) {"""
         F *__restrict light_row = line(s, t, LIGHT, j), *__restrict d_light_row = d_light_of(j);
         light_row[-1] = light_row[width] = d_light_row[-1] = d_light_row[width] = F(0);
         if (x_way > 0) near_row[-1] = near_row[0], d_near_row[-1] = d_near_row[0];
-        else near_row[width] = near_row[width - 1], d_near_row[width] = d_near_row[width - 1];"""
+        else near_row[width] = near_row[width - 1], d_near_row[width] = d_near_row[width - 1];
+        const long long face = face_of(t, begin + j);
+        if (s < entered) {
+            for (int c = 0; c < width; ++c)
+                light_row[c] = entering[face + c], d_light_row[c] = d_entering[face + c];
+            continue;
+        }"""
     + UPSTREAM
     + _CHANGES_UPSTREAM
     + PASS
@@ -161,6 +169,8 @@ for (int t = 0; t < height; ++t) {"""
         }"""
     + ACROSS
     + """
+        for (int c = 0; leaving && s == last - 1 && c < width; ++c)
+            leaving[face + c] = light_row[c], d_leaving[face + c] = d_light_row[c];
     }
     F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
