@@ -104,9 +104,10 @@ class Swept:
 
     def spelled(self) -> Swept:
         """The same with all moments of the source."""
-        if self.beam_factors is None:
+        beam = self.source[0]
+        if self.beam_factors is None or beam is None:
             return self
-        moments = self.beam_factors[..., None, None, None] * self.source[0]
+        moments = self.beam_factors[..., None, None, None] * beam
         return replace(self, beam_factors=None, source=in_parts(moments))
 
     @property
@@ -163,8 +164,8 @@ class Swept:
             parts = zip(in_parts(bar), needs, strict=True)
             return tuple(part if need else None for part, need in parts)
         found = bar.new_empty(bar[0].shape)
-        given = {"factors": self.beam_factors, "found": bar, "colors": len(found)}
-        given |= {"count": len(bar)}
+        given: dict[str, Any] = {"factors": self.beam_factors, "found": bar}
+        given |= {"colors": len(found), "count": len(bar)}
         launch_rows(beam_bar_kernel, self.grid, len(found), given, {"beam": found})
         return found, *[None] * (PARTS - 1)
 

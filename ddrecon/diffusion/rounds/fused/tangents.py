@@ -28,9 +28,9 @@ def changes_of(swept: Swept, *changes: Tensor | None) -> Swept:
     scales, extinction, scattering, factors = whole
     assert scales is not None and extinction is not None and factors is not None
     d_factors, *parts = changes[len(whole) :]
-    if swept.beam_factors is not None:
+    beam, d_beam = swept.source[0], parts[PARTS]
+    if swept.beam_factors is not None and beam is not None:
         # a product, of which both may change
-        beam, d_beam = swept.source[0], parts[PARTS]
         d_moments = torch.zeros_like(swept.beam_factors)[..., None, None, None] * beam
         if d_factors is not None:
             d_moments += d_factors[..., None, None, None] * beam
