@@ -110,5 +110,7 @@ def variation_kernel(bits: int) -> TextKernel:
     second derivative while lengths stay (E32). `kz`, `ky`, `kx`: one over the
     spacing of cells; an item is `length` cells of a row.
     """
-    given = "int length, nz, ny, nx; F kz, ky, kx, rounding, *field, *slope, *diagonal; double *totals"
+    given = (
+        "int length, nz, ny, nx; F kz, ky, kx, rounding, *field, *slope, *diagonal; double *totals"
+    )
     return TextKernel("vary", bits, _ROOT + _VARIATION, given)
