@@ -6,13 +6,13 @@ same formulas, so their numbers agree to rounding. Torch's are, with either engi
 for the mass on the way to them, the scattering of skies towards a camera, tangents in forward mode
 by where lights are, the model `flux_limited`, the scheme `printed`, and solvers other than
 `multigrid`. So is of light and of rounds what has the phase function in it, where that differs from
-cell to cell. So are, where ranks share out cells, beams, solves and the sweeps of rounds.
+cell to cell. So are, where ranks share out cells, beams, and on a GPU solves and sweeps.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from importlib.util import find_spec
 
 from ddrecon.errors import MissingExtraError, UsageError
@@ -60,6 +60,16 @@ def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
     """The engine that runs each part of the renderer: the current one, but for those `in_torch`."""
     engine = current_engine()
     return {part: "torch" if part in in_torch else engine for part in PARTS}
+
+
+def name_engines(engines: Mapping[str, str]) -> str:
+    """In words, the `engines` of parts: with warp what it runs and what it leaves to torch."""
+    fused = [part for part, engine in engines.items() if engine == "warp"]
+    others = [part for part, engine in engines.items() if engine == "torch"]
+    if not fused:
+        return "torch"
+    rest = f"; {' and '.join(others)} in torch" if others else ""
+    return f"warp ({', '.join(fused)}){rest}"
 
 
 def engine_versions() -> dict[str, str]:

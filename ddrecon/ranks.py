@@ -83,13 +83,8 @@ def join_ranks(has_gpu: bool, has_slabs: bool = False) -> None:
     _meet(store, rank, count, wait)
     backend = "cpu:gloo,cuda:nccl" if has_gpu else "gloo"
     try:
-        dist.init_process_group(
-            backend,
-            store=dist.PrefixStore("ddrecon", store),
-            rank=rank,
-            world_size=count,
-            timeout=timedelta(seconds=EXCHANGE_SECONDS),
-        )
+        limit, own = timedelta(seconds=EXCHANGE_SECONDS), dist.PrefixStore("ddrecon", store)
+        dist.init_process_group(backend, store=own, rank=rank, world_size=count, timeout=limit)
     except RuntimeError as error:
         raise RanksError(
             f"rank {rank} of {count} cannot connect to the others ({_reason(error)}); "
@@ -180,6 +175,15 @@ def gather_from_ranks(part: Tensor) -> list[Tensor]:
     with _exchange(part.nbytes):
         torch.distributed.all_gather(parts, part)
     return parts
+
+
+def trade_with_ranks(parts: Tensor) -> Tensor:
+    """What each rank has for this one, by rank; for each of them this one has one of `parts`."""
+    parts = parts.contiguous()
+    got = torch.empty_like(parts)
+    with _exchange(parts.nbytes):
+        torch.distributed.all_to_all_single(got, parts)
+    return got
 
 
 def swap_with_neighbors(

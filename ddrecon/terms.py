@@ -26,6 +26,23 @@ def needed_terms(scene: Scene) -> list[str]:
     return [*_light_in(scene), f"view rays: {samples} a cell of at most {depth} optical depths"]
 
 
+def parts_in_torch(scene: Scene, has_slabs: bool) -> tuple[str, ...]:
+    """The parts that are torch's with every engine, for what `scene` asks of them.
+
+    `has_slabs`: ranks share out its cells.
+    """
+    settings, parts = scene.diffusion, list[str]()
+    is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
+    if has_slabs and not all(isinstance(light, AmbientLight) for light in scene.lights):
+        parts.append("light")
+    on_gpu = has_slabs and scene.volume.density.is_cuda
+    if on_gpu or not is_fused or settings.solver != "multigrid":
+        parts.append("diffusion")
+    if on_gpu and settings.rounds:
+        parts.append("transport rounds")
+    return tuple(parts)
+
+
 def _light_in(scene: Scene) -> list[str]:
     """The terms of the light in the volume of `scene`."""
     settings = scene.diffusion

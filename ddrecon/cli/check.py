@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from ddrecon.engine import engine_of_parts
+from ddrecon.engine import engine_of_parts, name_engines
 from ddrecon.medium.coefficients import scale_medium
 from ddrecon.memory import Needs, gibibytes, memory_of
 from ddrecon.numerics.harmonics import count_harmonics
@@ -15,7 +15,7 @@ from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.doubts import find_doubts
-from ddrecon.terms import needed_terms
+from ddrecon.terms import needed_terms, parts_in_torch
 from ddrecon.variables.values import with_values
 
 
@@ -44,12 +44,12 @@ def memory_estimate(scene: Scene) -> int:
     return memory_of(needs)
 
 
-def describe(scene: Scene) -> dict[str, Any]:
+def describe(scene: Scene, has_slabs: bool = False) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
     And what can hardly be meant.
 
-    Its parameters are where they start.
+    Its parameters are where they start. `has_slabs`: ranks are to share out its cells.
     """
     scene = with_values(scene, scene.starts)
     grid = scene.volume.grid
@@ -64,7 +64,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
         "loss": _describe_loss(scene),
         "support": _describe_support(scene),
-        "engine": engine_of_parts(_parts_in_torch(scene)),
+        "engine": engine_of_parts(parts_in_torch(scene, has_slabs)),
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
     }
@@ -84,7 +84,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"optimizes: {', '.join(parameters) or 'nothing'}",
         *([loss_text(report["loss"])] if report["loss"] else []),
         *([support_text(report["support"])] if report["support"] else []),
-        f"engine: {_name_engines(report['engine'])}",
+        f"engine: {name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
         *(f"doubtful: {doubt}" for doubt in report["doubts"]),
     ]
@@ -109,23 +109,6 @@ def _view_line(view: dict[str, Any]) -> str:
     size = f"{view['width']} x {view['height']} pixels"
     image = ", with image" if view["has_image"] else ""
     return f"{view['name']}: {view['camera']}, {size}, {view['split']}{image}"
-
-
-def _name_engines(engines: dict[str, str]) -> str:
-    """The engine, and with warp what it runs and what it leaves to torch."""
-    fused = [part for part, engine in engines.items() if engine == "warp"]
-    others = [part for part, engine in engines.items() if engine == "torch"]
-    if not fused:
-        return "torch"
-    rest = f"; {' and '.join(others)} in torch" if others else ""
-    return f"warp ({', '.join(fused)}){rest}"
-
-
-def _parts_in_torch(scene: Scene) -> tuple[str, ...]:
-    """The parts that are torch's with every engine, for what `scene` asks of them."""
-    settings = scene.diffusion
-    is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    return () if is_fused and settings.solver == "multigrid" else ("diffusion",)
 
 
 def _count_entries(name: str, count: int) -> str:

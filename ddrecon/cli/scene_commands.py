@@ -35,12 +35,13 @@ class CountOrAuto(click.IntRange):
 @SCENE
 @DTYPE
 @AS_JSON
+@SHARE
 @in_session
 def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     from ddrecon.cli.check import describe, lines
 
-    report = describe(session.load(scene))
+    report = describe(session.load(scene), session.shares_cells)
     session.show(report, lines(report))
 
 

@@ -45,6 +45,7 @@ class Session:
     is_quiet: bool
     is_verbose: bool
     as_json: bool
+    shares_cells: bool = False
 
     def with_overrides(self, *overrides: str) -> Session:
         """The same session with more overrides of the scene file."""
@@ -157,7 +158,10 @@ def open_session(
     keep_freed_memory()
     torch.manual_seed(seed)
     is_quiet = is_quiet or not is_first()
-    return Session(overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json)
+    shares_cells = share == "cells"
+    return Session(
+        overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json, shares_cells
+    )
 
 
 def _own_gpu() -> torch.device:

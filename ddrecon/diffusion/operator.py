@@ -82,7 +82,8 @@ class Operator:
         given = self.loss, *self.conductances
         if all(len(tensor) == 1 for tensor in given):
             return self
-        return Operator.of({}, *(t[color : color + 1] if len(t) > 1 else t for t in given))
+        own = (t[color : color + 1] if len(t) > 1 else t for t in given)
+        return Operator.of({}, *own, ghosts=self.ghosts)
 
     def transposed(self) -> Operator:
         """A^T, which is A."""

@@ -1,7 +1,7 @@
 """View rays through a grid in slabs: each rank integrates what lies in its own (E41).
 
 A ray runs through one slab after the other. What a slab adds depends on the others by the mass
-alone that lies before it. So ranks tell each other the masses that rays pass, and add up radiance.
+alone that lies before it. So ranks add up the masses that lie before each, and then radiance.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ddrecon.march.integral import Integrate, Part, integrate_segments, opacity_
 from ddrecon.march.lattice import Lattice
 from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.nodes import Nodes
-from ddrecon.slabs.exchange import gather_parts, sum_slabs
+from ddrecon.slabs.exchange import sum_before, sum_slabs
 from ddrecon.slabs.slab import Slab
 
 Sampler = Bands | Equidistant
@@ -110,7 +110,8 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
     Or `look`, by fused kernels. With a forward peak (E13) radiance depends on all mass before it,
     which is then found first.
     """
-    slab, colors, scale = _slab_of(emission), emission.colors, emission.extinction.scale.view(-1, 1)
+    colors, scale = emission.colors, emission.extinction.scale.view(-1, 1)
+    is_upwards = rays.direction[:, _slab_of(emission).axis] >= 0
     if emission.peak is None:
 
         def both(values: Tensor, nodes: Nodes, _: Tensor) -> Tensor:
@@ -118,7 +119,7 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
 
         found = look(emission, sampler, None) if is_fused() else find(emission, sampler, both)
         scattered, mass = found[:colors], found[colors:]
-        front, total = _masses(slab, rays, mass)
+        front = sum_before(mass, is_upwards)
         scattered = scattered * torch.exp(-scale * front)
     else:
 
@@ -128,21 +129,15 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
         def after(values: Tensor, nodes: Nodes, index: Tensor) -> Tensor:
             return integrate_segments(emission, values, nodes, front[:, index])[0]
 
-        front, total = _masses(slab, rays, find(emission, _of_mass(emission, sampler), passed))
+        mass = find(emission, _of_mass(emission, sampler), passed)
+        front = sum_before(mass, is_upwards)
         scattered = (
             look(emission, sampler, front)[:colors]
             if is_fused()
             else find(emission, sampler, after)
         )
-    return torch.cat([sum_slabs(scattered), opacity_of(emission, total)])
-
-
-def _masses(slab: Slab, rays: Rays, mass: Tensor) -> tuple[Tensor, Tensor]:
-    """Mass [K, R] before this slab on its `rays`, and all of it, from what each rank has."""
-    masses = gather_parts(mass)
-    below, above = masses[: slab.rank].sum(0), masses[slab.rank + 1 :].sum(0)
-    is_upwards = rays.direction[:, slab.axis] >= 0
-    return torch.where(is_upwards, below, above), masses.sum(0)
+    radiance, total = sum_slabs(torch.cat([scattered, mass])).split([colors, len(mass)])
+    return torch.cat([radiance, opacity_of(emission, total)])
 
 
 def _of_mass(emission: Emission, sampler: Sampler) -> Sampler:

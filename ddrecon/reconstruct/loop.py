@@ -282,7 +282,7 @@ class Reconstruction:
         values = {name: value.detach() for name, value in self._values().items()}
         names = {view.name for view in compared.views}
         seen = [p for p in self.parameters if p.view is None or p.view in names]
-        solved = step_parameters(seen, gradients, self.schedule, self.iteration)
+        solved = step_parameters(seen, gradients, self.schedule, self.iteration, self.power)
         about = self.train_level, values, self.targets, self.memory.last
         solve_numbers(solved, gradients, compared, *about, self.iteration)
         for gauge in self.gauges:

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.losses import compress, total_variation
+from ddrecon.losses import KNEE, THIN, compress, compressed_slope, total_variation
 from ddrecon.reconstruct.levels import resample
+from ddrecon.reconstruct.roughness import Roughness
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 
@@ -29,6 +30,11 @@ FLOOR = 0.3
 
 So cells that no picture says much of are not moved as far as any by what noise says.
 """
+DAMPING = 2 * (1 - BETAS[0]) * (1 + 2 * BETAS[0]) / (1 + BETAS[0])
+"""What part of smoothing's stiffness is added to it besides (E49).
+
+Half of it would be where steps neither swell nor fade, in a field that smoothing alone moves.
+"""
 HALVED = 1 << 20
 """Of fields of so many numbers, what a run goes back to has moments in half the bits."""
 
@@ -39,10 +45,12 @@ class Parameter:
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
     is Adam (Kingma and Ba 2015, arXiv:1412.6980); of fields with Nesterov's momentum and a `FLOOR`
-    (E46), begun anew at each resolution. While a field `is_even`, all its cells change alike; that
-    ends after the part `even_until` of a run. `rate` is one number or one for each entry. `view` is
-    the name of the view that it belongs to, None for what all views see. One that `is_fitted` is
-    solved for instead; `curvature` is the second derivative of the loss by it.
+    (E46), as short as smoothing asks (E49), begun anew at each resolution. While a field `is_even`,
+    all its cells change alike; that ends after the part `even_until` of a run. `rate` is one number
+    or one for each entry. `view` is the name of the view that it belongs to, None for what all
+    views see. One that `is_fitted` is solved for instead; `curvature` is the second derivative of
+    the loss by it. Of a density, `unit` is what has an optical depth of 1 across the box's shortest
+    side.
     """
 
     def __init__(
@@ -52,6 +60,7 @@ class Parameter:
         rate: float | Tensor,
         value: Tensor,
         grid: Grid,
+        unit: float = 1.0,
     ):
         kind = kind_of(name)
         self.name, self.rate, self.grid = name, rate, grid
@@ -68,7 +77,8 @@ class Parameter:
         self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
-        self.is_compressed = kind.is_compressed
+        self.knee = KNEE * unit if kind.is_compressed else None
+        self.thin = THIN * unit if kind.is_compressed else None
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
@@ -81,33 +91,39 @@ class Parameter:
         See `ParameterSettings` for the weights.
         """
         value, total = self.value, self.value.new_zeros(())
-        if self.is_compressed:
-            value = compress(value)
         if self.tv:
             variation = total_variation
             if current_engine() == "warp":
                 from ddrecon.reconstruct.fused.passes import total_variation as variation
-            total = total + self.tv * variation(value, self.grid)
-        return total + self.l1 * value.abs().mean() if self.l1 else total
+            seen = value if self.knee is None else compress(value, self.knee)
+            total = total + self.tv * variation(seen, self.grid)
+        if self.l1:
+            size = value.abs() if self.thin is None else compress(value, self.thin)
+            total = total + self.l1 * size.mean()
+        return total
 
     @property
     def largest_rate(self) -> float:
         """Its learning rate, or the largest of its entries."""
         return self.rate if isinstance(self.rate, float) else float(self.rate.max())
 
-    def step(self, gradient: Tensor, rate: float) -> None:
+    def step(self, gradient: Tensor, rate: float, power: float = 0.0) -> None:
         """Moves the value against `gradient`, and back within its bounds.
 
-        `rate` is the part of its learning rate that counts now. With m and v the running means of
+        `rate` is the part of its learning rate that counts now, `power` the unit of the penalties
+        in the gradient, as in `add_penalties`. With m and v the running means of
         the derivative and of its square, each divided by the part of 1 that their weights sum to,
-        Adam moves the value by -rate m / (sqrt(v) + epsilon), and a field as E46 says.
+        Adam moves the value by -rate m / (sqrt(v) + epsilon), and a field as E46 and E49 say.
         """
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
         before = self.value.detach()
         if self.is_even:
             gradient = gradient.mean((-3, -2, -1), keepdim=True).expand_as(gradient).contiguous()
-        value, self.moments = self._step(before, gradient, rate * self.rate)
+        rate_now, smallest = rate * self.rate, self._smallest_size(gradient)
+        if self.tv and power and not self.is_even:
+            smallest = smallest + DAMPING * rate_now * power * self._stiffness(before)
+        value, self.moments = self._step(before, gradient, rate_now, smallest)
         if self.is_direction:
             value.mul_(before.norm() / value.norm())
         if self.support is not None:
@@ -115,14 +131,16 @@ class Parameter:
         self.value = value.requires_grad_()
 
     def _step(
-        self, before: Tensor, gradient: Tensor, rate: float | Tensor
+        self, before: Tensor, gradient: Tensor, rate: float | Tensor, smallest: Tensor
     ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """The value within its bounds, and the moments, after the step from `before`."""
+        """The value within its bounds, and the moments, after the step from `before`.
+
+        `smallest`, a number or one for each entry, is added to the size of derivatives.
+        """
         if current_engine() == "warp" and isinstance(rate, float):
             from ddrecon.reconstruct.fused.passes import step_adam
 
             bounds, ahead = (self.low, self.high), BETAS[0] if self.is_field else 1.0
-            smallest = self._smallest_size(gradient)
             return step_adam(
                 before, gradient, self.moments, BETAS, self.steps, rate, smallest, ahead, bounds
             )
@@ -130,7 +148,7 @@ class Parameter:
         weights = [1 - beta ** float(self.steps) for beta in BETAS]
         first = first.lerp(gradient, 1 - BETAS[0])
         second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-        size = (second.sqrt() / weights[1] ** 0.5).add_(self._smallest_size(gradient))
+        size = (second.sqrt() / weights[1] ** 0.5) + smallest
         onward = gradient.lerp(first, BETAS[0]) if self.is_field else first
         value = before - onward / size * (rate / weights[0])
         return value.clamp_(self.low, self.high), (first, second)
@@ -145,6 +163,22 @@ class Parameter:
         # Of the mean of the new second moments, before there are any.
         mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - BETAS[1])
         return FLOOR * (mean / (1 - BETAS[1] ** float(self.steps))).sqrt() + EPSILON
+
+    def _stiffness(self, value: Tensor) -> Tensor:
+        """By how much the derivative of its smoothing rises with each cell of `value`.
+
+        That is the diagonal of R (E32), with the slope of the compression at the cell itself.
+        """
+        seen = value if self.knee is None else compress(value, self.knee)
+        if current_engine() == "warp":
+            from ddrecon.reconstruct.fused.passes import variation_diagonal
+
+            diagonal = variation_diagonal(seen, self.grid)
+        else:
+            diagonal = Roughness.about(seen, self.grid, 1.0).diagonal()
+        if self.knee is not None:
+            diagonal *= compressed_slope(value, self.knee) ** 2
+        return self.tv * diagonal
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""

@@ -27,10 +27,12 @@ def step_parameters(
     gradients: Mapping[str, Tensor],
     schedule: Schedule,
     iteration: int,
+    power: float,
 ) -> list[Parameter]:
     """Moves those of `parameters` that are due along their `gradients`; returns those to be solved.
 
-    `schedule` says which are due in `iteration`, and how much of its learning rate counts.
+    `schedule` says which are due in `iteration`, and how much of its learning rate counts. `power`
+    is the unit of the penalties in the gradients.
     """
     _let_go(parameters, schedule, iteration)
     solved = []
@@ -39,7 +41,7 @@ def step_parameters(
         if rate and parameter.is_fitted:
             solved.append(parameter)
         elif rate:
-            parameter.step(gradients[parameter.name], rate)
+            parameter.step(gradients[parameter.name], rate, power)
     return solved
 
 

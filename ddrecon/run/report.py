@@ -7,7 +7,9 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+from ddrecon.engine import engine_of_parts, name_engines
 from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
     fold,
@@ -22,7 +24,7 @@ from ddrecon.report.page import (
 from ddrecon.run.findings import Findings
 from ddrecon.run.report_views import view_section
 from ddrecon.run.report_volume import turntable, volume_section
-from ddrecon.terms import needed_terms
+from ddrecon.terms import needed_terms, parts_in_torch
 
 TIMING_HEAD = [
     "cells",
@@ -38,6 +40,7 @@ TIMING_HEAD = [
 def write_run_report(path: Path, findings: Findings) -> None:
     """Writes the report of `findings` to `path`."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
+    engines = name_engines(engine_of_parts(parts_in_torch(scene, has_slabs(scene))))
     versions = [(key, _format(value)) for key, value in findings.environment.items()]
     diagnoses = [diagnosis["text"] for diagnosis in findings.summary["diagnoses"]]
     sections = [
@@ -47,7 +50,7 @@ def write_run_report(path: Path, findings: Findings) -> None:
         section("Views", *view_section(findings)),
         section("Turntable", turntable(findings)),
         section("Timings", _timings(findings.rows)),
-        section("Physics", paragraph(needs), items(needed_terms(scene))),
+        section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
         section("Settings", fold("scene.yaml, all defaults filled in", findings.settings)),
         section("Versions", table(["", ""], versions)),
     ]

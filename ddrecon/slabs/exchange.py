@@ -20,6 +20,7 @@ from ddrecon.ranks import (
     rank_count,
     sum_over_ranks,
     swap_with_neighbors,
+    trade_with_ranks,
 )
 from ddrecon.slabs.slab import Slab
 
@@ -58,6 +59,15 @@ def sum_slabs(part: Tensor) -> Tensor:
     return total
 
 
+def sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
+    """The sum of `part` [K, R] over the ranks before this one, differentiable (E40).
+
+    Those are the ranks below where ray R `is_upwards`, else the ranks above.
+    """
+    total: Tensor = _SumBefore.apply(part, is_upwards)
+    return total
+
+
 def swap_layers(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
     """What the ranks below and above have for this one, which has `below` and `above` for them.
 
@@ -85,7 +95,7 @@ class _AddHalo(torch.autograd.Function):
 
     @staticmethod
     def forward(own: Tensor, slab: Slab) -> Tensor:
-        return _with_halo(own, slab)
+        return with_halo(own, slab)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Slab], output: Tensor) -> None:
@@ -94,25 +104,30 @@ class _AddHalo(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, field_bar: Tensor) -> tuple[Tensor, None]:
-        slab, axis = ctx.slab, ctx.slab.axis - 3
-        (below, above), size = slab.halo, slab.size
-        own_bar = slab.own(field_bar).clone()
-        lent = swap_with_neighbors(
-            field_bar.narrow(axis, 0, below) if below else None,
-            field_bar.narrow(axis, below + size, above) if above else None,
-        )
-        if lent[0] is not None:
-            own_bar.narrow(axis, 0, below).add_(lent[0])
-        if lent[1] is not None:
-            own_bar.narrow(axis, size - above, above).add_(lent[1])
-        return own_bar, None
+        return return_halo(field_bar, ctx.slab), None
 
     @staticmethod
     def jvp(ctx: Any, d_own: Tensor, _: None) -> Tensor:
-        return _with_halo(d_own, ctx.slab)
+        return with_halo(d_own, ctx.slab)
 
 
-def _with_halo(own: Tensor, slab: Slab) -> Tensor:
+def return_halo(field_bar: Tensor, slab: Slab) -> Tensor:
+    """The transpose of `with_halo`: own cells' cotangents, with those that neighbors found."""
+    axis, (below, above), size = slab.axis - 3, slab.halo, slab.size
+    own_bar = slab.own(field_bar).clone()
+    lent = swap_with_neighbors(
+        field_bar.narrow(axis, 0, below) if below else None,
+        field_bar.narrow(axis, below + size, above) if above else None,
+    )
+    if lent[0] is not None:
+        own_bar.narrow(axis, 0, below).add_(lent[0])
+    if lent[1] is not None:
+        own_bar.narrow(axis, size - above, above).add_(lent[1])
+    return own_bar
+
+
+def with_halo(own: Tensor, slab: Slab) -> Tensor:
+    """`own` cells [..., z, y, x] with those of neighbors, without derivatives."""
     axis, (below, above) = slab.axis - 3, slab.halo
     got = swap_with_neighbors(
         own.narrow(axis, 0, below) if below else None,
@@ -163,6 +178,43 @@ class _Sum(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, d_part: Tensor) -> Tensor:
         return sum_over_ranks([d_part])[0]
+
+
+class _SumBefore(torch.autograd.Function):
+    """The sum over the ranks before; its transpose is that over the ranks after."""
+
+    @staticmethod
+    def forward(part: Tensor, is_upwards: Tensor) -> Tensor:
+        return _sum_before(part, is_upwards)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.is_upwards = inputs[1]
+
+    @staticmethod
+    @differentiate_once
+    def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor, None]:
+        return _sum_before(total_bar, ~ctx.is_upwards), None
+
+    @staticmethod
+    def jvp(ctx: Any, d_part: Tensor, _: None) -> Tensor:
+        return _sum_before(d_part, ctx.is_upwards)
+
+
+def _sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
+    """Each rank adds up some of the rays for all ranks: so bytes do not grow with their number."""
+    ranks, (fields, rays) = rank_count(), part.shape
+    share = -(-rays // ranks)
+
+    def of_all(values: Tensor) -> Tensor:
+        return pad(values, (0, share * ranks - rays)).unflatten(-1, (ranks, share))
+
+    parts = trade_with_ranks(of_all(part).transpose(0, 1))
+    nothing = torch.zeros_like(parts[:1])
+    up = torch.cat([nothing, parts[:-1]]).cumsum(0)
+    down = torch.cat([nothing, parts[1:].flip(0)]).cumsum(0).flip(0)
+    before = trade_with_ranks(torch.where(of_all(is_upwards)[own_rank()], up, down))
+    return before.transpose(0, 1).reshape(fields, -1)[:, :rays]
 
 
 class _Swap(torch.autograd.Function):

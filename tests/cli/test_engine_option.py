@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import Result
@@ -72,6 +73,12 @@ def test_check_names_what_is_left_to_torch(succeed: Run, change: str) -> None:
     assert line in found.stdout.splitlines()
 
 
+def test_check_names_what_slabs_leave_to_torch(succeed: Run) -> None:
+    found = succeed("check", "scene.yaml", "--engine", "warp", "--share", "cells")
+    line = "engine: warp (view rays, diffusion, transport rounds); light in torch"
+    assert line in found.stdout.splitlines()
+
+
 def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "find_spec", {}.get)
     command = "optimize", "scene.yaml", "-o", "out", "--engine"
@@ -90,9 +97,9 @@ def test_a_compilation_is_announced_once(
 ) -> None:
     describe = check.describe
 
-    def compile_and_describe(scene: object) -> object:
+    def compile_and_describe(*scene: Any) -> object:
         LOG.info("compiling kernels, once: %.1f s", 2.5)
-        return describe(scene)
+        return describe(*scene)
 
     monkeypatch.setattr(check, "describe", compile_and_describe)
     for _ in range(2):

@@ -50,7 +50,7 @@ def cycle(operator: Operator, source: Tensor) -> Tensor:
     """One cycle of the fused kernels for `source` as the residual."""
     use_engine("warp")
     made = operator.once(Hierarchy.of)
-    run = fused._Run(made, source / made.scale, None, -1.0)
+    run = fused.Run(made, source / made.scale, None, -1.0)
     run.iterate(0, 1)
     return run.vectors[run.places[4] :][: source.numel()].view_as(source).clone()
 

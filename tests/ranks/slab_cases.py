@@ -33,6 +33,7 @@ from torch.autograd import forward_ad
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.diffusion.operator import AXES, Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
+from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.engine import current_engine, use_engine
 from ddrecon.light.lights import EnvironmentLight, PointLight
@@ -41,7 +42,14 @@ from ddrecon.ranks import alone, join_ranks, own_rank, sum_over_ranks
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene, View
-from ddrecon.slabs.exchange import add_halo, gather_parts, gather_slabs, sum_slabs, swap_layers
+from ddrecon.slabs.exchange import (
+    add_halo,
+    gather_parts,
+    gather_slabs,
+    sum_before,
+    sum_slabs,
+    swap_layers,
+)
 from ddrecon.slabs.ghosts import Ghosts
 from ddrecon.slabs.slab import Slab, own_slab
 from ddrecon.variables.values import value_of, with_values
@@ -74,6 +82,7 @@ def exchange(axis: str) -> Found:
         "add_halo": lambda x: add_halo(x, slab),
         "gather_slabs": lambda x: gather_slabs(add_halo(x, slab), slab),
         "gather_parts": lambda x: gather_parts(x[:, :3, :3, :3]),
+        "sum_before": lambda x: sum_before(x.flatten(1)[:, :19], torch.arange(19) % 3 > 0),
         "sum_slabs": lambda x: sum_slabs(x[:, :3, :3, :3]),
         "swap_layers": lambda x: torch.stack(swap_layers(x[:, :3, :3, :3], x[:, 1:4, 1:4, 1:4])),
     }
@@ -90,9 +99,8 @@ def exchange(axis: str) -> Found:
         yield f"tangent of {name}", tangent, 2 * y.detach()
 
 
-def system(axis: str) -> Found:
-    """The matrix in slabs is that of the whole; a cycle of multigrid is symmetric in it."""
-    slab = slab_of(axis)
+def cut_system(slab: Slab) -> tuple[Operator, Operator, Callable[..., Tensor]]:
+    """A matrix in slabs and whole, and what cuts cells from the whole's."""
     grid, ghosts = slab.whole, Ghosts.of(slab)
     whole = make_operator(grid, 0.1 + random_values(2, *grid.shape), random_values(2, *grid.shape))
 
@@ -103,8 +111,14 @@ def system(axis: str) -> Found:
     z, y, x = (
         cut(c, missing=int(a == ghosts.axis)) for a, c in zip(AXES, whole.conductances, strict=True)
     )
-    shared = Operator((z, y, x), cut(whole.loss), ghosts=ghosts)
-    a, b = (random_values(2, *grid.shape, seed=seed) - 0.5 for seed in (1, 2))
+    return Operator((z, y, x), cut(whole.loss), ghosts=ghosts), whole, cut
+
+
+def system(axis: str) -> Found:
+    """The matrix in slabs is that of the whole; a cycle of multigrid is symmetric in it."""
+    slab = slab_of(axis)
+    shared, whole, cut = cut_system(slab)
+    a, b = (random_values(2, *SHAPES[axis], seed=seed) - 0.5 for seed in (1, 2))
     matrix, right = ScaledMatrix.of(shared), ScaledMatrix.of(whole)
     yield "product", matrix.apply(cut(a)), cut(right.apply(a))
     yield "inner", matrix.inner(cut(a), cut(b)), right.inner(a, b)
@@ -112,6 +126,25 @@ def system(axis: str) -> Found:
     one, other = level.cycle(cut(a)), level.cycle(cut(b))
     yield "symmetric", matrix.inner(one, cut(b)), matrix.inner(cut(a), other)
     yield "cycle", one, cut(Level.of(whole).cycle(a))
+
+
+def solve(axis: str) -> Found:
+    """Iterates are those of one process, from nothing and from a guess, of colors that differ."""
+    wide = box_grid(tuple(max(10, cells) for cells in SHAPES[axis]))
+    slab = own_slab(wide)
+    assert isinstance(slab, Slab)
+    shared, whole, cut = cut_system(slab)
+    source, guess = (random_values(2, *wide.shape, seed=seed) for seed in (1, 2))
+    source[1, 1:, 2:] = 0
+    engine = current_engine()
+    for name, start in (("from nothing", None), ("from a guess", guess / 10)):
+        use_engine("torch")
+        with alone():
+            right = multigrid(whole, source, start, 1e-3)
+        use_engine(engine)
+        found = multigrid(shared, cut(source), None if start is None else cut(start), 1e-3)
+        yield name, found.value, cut(right.value)
+        yield f"iterations {name}", *(torch.tensor(1.0 * s.iterations) for s in (found, right))
 
 
 def run(scene: Scene, cameras: list[Any], *more: str, has_tangents: bool = False) -> Found:
@@ -227,6 +260,7 @@ def inside() -> Found:
 CASES: dict[str, Callable[[], Found]] = {
     **{f"exchange along {axis}": partial(exchange, axis) for axis in SHAPES},
     **{f"system along {axis}": partial(system, axis) for axis in SHAPES},
+    **{f"solve along {axis}": partial(solve, axis) for axis in SHAPES},
     "light along z": partial(seen_from, "z", ACROSS),
     "light along y": partial(seen_from, "y", ACROSS, ALONG, ASKEW),
     "light along x": partial(seen_from, "x", ASKEW),
@@ -251,6 +285,7 @@ FEW = [name for name in CASES if name.startswith(("exchange", "system"))]
 FEW += ["light along x", "rounds along x"]
 FUSED = ["light along x", "light along y", "forward peak", "all per cell", "rounds along y"]
 FUSED += ["environment", "lattice", "inside", "rounds along z", "rounds along x"]
+FUSED += [f"solve along {axis}" for axis in SHAPES]
 GROUPS = {"few": FEW, "others": [name for name in CASES if name not in FEW], "fused": FUSED}
 """Cases that tell most in little time, the others, and those in which slabs have fused kernels."""
 

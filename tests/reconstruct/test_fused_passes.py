@@ -13,6 +13,7 @@ from torch import Tensor
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.losses import total_variation
 from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.roughness import Roughness
 from ddrecon.settings import ParameterSettings
 
 wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
@@ -38,6 +39,14 @@ def test_total_variation_and_its_derivative_agree(shape, dtype, monkeypatch):
         assert torch.equal(other, more)
 
 
+@each_type
+@pytest.mark.parametrize("shape", [(5, 7, 9), (1, 4, 1), (3, 4, 5, 33)])
+def test_the_diagonal_of_smoothing_agrees(shape, dtype):
+    grid, field = box_grid(shape[-3:]), 4 * half_empty(*shape, dtype=dtype)
+    known = Roughness.about(field, grid, 1.0).diagonal()
+    torch.testing.assert_close(passes.variation_diagonal(field, grid), known)
+
+
 def value_and_slope(variation, field: Tensor, grid) -> tuple[Tensor, Tensor]:
     leaf = field.clone().requires_grad_()
     total = variation(leaf, grid)
@@ -55,7 +64,7 @@ def test_steps_agree(name, dtype):
         parameter = Parameter(name, ParameterSettings(max=0.9), 0.1, start, grid)
         before = parameter.state()
         for seed in range(4):
-            parameter.step(random_values(*shape, seed=seed, dtype=dtype) - 0.5, 0.7)
+            parameter.step(random_values(*shape, seed=seed, dtype=dtype) - 0.5, 0.7, 30.0)
         assert torch.equal(before["value"], start) and not before["moments"][0].any()
         values.append((parameter.value.detach(), *parameter.moments))
     for one, other in zip(*values, strict=True):
@@ -74,7 +83,6 @@ def test_bounds_may_be_without_end():
 
 @pytest.mark.parametrize("arch", [80, 90])
 def test_kernels_compile_for_graphics_cards(arch: int, tmp_path: Path):
-    for make in (step_kernel, variation_kernel):
-        module = make(32).module
-        wp.compile_aot_module(module, arch=arch, use_ptx=True, module_dir=tmp_path / make.__name__)
-        assert list((tmp_path / make.__name__).glob("*.ptx"))
+    for name, kernel in (("step", step_kernel(32, True)), ("vary", variation_kernel(32))):
+        wp.compile_aot_module(kernel.module, arch=arch, use_ptx=True, module_dir=tmp_path / name)
+        assert list((tmp_path / name).glob("*.ptx"))

@@ -26,7 +26,7 @@ def multigrid(
     Raises SolveError when it is not reached.
     """
     # Fused, a thread does slices. On a GPU it does a cell, by torch's operations.
-    if current_engine() == "warp" and not source.is_cuda and operator.ghosts is None:
+    if current_engine() == "warp" and not source.is_cuda:
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)

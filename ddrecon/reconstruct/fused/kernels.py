@@ -25,12 +25,11 @@ F* __restrict new_v = new_value + begin;
 F* __restrict new_m = new_first + begin;
 F* __restrict new_s = new_second + begin;
 const int count = end - begin;
-const F least = smallest[0];
 for (int i = 0; i < count; ++i) {
     const F mean = m[i] + forget_first * (g[i] - m[i]);
     const F square = s[i] + forget_second * (g[i] * g[i] - s[i]);
     const F onward = g[i] + ahead * (mean - g[i]);
-    const F moved = v[i] - rate * onward / (root_of(square) * root + least);
+    const F moved = v[i] - rate * onward / (root_of(square) * root + LEAST);
     const F held = moved < low ? low : moved;
     new_m[i] = mean;
     new_s[i] = square;
@@ -38,7 +37,8 @@ for (int i = 0; i < count; ++i) {
 }
 """
 # A cell's slopes are to its next neighbors; where there is none that is the cell itself. It counts
-# in its own length of the gradient and in those of its neighbors before.
+# in its own length of the gradient and in those of its neighbors before. What binds it to its
+# neighbors is the square of one over the spacing over such a length; 0 where there is none.
 _VARIATION = """
 const int parts = (nx + length - 1) / length, row = item / parts;
 const int begin = item % parts * length, end = begin + length < nx ? begin + length : nx;
@@ -48,6 +48,9 @@ const long long zp = z + 1 < nz ? up : 0, yp = y + 1 < ny ? nx : 0;
 const long long zm = z > 0 ? -up : 0, ym = y > 0 ? -nx : 0;
 const F* __restrict f = field + (long long)row * nx;
 F* __restrict out = slope + (long long)row * nx;
+F* __restrict bound = diagonal + (long long)row * nx;
+const F above = (z + 1 < nz ? kz * kz : F(0)) + (y + 1 < ny ? ky * ky : F(0));
+const F behind = z > 0 ? kz * kz : F(0), beside = y > 0 ? ky * ky : F(0);
 double total = 0.0;
 auto norm = [&](F dz, F dy, F dx) __attribute__((always_inline)) -> F {
     return root_of(rounding * rounding + dz * dz + dy * dy + dx * dx);
@@ -65,6 +68,8 @@ auto cell = [&](int i, int xp, int xm) __attribute__((always_inline)) -> F {
     const F cx = kx * (here - left[0]);
     const F c = norm(kz * (left[zp] - left[0]), ky * (left[yp] - left[0]), cx);
     out[i] = kz * az / a + ky * by / b + kx * cx / c - (kz * dz + ky * dy + kx * dx) / own;
+    bound[i] = (above + (xp ? kx * kx : F(0))) / own + behind / a + beside / b
+        + (xm ? kx * kx : F(0)) / c;
     return own - rounding;
 };
 const int last = end < nx - 1 ? end : nx - 1;
@@ -84,21 +89,28 @@ totals[item] = total;
 
 
 @functools.cache
-def step_kernel(bits: int) -> TextKernel:
-    """The kernel of a step of Adam: new value, first and second moment, each a flat array."""
+def step_kernel(bits: int, is_each: bool) -> TextKernel:
+    """The kernel of a step of Adam: new value, first and second moment, each a flat array.
+
+    `smallest` is one number, or one for each where it `is_each`.
+    """
+    text = _STEP.replace("LEAST", "smallest[begin + i]" if is_each else "smallest[0]")
     given = """
     int length, total; F forget_first, forget_second, root, ahead, rate, low, high, *smallest;
     F *value, *gradient, *first_moment, *second_moment, *new_value, *new_first, *new_second
     """
-    return TextKernel("step", bits, BLOCK + _ROOT + _STEP, given)
+    return TextKernel("step", bits, BLOCK + _ROOT + text, given)
 
 
 @functools.cache
 def variation_kernel(bits: int) -> TextKernel:
     """The kernel of lengths of the gradient of `field`, summed over each item, less `rounding`.
 
-    And of `slope`: what their sum over all cells changes with each. `kz`, `ky`, `kx`: one over the
+    And of `slope`: what their sum over all cells changes with each, and of the `diagonal` of its
+    second derivative while lengths stay (E32). `kz`, `ky`, `kx`: one over the
     spacing of cells; an item is `length` cells of a row.
     """
-    given = "int length, nz, ny, nx; F kz, ky, kx, rounding, *field, *slope; double *totals"
+    given = (
+        "int length, nz, ny, nx; F kz, ky, kx, rounding, *field, *slope, *diagonal; double *totals"
+    )
     return TextKernel("vary", bits, _ROOT + _VARIATION, given)

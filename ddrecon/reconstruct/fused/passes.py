@@ -35,8 +35,8 @@ def step_adam(
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """The new value, within its bounds, and the new moments, after `steps` with this one.
 
-    `smallest`, one number, is added to the size of each derivative. The value moves along the part
-    `ahead` of the mean derivative, and for the rest along the newest (E46).
+    `smallest`, a number or one for each, is added to the size of derivatives. The value moves along
+    the part `ahead` of the mean derivative, and for the rest along the newest (E46).
     """
     new = [value.new_empty(value.shape) for _ in range(3)]
     weights = [1 - beta**steps for beta in betas]
@@ -58,7 +58,8 @@ def step_adam(
         "high": bounds[1],
     }
     made = dict(zip(("new_value", "new_first", "new_second"), new, strict=True))
-    step_kernel(torch.finfo(value.dtype).bits).launch(items, given, made, _threads(value))
+    kernel = step_kernel(torch.finfo(value.dtype).bits, smallest.numel() > 1)
+    kernel.launch(items, given, made, _threads(value))
     return new[0], (new[1], new[2])
 
 
@@ -69,21 +70,32 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
     return total
 
 
+def variation_diagonal(field: Tensor, grid: Grid) -> Tensor:
+    """The diagonal of R (E32) about `field` [..., z, y, x] where smoothing weighs 1."""
+    return _vary(field, grid)[2].div_(field.numel())
+
+
+def _vary(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
+    """What `variation_kernel` makes of `field` [..., z, y, x]: `totals`, `slope`, `diagonal`."""
+    side, (nz, ny, nx) = min(grid.extent), field.shape[-3:]
+    slope, diagonal = field.new_empty(field.shape), field.new_empty(field.shape)
+    length = PART if field.is_cuda else nx
+    items = field.numel() // nx * -(-nx // length)
+    totals = field.new_empty(items, dtype=torch.float64)
+    kz, ky, kx = (side / spacing for spacing in grid.spacing)
+    given = {"length": length, "nz": nz, "ny": ny, "nx": nx, "field": field}
+    given |= {"kz": kz, "ky": ky, "kx": kx, "rounding": ROUNDING}
+    made = {"slope": slope, "diagonal": diagonal, "totals": totals}
+    variation_kernel(torch.finfo(field.dtype).bits).launch(items, given, made, _threads(field))
+    return totals, slope, diagonal
+
+
 class _Variation(torch.autograd.Function):
     """The derivative is found with the value: it is what a penalty is for."""
 
     @staticmethod
     def forward(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
-        side, (nz, ny, nx) = min(grid.extent), field.shape[-3:]
-        slope = field.new_empty(field.shape)
-        length = PART if field.is_cuda else nx
-        items = field.numel() // nx * -(-nx // length)
-        totals = field.new_empty(items, dtype=torch.float64)
-        kz, ky, kx = (side / spacing for spacing in grid.spacing)
-        given = {"length": length, "nz": nz, "ny": ny, "nx": nx, "field": field}
-        given |= {"kz": kz, "ky": ky, "kx": kx, "rounding": ROUNDING}
-        made = {"slope": slope, "totals": totals}
-        variation_kernel(torch.finfo(field.dtype).bits).launch(items, given, made, _threads(field))
+        totals, slope, _ = _vary(field, grid)
         return (totals.sum() / field.numel()).to(field.dtype), slope
 
     @staticmethod

@@ -51,7 +51,7 @@ if (act == START) {
         const Size at_ = z * slice;
         F* const right = slot(4);
         take(l.scale + at_, b + at_, right, slice);
-        norm += inner(right, right, slice);
+        norm += inner_of(z, l.nx, right, right);
         if (has_guess) {
             for (; ready <= z + 1 && ready < l.nz; ++ready) {
                 F* __restrict v = slot(ready & 3);
@@ -63,7 +63,7 @@ if (act == START) {
             stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v,
                     right, F(-1), F(1), F(1), r + at_);
             for (Size i = 0; i < slice; ++i) y[at_ + i] = v[i];
-            square += inner(r + at_, r + at_, slice);
+            square += inner_of(z, l.nx, r + at_, r + at_);
         } else
             for (Size i = 0; i < slice; ++i) { r[at_ + i] = right[i]; y[at_ + i] = F(0); }
     }
@@ -101,7 +101,7 @@ if (act == DIRECT && !is_done) {
         stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v, v,
             F(1),
                 F(0), F(-1), q + z * slice);
-        curved += inner(v, q + z * slice, slice);
+        curved += inner_of(z, l.nx, v, q + z * slice);
     }
     sum(CURVED_ROW) = curved;
 }
@@ -111,17 +111,16 @@ if (act == ADVANCE) {
     else {
         const F step = (F)(total_of(CORRECTED_ROW + now)
                            / above(total_of(CURVED_ROW), tiny));
-        const F *__restrict v = d_new + first_cell, *__restrict product = q + first_cell;
-        F *__restrict solution = y + first_cell, *__restrict left = r + first_cell;
         double square = 0.0;
-        const Size block = 4096;
-        for (Size i0 = 0; i0 < count; i0 += block) {
-            const Size i1 = i0 + block < count ? i0 + block : count;
-            for (Size i = i0; i < i1; ++i) {
+        for (int z = from; z < to; ++z) {
+            const Size at_ = z * slice;
+            const F *__restrict v = d_new + at_, *__restrict product = q + at_;
+            F *__restrict solution = y + at_, *__restrict left = r + at_;
+            for (Size i = 0; i < slice; ++i) {
                 solution[i] += step * v[i];
                 left[i] -= step * product[i];
             }
-            square += inner(left + i0, left + i0, i1 - i0);
+            square += inner_of(z, l.nx, left, left);
         }
         sum(RESIDUAL_ROW + later) = square;
     }

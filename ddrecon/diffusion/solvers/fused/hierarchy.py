@@ -15,6 +15,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.fused.prepare import prepare_kernel
 from ddrecon.diffusion.solvers.fused.stages import (
+    MATRIX,
     Axes,
     Shape,
     Stages,
@@ -41,7 +42,8 @@ class Hierarchy:
 
     Which axes are strong is known only with the conductances of each level. So that nobody waits
     for them, a hierarchy is made with the axes of the last one of its shape; `strengths` then say
-    whether these were right. `shares`: of a color, so that threads have equally many.
+    whether these were right. `shares`: of a color, so that threads have equally many. `work`: the
+    last grid's matrix, where that grid is part of one that ranks have together.
     """
 
     stages: Stages
@@ -49,23 +51,24 @@ class Hierarchy:
     data: Tensor
     strengths: Tensor
     is_checked: bool = False
+    work: Tensor | None = None
 
     @staticmethod
     def of(operator: Operator) -> Hierarchy:
         """All grids of `operator`; which axes are strong may have to be checked yet."""
-        shape, colors = _shape(operator)
+        shape, colors = shape_of(operator)
         axes = _last_axes.get((shape, colors))
         if axes is not None:
-            return _make(operator, axes)
-        made = _make(operator, first_guess(shape))
+            return make(operator, axes)
+        made = make(operator, first_guess(shape))
         return made.checked(operator, made.strengths.tolist())
 
     def checked(self, operator: Operator, strengths: Sequence[float]) -> Hierarchy:
         """This hierarchy if it coarsens the axes it should by `strengths`, else one that does."""
-        shape, colors = _shape(operator)
+        shape, colors = shape_of(operator)
         made = self
         while (axes := strong_axes(shape, made.stages.axes, made.means(strengths))) != made.axes:
-            made = _make(operator, axes)
+            made = make(operator, axes)
             strengths = made.strengths.tolist()
         _last_axes[shape, colors] = axes
         made.is_checked = True
@@ -74,9 +77,16 @@ class Hierarchy:
     @property
     def scale(self) -> Tensor:
         """S of the finest grid [matrices, z, y, x]."""
-        shape, colors = self.stages.shape(0), self.stages.colors
-        begin = self.stages.column(0, "SCALE")
-        return self.data[begin : begin + colors * math.prod(shape)].view(colors, *shape)
+        return self.array(0, "SCALE")
+
+    def array(self, stage: int, name: str) -> Tensor:
+        """What the table calls so, of the cells of a `stage`, [matrices, z, y, x] (a view)."""
+        shape, colors = self.stages.shape(stage), self.stages.colors
+        begin, numbers = self.stages.column(stage, name), self.data
+        if name in MATRIX:
+            assert self.work is not None
+            numbers = self.work
+        return numbers[begin : begin + colors * math.prod(shape)].view(colors, *shape)
 
     @property
     def axes(self) -> Axes:
@@ -110,18 +120,19 @@ def table_of(stages: Stages, device: torch.device) -> Tensor:
     return torch.tensor(stages.table, dtype=torch.int64, device=device)
 
 
-def _shape(operator: Operator) -> tuple[Shape, int]:
+def shape_of(operator: Operator) -> tuple[Shape, int]:
     """Cells along z, y and x, and how many matrices there are."""
     z, y, x = operator.loss.shape[1:]
     return (z, y, x), max(len(tensor) for tensor in (operator.loss, *operator.conductances))
 
 
-def _make(operator: Operator, axes: Axes) -> Hierarchy:
+def make(operator: Operator, axes: Axes) -> Hierarchy:
     """The grids of `operator` that come about by coarsening these `axes`."""
-    shape, colors = _shape(operator)
-    stages, loss = stages_of(shape, colors, axes), operator.loss
+    (shape, colors), ghosts = shape_of(operator), operator.ghosts
+    stages, loss = stages_of(shape, colors, axes, ghosts is not None), operator.loss
     shares, threads = shares_of(math.prod(shape), colors, loss)
     levels, few = len(stages.levels) - 1, math.prod(stages.shape(stages.levels[-1]))
+    is_solved = levels > 0 and ghosts is None
     data, work = borrow(stages.data, loss), borrow(stages.work, loss)
     strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
     made = {
@@ -129,7 +140,7 @@ def _make(operator: Operator, axes: Axes) -> Hierarchy:
         "work": work,
         "scratch": loss.new_empty(colors * shares * 3 * (shape[2] + 3)),
         "strengths": strengths,
-        "dense": loss.new_empty(2 * colors * few**2 if levels else 0, dtype=torch.float64),
+        "dense": loss.new_empty(2 * colors * few**2 if is_solved else 0, dtype=torch.float64),
     }
     given: dict[str, Any] = {"table": table_of(stages, loss.device), "colors": colors}
     given["finest_parts"] = shares
@@ -140,15 +151,20 @@ def _make(operator: Operator, axes: Axes) -> Hierarchy:
     def do(step: str, stage: int, parts: int, threads: int) -> None:
         kernel.launch(colors * parts, threads, step=STEPS[step], stage=stage, parts=parts)
 
+    hierarchy = Hierarchy(stages, shares, data, strengths, work=None if ghosts is None else work)
     do("scale cells", 0, shares, threads)
+    if ghosts is not None:
+        # Outermost cells have neighbors that are not here.
+        for name in ("SCALE", "TAKEN"):
+            ghosts.fill(hierarchy.array(0, name))
     do("scale faces", 0, shares, threads)
     second = stages.levels[1] if levels else 0
     for stage in range(second):
         do("weights", stage, shares, threads)
         do("coarse cells", stage, shares, threads)
-    if levels:
+    if is_solved:
         do("all but first", second, 1, min(threads, colors))
-    give_back(work)
-    hierarchy = Hierarchy(stages, shares, data, strengths)
+    if ghosts is None:
+        give_back(work)
     weakref.finalize(hierarchy, give_back, data)
     return hierarchy

@@ -7,25 +7,18 @@ the residual is looked at after them: no result depends on how many were.
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict, deque
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.fused.cycle import SLOTS, cycle_kernel
-from ddrecon.diffusion.solvers.fused.gradients import gradient_kernel
-from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, table_of
-from ddrecon.diffusion.solvers.fused.stages import margin
-from ddrecon.diffusion.solvers.fused.sums import ROWS
+from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy
+from ddrecon.diffusion.solvers.fused.run import Run
+from ddrecon.diffusion.solvers.fused.slabs import solve_in_slabs
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.kernels.spare import borrow, give_back, trim_freed_memory
+from ddrecon.kernels.spare import trim_freed_memory
 
-DOWN, COARSER, UP = range(3)
-START, CHOOSE, DIRECT, ADVANCE = range(4)
-VECTORS = 6
 MOST_AHEAD = 16
 """So many iterations are launched at most before the residual is looked at."""
 ALONE = 1 << 19
@@ -44,7 +37,9 @@ def solve(
     Its residual may be above `tolerance` then.
     """
     made = source.new_empty(source.shape)
-    if source[0].numel() < ALONE:
+    # The same on all ranks: of the largest slab.
+    layers = 1.0 if (ghosts := operator.ghosts) is None else ghosts.most / source.shape[ghosts.axis]
+    if layers * source[0].numel() < ALONE:
         return _solve_checked(operator, source, guess, tolerance, most, made)
     if source.nbytes >= TRIMMED:
         trim_freed_memory()
@@ -74,6 +69,8 @@ def _solve_checked(
     made: Tensor,
 ) -> Solution:
     """The solution, written to `made`, by a hierarchy that coarsens the axes it should."""
+    if operator.ghosts is not None:
+        return solve_in_slabs(operator, operator.ghosts, source, guess, tolerance, most, made)
     hierarchy = operator.once(Hierarchy.of)
     solution, strengths = _solve(hierarchy, source, guess, tolerance, most, made)
     while not hierarchy.is_checked:
@@ -94,7 +91,7 @@ def _solve(
     made: Tensor,
 ) -> tuple[Solution, list[float]]:
     """The solution in `made`, and the strengths of a hierarchy that is not checked yet."""
-    run, counts = _Run(hierarchy, source, guess, tolerance), _counts[source.shape]
+    run, counts = Run(hierarchy, source, guess, tolerance), _counts[source.shape]
     launched = min(max(counts), most)
     run.iterate(0, launched)
     verdict, strengths = run.verdict(launched)
@@ -105,102 +102,3 @@ def _solve(
         verdict, strengths = run.verdict(launched)
     counts.append(verdict.iterations)
     return Solution(run.value(made), verdict.iterations, verdict.residual), strengths
-
-
-@dataclass(frozen=True)
-class _Verdict:
-    """How many `iterations` were needed so far, and the relative `residual` that is left."""
-
-    iterations: int
-    residual: float
-
-    def is_open(self, tolerance: float) -> bool:
-        return self.residual > tolerance
-
-
-class _Run:
-    """A solve under way: its vectors, and the launches that change them."""
-
-    def __init__(
-        self, hierarchy: Hierarchy, source: Tensor, guess: Tensor | None, tolerance: float
-    ):
-        self.hierarchy, self.source, stages = hierarchy, source, hierarchy.stages
-        self.colors, (_, y, x) = len(source), source.shape[1:]
-        cells, edge = source[0].numel(), margin(x)
-        self.shares, self.threads = shares_of(cells, self.colors, source)
-        # solution, residual, two directions, what the cycle makes, A d
-        size = -(-self.colors * cells // 16) * 16 + edge
-        self.places = [edge + k * size for k in range(VECTORS)]
-        self.vectors = borrow(VECTORS * size + edge, source)
-        self.coarser = borrow(self.colors * stages.vectors, source).zero_()
-        slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
-        self.scratch = borrow(self.colors * self.shares * slots, source)
-        self.sums = source.new_empty(len(ROWS) * self.colors * self.shares, dtype=torch.float64)
-        self.tiny, self.tolerance = torch.finfo(source.dtype).tiny, tolerance
-        given = {
-            "table": table_of(stages, source.device),
-            "data": hierarchy.data,
-            "first_vector": edge,
-            "vector_size": size,
-            "scratch_size": slots,
-            "tolerance": tolerance,
-            "tiny": self.tiny,
-            "matrices": stages.colors,
-            "all_colors": self.colors,
-            "shares": self.shares,
-        }
-        made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
-        guessed = None if guess is None or guess.shape != source.shape else guess
-        guesses = {"source": source, "guess": guessed, "has_guess": int(guessed is not None)}
-        bits = source.element_size() * 8
-        self.gradient = gradient_kernel(bits).bind(given | guesses, made)
-        coarser = {"coarser": self.coarser}
-        self.cycle = cycle_kernel(bits).bind(given | {"share": stages.vectors}, made | coarser)
-
-    def iterate(self, first: int, last: int) -> None:
-        """Launches these iterations."""
-        if first == 0:
-            self._advance(START, 0)
-            self._advance(CHOOSE, 0)
-        for iteration in range(first, last):
-            for leg in (DOWN, COARSER, UP):
-                self._cycle(leg, iteration)
-            for act in (DIRECT, ADVANCE):
-                self._advance(act, iteration)
-
-    def verdict(self, launched: int) -> tuple[_Verdict, list[float]]:
-        """What came of so many iterations launched; one read."""
-        unread = self.sums.new_empty(0) if self.hierarchy.is_checked else self.hierarchy.strengths
-        found = torch.cat([self.sums, unread]).tolist() if len(unread) else self.sums.tolist()
-        size = self.colors * self.shares
-
-        def norms(row: int) -> list[float]:
-            parts = [
-                found[row * size + c * self.shares :][: self.shares] for c in range(self.colors)
-            ]
-            return [math.sqrt(sum(part)) for part in parts]
-
-        left, norm = norms(ROWS.index("RESIDUAL") + launched % 2), norms(ROWS.index("SOURCE_NORM"))
-        relative = [a / max(b, self.tiny) for a, b in zip(left, norm, strict=True)]
-        worst = math.nan if any(map(math.isnan, relative)) else max(relative)
-        begin = (ROWS.index("COUNT") + launched % 2) * size
-        count = max(found[begin : begin + size])
-        return _Verdict(int(count), worst), found[len(self.sums) :]
-
-    def value(self, made: Tensor) -> Tensor:
-        """`made`, the solution u = S y; nothing else can be asked for after it."""
-        # The last act: what it was computed in is free again.
-        y = self.vectors[self.places[0] :][: self.source.numel()].view_as(self.source)
-        torch.mul(y, self.hierarchy.scale, out=made)
-        give_back(self.vectors, self.coarser, self.scratch)
-        return made
-
-    def _cycle(self, leg: int, iteration: int) -> None:
-        parts, threads = self.shares, self.threads
-        if leg == COARSER:
-            parts, threads = 1, min(self.threads, self.colors)
-        self.cycle.launch(self.colors * parts, threads, leg=leg, iteration=iteration, parts=parts)
-
-    def _advance(self, act: int, iteration: int) -> None:
-        items = self.colors * self.shares
-        self.gradient.launch(items, self.threads, act=act, iteration=iteration)

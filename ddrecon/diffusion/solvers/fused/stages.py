@@ -29,6 +29,8 @@ COLUMNS = (
     "INVERSE",  # of the coarsest matrix, in `data`
     "SOURCE", "U",  # right side and solution of a level, in a color's share of `vectors`
 )  # fmt: skip
+MATRIX = COLUMNS[5:9]
+"""Conductances and loss of a stage that is not the finest."""
 ENUM = f"enum {{{', '.join(COLUMNS)}, COLUMNS}};"
 
 
@@ -89,8 +91,11 @@ def margin(width: int) -> int:
 
 
 @functools.cache
-def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
-    """The stages of `shape` cells and matrices of so many `colors`."""
+def stages_of(shape: Shape, colors: int, axes: Axes, is_open: bool = False) -> Stages:
+    """The stages of `shape` cells and matrices of so many `colors`.
+
+    The last one is not solved directly where they are `is_open`.
+    """
     rows, sizes = list(_rows(shape, axes)), {"data": 0, "work": 0, "vectors": 0}
     levels = [i for i, row in enumerate(rows) if row["IS_LEVEL"]]
     following = dict(itertools.pairwise(levels))
@@ -104,13 +109,13 @@ def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
         cells, is_last = _cells(row), row["AXIS"] < 0
         row["NEXT"] = following.get(i, -1)
         if i > 0:
-            row |= {name: take("work", colors * cells) for name in COLUMNS[5:9]}
+            row |= {name: take("work", colors * cells) for name in MATRIX}
         if not is_last:
             coarse = colors * _cells(rows[i + 1])
             row |= {name: take("data", coarse) for name in COLUMNS[9:11]}
         if row["IS_LEVEL"] and not (is_last and i > 0):
             row |= {name: take("data", colors * cells) for name in COLUMNS[11:16]}
-        if is_last:
+        if is_last and not is_open:
             row["INVERSE"] = take("data", colors * cells**2)
         if row["IS_LEVEL"] and i > 0:
             row |= {name: take("vectors", cells) for name in COLUMNS[17:19]}
