@@ -103,9 +103,8 @@ def by_path_replay(scene: Scene, iterations: int, headroom: float = 1.0) -> Foun
         )
         penalty = power * parameter.penalty()
         smooth = torch.autograd.grad(penalty, parameter.value)[0] if parameter.tv else 0
-        parameter.step(
-            replay.by_density(gradient, density) + smooth, rate_at(iteration, iterations)
-        )
+        rate = rate_at(iteration, iterations)
+        parameter.step(replay.by_density(gradient, density) + smooth, rate, power)
         _note(found, time.process_time() - start, loss + float(penalty), parameter.value.detach())
     return found
 

@@ -86,7 +86,7 @@ def test_a_step_takes_any_layout(engine: str):
 
     def step(value: Tensor, gradient: Tensor) -> Tensor:
         parameter = Parameter("density", ParameterSettings(), 0.1, value, scene.volume.grid)
-        parameter.step(gradient, 1.0)
+        parameter.step(gradient, 1.0, 1.0)
         return parameter.value.detach()
 
     known = step(scene.volume.density, gradient)

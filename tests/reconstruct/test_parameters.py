@@ -1,11 +1,13 @@
-"""Steps of fields: closed forms, units, and a new beginning at each resolution."""
+"""Steps of fields: closed forms, units, stability, and a new beginning at each resolution."""
 
 from __future__ import annotations
 
+import pytest
 import torch
 from media import box_grid, random_values
+from torch import Tensor
 
-from ddrecon.reconstruct.parameters import BETAS, FLOOR, Parameter
+from ddrecon.reconstruct.parameters import BETAS, DAMPING, FLOOR, Parameter
 from ddrecon.settings import ParameterSettings
 
 GRID = box_grid((4, 6, 5))
@@ -34,6 +36,60 @@ def test_steps_do_not_depend_on_the_unit_of_the_objective() -> None:
         one.step(gradient, 1.0)
         other.step(1e-4 * gradient, 1.0)
     torch.testing.assert_close(one.value, other.value)
+
+
+def test_a_step_counts_the_curvature_of_smoothing_where_a_field_is_even() -> None:
+    value, power = torch.full(GRID.shape, 0.2, dtype=torch.float64), 7.0
+    parameter = Parameter("density", ParameterSettings(tv=0.1), RATE, value, GRID)
+    gradient = random_values(*GRID.shape) - 0.5
+
+    def penalty(field: Tensor) -> Tensor:
+        parameter.value = field.view(GRID.shape)
+        return power * parameter.penalty()
+
+    hessian = torch.autograd.functional.hessian(penalty, value.flatten())
+    parameter.value = value
+    parameter.step(gradient, 1.0, power)
+    size = gradient.abs() + FLOOR * gradient.square().mean().sqrt()
+    size += DAMPING * RATE * hessian.diagonal().view(GRID.shape)
+    torch.testing.assert_close(
+        parameter.value.detach(), value - RATE * (1 + BETAS[0]) * gradient / size
+    )
+
+
+@pytest.mark.parametrize("part, largest", [(1.0, 1.0), (0.5, 0.6)])
+def test_half_of_the_damping_is_where_steps_no_longer_fade(part: float, largest: float) -> None:
+    # A step of length 1 over the damping meets eigenvalues of smoothing over its diagonal up to 2.
+    keep, length = BETAS[0], part * 2 / (DAMPING / 2)
+    mean = torch.tensor([[1 - keep, keep]], dtype=torch.float64)
+    onward = keep * mean + torch.tensor([[1 - keep, 0.0]])
+    matrix = torch.cat([torch.tensor([[1.0, 0.0]]) - length * onward, mean])
+    radius = float(torch.linalg.eigvals(matrix).abs().max())
+    assert radius == pytest.approx(1) if part == 1 else radius < largest
+
+
+def descend(start: Tensor, target: Tensor, weight: float) -> Tensor:
+    """The density after 30 steps towards `target`, with smoothing."""
+    grid = box_grid(tuple(start.shape))
+    parameter = Parameter("density", ParameterSettings(), 0.1, start, grid)
+    for _ in range(30):
+        value = parameter.value
+        loss = parameter.penalty() + weight * (value - target).square().mean()
+        parameter.step(torch.autograd.grad(loss, value)[0], 1.0, 1.0)
+    return parameter.value.detach()
+
+
+def test_a_field_that_smoothing_alone_moves_becomes_even() -> None:
+    start = 0.5 + 1e-4 * random_values(6, 6, 6)
+    assert descend(start, start, 0.0).std() < 0.3 * start.std()
+
+
+@pytest.mark.parametrize("weight", [1e-3, 1e-1])
+def test_steps_do_not_amplify_what_a_start_differs_by(weight: float) -> None:
+    start, change = torch.zeros(8, 8, 8, dtype=torch.float64), 1e-6 * random_values(8, 8, 8, seed=2)
+    target = 0.5 * (random_values(8, 8, 8, seed=1) > 0.7)
+    ends = [descend(value, target, weight) for value in (start, start + change)]
+    assert (ends[1] - ends[0]).abs().max() < 30 * change.max()
 
 
 def test_cells_without_a_derivative_stay() -> None:

@@ -35,8 +35,8 @@ def step_adam(
 ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """The new value, within its bounds, and the new moments, after `steps` with this one.
 
-    `smallest`, a number or one for each, is added to the size of derivatives. The value moves along the part
-    `ahead` of the mean derivative, and for the rest along the newest (E46).
+    `smallest`, a number or one for each, is added to the size of derivatives. The value moves along
+    the part `ahead` of the mean derivative, and for the rest along the newest (E46).
     """
     new = [value.new_empty(value.shape) for _ in range(3)]
     weights = [1 - beta**steps for beta in betas]
