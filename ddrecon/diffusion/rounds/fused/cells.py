@@ -4,7 +4,7 @@ All directions go on by a slice at a time, each across the axis along which it c
 What scatters and I are arrays of all directions, [D, C, z, y, x].
 """
 
-from ddrecon.diffusion.rounds.fused.rows import DECAYED, SLOPES
+from ddrecon.diffusion.rounds.fused.row_steps import DECAYED, SLOPES
 
 GIVEN = """
     F *extinction, *scattering, *scales, *parts, *near, *light, *bar, *q_bars;

@@ -11,12 +11,16 @@ Where a step meets no medium, nothing returns to what scatters.
 """
 
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
-from ddrecon.diffusion.rounds.fused.rows import (
-    ACROSS,
+from ddrecon.diffusion.rounds.fused.row_steps import (
     BEGINNINGS,
     DECAYED,
     DIRECTION,
     ENDS,
+    SLOPES,
+    UPSTREAM,
+)
+from ddrecon.diffusion.rounds.fused.rows import (
+    ACROSS,
     FOLLOW_ROWS,
     GROUP,
     PASS,
@@ -24,8 +28,6 @@ from ddrecon.diffusion.rounds.fused.rows import (
     PLACES,
     RANGE,
     ROW,
-    SLOPES,
-    UPSTREAM,
 )
 
 # Cells whose steps begin at this one. What begins beyond a face of the box took q at the face: then

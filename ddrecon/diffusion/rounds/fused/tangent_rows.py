@@ -9,12 +9,15 @@ from __future__ import annotations
 import functools
 
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
-from ddrecon.diffusion.rounds.fused.rows import (
-    ACROSS,
+from ddrecon.diffusion.rounds.fused.row_steps import (
     BEGINNINGS,
     DECAYED,
     DIRECTION,
     ENDS,
+    UPSTREAM,
+)
+from ddrecon.diffusion.rounds.fused.rows import (
+    ACROSS,
     GIVEN,
     GROUP,
     PASS,
@@ -22,7 +25,6 @@ from ddrecon.diffusion.rounds.fused.rows import (
     PLACES,
     RANGE,
     ROW,
-    UPSTREAM,
 )
 from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.kernels.text import TextKernel
