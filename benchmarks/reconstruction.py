@@ -11,6 +11,8 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch.nn.functional import max_pool3d
 
 from ddrecon.io.volumes.table import read_field
 
@@ -27,8 +29,11 @@ def main() -> None:
     arguments = parser.parse_args()
     true = read_field(arguments.truth, "density").values.astype(np.float64)
     print(
-        "| run | L1 | L2 | correlation | held-out PSNR [dB] | seconds |\n|---|---|---|---|---|---|"
+        "| run | L1 | L2 | correlation | haze | far | held-out PSNR [dB] | seconds |\n"
+        "|---|---|---|---|---|---|---|---|"
     )
+    empty = true == 0
+    near = max_pool3d(torch.as_tensor(~empty)[None].double(), 3, 1, 1)[0].numpy() > 0
     for run in arguments.runs:
         found = read_field(run / "volumes" / "density.npz", "density").values.astype(np.float64)
         summary = json.loads((run / "summary.json").read_text())
@@ -39,6 +44,9 @@ def main() -> None:
             np.corrcoef(found.flat, true.flat)[0, 1],
         )
         shown = " | ".join(f"{error:.3f}" for error in errors)
+        # What lies where truth is empty, and what of it is more than a cell away, of the whole.
+        hazes = found[empty].sum() / found.sum(), found[~near].sum() / found.sum()
+        shown += "".join(f" | {haze:.2%}" for haze in hazes)
         print(f"| {run} | {shown} | {summary['test_psnr']:.2f} | {summary['seconds']:.1f} |")
 
 

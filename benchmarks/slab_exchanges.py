@@ -84,7 +84,8 @@ class Case:
 
 
 SWAP, GATHER, SUM = "swap_with_neighbors", "gather_from_ranks", "sum_over_ranks"
-"""Exchanges: with neighbors; of a part that each has; of sums that all get."""
+TRADE = "trade_with_ranks"
+"""Exchanges: with neighbors; of a part that each has; of sums that all get; of a part for each."""
 Grown = dict[str, Callable[[Case], float]]
 LAWS: dict[tuple[str, str], Grown] = {
     (SWAP, "the solver"): {
@@ -104,9 +105,9 @@ LAWS: dict[tuple[str, str], Grown] = {
         "face x ranks": lambda c: c.face * c.ranks,
         "distances x colors": lambda c: c.distances * c.colors,
     },
-    (GATHER, "views"): {"pixels": lambda c: c.rays},
+    (TRADE, "views"): {"pixels": lambda c: c.rays},
     (SUM, "views"): {
-        "pixels x ranks": lambda c: c.rays * c.ranks,
+        "pixels": lambda c: c.rays,
         "pixels x colors": lambda c: c.rays * c.colors,
     },
     (SUM, "derivatives"): {"cells": lambda c: c.cells},
@@ -156,7 +157,7 @@ def iterate(case: Case) -> dict[str, Any]:
     def counted(count: int) -> AbstractContextManager[None]:
         frame = sys._getframe(1)
         name = frame.f_code.co_name
-        is_large = name in (SWAP, GATHER, SUM) and count > FEW
+        is_large = name in (SWAP, GATHER, SUM, TRADE) and count > FEW
         entry = found[f"{name}|{purpose_of(frame) if is_large else NUMBERS}"]
         entry[0] += count
         entry[1] += 1

@@ -6,7 +6,7 @@ same formulas, so their numbers agree to rounding. Torch's are, with either engi
 for the mass on the way to them, the scattering of skies towards a camera, tangents in forward mode
 by where lights are, the model `flux_limited`, the scheme `printed`, and solvers other than
 `multigrid`. So is of light and of rounds what has the phase function in it, where that differs from
-cell to cell. So are, where ranks share out cells, beams, and on a GPU solves and sweeps.
+cell to cell. So are, on GPUs whose ranks share out cells, the sweeps of rounds.
 """
 
 from __future__ import annotations

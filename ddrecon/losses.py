@@ -17,8 +17,13 @@ ROUNDING = 1e-2
 """Gradients below this, in units of one over the box's shortest side, are penalized quadratically
 rather than as total variation.
 """
-KNEE = 0.1
-"""Total variation is that of densities far below it, and of the logarithm of those above (E47)."""
+KNEE = 1.2
+"""Total variation is that of densities far below it, and of the logarithm of those above (E47).
+
+It is in optical depths across the box's shortest side, whatever the unit of density is.
+"""
+THIN = 0.24
+"""The same for `l1` of density."""
 HUBER = 0.05
 """Errors above this part of the targets' root mean square count linearly in the Huber loss."""
 RELATIVE = 0.05
@@ -206,14 +211,14 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
     return (square.sqrt() - ROUNDING).mean()
 
 
-def compress(field: Tensor) -> Tensor:
-    """What of the density `field` total variation is taken of: log(1 + field / `KNEE`) / 3 (E47).
+def compress(field: Tensor, knee: float) -> Tensor:
+    """What of the density `field` is penalized: log(1 + field / `knee`) / 3 (E47).
 
-    Density below 0 counts as 0.
+    Density below 0 counts as 0. `knee` > 0 is in its unit.
     """
-    return torch.log1p(field.clamp(min=0) / KNEE) / 3
+    return torch.log1p(field.clamp(min=0) / knee) / 3
 
 
-def compressed_slope(field: Tensor) -> Tensor:
+def compressed_slope(field: Tensor, knee: float) -> Tensor:
     """The derivative of `compress` at `field`."""
-    return (field >= 0) / (3 * (field.clamp(min=0) + KNEE))
+    return (field >= 0) / (3 * (field.clamp(min=0) + knee))

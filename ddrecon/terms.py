@@ -31,16 +31,12 @@ def parts_in_torch(scene: Scene, has_slabs: bool) -> tuple[str, ...]:
 
     `has_slabs`: ranks share out its cells.
     """
-    settings, parts = scene.diffusion, list[str]()
+    settings = scene.diffusion
     is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    if has_slabs and not all(isinstance(light, AmbientLight) for light in scene.lights):
-        parts.append("light")
-    on_gpu = has_slabs and scene.volume.density.is_cuda
-    if on_gpu or not is_fused or settings.solver != "multigrid":
-        parts.append("diffusion")
-    if on_gpu and settings.rounds:
-        parts.append("transport rounds")
-    return tuple(parts)
+    parts = () if is_fused and settings.solver == "multigrid" else ("diffusion",)
+    # On a GPU, kernels sweep whole grids alone.
+    sweeps_slabs = has_slabs and settings.rounds > 0 and scene.volume.density.is_cuda
+    return (*parts, "transport rounds") if sweeps_slabs else parts
 
 
 def _light_in(scene: Scene) -> list[str]:

@@ -438,12 +438,12 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "tv": (
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
-                " density, of which it is that of log(1 + 10 density) / 3, and 0 for others."
+                " density, of whose logarithm it is (E47), and 0 for others."
                 " `auto` finds it by leaving a view out."
             ),
             "l1": (
-                "Weight of its mean, which empties what no picture needs; for density that of"
-                " log(1 + 10 density) / 3."
+                "Weight of its mean, which empties what no picture needs; for density of its"
+                " logarithm (E47), and 0.05 empties haze."
             ),
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "

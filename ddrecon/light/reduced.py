@@ -22,7 +22,6 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
 from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.remember import remember
-from ddrecon.slabs.slab import Slab
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
     directional = {
         i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
     }
-    is_even = directional and not medium.is_cellwise and not isinstance(medium.grid, Slab)
+    is_even = directional and not medium.is_cellwise
     if is_even and is_fused(*(light.direction for light in directional.values())):
         from ddrecon.light.fused.beams import follow_beams
 
@@ -95,8 +94,7 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
 def _follow(
     medium: Medium, light: DirectionalLight | PointLight, degree: int
 ) -> tuple[Beam | PointBeam, Moments]:
-    has_slabs = isinstance(medium.grid, Slab)
-    if isinstance(light, DirectionalLight) and not has_slabs and is_fused(light.direction):
+    if isinstance(light, DirectionalLight) and is_fused(light.direction):
         from ddrecon.light.fused.beams import follow_beams
 
         (beam,), received = follow_beams(medium, [light], has_flux=False)

@@ -39,16 +39,15 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
-    if isinstance(grid, Slab):
-        from ddrecon.light import shear_slabs
-
-        sum_one: Callable[..., tuple[Tensor, Tensor]] = shear_slabs.sum_mass
-    elif is_fused(direction):
+    if is_fused(direction):
         from ddrecon.light.fused.sum_mass import sum_mass
 
         return sum_mass(field, grid, direction, bound)
-    else:
-        sum_one = _sum_mass
+    sum_one: Callable[..., tuple[Tensor, Tensor]] = _sum_mass
+    if isinstance(grid, Slab):
+        from ddrecon.light import shear_slabs
+
+        sum_one = shear_slabs.sum_mass
     if field.shape[0] == 1:
         return sum_one(field, grid, direction, bound)
     each = [recompute(sum_one, one, grid, direction, bound) for one in field.split(1)]

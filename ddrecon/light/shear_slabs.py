@@ -28,46 +28,39 @@ def sum_mass(
 ) -> tuple[Tensor, Tensor]:
     """What `sum_mass_to_cells` returns in `slab`, of one `field` [1, z, y, x] there."""
     slicing, slope, step = cross_grid(slab.whole, direction)
-    rays = _Rays.of(slab, slicing, slope)
+    rays = SlabRays.of(slab, slicing, slope)
     is_upwards = direction[slab.axis].item() >= 0
 
     # Sums along rays over own cells: those that the next slab has in its halo apart from the rest.
-    begin, end = slab.cuts[slab.rank : slab.rank + 2]
-    middle = end - HALO if is_upwards else begin + HALO
-    parts = [rays.sums(field, begin, middle), rays.sums(field, middle, end)]
-    sums = gather_parts(torch.stack(parts if is_upwards else parts[::-1]))
-
-    # Of all slabs before this one, but for what this one has in its halo.
-    counted = sums.new_zeros(sums.shape[:2])
-    counted[: slab.rank] = 1
-    if not is_upwards:
-        counted = 1 - counted
-        counted[slab.rank] = 0
-    neighbor = slab.rank + (-1 if is_upwards else 1)
-    if 0 <= neighbor < len(counted):
-        counted[neighbor, 1] = 0
+    sums = gather_parts(
+        torch.stack([rays.sums(field, part) for part in own_parts(rays, is_upwards)])
+    )
 
     # The slab with its halo; near its ends, where rays are missing, its neighbors' cells are right.
     third_order = ThirdOrder(0, 1, bound)
-    some = rays.through(field, slab.first, slab.last)
+    some = rays.part(slab.first, slab.last)
+    counted = sums.new_tensor(counted_parts(slab, len(sums), is_upwards))
     before = some.cut(torch.einsum("rp,rp...->...", counted, sums))
-    passed = mass_passed(*some.shear.look(some.slices), step, third_order, before)
+    slices = rays.slices(field, some)
+    passed = mass_passed(*some.shear.look(slices), step, third_order, before)
     shear = replace(some.shear, begin=some.shear.begin + some.added)
-    own = slice(some.added, len(some.slices) - some.after)
+    own = slice(some.added, len(slices) - some.after)
     entered = slicing.lift(shear.to_cells(passed[own], third_order))
     return add_halo(slab.own(entered), slab), step
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Some layers of a slab as `slices`, and the rays that meet them.
+class Part:
+    """The layers `begin` to `end` of the whole, in slices, and the rays that meet them.
 
     These are part of the whole's: from `first` on in rows and columns. So many slices were `added`
-    before, and so many `after`.
+    before, and so many `after`: where the beam crosses slabs one by one, there is an empty slice at
+    either end, because the field bends there as well.
     """
 
+    begin: int
+    end: int
     shear: Shear
-    slices: Tensor
     first: tuple[int, int]
     added: int
     after: int
@@ -85,7 +78,7 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class _Rays:
+class SlabRays:
     """The rays of the `whole` grid, of `count` slices, as a `slab` of it knows them."""
 
     slab: Slab
@@ -94,30 +87,26 @@ class _Rays:
     count: int
 
     @staticmethod
-    def of(slab: Slab, slicing: Slicing, slope: Tensor) -> _Rays:
+    def of(slab: Slab, slicing: Slicing, slope: Tensor) -> SlabRays:
         """The rays along a beam of `slope` that meets the slices of `slicing`."""
         count, _, *size = (1 if axis == 0 else slab.whole.shape[axis - 1] for axis in slicing.order)
-        return _Rays(slab, slicing, Shear.of(count, size, slope), count)
+        return SlabRays(slab, slicing, Shear.of(count, size, slope), count)
 
-    def through(self, field: Tensor, begin: int, end: int) -> _Part:
-        """How rays go through the layers `begin` to `end` of the whole, whose `field` the slab has.
-
-        Where the beam crosses slabs one by one, there is an empty slice at either end: the field
-        bends there as well.
-        """
-        slab, whole = self.slab, self.whole
-        slices = self.slicing.lay(field.narrow(slab.axis - 3, begin - slab.first, end - begin))
+    def part(self, begin: int, end: int) -> Part:
+        """How rays go through the layers `begin` to `end` of the whole."""
+        slab, whole, count = self.slab, self.whole, self.count
         number, added, after, cut = 0, 0, 0, self.slicing.order.index(1 + slab.axis) - 2
         if cut < 0:
-            number = self.count - end if self.slicing.is_reversed else begin
-            added, after = int(number > 0), int(number + len(slices) < self.count)
-            slices = pad(slices, (0, 0, 0, 0, 0, 0, added, after))
+            number = count - end if self.slicing.is_reversed else begin
+            added, after = int(number > 0), int(number + end - begin < count)
+            count = end - begin + added + after
             number -= added
         # The rays that meet these cells on the first slice, on the last or between.
-        firsts, counts, starts = [], [], []
+        firsts, counts, starts, sizes = [], [], [], list[int]()
         for which, slope in enumerate(whole.slope.tolist()):
-            low, size = (begin if which == cut else 0), slices.shape[2 + which]
-            drifts = slope * number, slope * (number + len(slices) - 1)
+            low, size = (begin, end - begin) if which == cut else (0, whole.size[which])
+            sizes.append(size)
+            drifts = slope * number, slope * (number + count - 1)
             nearest = math.floor(low + whole.first[which] - max(drifts)) - MARGIN
             farthest = math.ceil(low + size + whole.first[which] - min(drifts)) + MARGIN
             firsts.append(max(nearest, 0))
@@ -125,15 +114,38 @@ class _Rays:
             starts.append(whole.first[which] + low - firsts[which])
         shear = replace(
             whole,
-            size=(slices.shape[2], slices.shape[3]),
+            size=(sizes[0], sizes[1]),
             lattice=(counts[0], counts[1]),
             first=(starts[0], starts[1]),
             begin=number,
         )
-        return _Part(shear, slices, (firsts[0], firsts[1]), added, after)
+        return Part(begin, end, shear, (firsts[0], firsts[1]), added, after)
 
-    def sums(self, field: Tensor, begin: int, end: int) -> Tensor:
-        """Sums of `Shear.look` over these layers, on all rays of the whole: [2, K, *lattice]."""
-        part = self.through(field, begin, end)
-        found = torch.stack([each.sum(0) for each in part.shear.look(part.slices)])
-        return part.spread(found, self.whole.lattice)
+    def slices(self, field: Tensor, part: Part) -> Tensor:
+        """The slices [N, K, H, W] of a `part` of the whole, whose `field` the slab has."""
+        axis, first = self.slab.axis - 3, part.begin - self.slab.first
+        slices = self.slicing.lay(field.narrow(axis, first, part.end - part.begin))
+        return pad(slices, (0, 0, 0, 0, 0, 0, part.added, part.after))
+
+    def sums(self, field: Tensor, part: Part) -> Tensor:
+        """Sums of `Shear.look` over a `part`, on all rays of the whole: [2, K, *lattice]."""
+        found = part.shear.look(self.slices(field, part))
+        return part.spread(torch.stack([each.sum(0) for each in found]), self.whole.lattice)
+
+
+def own_parts(rays: SlabRays, is_upwards: bool) -> list[Part]:
+    """A slab's own layers in two: the last are those that the next slab has in its halo."""
+    slab = rays.slab
+    begin, end = slab.cuts[slab.rank : slab.rank + 2]
+    middle = end - HALO if is_upwards else begin + HALO
+    parts = [rays.part(begin, middle), rays.part(middle, end)]
+    return parts if is_upwards else parts[::-1]
+
+
+def counted_parts(slab: Slab, ranks: int, is_upwards: bool) -> list[list[float]]:
+    """1 for those `own_parts` of all ranks that lie before `slab` and its halo, else 0."""
+    neighbor = slab.rank + (-1 if is_upwards else 1)
+    is_before = [rank < slab.rank if is_upwards else rank > slab.rank for rank in range(ranks)]
+    return [
+        [float(before), float(before and rank != neighbor)] for rank, before in enumerate(is_before)
+    ]

@@ -18,7 +18,6 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
-from ddrecon.slabs.slab import Slab
 
 MOST_MOMENTS = 4
 """So many moments are summed at once by fused kernels."""
@@ -39,8 +38,7 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     as going along its middle (E17).
     """
     skies = _lit_skies(lights)
-    has_slabs = isinstance(medium.grid, Slab)
-    if skies and not has_slabs and is_fused(*(sky.travel for sky in skies)):
+    if skies and is_fused(*(sky.travel for sky in skies)):
         return _sum_fused(medium, skies, degree)
     total = None
     for sky in skies:
@@ -117,7 +115,7 @@ def _attenuate_direction(medium: Medium, direction: Tensor, weights: Tensor) -> 
 
     tau is averaged over each cell.
     """
-    if len(weights) == 1 and not isinstance(medium.grid, Slab) and is_fused(direction):
+    if len(weights) == 1 and is_fused(direction):
         from ddrecon.light.fused.beams import attenuate
 
         return attenuate(medium, direction[None], weights[None])[0].mean[None]

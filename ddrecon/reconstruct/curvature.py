@@ -64,7 +64,7 @@ class Curvature:
             for view in scene.views
         }
         self.roughness = {
-            p.name: Roughness.about(self.values[p.name], p.grid, power * p.tv, p.is_compressed)
+            p.name: Roughness.about(self.values[p.name], p.grid, power * p.tv, p.knee)
             for p in parameters
             if p.tv
         }

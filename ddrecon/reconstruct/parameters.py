@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.losses import compress, compressed_slope, total_variation
+from ddrecon.losses import KNEE, THIN, compress, compressed_slope, total_variation
 from ddrecon.reconstruct.levels import resample
 from ddrecon.reconstruct.roughness import Roughness
 from ddrecon.settings import ParameterSettings
@@ -49,7 +49,8 @@ class Parameter:
     all its cells change alike; that ends after the part `even_until` of a run. `rate` is one number
     or one for each entry. `view` is the name of the view that it belongs to, None for what all
     views see. One that `is_fitted` is solved for instead; `curvature` is the second derivative of
-    the loss by it.
+    the loss by it. Of a density, `unit` is what has an optical depth of 1 across the box's shortest
+    side.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Parameter:
         rate: float | Tensor,
         value: Tensor,
         grid: Grid,
+        unit: float = 1.0,
     ):
         kind = kind_of(name)
         self.name, self.rate, self.grid = name, rate, grid
@@ -75,7 +77,8 @@ class Parameter:
         self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
-        self.is_compressed = kind.is_compressed
+        self.knee = KNEE * unit if kind.is_compressed else None
+        self.thin = THIN * unit if kind.is_compressed else None
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
@@ -88,14 +91,16 @@ class Parameter:
         See `ParameterSettings` for the weights.
         """
         value, total = self.value, self.value.new_zeros(())
-        if self.is_compressed:
-            value = compress(value)
         if self.tv:
             variation = total_variation
             if current_engine() == "warp":
                 from ddrecon.reconstruct.fused.passes import total_variation as variation
-            total = total + self.tv * variation(value, self.grid)
-        return total + self.l1 * value.abs().mean() if self.l1 else total
+            seen = value if self.knee is None else compress(value, self.knee)
+            total = total + self.tv * variation(seen, self.grid)
+        if self.l1:
+            size = value.abs() if self.thin is None else compress(value, self.thin)
+            total = total + self.l1 * size.mean()
+        return total
 
     @property
     def largest_rate(self) -> float:
@@ -164,15 +169,15 @@ class Parameter:
 
         That is the diagonal of R (E32), with the slope of the compression at the cell itself.
         """
-        seen = compress(value) if self.is_compressed else value
+        seen = value if self.knee is None else compress(value, self.knee)
         if current_engine() == "warp":
             from ddrecon.reconstruct.fused.passes import variation_diagonal
 
             diagonal = variation_diagonal(seen, self.grid)
         else:
             diagonal = Roughness.about(seen, self.grid, 1.0).diagonal()
-        if self.is_compressed:
-            diagonal *= compressed_slope(value) ** 2
+        if self.knee is not None:
+            diagonal *= compressed_slope(value, self.knee) ** 2
         return self.tv * diagonal
 
     def value_on(self, grid: Grid) -> Tensor:

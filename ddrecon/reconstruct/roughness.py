@@ -27,18 +27,18 @@ class Roughness:
     stiffness: Tensor
 
     @staticmethod
-    def about(field: Tensor, grid: Grid, weight: float, is_compressed: bool = False) -> Roughness:
+    def about(field: Tensor, grid: Grid, weight: float, knee: float | None = None) -> Roughness:
         """That of `weight` times `losses.total_variation`, about `field` [..., z, y, x].
 
-        Where that is of a field that `is_compressed` (E47), its slopes are those of the field times
-        the slope of the compression there.
+        Where that is of a field compressed above `knee` (E47), its slopes are those of the field
+        times the slope of the compression there.
         """
-        seen = compress(field) if is_compressed else field
+        seen = field if knee is None else compress(field, knee)
         square = torch.stack([slope.square() for slope in slopes(seen, grid)]).sum(0)
         stiffness = weight / field.numel() / (square + ROUNDING**2).sqrt()
-        return Roughness(
-            grid, stiffness * compressed_slope(field) ** 2 if is_compressed else stiffness
-        )
+        if knee is not None:
+            stiffness = stiffness * compressed_slope(field, knee) ** 2
+        return Roughness(grid, stiffness)
 
     def times(self, factor: float) -> Roughness:
         """That of `factor` times the weight."""

@@ -18,6 +18,7 @@ from ddrecon.reconstruct.rates import default_rate
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations, OptimizeSettings
+from ddrecon.variables.kinds import kind_of, split_name
 from ddrecon.variables.values import value_of, variable_names
 
 
@@ -139,8 +140,22 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         start = scene.starts.get(name)
         start = value_of(scene, name) if start is None else start
         rate = wanted.lr or default_rate(scene, name, start)
-        parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid))
+        unit = _density_unit(scene, name)
+        parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid, unit))
     return parameters
+
+
+def _density_unit(scene: Scene, name: str) -> float:
+    """The density that has an optical depth of 1 across the shortest side of the box of `scene`.
+
+    By the mean extinction of the medium whose density is the variable `name`; 1 where that is 0,
+    and for another variable.
+    """
+    if not kind_of(name).is_compressed:
+        return 1.0
+    medium, _ = split_name(name)
+    depth = float(value_of(scene, f"{medium}sigma_t").mean()) * min(scene.volume.grid.extent)
+    return 1 / depth if depth > 0 else 1.0
 
 
 def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:

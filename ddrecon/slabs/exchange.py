@@ -95,7 +95,7 @@ class _AddHalo(torch.autograd.Function):
 
     @staticmethod
     def forward(own: Tensor, slab: Slab) -> Tensor:
-        return _with_halo(own, slab)
+        return with_halo(own, slab)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Slab], output: Tensor) -> None:
@@ -104,25 +104,30 @@ class _AddHalo(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, field_bar: Tensor) -> tuple[Tensor, None]:
-        slab, axis = ctx.slab, ctx.slab.axis - 3
-        (below, above), size = slab.halo, slab.size
-        own_bar = slab.own(field_bar).clone()
-        lent = swap_with_neighbors(
-            field_bar.narrow(axis, 0, below) if below else None,
-            field_bar.narrow(axis, below + size, above) if above else None,
-        )
-        if lent[0] is not None:
-            own_bar.narrow(axis, 0, below).add_(lent[0])
-        if lent[1] is not None:
-            own_bar.narrow(axis, size - above, above).add_(lent[1])
-        return own_bar, None
+        return return_halo(field_bar, ctx.slab), None
 
     @staticmethod
     def jvp(ctx: Any, d_own: Tensor, _: None) -> Tensor:
-        return _with_halo(d_own, ctx.slab)
+        return with_halo(d_own, ctx.slab)
 
 
-def _with_halo(own: Tensor, slab: Slab) -> Tensor:
+def return_halo(field_bar: Tensor, slab: Slab) -> Tensor:
+    """The transpose of `with_halo`: own cells' cotangents, with those that neighbors found."""
+    axis, (below, above), size = slab.axis - 3, slab.halo, slab.size
+    own_bar = slab.own(field_bar).clone()
+    lent = swap_with_neighbors(
+        field_bar.narrow(axis, 0, below) if below else None,
+        field_bar.narrow(axis, below + size, above) if above else None,
+    )
+    if lent[0] is not None:
+        own_bar.narrow(axis, 0, below).add_(lent[0])
+    if lent[1] is not None:
+        own_bar.narrow(axis, size - above, above).add_(lent[1])
+    return own_bar
+
+
+def with_halo(own: Tensor, slab: Slab) -> Tensor:
+    """`own` cells [..., z, y, x] with those of neighbors, without derivatives."""
     axis, (below, above) = slab.axis - 3, slab.halo
     got = swap_with_neighbors(
         own.narrow(axis, 0, below) if below else None,

@@ -7,14 +7,16 @@ import logging
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from click.testing import Result
 
-from ddrecon import engine
+from ddrecon import engine, terms
 from ddrecon.cli import check
 from ddrecon.cli.session import open_session, show_compilations
+from ddrecon.settings import DiffusionSettings
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -74,9 +76,15 @@ def test_check_names_what_is_left_to_torch(succeed: Run, change: str) -> None:
 
 
 def test_check_names_what_slabs_leave_to_torch(succeed: Run) -> None:
-    found = succeed("check", "scene.yaml", "--engine", "warp", "--share", "cells")
-    line = "engine: warp (view rays, diffusion, transport rounds); light in torch"
-    assert line in found.stdout.splitlines()
+    command = "check", "scene.yaml", "--engine", "warp", "--share", "cells"
+    line = "engine: warp (view rays, light, diffusion, transport rounds)"
+    assert line in succeed(*command).stdout.splitlines()
+    scene: Any = SimpleNamespace(
+        volume=SimpleNamespace(density=SimpleNamespace(is_cuda=True)),
+        diffusion=DiffusionSettings(transport_rounds=1),
+    )
+    assert terms.parts_in_torch(scene, has_slabs=True) == ("transport rounds",)
+    assert terms.parts_in_torch(scene, has_slabs=False) == ()
 
 
 def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -105,7 +105,7 @@ def test_tangents_compile_for_graphics_cards(architecture: int, tmp_path: Path) 
     kernels = [
         tangent_of(system_kernel(True, 32), names),
         interleaved_tangent_of(shear_kernels(64).rays),
-        packet_tangent_kernel(layout),
+        packet_tangent_kernel(layout, True),
     ]
     for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=architecture, module_dir=tmp_path, use_ptx=True)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
+from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
@@ -32,6 +33,7 @@ from ddrecon.march.fused.packet_walks import (  # noqa: E402
     packet_adjoint_kernel,
     packet_integral_kernel,
 )
+from ddrecon.march.fused.stretches import mark_kernel  # noqa: E402
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -228,6 +230,22 @@ def test_packets_read_and_write_whole_rows(eye: tuple[float, float, float], dtyp
         assert_near(found, expected, 3e-5 if dtype is torch.float32 else 1e-11)
 
 
+@pytest.mark.parametrize("eye", [(0.0, 0.0, 3.0), (3.0, 0.0, 0.0), (0.3, 3.0, 0.2)], ids=str)
+def test_derivatives_by_rays_through_centers_of_cells(eye: tuple[float, float, float]):
+    """There slopes are the mean of both sides; from all sides, by packets of rows or columns."""
+    camera = make_camera(size=(9, 7), half_width=0.3, eye=eye, is_perspective=False)
+    if eye[1]:
+        camera = make_camera(size=(9, 7), half_width=0.3, eye=eye)
+    grid = Grid((9, 7, 9), (-0.5, -0.6, -0.4), (0.5, 0.6, 0.4))
+    density = half_empty(*grid.shape)
+    scene = make_scene(density, sigma_a=(1.0,), sigma_s=(6.0,), camera=camera, grid=grid)
+    found, known = (gradients(scene, ["density", *POSE], engine)[1] for engine in ("warp", "torch"))
+    for one, other in zip(found, known, strict=True):
+        assert_near(one, other, 1e-11)
+    found, known = (tangent(scene, *POSE, engine) for engine in ("warp", "torch"))
+    assert_near(found, known, 1e-11)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_hard_cases_are_passed(name: str):
     """Where cells are opaque, little mass is left of much on the walk back."""
@@ -267,12 +285,12 @@ def kernels_for(architecture: int) -> list:
         one = Layout(1, 1, 1, (False, True), 0, 0, 1, 32)
         several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 1, 3, 3)
         walks = [tangent_kernel(one, True), adjoint_kernel(one, True, True)]
-        return [*walks, packet_integral_kernel(several), packet_adjoint_kernel(one)]
+        return [*walks, packet_integral_kernel(several), packet_adjoint_kernel(one, True)]
     one = Layout(1, 1, 1, (True,), 0, 0, 1, 32)
     several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64)
     steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1, 1, 1)
     walks = [integral_kernel(steep), adjoint_kernel(one, False, True)]
-    return [*walks, packet_integral_kernel(one), packet_adjoint_kernel(several)]
+    return [*walks, mark_kernel(32), packet_integral_kernel(one), packet_adjoint_kernel(several)]
 
 
 @pytest.mark.parametrize("architecture", [80, 90])

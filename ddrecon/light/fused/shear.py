@@ -65,6 +65,10 @@ class Shear:
         """What `lay` makes of cells, as cells [K, z, y, x]."""
         return laid.transpose(2, 3).contiguous() if self.axis == 2 else laid
 
+    def sum(self, laid: Tensor, numbers: Tensor, light: int, has_adjoint: bool = False) -> Sum:
+        """The mass of `laid`."""
+        return Sum(self, laid, numbers, light, has_adjoint)
+
     def items(self, field: Tensor) -> tuple[int, int]:
         """How many items kernels of rays have, and those of cells."""
         block, record = 1 if field.is_cuda else BLOCK, self.record
@@ -78,11 +82,18 @@ class Sum:
 
     Row `light` of `numbers` [L, 4] holds the beam's slope by rows and by columns, its path in a
     slice [u] and the bound of corrections. `entered` is laid out as the field is. Only where it
-    `has_adjoint` what that needs is kept.
+    `has_adjoint` what that needs is kept. `before` [2, K, rows, columns]: sums along rays of what
+    lies before the first slice, of the field and of its bends; `before_bar` their cotangent.
     """
 
     def __init__(
-        self, shear: Shear, laid: Tensor, numbers: Tensor, light: int, has_adjoint: bool = False
+        self,
+        shear: Shear,
+        laid: Tensor,
+        numbers: Tensor,
+        light: int,
+        has_adjoint: bool = False,
+        before: Tensor | None = None,
     ):
         self.shear, self.laid = shear, laid
         self.kernels = shear_kernels(laid.element_size() * 8)
@@ -90,6 +101,9 @@ class Sum:
         windows = laid.new_empty(1 + has_adjoint, len(laid) * shear.window)
         self.masses, self.refinements = windows[0], windows[-1]
         self.given = shear.record | {"light": light, "numbers": numbers, "field": laid}
+        self.given |= {"channels": len(laid), "before": before}
+        self.before = before
+        self.before_bar: Tensor | None = None
         rays, cells = shear.items(laid)
         made = {"masses": self.masses, "refinements": self.refinements if has_adjoint else None}
         self.kernels.rays.launch(rays, self.given, made)
@@ -108,6 +122,8 @@ class Sum:
         }
         given = self.given | {"varies": varies, "entered_bar": entered_bar}
         made = sums | {"masses": self.masses, "refinements": self.refinements}
+        if self.before is not None:
+            made["before_bar"] = self.before_bar = torch.zeros_like(self.before)
         made |= {"corrections_bar": torch.empty_like(entered_bar), "field_bar": field_bar}
         self.kernels.cells_adjoint.launch(cells, given, made)
         self.kernels.rays_adjoint.launch(rays, given, made)
@@ -119,8 +135,9 @@ class Sum:
 
 _GIVEN = """
 int slices, height, width, rows, columns, first_row, first_column, start, slice_stride, row_stride;
-int window_slice_stride, window_row_stride, is_slices_first, light, varies;
+int window_slice_stride, window_row_stride, is_slices_first, light, varies, first_slice, channels;
 F *numbers, *field, *entered, *masses, *refinements, *entered_bar, *corrections_bar, *field_bar;
+F *before, *after, *before_bar, *after_bar;
 double *by_cells, *by_rays, *by_field
 """
 

@@ -52,8 +52,8 @@ if (begin == 0) {
     of_column[0] -= out[0] * (tap(first.bend_slope, linear) - tap(ct.bend_slope, linear));
 }
 double* const sums = &by_cells[4 * item];
-sums[0] = -k * total(of_row, count);
-sums[1] = -k * total(of_column, count);
+sums[0] = -(k + first_slice) * total(of_row, count);
+sums[1] = -(k + first_slice) * total(of_column, count);
 sums[3] = total(of_bound, count);
 """
 )
@@ -67,6 +67,12 @@ RAYS_ADJOINT = (
 F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], bent[BLOCK + 6], bar[BLOCK + 3];
 F of_step[BLOCK], of_bound[BLOCK];
 clear(passed, BLOCK), clear(bends, BLOCK);
+// In units of what masses are multiplied by.
+const size_t ends = end_of(channel, ray) + begin;
+for (int t = 0; after_bar && t < end - begin; ++t) {
+    passed[t] = after_bar[ends + t] / step;
+    bends[t] = F(2) * after_bar[other_sums + ends + t] / step;
+}
 double by_step = 0, by_bound = 0;
 for (int k = N - 1; k >= 0; --k) {
     const Place r = row_place(k), c = column_place(k);
@@ -97,7 +103,7 @@ for (int k = N - 1; k >= 0; --k) {
             add_row(bent, part, left, size + 3, W, rt.linear[t]);
         }
     };
-    if (k > 0) {
+    if (entered_bar && (k > 0 || before_bar)) {
         add_window_row(m);
         if (i == 0 && m == 1) add_window_row(0);
         if (i == ROWS - 1) for (int next = m + 1; next < H + 3; ++next) add_window_row(next);
@@ -128,12 +134,17 @@ for (int k = N - 1; k >= 0; --k) {
     for (int t = 0; t < hi - lo; ++t) {
         const F x = refinement[t], root = F(1) / wp::sqrt(F(1) + bound * bound * x * x);
         const F of_bend = of_mass[t] * root * root * root;
-        mass[t] = step * sum[t] - F(0.25) * step * (F(2) * bend[t] + of_bend);
+        // Nothing bends after the last slice.
+        mass[t] = step * sum[t] - F(0.25) * step * ((k + 1 < N ? F(2) : F(1)) * bend[t] + of_bend);
         refinement[t] = F(0.5) * step * bend[t];
         sum[t] += of_mass[t];
         bend[t] += of_bend;
     }
     if (k == 0) for (int t = 0; t < hi - lo; ++t) mass[t] += F(0.25) * step * bend[t];
+}
+for (int t = 0; before_bar && !is_ghost && t < end - begin; ++t) {
+    before_bar[ends + t] = step * passed[t];
+    before_bar[other_sums + ends + t] = F(0.5) * step * bends[t];
 }
 if (varies) {
     by_rays[4 * item + 2] = by_step / (double)(step);
@@ -175,8 +186,8 @@ auto gather = [&](const F* bars, int s, double shift, F weight) {
         of_column[t] = cells[t] * (weights[0] * linear[t] + weights[1] * linear[t + 1]
                                    + weights[2] * linear[t + 2] + weights[3] * linear[t + 3]);
     }
-    by_row -= (s + shift) * total(of_row, count);
-    by_column -= (s + shift) * total(of_column, count);
+    by_row -= (s + shift + first_slice) * total(of_row, count);
+    by_column -= (s + shift + first_slice) * total(of_column, count);
 };
 gather(&masses[0], k, 0, F(1));
 if (k + 1 < N) gather(&refinements[0], k, 0.5, F(0.5));

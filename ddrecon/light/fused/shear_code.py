@@ -29,8 +29,17 @@ auto place_of = [](F slope, int first, double k) -> Place {
     n -= n > q;
     return Place{n, (F)(q - n), q};
 };
-auto row_place = [&](double k) -> Place { return place_of(slope_row, first_row, k); };
-auto column_place = [&](double k) -> Place { return place_of(slope_column, first_column, k); };
+auto row_place = [&](double k) -> Place {
+    return place_of(slope_row, first_row, k + first_slice);
+};
+auto column_place = [&](double k) -> Place {
+    return place_of(slope_column, first_column, k + first_slice);
+};
+// Sums along rays that come to the first slice and leave the last: of the field, and of its bends.
+auto end_of = [&](int channel, int ray) -> size_t {
+    return (size_t(channel) * ROWS + ray) * COLUMNS;
+};
+const size_t other_sums = size_t(channels) * ROWS * COLUMNS;
 
 // What the four rays n - 1 to n + 2 around a cell count for: in linear interpolation, in what third
 // order takes off it, and the slopes of both by q, on a kink the mean of both sides'. `end` is 1 on
@@ -102,6 +111,9 @@ RAYS = (
     + """
 F passed[BLOCK], bends[BLOCK], here[BLOCK + 1], midway[BLOCK + 1], unused[2 * BLOCK];
 clear(passed, BLOCK), clear(bends, BLOCK);
+const size_t ends = end_of(channel, ray) + begin;
+for (int t = 0; before && t < end - begin; ++t)
+    passed[t] = before[ends + t], bends[t] = before[other_sums + ends + t];
 for (int k = 0; k < N; ++k) {
     const Place r = row_place(k), c = column_place(k);
     const int m = i - r.n + 1;
@@ -127,28 +139,30 @@ for (int k = 0; k < N; ++k) {
     }
 
     // The mass of the slices passed, and of trapezoids over half steps less those over whole ones.
-    const bool is_kept = m >= 0 && m < H + 3;  // a ghost may not be, where its ray is
+    const bool is_kept = masses && m >= 0 && m < H + 3;  // a ghost may not be, where its ray is
     const size_t at = is_kept ? window_row(channel, k, m) : 0;
     F* __restrict mass = is_kept ? &masses[at + lo - c.n + 1] : unused;
     F* __restrict refinement = is_kept && refinements
         ? &refinements[at + lo - c.n + 1] : unused + BLOCK;
     F* __restrict sum = passed + (lo - begin);
     F* __restrict bend = bends + (lo - begin);
-    const F half = k > 0 ? F(0.5) : F(0), keep = k > 0 ? F(1) : F(0);
+    const F half = k > 0 ? F(0.5) : F(0), more = k + 1 < N ? F(1) : F(0);
     for (int t = 0; t < size; ++t) {
         const F value = c.a * here[t] + (F(1) - c.a) * here[t + 1];
         const F between = c_half.a * midway[t] + (F(1) - c_half.a) * midway[t + 1];
-        const F bent = keep * bend[t] - half * value;
+        const F bent = bend[t] - half * value;
         const F x = F(0.5) * step * bent;
         mass[t] = sum[t] * step + x / wp::sqrt(F(1) + bound * bound * x * x);
         refinement[t] = x;
-        bend[t] = bent + (between - F(0.5) * value);
+        bend[t] = bent + more * (between - F(0.5) * value);
         sum[t] += value;
     }
     if (is_kept && lo == 0 && c.n == 0) masses[at] = mass[0];
     if (is_kept && hi == COLUMNS)
         for (int q = COLUMNS - c.n + 1; q < W + 3; ++q) masses[at + q] = mass[size - 1];
 }
+for (int t = 0; after && !is_ghost && t < end - begin; ++t)
+    after[ends + t] = passed[t], after[other_sums + ends + t] = bends[t];
 """
 )
 

@@ -8,11 +8,13 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.fused.shear import Shear, Sum
+from ddrecon.light.fused.shear import Shear
+from ddrecon.light.fused.shear_slabs import SlabShear
 from ddrecon.light.fused.tangents import BeamTangents
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
+from ddrecon.slabs.slab import Slab, whole_of
 
 
 def sum_mass(
@@ -27,22 +29,26 @@ def sum_mass(
 @remember
 def follow(
     grid: Grid, directions: Tensor, bound: Tensor | float
-) -> tuple[tuple[Shear, ...], Tensor]:
+) -> tuple[tuple[Shear | SlabShear, ...], Tensor]:
     """How beams along `directions` [L, 3] cross slices, and the numbers [L, 4] of each.
 
     These are the slope by rows and by columns, the path in a slice [u] and the `bound`.
     """
-    speed = directions / directions.new_tensor(grid.spacing)
+    speed = directions / directions.new_tensor(whole_of(grid).spacing)
     slicings = [Slicing.of(each) for each in speed.tolist()]
     order = [[*across(slicing.axis), slicing.axis] for slicing in slicings]
     ordered = speed.gather(1, torch.tensor(order, device=speed.device))
     fastest = ordered[:, 2:].abs()
     slope = ordered[:, :2] / fastest
     bounds = torch.as_tensor(bound).to(speed).expand(len(speed), 1)
-    shears = [
-        Shear(grid, slicing, (row, column))
-        for slicing, (row, column) in zip(slicings, slope.tolist(), strict=True)
-    ]
+    slopes = [(row, column) for row, column in slope.tolist()]
+    shears: list[Shear | SlabShear]
+    if isinstance(grid, Slab):
+        ways = (speed[:, grid.axis] >= 0).tolist()
+        each = zip(slicings, slopes, ways, strict=True)
+        shears = [SlabShear(grid, slicing, one, is_upwards) for slicing, one, is_upwards in each]
+    else:
+        shears = [Shear(grid, *each) for each in zip(slicings, slopes, strict=True)]
     return tuple(shears), torch.cat([slope, 1 / fastest, bounds], 1)
 
 
@@ -53,8 +59,8 @@ class _SumMass(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(shear: Shear, field: Tensor, numbers: Tensor) -> Tensor:
-        return shear.lift(Sum(shear, shear.lay(field.detach()), numbers, 0).entered)
+    def forward(shear: Shear | SlabShear, field: Tensor, numbers: Tensor) -> Tensor:
+        return shear.lift(shear.sum(shear.lay(field.detach()), numbers, 0).entered)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -68,9 +74,7 @@ class _SumMass(torch.autograd.Function):
         shear, varies = ctx.shear, ctx.needs_input_grad[2]
         laid = shear.lay(field)
         field_bar = torch.zeros_like(laid)
-        found = Sum(shear, laid, numbers, 0, True).adjoint(
-            shear.lay(entered_bar), field_bar, varies
-        )
+        found = shear.sum(laid, numbers, 0, True).adjoint(shear.lay(entered_bar), field_bar, varies)
         numbers_bar = None if found is None else found.to(numbers)[None]
         return None, shear.lift(field_bar), numbers_bar
 

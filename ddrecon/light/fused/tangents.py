@@ -10,6 +10,7 @@ from torch import Tensor
 from ddrecon.kernels.dual import interleaved_tangent_of, pair, tangent_of, with_changes
 from ddrecon.light.fused.receive import MOMENTS, Receiver, receive_kernel
 from ddrecon.light.fused.shear import Shear, shear_kernels
+from ddrecon.light.fused.shear_slabs import SlabShear
 
 
 class BeamTangents:
@@ -25,8 +26,11 @@ class BeamTangents:
         self.d_field = torch.zeros_like(field) if d_field is None else d_field
         self.numbers = pair(numbers, d_numbers)
 
-    def follow(self, shear: Shear, light: int) -> tuple[Tensor, Tensor]:
+    def follow(self, shear: Shear | SlabShear, light: int) -> tuple[Tensor, Tensor]:
         """The mass up to where beam number `light` enters cells [K, z, y, x], and its change."""
+        if isinstance(shear, SlabShear):
+            both = shear.follow_tangent(self.field, self.d_field, self.numbers, light)
+            return both[..., 0].contiguous(), both[..., 1].contiguous()
         laid = pair(shear.lay(self.field), shear.lay(self.d_field))
         kernels = shear_kernels(laid.element_size() * 8)
         entered = torch.empty_like(laid)

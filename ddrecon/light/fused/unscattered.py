@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -9,7 +10,8 @@ from torch import Tensor
 
 from ddrecon.kernels.dual import split
 from ddrecon.light.fused.receive import Receiver
-from ddrecon.light.fused.shear import Shear, Sum
+from ddrecon.light.fused.shear import Shear
+from ddrecon.light.fused.shear_slabs import SlabShear
 from ddrecon.light.fused.tangents import BeamTangents, change_received
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
@@ -32,7 +34,7 @@ class Unscattered(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        shears: tuple[Shear, ...],
+        shears: tuple[Shear | SlabShear, ...],
         has_mass: bool,
         field: Tensor,
         scale: Tensor,
@@ -42,12 +44,12 @@ class Unscattered(torch.autograd.Function):
         receiver = Receiver(field, scale, numbers, weights)
         moments, masses = receiver.new_moments(), []
         laid = _Laid(field)
-        for lights in _batches(len(shears), field):
+        for lights in _batches(shears, field):
             entered = field.new_empty(len(lights), *field.shape)
             for light, to in zip(lights, entered, strict=True):
                 to.copy_(
                     shears[light].lift(
-                        Sum(shears[light], laid.of(shears[light]), numbers, light).entered
+                        shears[light].sum(laid.of(shears[light]), numbers, light).entered
                     )
                 )
             receiver.receive(lights[0], entered, moments, adds=lights[0] > 0)
@@ -76,10 +78,10 @@ class Unscattered(torch.autograd.Function):
         scale_bar = torch.zeros_like(scale, dtype=torch.float64)
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
         weights_bar = torch.zeros_like(weights, dtype=torch.float64)
-        for lights in _batches(len(ctx.shears), field):
+        for lights in _batches(ctx.shears, field):
             shears = [ctx.shears[light] for light in lights]
             sums = [
-                Sum(s, laid.of(s), numbers, i, True) for i, s in zip(lights, shears, strict=True)
+                s.sum(laid.of(s), numbers, i, True) for i, s in zip(lights, shears, strict=True)
             ]
             entered = torch.stack([each.shear.lift(each.entered) for each in sums])
             entered_bars, found = receiver.adjoint(
@@ -131,9 +133,14 @@ class Unscattered(torch.autograd.Function):
         return d_found
 
 
-def _batches(lights: int, field: Tensor) -> list[range]:
-    """The numbers of beams, in parts small enough for their masses to be held at once."""
-    size = max(1, min(MOST_BEAMS, MOST_NUMBERS // field.numel()))
+def _batches(shears: Sequence[Shear | SlabShear], field: Tensor) -> list[range]:
+    """The numbers of beams, in parts small enough for their masses to be held at once.
+
+    In slabs one by one: all ranks exchange in the same order.
+    """
+    lights, size = len(shears), max(1, min(MOST_BEAMS, MOST_NUMBERS // field.numel()))
+    if any(isinstance(shear, SlabShear) for shear in shears):
+        size = 1
     return [range(first, min(first + size, lights)) for first in range(0, lights, size)]
 
 
@@ -145,9 +152,9 @@ class _Laid:
         self.across_x: Tensor | None = None
         self.shear: Shear | None = None
 
-    def of(self, shear: Shear) -> Tensor:
+    def of(self, shear: Shear | SlabShear) -> Tensor:
         """The field as `shear` lays it, the same tensor each time."""
-        if shear.axis != 2:
+        if isinstance(shear, SlabShear) or shear.axis != 2:
             return self.cells
         if self.across_x is None:
             self.across_x, self.shear = shear.lay(self.cells), shear

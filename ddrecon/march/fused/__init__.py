@@ -2,10 +2,11 @@
 
 `layout` says what a node holds and `rays` what a ray is, `cells` where its nodes are.
 Rays that meet slices go in packets, a ray a lane of a processor's vectors: `packet_cells` and
-`packet_spread` have values at nodes and their adjoint, `packet_optics` the formulas, `packet_rays`
-what a node emits, and `packet_walks` the kernels.
-A ray a thread, in Warp's own language, are equal steps, derivatives by the rays themselves, and
-forward mode: `lines`, `planes` and `sampling` find values among cells, `stops` those at a node,
+`packet_spread` have values at nodes and their adjoint, `packet_slopes` how these change with the
+rays, `packet_optics` the formulas, `packet_rays` what a node emits, and `packet_walks` and
+`packet_tangent` the kernels. `stretches` finds which segments of a packet are walked at all.
+A ray a thread, in Warp's own language, are equal steps, and derivatives by rays beside light from
+points: `lines`, `planes` and `sampling` find values among cells, `stops` those at a node,
 `emission` what it emits (by `node_phases` and the formulas of `optics`), and `segments` what
 arrives from between two; `walks` and `adjoint` are the kernels.
 Phase functions that differ from cell to cell are tables and a number of the cell: `cellwise` says

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from ddrecon.numerics.slicing import across
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Where nodes of rays are among cells of fields [channels, ., ., .].
+    """Where nodes of some rays are among cells of fields [channels, ., ., .].
 
     `planes` [N]: nodes, across the slices [u] or as parts of the way from near to far. `order` [N]
     (int32) are the slices across `axis` in which these lie; None where rays meet no slices.
@@ -29,6 +29,7 @@ class Cells:
     axis: int = 0
     order: Tensor | None = None
     support: Tensor | None = None
+    _found: list[Tensor] = field(default_factory=list)
 
     @property
     def is_sliced(self) -> bool:
@@ -48,8 +49,10 @@ class Cells:
         }
 
     def walked(self, rays: Tensor) -> Tensor | None:
-        """The segments that packets of `rays` are to walk, as `find_walked` has them; None: all."""
-        return None if self.support is None else find_walked(self.support, self.planes, rays)
+        """The segments that packets of its `rays` are to walk; None: all. They are found once."""
+        if self.support is not None and not self._found:
+            self._found.append(find_walked(self.support, self.planes, rays))
+        return self._found[0] if self._found else None
 
     def pack(self, fields: Sequence[Tensor]) -> Tensor:
         """Values [n, h, w, channels] of all `fields`, in the order in which rays meet them."""

@@ -73,8 +73,8 @@ class Integrate(torch.autograd.Function):
         )
         needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
         varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))
-        if ctx.cells.is_sliced and not varies_rays:
-            needs = needs_polynomials, ctx.needs_input_grad[6], ctx.needs_input_grad[8:]
+        if _go_in_packets(ctx.layout, ctx.cells, varies_rays):
+            needs = needs_rays, needs_polynomials, ctx.needs_input_grad[6], ctx.needs_input_grad[8:]
             found = _transpose_packets(ctx, needs, out_bar, masses_bar)
         else:
             varies_rays = varies_rays or needs_angles or needs_polynomials
@@ -88,11 +88,16 @@ class Integrate(torch.autograd.Function):
 
         def change(*tensors: Any) -> tuple[Tensor, Tensor]:
             values, d_values = split(tensors)
-            if ctx.cells.is_sliced and not varies_rays:
+            if _go_in_packets(ctx.layout, ctx.cells, varies_rays):
                 return _change_packets(ctx.layout, ctx.cells, values, d_values)
             return _change(ctx.layout, ctx.cells, values, d_values)
 
         return *run_plainly(change, *ctx.saved_tensors[1:], *changes[2:]), None
+
+
+def _go_in_packets(layout: Layout, cells: Cells, varies_rays: bool) -> bool:
+    """Whether derivatives are found in packets: where rays vary and light is from points, not."""
+    return cells.is_sliced and not (varies_rays and any(layout.beams))
 
 
 def _change(
@@ -116,8 +121,8 @@ def _change(
 def _change_packets(
     layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
 ) -> tuple[Tensor, Tensor]:
-    """The same in packets, of rays that do not change themselves."""
-    rays, fields = values[0], values[6:]
+    """The same in packets."""
+    rays, d_rays, fields = values[0], d_values[0], values[6:]
     d_out, d_masses = _empty(layout, rays)
     d_coefficients, d_numbers, d_table, d_fronts, *d_fields = d_values[2:]
     given = _packets(cells, values[:6], fields)
@@ -127,8 +132,10 @@ def _change_packets(
     given["all_fields"] = [*given.pop("fields"), *channels]
     given |= {"d_coefficients": d_coefficients, "d_table": d_table, "d_fronts": d_fronts}
     given["d_numbers"] = torch.zeros_like(values[3]) if d_numbers is None else d_numbers
+    given["d_rays"] = d_rays
     made = {"d_out": d_out, "d_masses": d_masses}
-    packet_tangent_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
+    kernel = packet_tangent_kernel(layout, d_rays is not None)
+    kernel.launch(cut(len(rays), LANES, rays)[0], given, made)
     return d_out, d_masses
 
 
@@ -167,10 +174,11 @@ def _transpose(
 
 
 def _transpose_packets(
-    ctx: Any, needs: tuple[bool, bool, Sequence[bool]], out_bar: Tensor, masses_bar: Tensor
+    ctx: Any, needs: tuple[bool, bool, bool, Sequence[bool]], out_bar: Tensor, masses_bar: Tensor
 ) -> list[Tensor | None]:
-    """The same in packets, but of rays; of polynomials, table and fields those it `needs`."""
-    layout, cells, (needs_polynomials, needs_table, needs_fields) = ctx.layout, ctx.cells, needs
+    """The same in packets; of rays, polynomials, table and fields those it `needs`."""
+    layout, cells = ctx.layout, ctx.cells
+    needs_rays, needs_polynomials, needs_table, needs_fields = needs
     masses, rays, angles, coefficients, numbers, table, fronts, *fields = ctx.saved_tensors
     packets, _ = cut(len(rays), LANES, rays)
     polynomials_bar = rays.new_empty(coefficients.shape) if needs_polynomials else None
@@ -184,14 +192,15 @@ def _transpose_packets(
     fronts_bar = fronts.new_empty(fronts.shape) if fronts.numel() else None
     given = _packets(cells, (rays, angles, coefficients, numbers, table, fronts), fields)
     given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
-    made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar}
+    rays_bar = rays.new_empty(rays.shape) if needs_rays else None
+    made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar, "rays_bar": rays_bar}
     made["fronts_bar"] = fronts_bar
     tables = [torch.zeros_like(table if needs_table else table[:0]) for _ in shares]
     own = [
         {"bars": _channels(share, fields), "table_bar": table_bar if needs_table else None}
         for share, table_bar in zip(shares, tables, strict=True)
     ]
-    packet_adjoint_kernel(layout).launch(packets, given, made, shares=own)
+    packet_adjoint_kernel(layout, needs_rays).launch(packets, given, made, shares=own)
     for share in shares[1:]:
         for total, part in zip(shares[0], share, strict=True):
             if total is not None:
@@ -199,7 +208,7 @@ def _transpose_packets(
     numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
     found = [table_bar for table_bar in tables if table_bar is not None]
     table_bar = functools.reduce(torch.add, found) if found else None
-    return [None, None, polynomials_bar, numbers_bar, table_bar, fronts_bar, *shares[0]]
+    return [rays_bar, None, polynomials_bar, numbers_bar, table_bar, fronts_bar, *shares[0]]
 
 
 def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -> dict[str, Any]:

@@ -88,7 +88,8 @@ auto stretch_before = [&](int& from, int& to) -> bool {
     for (from = to; from > first_node && walks(from);) --from;
     return from < to;
 };
-// Along y the packet's rays are closer together than along x.
+// Along y the packet's rays are closer together than along x; it `is_turned` where y are columns.
+bool is_turned = false;
 Lines lines = {rows, columns, row_stride, column_stride};
 if (LANES > 1) {
     const V s = distance((first_node + last_node) / 2);
@@ -96,6 +97,7 @@ if (LANES > 1) {
     const int end = begin + LANES <= last ? LANES - 1 : last - begin;
     const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
     if (high * high > wide * wide) {
+        is_turned = true;
         lines = {columns, rows, column_stride, row_stride};
         const V o = ray.o1, d = ray.d1;
         ray.o1 = ray.o2;

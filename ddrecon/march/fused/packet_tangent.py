@@ -1,8 +1,8 @@
 """The walk along packets of rays that finds the change of their integral.
 
-With those of fields, numbers, polynomials and the table of p; changes of the rays themselves are
-left to `walks`. A node and its change are two records of the same kind: that of the change has
-changes for values, emission and depth.
+With those of fields, numbers, polynomials and the table of p, and of the rays themselves. A node
+and its change are two records of the same kind: that of the change has changes for distances,
+values, emission and depth.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import functools
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_rays import packet_kernel
+from ddrecon.march.fused.packet_slopes import MOVE_TANGENT, SLOPES, STAY_TANGENT
 
 _WALK = """
 const F *d_scale = d_numbers, *d_peaks = d_numbers + C;
 const F d_bound = d_numbers[2 * C];
-const V none = P::all(F(0));
 V d_coefficients_of[BEAMS * RAY_TERMS + 1];
 const bool turns = HAS_NUMBERS && d_coefficients;
 if ((HAS_PEAK || HAS_NUMBERS) && d_coefficients)
@@ -26,6 +26,7 @@ auto sample_change = [&](Node& change, int n, int from, int to) {
     fields = all_fields + CHANNELS;
     sample(change, n, from, to);
     fields = all_fields;
+    move_values(change, n, from, to);
 };
 // The change of the matter at node n, where that is known: the same place.
 auto locate_change = [&](int n, Node& node, Node& change) {
@@ -36,6 +37,7 @@ auto locate_change = [&](int n, Node& node, Node& change) {
 #if !defined(__CUDA_ARCH__)
     for (int r = 0; r < node.runs && r < LANES; ++r) change.run[r] = node.run[r];
 #endif
+    move_node(node, change);
     sample_change(change, n, 0, EXTINCTION);
     if (SCATTERING) sample_change(change, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
     for (int c = 0; c < EXTINCTION; ++c)
@@ -144,6 +146,7 @@ for (int from, to = first_node; next_stretch(from, to);) {
             for (int k = 0; k < EXTINCTION; ++k) {
                 m[k] += mass_between(*a, *b, k);
                 d_m[k] += F(0.5) * (d_a->v[k] + d_b->v[k]) * (b->t - a->t);
+                if (VARIES_RAYS) d_m[k] += F(0.5) * (a->v[k] + b->v[k]) * (d_b->t - d_a->t);
             }
             emit(n, *b, m, turns);
             emit_change(n, *b, *d_b, m, d_m);
@@ -155,6 +158,8 @@ for (int from, to = first_node; next_stretch(from, to);) {
                 const V brighter = (d_a->w[i] + d_b->w[i]) * decay;
                 const V deeper = (a->w[i] + b->w[i]) * (by_a * d_a->u[i] + by_b * d_b->u[i]);
                 total[i] += F(0.5) * measure(*a, *b, i) * (brighter + deeper);
+                if (VARIES_RAYS)
+                    total[i] += F(0.5) * (a->w[i] + b->w[i]) * decay * (d_b->t - d_a->t);
             }
         }
         Node *passed = a, *d_passed = d_a;
@@ -172,10 +177,13 @@ for (int l = 0; l < LANES && begin + l <= last; ++l) {
 
 
 @functools.cache
-def packet_tangent_kernel(layout: Layout) -> TextKernel:
+def packet_tangent_kernel(layout: Layout, varies_rays: bool = False) -> TextKernel:
     """The kernel of the changes `d_out` [outputs, R] and `d_masses` [K, R] of packets of rays.
 
-    `d_coefficients`, `d_table` and `d_fronts`, as what they are changes of, may be left out.
+    `d_coefficients`, `d_table` and `d_fronts`, as what they are changes of, may be left out. Where
+    it `varies_rays` it is given their changes, `d_rays` [R, 8]; point lights there are none then.
     """
-    given = "F *d_coefficients, *d_numbers, *d_table, *d_fronts, *d_out, *d_masses"
-    return packet_kernel("integrate_tangent", layout, _WALK, given, changes=True)
+    given = "F *d_coefficients, *d_numbers, *d_table, *d_fronts, *d_out, *d_masses, *d_rays"
+    begin = f"constexpr bool VARIES_RAYS = {int(varies_rays)};\nconst V none = P::all(F(0));"
+    moving = SLOPES + MOVE_TANGENT if varies_rays else STAY_TANGENT
+    return packet_kernel("integrate_tangent", layout, begin + moving + _WALK, given, changes=True)

@@ -1,7 +1,7 @@
 """The walks along packets of rays that meet slices: the integral, and its adjoint.
 
-They compute what `walks` and `adjoint` do for one ray a thread, in vector lanes; derivatives by the
-rays themselves are left to those.
+They compute what `walks` and `adjoint` do for one ray a thread, in vector lanes; derivatives by
+rays beside light from points are left to those.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import functools
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_rays import packet_kernel
+from ddrecon.march.fused.packet_slopes import MOVE, SLOPES, STAY
 from ddrecon.march.fused.packet_spread import SPREAD
 
 _INTEGRATE = """
@@ -52,7 +53,6 @@ for (int l = 0; l < LANES && begin + l <= last; ++l) {
 }
 """
 _TRANSPOSE = """
-const V none = P::all(F(0));
 V inside = none;
 for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
 V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], bound_bar = none;
@@ -148,7 +148,7 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
         }
     }
 };
-auto spread = [&](int n, const Node& node, const V* v_bar) {
+auto spread = [&](int n, const Node& node, const V* v_bar, V t_bar) {
     V bend_bar[MASSES + 1];
     for (int k = 0; k < MASSES; ++k) {
         const V bent = bound * node.bend[k], inverse = F(1) / P::root(F(1) + bent * bent);
@@ -156,14 +156,17 @@ auto spread = [&](int n, const Node& node, const V* v_bar) {
         bound_bar -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
     }
     spread_to_cells(node, slice(n), v_bar, bend_bar);
+    move(n, node, v_bar, bend_bar, t_bar);
 };
 Node nodes[2];
 Node* a = nodes;
 Node* b = nodes + 1;
 V a_bar[CHANNELS], b_bar[CHANNELS], wa_bar[OUT], wb_bar[OUT], ua_bar[OUT], ub_bar[OUT];
+V ta_bar, tb_bar;
 for (int from = last_node, to; stretch_before(from, to);) {
     for (int c = 0; c < CHANNELS; ++c) b_bar[c] = none;
     for (int i = 0; i < OUT; ++i) wb_bar[i] = ub_bar[i] = none;
+    tb_bar = none;
     locate(to, *b);
     emit(to, *b, m, varies_polynomials);
     // Node b lies behind node a. Its bars grow by the segments on both sides, then it is done.
@@ -176,6 +179,7 @@ for (int from = last_node, to; stretch_before(from, to);) {
         }
         emit(n, *a, m, varies_polynomials);
         const bool is_empty = a->is_empty && b->is_empty;
+        V length_bar = none;
         for (int i = 0; i < OUT; ++i) {
             V by_a = none, by_b = none;
             const V decay = is_empty
@@ -187,6 +191,7 @@ for (int from = last_node, to; stretch_before(from, to);) {
             wb_bar[i] += wa_bar[i];
             ua_bar[i] = both * by_a;
             ub_bar[i] += both * by_b;
+            if (VARIES_RAYS) length_bar += F(0.5) * bar[i] * (a->w[i] + b->w[i]) * decay;
         }
         finish(n + 1, *b, m_b, b_bar, wb_bar, ub_bar, m_bar);
         // Its mass is that of node a and half the sum of extinctions, by the length.
@@ -194,8 +199,11 @@ for (int from = last_node, to; stretch_before(from, to);) {
         for (int k = 0; k < EXTINCTION; ++k) {
             a_bar[k] = F(0.5) * m_bar[k] * (b->t - a->t);
             b_bar[k] += a_bar[k];
+            if (VARIES_RAYS) length_bar += F(0.5) * m_bar[k] * (a->v[k] + b->v[k]);
         }
-        spread(n + 1, *b, b_bar);
+        ta_bar = -length_bar;
+        spread(n + 1, *b, b_bar, tb_bar + length_bar);
+        tb_bar = ta_bar;
         for (int c = 0; c < CHANNELS; ++c) b_bar[c] = a_bar[c];
         for (int i = 0; i < OUT; ++i) {
             wb_bar[i] = wa_bar[i];
@@ -206,13 +214,14 @@ for (int from = last_node, to; stretch_before(from, to);) {
         a = passed;
     }
     finish(from, *b, m, b_bar, wb_bar, ub_bar, m_bar);
-    spread(from, *b, b_bar);
+    spread(from, *b, b_bar, tb_bar);
 }
 for (int c = 0; c < C; ++c) {
     numbers_bar[c * packets + item] = P::sum(scale_bar[c]);
     numbers_bar[(C + c) * packets + item] = P::sum(peak_bar[c]);
 }
 numbers_bar[2 * C * packets + item] = P::sum(bound_bar);
+store_ray();
 if (fronts_bar)
     for (int k = 0; k < EXTINCTION; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
@@ -232,14 +241,18 @@ def packet_integral_kernel(layout: Layout) -> TextKernel:
 
 
 @functools.cache
-def packet_adjoint_kernel(layout: Layout) -> TextKernel:
+def packet_adjoint_kernel(layout: Layout, varies_rays: bool = False) -> TextKernel:
     """The kernel that adds to `bars`, of `fields`, what bars of outputs and masses are for them.
 
     These are left out where none are asked for. Each packet has its own `numbers_bar`
     [2 C + 1, packets]; `polynomials_bar` and `table_bar`, as what they are of, may be left out.
+    Where it `varies_rays` there are `rays_bar` [R, 8] as well; point lights there are none then.
     """
     given = f"""
     double *masses, *numbers_bar; int packets;
-    F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *fronts_bar, *bars[{layout.channels}]
+    F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
+    F *rays_bar
     """
-    return packet_kernel("transpose", layout, SPREAD + _TRANSPOSE, given)
+    begin = f"constexpr bool VARIES_RAYS = {int(varies_rays)};\nconst V none = P::all(F(0));"
+    moving = SLOPES + MOVE if varies_rays else STAY
+    return packet_kernel("transpose", layout, begin + SPREAD + moving + _TRANSPOSE, given)

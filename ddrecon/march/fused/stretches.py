@@ -58,7 +58,8 @@ for (int n = 0; n < node_count; ++n) {
 
 
 @functools.cache
-def _mark_kernel(bits: int) -> TextKernel:
+def mark_kernel(bits: int) -> TextKernel:
+    """The kernel that finds which segments of a packet of rays touch cells of a support."""
     given = """
     F *planes, *rays; bool *touched; int *walked;
     int ray_count, node_count, rows, columns, words;
@@ -78,7 +79,7 @@ def find_walked(support: Tensor, planes: Tensor, rays: Tensor) -> Tensor:
     walked = rays.new_empty(packets, words, dtype=torch.int32)
     given = {"planes": planes, "rays": rays, "touched": touched, "ray_count": len(rays)}
     given |= {"node_count": nodes, "rows": support.shape[1], "columns": support.shape[2]}
-    _mark_kernel(torch.finfo(rays.dtype).bits).launch(
+    mark_kernel(torch.finfo(rays.dtype).bits).launch(
         packets, given | {"words": words}, {"walked": walked}
     )
     return walked

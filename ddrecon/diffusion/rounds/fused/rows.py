@@ -26,7 +26,7 @@ POINTERS = 64
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
     F *found, *saved, *returning, *e_bar, *sc_bar, *light_parts[5], *source_parts[5], *bars[5];
-    F *densest, *entering, *leaving, *entering_bar, *leaving_bar;
+    F *densest, *beam_factors, *entering, *leaving, *entering_bar, *leaving_bar;
     double *sums; int layers_below, layers_above;
     int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
