@@ -235,16 +235,11 @@ class Reconstruction:
         )
         self.noise_targets = setup.noise_targets(self.train_level, self.train, self.noises)
         grid = self.train_level.volume.grid
-        support = None if self.support is None else self.support.on(grid)
-        if support is not None:
-            for level in (self.train_level, self.test_level):
-                level.volume = replace(level.volume, support=support)
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
             parameter.curvature = None
-            if parameter.name == "density" and support is not None:
-                parameter.restrict(support)
+        setup.keep_within(self.support, self.parameters, self.train_level, self.test_level)
         self.memory.last = resample_solutions(self.memory.last, grid)
 
     def _views(self) -> list[View]:

@@ -170,6 +170,18 @@ def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     return support
 
 
+def keep_within(support: Support | None, parameters: Sequence[Parameter], *levels: Scene) -> None:
+    """Keeps density in `support` from now on: that of `parameters`, and of scenes on one grid."""
+    if support is None:
+        return
+    cells = support.on(levels[0].volume.grid)
+    for level in levels:
+        level.volume = replace(level.volume, support=cells)
+    for parameter in parameters:
+        if parameter.name == "density":
+            parameter.restrict(cells)
+
+
 def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bool) -> None:
     """Has poses and lights among `parameters` descend where they are not to be solved for.
 

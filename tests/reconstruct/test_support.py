@@ -108,7 +108,7 @@ def ball(*overrides: str) -> Scene:
 
 
 def test_outside_of_its_support_a_volume_stays_empty() -> None:
-    """At every level, whatever `min` says; and the ball itself is inside."""
+    """At every level, whatever `min` says, and rays know it; and the ball itself is inside."""
     run = Reconstruction(
         ball("optimize.parameters.density={support: 0.55, support_margin: 1, min: 0.01}")
     )
@@ -120,6 +120,7 @@ def test_outside_of_its_support_a_volume_stays_empty() -> None:
         hull = run.support.on(density.grid)
         grids.add(density.grid)
         assert not density.value[~hull].any() and density.value[hull].min() >= 0.01
+        assert torch.equal(run.train_level.volume.support, hull)
         assert 0.1 < float(hull.float().mean()) < 1
     assert len(grids) > 1
     truth = np.load(BALL.parents[1] / "data" / "ball" / "density.npz")["density"]
