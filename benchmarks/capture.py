@@ -22,8 +22,8 @@ LAMP = (7.3, 7.0, 6.4)
 
 def rotation_between(found: np.ndarray, true: np.ndarray) -> float:
     """The angle [degrees] by which the poses [3, 4] `found` and `true` are turned."""
-    turn = found[:, :3].T @ true[:, :3]
-    return float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
+    chord = np.linalg.norm(found[:, :3] - true[:, :3]) / 8**0.5
+    return float(np.degrees(2 * np.arcsin(min(chord, 1))))
 
 
 def angles_between_rays(found: np.ndarray, true: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -64,6 +64,7 @@ def main() -> None:
         overrides = [
             f"diffusion.transport_rounds={rounds}",
             f"optimize.parameters.density.tv={tv}",
+            "optimize.parameters.density.l1=0",
             f"optimize.iterations={arguments.iterations}",
         ]
         full = load_scene(ROOT / "configs/plume.yaml", overrides=overrides)

@@ -443,7 +443,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             ),
             "l1": (
                 "Weight of its mean, which empties what no picture needs; for density of its"
-                " logarithm (E47), and 0.06 is a good start."
+                " logarithm (E47), and 0.05 empties haze."
             ),
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -35,11 +35,21 @@ class Moments:
 
     `higher` are the moments phi_k of degree 2 and more: radiance(w) holds the sum of Y_k(w) phi_k.
     `flux` is None where light's direction does not matter, `higher` where two moments are kept.
+    Where all light goes one way, `beam` may stand for `higher`: B [C, z, y, x] and factors
+    [K, C or 1] by which all phi_k are B.
     """
 
     mean: Tensor
     flux: Vector | None = None
     higher: Tensor | None = None
+    beam: tuple[Tensor, Tensor] | None = None
+
+    def spelled(self) -> Moments:
+        """The same light with all of `higher`, and no `beam`."""
+        if self.beam is None:
+            return self
+        radiance, factors = self.beam
+        return Moments(self.mean, self.flux, factors[4:, :, None, None, None] * radiance)
 
     @staticmethod
     def of_harmonics(values: Tensor) -> Moments:
@@ -58,8 +68,9 @@ class Moments:
             else:
                 z, y, x = self.flux
                 parts.append(torch.stack([y, z, x]) / _FIRST)
-        if self.higher is not None:
-            parts.append(self.higher)
+        higher = self.spelled().higher
+        if higher is not None:
+            parts.append(higher)
         elif degree > 1:
             missing = count_harmonics(degree) - 4
             parts.append(torch.zeros_like(self.mean).expand(missing, *self.mean.shape))
@@ -72,21 +83,27 @@ class Moments:
         return Moments(
             mean * self.mean,
             None if self.flux is None else _vector(flux * component for component in self.flux),
-            None if self.higher is None else higher * self.higher,
+            None if (of_light := self.spelled().higher) is None else higher * of_light,
         )
 
     def weighted(self, factors: Tensor) -> Moments:
         """Moments of degree l times `factors`[l], which broadcast to `[C, z, y, x]`."""
-        higher: Tensor | float = 1.0
-        if self.higher is not None:
-            higher = factors[list(degrees_of_harmonics(len(factors) - 1)[4:])]
-        return self.scaled(factors[0], factors[1] if self.flux is not None else 1.0, higher)
+        by_harmonic = list(degrees_of_harmonics(len(factors) - 1))
+        flux = factors[1] if self.flux is not None else 1.0
+        if self.beam is not None and factors[0, 0].numel() == 1:
+            radiance, of_beam = self.beam
+            first = replace(self, beam=None).scaled(factors[0], flux)
+            return replace(first, beam=(radiance, factors[by_harmonic].flatten(1) * of_beam))
+        light = self.spelled()
+        higher = 1.0 if light.higher is None else factors[by_harmonic[4:]]
+        return light.scaled(factors[0], flux, higher)
 
     def plus(self, other: Moments) -> Moments:
         """The sum of two lights; what one of them lacks is zero there."""
-        higher = other.higher if self.higher is None else self.higher
-        if self.higher is not None and other.higher is not None:
-            higher = self.higher + other.higher
+        own, others = self.spelled().higher, other.spelled().higher
+        higher = others if own is None else own
+        if own is not None and others is not None:
+            higher = own + others
         return Moments(self.mean + other.mean, add_vectors(self.flux, other.flux), higher)
 
     def along(self, direction: Vector) -> Tensor:
@@ -94,11 +111,12 @@ class Moments:
         radiance = self.mean
         for component, cosine in zip(self.flux or (), direction, strict=self.flux is not None):
             radiance = torch.addcmul(radiance, component, cosine)
-        if self.higher is not None:
-            degree = math.isqrt(len(self.higher) + 4) - 1
+        higher = self.spelled().higher
+        if higher is not None:
+            degree = math.isqrt(len(higher) + 4) - 1
             for k, value in each_harmonic(*direction, degree):
                 if k >= 4:
-                    radiance = torch.addcmul(radiance, self.higher[k - 4], value)
+                    radiance = torch.addcmul(radiance, higher[k - 4], value)
         return radiance
 
     def positive_along(self, direction: Vector, more: Tensor | None = None) -> Tensor:
@@ -146,10 +164,10 @@ def beam_moments(radiance: Tensor, direction: Tensor, degree: int) -> Moments:
     if degree == 0:
         return Moments(radiance)
     z, y, x = direction
-    higher = None
+    higher = beam = None
     if degree > 1 and direction.ndim == 1:
-        higher = _harmonics_of(direction, degree)[4:].view(-1, 1, 1, 1, 1) * radiance
+        beam = radiance, _harmonics_of(direction, degree)[:, None]
     elif degree > 1:
         values = dict(each_harmonic(z, y, x, degree))
         higher = torch.stack([values[k] * radiance for k in range(4, count_harmonics(degree))])
-    return Moments(radiance, (3 * z * radiance, 3 * y * radiance, 3 * x * radiance), higher)
+    return Moments(radiance, (3 * z * radiance, 3 * y * radiance, 3 * x * radiance), higher, beam)

@@ -30,7 +30,7 @@ from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 _NAMES = "light_z", "light_y", "light_x"
 _OTHERS = "begun_z", "begun_y", "begun_x", "more_z", "more_y", "more_x"
 _TENSORS = "diffusion", "scattering_scale", "scattering", "outside", "mean", *_OTHERS, *FLUX
-_NONE = (None,) * 3
+_NONE: tuple[Any, ...] = (None,) * 3
 
 
 def find_flux(
@@ -144,7 +144,7 @@ def _given(
     field: Tensor,
     outside: Tensor,
     mean: Tensor,
-    *fluxes: Tensor | None,
+    *fluxes: Any,
 ) -> dict[str, Any]:
     """What both kernels are given, by its names; others stand for arrays that are not."""
     others, flux = fluxes[: len(_OTHERS)], fluxes[len(_OTHERS) :]

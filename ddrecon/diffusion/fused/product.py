@@ -46,6 +46,7 @@ def multiply(
     z: Tensor,
     y: Tensor,
     x: Tensor,
+    *,
     begun: Tensor | None = None,
     sign: int = 1,
 ) -> Tensor:
@@ -90,9 +91,7 @@ class _Imbalance(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, d_right: Tensor | None, d_u: Tensor | None, *d_matrix: Any) -> Tensor:
-        def change(
-            u: Tensor, d_right: Tensor | None, d_u: Tensor | None, *tensors: Tensor | None
-        ) -> Tensor:
+        def change(u: Tensor, d_right: Tensor | None, d_u: Tensor | None, *tensors: Any) -> Tensor:
             matrix, d_parts = tensors[:4], tensors[4:]
             found = torch.zeros_like(u) if d_right is None else d_right
             # dS - A du - dA u

@@ -46,7 +46,7 @@ class Case:
     """What is swept: `depth` is that of the densest cells; fields `vary` by cell and color.
 
     `moments`: of what scatters; `known`: of light before; `degree`: of the quadrature. An island
-    has a medium in a few cells amid empty ones.
+    has a medium in a few cells amid empty ones; of a beam all moments of the source are parts.
     """
 
     shape: tuple[int, int, int] = (5, 7, 6)
@@ -60,6 +60,7 @@ class Case:
     depth: float = 3.0
     dtype: torch.dtype = torch.float64
     is_island: bool = False
+    is_beam: bool = False
 
     @property
     def grid(self) -> Grid:
@@ -86,6 +87,8 @@ class Case:
             moments = random(min(count, self.moments), self.colors, *self.shape, seed=3 + seed)
             moments[0] += 1.5
             found[name] = moments - 0.5
+        if self.is_beam:
+            found["along"] = random(self.moments, self.colors, seed=8)
         if self.is_lit:
             found["inflow"] = random(self.colors, 1, 1, 1, seed=7)
         return found
@@ -96,11 +99,20 @@ class Case:
         volume = Volume(self.grid, density, sigma_a, sigma_s, g)
         return scale_medium(volume, max(1, math.isqrt(self.moments) - 1))
 
+    def source(self, values: dict[str, Tensor]) -> Moments:
+        """What scatters besides light: if it is a beam, one field times factors of moments."""
+        source = Moments.of_harmonics(values["source"])
+        if not self.is_beam:
+            return source
+        beam, factors = source.mean, values["along"]
+        whole = Moments.of_harmonics(factors[:, :, None, None, None] * beam)
+        return replace(whole, higher=None, beam=(beam, factors))
+
 
 def moments_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tensor]:
     use_engine(engine)
     medium = case.medium(values)
-    light, source = (Moments.of_harmonics(values[name]) for name in ("light", "source"))
+    light, source = Moments.of_harmonics(values["light"]), case.source(values)
     swept = sweep_change(medium, light, source, values.get("inflow"), case.degree)
     return [swept.harmonics(medium.degree)]
 
@@ -108,7 +120,7 @@ def moments_of(case: Case, values: dict[str, Tensor], engine: str) -> list[Tenso
 def moments_by_cells(case: Case, values: dict[str, Tensor], _: str) -> list[Tensor]:
     """As a GPU does it."""
     medium = case.medium(values)
-    light, source = (Moments.of_harmonics(values[name]) for name in ("light", "source"))
+    light, source = Moments.of_harmonics(values["light"]), case.source(values)
     factors = remaining_moments(medium)[: medium.degree + 1]
     number = DIRECTIONS[case.degree]
     swept = sweep_fused(medium, light, factors, source, values.get("inflow"), number, True)
@@ -147,6 +159,7 @@ def assert_same(one: tuple, other: tuple, error: float) -> None:
 CASES = {
     "color": Case(),
     "begun": Case(known=4),
+    "beam": Case(known=4, is_beam=True),
     "cubes": Case(spacing=CUBES),
     "thin": Case(spacing=THIN, moments=4),
     "gray": Case(colors=1, moments=1, is_lit=False),
@@ -198,7 +211,7 @@ def test_some_derivatives_are_asked_for(varied: list[str]):
     )
 
 
-@pytest.mark.parametrize("name", ["color", "fields"])
+@pytest.mark.parametrize("name", ["beam", "fields"])
 def test_the_adjoint_is_the_transpose_of_the_tangent(name: str):
     """<J v, w> = <v, J^T w>."""
     case = CASES[name]

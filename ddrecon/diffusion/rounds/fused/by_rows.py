@@ -148,6 +148,7 @@ class Rows:
         tables, swept = self.tables, self.swept
         return {
             "light_parts": swept.light, "source_parts": swept.source, "factors": swept.factors,
+            "beam_factors": swept.beam_factors,
             "slab": self.slab, "slabs": self.slabs, "directions": swept.directions,
             "extinction": self.fields[0], "scattering": self.fields[-1],
             "scales": swept.scales, "parts": tables.parts, "matrices": tables.matrices,

@@ -67,13 +67,15 @@ auto part_of = [&](F* const* parts, int k) -> const F* {
 };
 // One of the moments that scatter, from a cell on.
 auto read_scattering = [&](long long at, int k, F* row, int from, int to) {
-    const F *light = part_of(light_parts, k), *source = part_of(source_parts, k);
+    const F* light = part_of(light_parts, k);
+    const F* source = beam_factors ? source_parts[0] : part_of(source_parts, k);
     if (!light && !source) {
         for (int c = from; c < to; ++c) row[c] = F(0);
         return;
     }
     const F by_light = light ? factors[k * colors + color] : F(0);
-    const F by_source = source ? F(1) : F(0);
+    const F by_source
+        = !source ? F(0) : beam_factors ? beam_factors[k * colors + color] : F(1);
     const F *one = (light ? light : source) + at, *other = (source ? source : light) + at;
     INDEPENDENT
     for (int c = from; c < to; ++c) row[c] = by_light * one[c] + by_source * other[c];

@@ -24,7 +24,7 @@ POINTERS = 64
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
     F *found, *saved, *returning, *e_bar, *sc_bar, *light_parts[5], *source_parts[5], *bars[5];
-    F *densest, *entering, *leaving, *entering_bar, *leaving_bar; double *sums;
+    F *densest, *beam_factors, *entering, *leaving, *entering_bar, *leaving_bar; double *sums;
     int *ranges, *jobs, *starts, *groups, *points, *pairs, *order, layers_below, layers_above;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
     int directions, extinction_channels, scattering_channels

@@ -9,7 +9,13 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, choose, parts_of, split
+from ddrecon.diffusion.rounds.fused.swept import (
+    PARTS,
+    Swept,
+    parts_of,
+    split,
+    units_of_parts,
+)
 from ddrecon.diffusion.rounds.fused.tangents import CellTangents, RowTangents, changes_of
 from ddrecon.diffusion.rounds.fused.turned import Turned
 from ddrecon.grid import Grid
@@ -39,6 +45,11 @@ def sweep_fused(
     not rows of directions; None: on a GPU.
     """
     colors = len(medium.extinction.value) if light is None else len(light.mean)
+    beam_factors = None
+    if source.beam is not None:
+        beam, each = source.beam
+        source, units = Moments(beam), _units_of(factors)
+        beam_factors = (units * each).expand(-1, colors)
     shares_field = medium.remaining.field is medium.extinction.field
     grid = Turned.of(medium.grid) if isinstance(medium.grid, Slab) else medium.grid
     fields = medium.extinction.field, None if shares_field else medium.remaining.field
@@ -56,6 +67,7 @@ def sweep_fused(
         ),
         *(_lay(field, grid) for field in fields),
         _spread_factors(factors, colors),
+        beam_factors,
         *(_lay(part, grid) for part in (*light_parts, *parts_of(source, colors))),
     )
     if isinstance(grid, Turned):
@@ -83,6 +95,12 @@ def _spread_factors(factors: Tensor, colors: int) -> Tensor:
     """`factors` [L + 1, 1 or C, 1, 1, 1] by harmonic, [K, C]."""
     degrees = torch.tensor(degrees_of_harmonics(len(factors) - 1), device=factors.device)
     return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
+
+
+@remember
+def _units_of(factors: Tensor) -> Tensor:
+    """How many times the moments that have `factors` the parts of light are, [K, 1]."""
+    return units_of_parts(len(factors) - 1)[:, None].to(factors)
 
 
 class _Sweep(torch.autograd.Function):
@@ -114,7 +132,8 @@ class _Sweep(torch.autograd.Function):
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
-        _, _, _, _, needs_scales, _, _, needs_factors, *needs_parts = ctx.needs_input_grad
+        _, _, _, _, needs_scales, _, _, needs_factors, *needs_more = ctx.needs_input_grad
+        needs_beam_factors, *needs_parts = needs_more
         parts = (*bars[:-2], *[None] * PARTS)[:PARTS]
         if ctx.by_cells:
             found = Cells(swept).transpose(parts, needs_scales)
@@ -131,8 +150,9 @@ class _Sweep(torch.autograd.Function):
             extinction_bar,
             scattering_bar[0] if scattering_bar else None,
             swept.factor_bar(moments_bar) if needs_factors else None,
+            swept.beam_factor_bar(moments_bar) if needs_beam_factors else None,
             *swept.light_bars(moments_bar, parts, needs_parts[:PARTS]),
-            *choose(moments_bar, needs_parts[PARTS:]),
+            *swept.source_bars(moments_bar, needs_parts[PARTS:]),
         )
 
     @staticmethod
@@ -141,6 +161,7 @@ class _Sweep(torch.autograd.Function):
             values, d_values = halve(tensors)
             swept = Swept.of(*ctx.of, *values)
             d_swept = changes_of(swept, *d_values)
+            swept = swept.spelled()
             tangents = (
                 CellTangents(swept, d_swept)
                 if ctx.by_cells

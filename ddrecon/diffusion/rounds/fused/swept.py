@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -47,6 +47,11 @@ def split(moments: Tensor) -> tuple[Tensor, ...]:
     return (*first, moments[PARTS - 1 :])[: 5 if len(moments) > 4 else 4]
 
 
+def in_parts(moments: Tensor) -> Parts:
+    """The same, with None for parts that are missing."""
+    return (*split(moments), *[None] * PARTS)[:PARTS]
+
+
 def moment_of(parts: Parts, k: int) -> Tensor | None:
     """The part of light, or of its part of higher moments, that is moment `k`; None for none."""
     if k < PARTS - 1:
@@ -61,7 +66,8 @@ class Swept:
 
     `scales` [3, C]: of extinction, of scattering, and inflow; `extinction` and `scattering`: fields
     [1 or C, z, y, x], None where the second is the first. What scatters has the moments
-    `factors` [K, C] times those of `light`, and those of `source`.
+    `factors` [K, C] times those of `light`, and those of `source`: where there are `beam_factors`
+    [K, C], these times its first part.
     """
 
     grid: Grid
@@ -70,6 +76,7 @@ class Swept:
     extinction: Tensor
     scattering: Tensor | None
     factors: Tensor
+    beam_factors: Tensor | None
     light: Parts
     source: Parts
 
@@ -81,17 +88,27 @@ class Swept:
         extinction: Tensor,
         scattering: Tensor | None,
         factors: Tensor,
+        beam_factors: Tensor | None,
         *parts: Tensor | None,
     ) -> Swept:
         """From tensors as autograd must be given them: one by one."""
+        coefficients = scales, extinction, scattering
         light, source = parts[:PARTS], parts[PARTS:]
-        return Swept(grid, directions, scales, extinction, scattering, factors, light, source)
+        return Swept(grid, directions, *coefficients, factors, beam_factors, light, source)
 
     @property
     def like(self) -> Tensor:
         """A tensor [C, z, y, x] of the right kind."""
         (like, *_) = (part for part in (*self.source, *self.light) if part is not None)
         return like
+
+    def spelled(self) -> Swept:
+        """The same with all moments of the source."""
+        beam = self.source[0]
+        if self.beam_factors is None or beam is None:
+            return self
+        moments = self.beam_factors[..., None, None, None] * beam
+        return replace(self, beam_factors=None, source=in_parts(moments))
 
     @property
     def fields(self) -> list[Tensor]:
@@ -100,9 +117,9 @@ class Swept:
 
     def total(self) -> Tensor:
         """The moments of what scatters, [K, C, z, y, x], in units of parts."""
-        found = self.like.new_zeros(len(self.factors), *self.like.shape)
+        found, whole = self.like.new_zeros(len(self.factors), *self.like.shape), self.spelled()
         for k, total in enumerate(found):
-            light, source = moment_of(self.light, k), moment_of(self.source, k)
+            light, source = moment_of(self.light, k), moment_of(whole.source, k)
             if light is not None:
                 total += self.factors[k].view(-1, 1, 1, 1) * light
             if source is not None:
@@ -129,18 +146,38 @@ class Swept:
         given |= {"colors": len(found[0]), "count": len(first)}
         launch_rows(light_bar_kernel, self.grid, len(found[0]), given, {"light": first})
         higher = self.factors[4:, :, None, None, None] * found[4:] if needs[PARTS - 1] else None
-        parts = (*split(first), *[None] * PARTS)[: PARTS - 1]
-        kept = (part if need else None for part, need in zip(parts, needs, strict=False))
+        parts = zip(in_parts(first)[: PARTS - 1], needs, strict=False)
+        kept = (part if need else None for part, need in parts)
         return *kept, higher
 
     def factor_bar(self, bar: Tensor) -> Tensor:
         """The cotangent of `factors`, of `bar` of moments."""
-        found = torch.zeros_like(self.factors, dtype=torch.float64)
-        for k in range(len(bar)):
-            if (moment := moment_of(self.light, k)) is not None:
-                terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
-                found[k] = torch.stack([torch.dot(*each) for each in terms])
-        return found.to(bar.dtype)
+        return _products(bar, [moment_of(self.light, k) for k in range(len(bar))])
+
+    def beam_factor_bar(self, bar: Tensor) -> Tensor:
+        """The cotangent of `beam_factors`."""
+        return _products(bar, [self.source[0]] * len(bar))
+
+    def source_bars(self, bar: Tensor, needs: Sequence[bool]) -> Parts:
+        """Cotangents of those parts of the source that need them."""
+        if self.beam_factors is None:
+            parts = zip(in_parts(bar), needs, strict=True)
+            return tuple(part if need else None for part, need in parts)
+        found = bar.new_empty(bar[0].shape)
+        given: dict[str, Any] = {"factors": self.beam_factors, "found": bar}
+        given |= {"colors": len(found), "count": len(bar)}
+        launch_rows(beam_bar_kernel, self.grid, len(found), given, {"beam": found})
+        return found, *[None] * (PARTS - 1)
+
+
+def _products(bar: Tensor, moments: Sequence[Tensor | None]) -> Tensor:
+    """Inner products of `bar` [K, C, z, y, x] with each of the `moments`, [K, C]."""
+    found = bar.new_zeros(bar.shape[:2], dtype=torch.float64)
+    for k, moment in enumerate(moments):
+        if moment is not None:
+            terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
+            found[k] = torch.stack([torch.dot(*each) for each in terms])
+    return found.to(bar.dtype)
 
 
 _LIGHT_BARS = """
@@ -164,7 +201,18 @@ def light_bar_kernel(bits: int) -> Any:
     return row_kernel("light_bars", bits, _LIGHT_BARS, arrays, "colors count")
 
 
-def choose(bar: Tensor, needs: Sequence[bool]) -> Parts:
-    """The parts of `bar` of moments that are needed."""
-    parts = (*split(bar), *[None] * PARTS)[:PARTS]
-    return tuple(part if need else None for part, need in zip(parts, needs, strict=True))
+_BEAM_BAR = """
+const long long all = colors * size, at = c * size + start;
+F* sum = beam + at;
+for (int k = 0; k < count; ++k) {
+    const F *from = found + k * all + at, factor = factors[k * colors + c];
+    INDEPENDENT
+    for (int i = begin; i < end; ++i) sum[i] = factor * from[i] + (k > 0 ? sum[i] : F(0));
+}
+"""
+
+
+@functools.cache
+def beam_bar_kernel(bits: int) -> Any:
+    """The kernel of the cotangent of a beam, of which all moments of the source are parts."""
+    return row_kernel("beam_bar", bits, _BEAM_BAR, "factors found beam", "colors count")

@@ -10,13 +10,16 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
 from ddrecon.diffusion.rounds.fused.by_rows import Rows
-from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept
+from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, in_parts
 from ddrecon.diffusion.rounds.fused.tangent_rows import tangent_kernel
 from ddrecon.kernels.dual import tangent_of, with_changes
 
 
 def changes_of(swept: Swept, *changes: Tensor | None) -> Swept:
-    """What is added to all tensors of `swept`, as `Swept.of` takes them; None for nothing."""
+    """What is added to all tensors of `swept`, as `Swept.of` takes them; None for nothing.
+
+    The source has all its moments, a beam or not.
+    """
     tensors = swept.scales, swept.extinction, swept.scattering, swept.factors
     whole = [
         tensor if tensor is None else torch.zeros_like(tensor) if change is None else change
@@ -24,8 +27,19 @@ def changes_of(swept: Swept, *changes: Tensor | None) -> Swept:
     ]
     scales, extinction, scattering, factors = whole
     assert scales is not None and extinction is not None and factors is not None
-    parts = changes[len(whole) :]
-    return Swept.of(swept.grid, swept.directions, scales, extinction, scattering, factors, *parts)
+    d_factors, *parts = changes[len(whole) :]
+    beam, d_beam = swept.source[0], parts[PARTS]
+    if swept.beam_factors is not None and beam is not None:
+        # a product, of which both may change
+        d_moments = torch.zeros_like(swept.beam_factors)[..., None, None, None] * beam
+        if d_factors is not None:
+            d_moments += d_factors[..., None, None, None] * beam
+        if d_beam is not None:
+            d_moments += swept.beam_factors[..., None, None, None] * d_beam
+        parts[PARTS:] = in_parts(d_moments)
+    return Swept.of(
+        swept.grid, swept.directions, scales, extinction, scattering, factors, None, *parts
+    )
 
 
 class RowTangents(Rows):
