@@ -7,9 +7,7 @@ direction goes, they were done already. Of a row and a direction there are two l
 `NEAR`, what scatters along it, and `LIGHT`, I less the light from outside. Lines of the last slice
 are kept, each in the place of one that no step needs any more. I before each slab of slices is
 saved: for the adjoint, light goes through a slab once more, and lines of all its slices are kept.
-
-Where cells are shared out, the slices of a way may begin with one of another rank: there I is what
-that rank has found, `entering`; that of the last slice of one's own is `leaving` (E48).
+A first slice may be another rank's, where I is `entering`; `leaving` is that of the last (E48).
 
 Behind each row there are at least two cells that hold what is beyond its ends. Where a step meets
 no medium, light is only moved: `Empty` stands for that, and is decided for stretches of a row. In
@@ -33,9 +31,8 @@ POINTERS = 64
 GIVEN = """
     F *factors, *extinction, *scattering, *scales, *parts, *matrices, *lines, *scratch, *nothing;
     F *found, *saved, *returning, *e_bar, *sc_bar, *light_parts[5], *source_parts[5], *bars[5];
-    F *densest, *beam_factors, *entering, *leaving, *entering_bar, *leaving_bar;
-    double *sums; int layers_below, layers_above;
-    int *ranges, *jobs, *starts, *groups, *points, *pairs, *order;
+    F *densest, *beam_factors, *entering, *leaving, *entering_bar, *leaving_bar; double *sums;
+    int *ranges, *jobs, *starts, *groups, *points, *pairs, *order, layers_below, layers_above;
     int depth, height, width, pitch, colors, count, even, most, scratch_rows, slab, slabs;
     int directions, extinction_channels, scattering_channels
 """
@@ -63,9 +60,7 @@ const F* empty_row = nothing + MARGIN;
 // Slices of other ranks, before those that are one's own on this way and after them.
 const int entered = way > 0 ? layers_below : layers_above;
 const int last = depth - (way > 0 ? layers_above : layers_below);
-auto face_of = [&](int t, int direction) -> long long {
-    return ((color * (long long)directions + direction) * height + t) * width;
-};
+auto face_of = [&](long long t, int j) { return ((color * directions + j) * height + t) * width; };
 // Slabs of slices begin anew in the middle, where the ways meet; of those but the first I is saved.
 auto slab_of = [&](int s) { return s - (s < middle ? s : s - middle) % slab; };
 auto save_of = [&](int s, int t, int direction) -> long long {
