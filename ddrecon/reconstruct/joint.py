@@ -3,7 +3,7 @@
 A volume learns what is wrong with its cameras, exposures and lights, and then holds them there:
 moved in turn, each finds that the others are right. Together they go to what fits the pictures
 best, to first order, within bounds and without what no picture shows. Smoothing then moves cells
-alone (E55): a dim lamp, thick smoke and tilted exposures look like what is true, and are smoother.
+alone (E51): a dim lamp, thick smoke and tilted exposures look like what is true, and are smoother.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class _Objective:
 
 
 def _find_changes(curvature: Curvature, objective: _Objective) -> tuple[Tensor, Tensor]:
-    """How all parameters are to move by pictures alone, and then fields by all [n] (E55).
+    """How all parameters are to move by pictures alone, and then fields by all [n] (E51).
 
     To the least of the quadratic of the misfit, and with numbers as they then are to that of
     `objective`. Smoothing counts as its curvature in both.
