@@ -204,8 +204,7 @@ def solve_in_slabs(
     while run.is_open and iterations < most:
         run.iterate_once(iterations)
         iterations += 1
-    relative = torch.tensor(
-        run.relative, dtype=torch.float64
-    ).max()  # max() would pass over what is not a number
+    # Python's max() would pass over what is not a number.
+    relative = torch.tensor(run.relative, dtype=torch.float64).max()
     ghosts.fill(run.value(made))
     return Solution(made, iterations, float(relative))
