@@ -136,7 +136,7 @@ class _Objective:
         return self.curvature.join({name: bar for name, bar in found if bar is not None})
 
     def _penalties(self) -> Tensor:
-        return self.power * sum((p.penalty() for p in self.parameters), torch.zeros(()))
+        return sum((p.penalty(self.power) for p in self.parameters), torch.zeros(()))
 
 
 def _find_changes(curvature: Curvature, objective: _Objective) -> tuple[Tensor, Tensor]:

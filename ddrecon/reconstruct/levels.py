@@ -11,8 +11,9 @@ from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interp
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
-from ddrecon.ranks import cells_are_shared
 from ddrecon.scene import Scene, View
+from ddrecon.slabs.ghosts import Ghosts
+from ddrecon.slabs.slab import Slab, own_slab
 
 FEWEST_CELLS = 8
 FEWEST_PIXELS = 16
@@ -83,12 +84,19 @@ def resample(field: Tensor, grid: Grid) -> Tensor:
 
 
 def resample_solutions(
-    solutions: Mapping[tuple[str, int], Tensor], grid: Grid
+    solutions: Mapping[tuple[str, int], Tensor], before: Grid, grid: Grid
 ) -> dict[tuple[str, int], Tensor]:
-    """`solutions` on `grid`; none where ranks share out cells, and have others on another grid."""
-    if cells_are_shared():
-        return {}
-    return {kind: resample(field, grid) for kind, field in solutions.items()}
+    """`solutions` on `grid`, which were on the grid `before`; of slabs where ranks share cells."""
+    old, new = own_slab(before), own_slab(grid)
+
+    def carried(field: Tensor) -> Tensor:
+        if isinstance(old, Slab):
+            ghosts = Ghosts.of(old)
+            field = ghosts.gather(ghosts.own(field))
+        field = resample(field, grid)
+        return Ghosts.of(new).cut(field) if isinstance(new, Slab) else field
+
+    return {kind: carried(field) for kind, field in solutions.items()}
 
 
 def _resample_cross_section(sigma: Tensor, grid: Grid) -> Tensor:

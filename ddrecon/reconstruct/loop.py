@@ -234,13 +234,13 @@ class Reconstruction:
             for level in (self.train_level, self.test_level)
         )
         self.noise_targets = setup.noise_targets(self.train_level, self.train, self.noises)
-        grid = self.train_level.volume.grid
+        before, grid = self.parameters[0].grid, self.train_level.volume.grid
+        self.memory.last = resample_solutions(self.memory.last, before, grid)
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
             parameter.curvature = None
         setup.keep_within(self.support, self.parameters, self.train_level, self.test_level)
-        self.memory.last = resample_solutions(self.memory.last, grid)
 
     def _views(self) -> list[View]:
         views, wanted = self.train_level.views, self.settings.views_per_iteration

@@ -159,7 +159,7 @@ def add_penalties(
     loss, gradients = objective.loss, dict(objective.gradients)
     for parameter in parameters:
         if parameter.tv or parameter.l1:
-            penalty = power * parameter.penalty()
+            penalty = parameter.penalty(power)
             loss = loss + penalty.detach()
             gradients[parameter.name] += torch.autograd.grad(penalty, parameter.value)[0]
     return loss, gradients

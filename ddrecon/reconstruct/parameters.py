@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.losses import KNEE, THIN, compress, compressed_slope, total_variation
+from ddrecon.losses import KNEE, THIN, compress, total_variation
 from ddrecon.reconstruct.levels import resample
 from ddrecon.reconstruct.roughness import Roughness
 from ddrecon.settings import ParameterSettings
@@ -85,22 +85,22 @@ class Parameter:
         self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
-    def penalty(self) -> Tensor:
-        """What its regularizers add to the loss, in units of the targets' mean square.
+    def penalty(self, power: float = 1.0) -> Tensor:
+        """What its regularizers add to the loss, where the targets' mean square is `power`.
 
         See `ParameterSettings` for the weights.
         """
-        value, total = self.value, self.value.new_zeros(())
+        value, parts = self.value, list[Tensor]()
         if self.tv:
             variation = total_variation
             if current_engine() == "warp":
                 from ddrecon.reconstruct.fused.passes import total_variation as variation
             seen = value if self.knee is None else compress(value, self.knee)
-            total = total + self.tv * variation(seen, self.grid)
+            parts.append((power * self.tv) * variation(seen, self.grid))
         if self.l1:
             size = value.abs() if self.thin is None else compress(value, self.thin)
-            total = total + self.l1 * size.mean()
-        return total
+            parts.append((power * self.l1) * size.mean())
+        return sum(parts[1:], parts[0]) if parts else value.new_zeros(())
 
     @property
     def largest_rate(self) -> float:
@@ -122,7 +122,8 @@ class Parameter:
             gradient = gradient.mean((-3, -2, -1), keepdim=True).expand_as(gradient).contiguous()
         rate_now, smallest = rate * self.rate, self._smallest_size(gradient)
         if self.tv and power and not self.is_even:
-            smallest = smallest + DAMPING * rate_now * power * self._stiffness(before)
+            factor = DAMPING * rate * self.largest_rate * power
+            smallest = self._add_stiffness(smallest, before, factor)
         value, self.moments = self._step(before, gradient, rate_now, smallest)
         if self.is_direction:
             value.mul_(before.norm() / value.norm())
@@ -162,23 +163,27 @@ class Parameter:
             return gradient.new_tensor(EPSILON)
         # Of the mean of the new second moments, before there are any.
         mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - BETAS[1])
-        return FLOOR * (mean / (1 - BETAS[1] ** float(self.steps))).sqrt() + EPSILON
+        return (mean * (FLOOR**2 / (1 - BETAS[1] ** float(self.steps)))).sqrt() + EPSILON
 
-    def _stiffness(self, value: Tensor) -> Tensor:
-        """By how much the derivative of its smoothing rises with each cell of `value`.
+    def _add_stiffness(self, smallest: Tensor, value: Tensor, factor: float) -> Tensor:
+        """`smallest`, and by how much `factor` times the slope of smoothing rises with each cell.
 
-        That is the diagonal of R (E32), with the slope of the compression at the cell itself.
+        That is the diagonal of R (E32) about `value`, with the slope of the compression there.
         """
-        seen = value if self.knee is None else compress(value, self.knee)
+        seen = value
+        if self.knee is not None:
+            dense = value.clamp(min=0).div_(self.knee)
+            seen = dense.log1p().div_(3)
         if current_engine() == "warp":
             from ddrecon.reconstruct.fused.passes import variation_diagonal
 
             diagonal = variation_diagonal(seen, self.grid)
         else:
             diagonal = Roughness.about(seen, self.grid, 1.0).diagonal()
-        if self.knee is not None:
-            diagonal *= compressed_slope(value, self.knee) ** 2
-        return self.tv * diagonal
+        if self.knee is None:
+            return torch.add(smallest, diagonal, alpha=factor * self.tv)
+        weight = factor * self.tv / (3 * self.knee) ** 2
+        return torch.addcdiv(smallest, diagonal, dense.add_(1).square_(), value=weight)
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""
