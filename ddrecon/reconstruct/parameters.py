@@ -111,9 +111,9 @@ class Parameter:
         """Moves the value against `gradient`, and back within its bounds.
 
         `rate` is the part of its learning rate that counts now, `power` the unit of the penalties
-        in the gradient, as in `add_penalties`. With m and v the running means of
-        the derivative and of its square, each divided by the part of 1 that their weights sum to,
-        Adam moves the value by -rate m / (sqrt(v) + epsilon), and a field as E46 and E49 say.
+        in the gradient, as in `add_penalties`. With m and v the running means of the derivative and
+        of its square, each divided by the part of 1 that their weights sum to, Adam moves the value
+        by -rate m / (sqrt(v) + epsilon), and a field as E46 and E49 say.
         """
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
@@ -172,6 +172,7 @@ class Parameter:
         """
         seen = value
         if self.knee is not None:
+            # `compress`, whose slope is 1 over 3 (knee + density), in few operations.
             dense = value.clamp(min=0).div_(self.knee)
             seen = dense.log1p().div_(3)
         if current_engine() == "warp":

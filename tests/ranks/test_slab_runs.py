@@ -10,7 +10,8 @@ from shared_runs import RENDER, TESTS, VIEWS, Job, Runs, job, run_jobs
 
 pytestmark = pytest.mark.slow
 BENCH = ["bench", "scene.yaml", "--engine", "torch"]
-TALL = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch", "-D", "diffusion.warm_start=false"
+WARM = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch"
+TALL = *WARM, "-D", "diffusion.warm_start=false"
 ROUNDS = "-D", "diffusion.transport_rounds=1", "-D", "diffusion.degree=1"
 CELLS = "--share", "cells"
 
@@ -37,6 +38,8 @@ JOBS = {
     "told in cells": told(2, "told in cells", *CELLS),
     "whole": job(1, "whole", *TALL, *ROUNDS),
     "cells": job(2, "cells", *TALL, *ROUNDS, *CELLS, "--preview-every", "4"),
+    "warm": job(1, "warm", *WARM),
+    "warm cells": job(2, "warm cells", *WARM, *CELLS),
     "cells killed": job(3, "torn", *TALL, *ROUNDS, *CELLS, failing=[2, 4, "killed"]),
     "cells resumed": job(2, "torn", *TALL, *ROUNDS, *CELLS, "--resume"),
     "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.model=flux_limited"),
@@ -51,9 +54,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     return run_jobs(tmp_path_factory.mktemp("ranks"), JOBS)
 
 
-@pytest.mark.parametrize("output", ["cells", "torn"])
-def test_slabs_find_what_one_finds(runs: Runs, output: str) -> None:
-    runs.compare(output, "whole")
+@pytest.mark.parametrize(
+    ("output", "alone"), [("cells", "whole"), ("torn", "whole"), ("warm cells", "warm")]
+)
+def test_slabs_find_what_one_finds(runs: Runs, output: str, alone: str) -> None:
+    """Also where solves begin at the last solutions, carried from resolution to resolution."""
+    runs.compare(output, alone)
 
 
 def test_ranks_render_in_slabs_what_one_renders(runs: Runs) -> None:
