@@ -175,9 +175,12 @@ class ImplicitSolve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, *tensors = ctx.saved_tensors
-        # E9: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:
-        # several solves may share it, and with the last of them its memory is free again.
-        prepared, ctx.prepared = ctx.prepared, {}
+        # E9: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time,
+        # but in a recording: several solves may share it, and with the last of them its memory is
+        # free again.
+        prepared = ctx.prepared
+        if ctx.solve.memory.unread is None:
+            ctx.prepared = {}
         adjoint = ctx.solve("adjoint", ctx.assemble(prepared, *tensors).transposed(), u_bar)
         del prepared
         # E9: p_bar, the entries of A_bar = -lambda u^T that depend on p.

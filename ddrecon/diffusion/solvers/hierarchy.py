@@ -118,9 +118,8 @@ class Level:
         found = [torch.ones_like(self.taken[0, 0, 0, 0], dtype=torch.bool)]
         for level, coarsened in zip(self.levels, self.axes, strict=True):
             axes, means = _strengths(level.matrix)
-            most = torch.stack(means).amax() if axes else None
             for axis, mean in zip(axes, means, strict=True):
-                is_weak = mean < STRONG * most
+                is_weak = mean < STRONG * torch.stack(means).amax()
                 found.append(~is_weak if axis in coarsened else is_weak)
         return torch.stack(found).all()
 
@@ -172,9 +171,7 @@ class Gathered:
         return self.ghosts.cut(self.whole.correction(whole))
 
 
-def _coarser(
-    operator: Operator, axes: Sequence[Sequence[int]] = ()
-) -> Level | Coarsest | Gathered:
+def _coarser(operator: Operator, axes: Sequence[Sequence[int]] = ()) -> Level | Coarsest | Gathered:
     """The grid of `operator`, coarsened from a finer one, and all coarser ones."""
     if operator.ghosts is not None:
         return Gathered.of(operator, operator.ghosts)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +25,8 @@ BARS = "returning", "far_bar", "mass_bar", "scattered_bar"
 NUMBER_BARS = "scale_bars", "strength_bars", "inflow_bars"
 
 
-class Directions(NamedTuple):
+@dataclass(frozen=True)
+class Directions:
     """Some directions of a sweep, as kernels and sums are given them.
 
     Of each, whole `numbers` [D, 17] and `parts` [D, 5] of its step, and what moments [K, D] are
@@ -157,14 +159,9 @@ def _directions(
     with torch.inference_mode(False):
         return Directions(
             torch.tensor(numbers, dtype=torch.int32, device=device),
-            *(
-                each.to(device, dtype)
-                for each in (
-                    torch.tensor(parts, dtype=torch.float64),
-                    units * values * weight,
-                    values / units,
-                )
-            ),
+            torch.tensor(parts, dtype=dtype, device=device),
+            (units * values * weight).to(device, dtype),
+            (values / units).to(device, dtype),
             math.fsum(weights),
         )
 
