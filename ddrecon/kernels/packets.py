@@ -60,6 +60,8 @@ struct P {{
     INLINE int lane_of(I x, int) {{ return x; }}
     INLINE W load_wide(const double* p, int first, int) {{ return p[first]; }}
     INLINE void put(V& x, int, F value) {{ x = value; }}
+    INLINE V read(const F* p) {{ return *p; }}
+    INLINE void write(F* p, V x) {{ *p = x; }}
     INLINE V gather(const F* p, I at) {{ return p[at]; }}
     INLINE void add(F* p, I at, V x) {{ atomicAdd(p + at, x); }}
     INLINE V decay(V depth) {{ return {exp}(-depth); }}
@@ -95,6 +97,13 @@ struct P {{
         return x;
     }}
     INLINE void put(V& x, int l, F value) {{ x[l] = value; }}
+    // LANES numbers beside each other.
+    INLINE V read(const F* p) {{
+        V x;
+        __builtin_memcpy(&x, p, sizeof(V));
+        return x;
+    }}
+    INLINE void write(F* p, V x) {{ __builtin_memcpy(p, &x, sizeof(V)); }}
     INLINE V gather(const F* p, I at) {{
         V x;
         for (int l = 0; l < LANES; ++l) x[l] = p[at[l]];

@@ -128,8 +128,8 @@ auto sample_runs = [&](Node& node, long long offset, int from, int to) {
             V bend = P::all(F(0));
             const bool is_bent = k >= 0 && k < MASSES;
             const V v = is_bent ? w.curved(field, node.y, node.x, bend) : w.linear(field);
-            node.v[c] = node.runs == 1 ? v : P::pick(w.is_in, v, node.v[c]);
-            if (is_bent) node.bend[k] = node.runs == 1 ? bend : P::pick(w.is_in, bend, node.bend[k]);
+            node.v[c] = P::pick(w.is_in, v, node.v[c]);
+            if (is_bent) node.bend[k] = P::pick(w.is_in, bend, node.bend[k]);
         }
     }
 };

@@ -40,9 +40,9 @@ constexpr bool HAS_PERMUTATION = sizeof(F) == 4 && LANES == 16;
 typedef float V32 __attribute__((vector_size(64)));
 struct Rows {
     INLINE V read(const F* row, int first, int stride) {
+        if (stride == 1) return P::read(row + first);
         V x;
-        if (stride == 1) __builtin_memcpy(&x, row + first, sizeof(V));
-        else for (int j = 0; j < LANES; ++j) x[j] = row[(long long)(first + j) * stride];
+        for (int j = 0; j < LANES; ++j) x[j] = row[(long long)(first + j) * stride];
         return x;
     }
     INLINE V pick(V row, I at) {

@@ -163,10 +163,7 @@ struct Shares {
     }
     void write(F* row, const V& sum) const {
         if (lines.column == 1 && lines.columns >= LANES) {
-            V x;
-            __builtin_memcpy(&x, row + first, sizeof(V));
-            x += sum;
-            __builtin_memcpy(row + first, &x, sizeof(V));
+            P::write(row + first, P::read(row + first) + sum);
         } else {
             const F* values = (const F*)&sum;
             for (int j = run.low; j <= run.high; ++j)
