@@ -78,17 +78,12 @@ for (int t = height - 1; t >= 0; --t) {"""
     const int own = 3 * POINTERS;
     auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
-    auto read = [&](int k, F* row, int from, int to) {
+    auto find = [&](int k, const F** rows, F* by) {
         const F* moment = part_of(bars, k);
-        if (!moment) {
-            for (int c = from; c < to; ++c) row[c] = F(0);
-            return;
-        }
-        moment += color * cells + at;
-        for (int c = from; c < to; ++c) row[c] = moment[c];
-        ask_for(moment, from, to);
+        rows[0] = moment ? moment + color * cells + at : empty_row;
+        by[0] = F(1);
     };
-    to_directions(to_weighted_light, read, bar_of, 0, width);
+    to_directions(to_weighted_light, One(), find, bar_of, 0, width);
     for (int j = 0; leaving_bar && s == last - 1 && j < members; ++j) {
         const F* row = leaving_bar + face_of(t, begin + j);
         F* bar = bar_of(j);
@@ -225,7 +220,7 @@ for (int t = height - 1; t >= 0; --t) {"""
     }
     const bool is_adding = adds || g < group_to - 1;
     F* found_row = found + piece * count * all + color * cells + at;
-    to_moments(to_sums, found_row, bar_of, is_adding, 0, width);
+    to_moments(to_sums, found_row, bar_of, is_adding, F(0), nullptr, at, 0, width);
 }
 }
 """

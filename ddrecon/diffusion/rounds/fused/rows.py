@@ -75,6 +75,7 @@ struct Thin { enum { is_empty = 0, is_thin = 1 }; };
 struct Thick { enum { is_empty = 0, is_thin = 0 }; };
 struct One { enum { value = 1 }; };
 struct Two { enum { value = 2 }; };
+struct Three { enum { value = 3 }; };
 struct Four { enum { value = 4 }; };
 struct Along { enum { value = 1 }; };
 struct Across { enum { value = 0 }; };
@@ -154,10 +155,10 @@ for (int t = 0; t < height; ++t) {"""
     + RANGE
     + """
     const int near_begin = KEEPS ? 0 : range[2], near_end = KEEPS ? width : range[3];
-    auto read = [&](int k, F* row, int from, int to) {
-        read_scattering(color * cells + at, k, row, from, to);
+    auto find = [&](int k, const F** rows, F* by) {
+        find_scattering(color * cells + at, k, rows, by);
     };
-    to_directions(to_light, read, near_of, near_begin, near_end);
+    to_directions(to_light, Two(), find, near_of, near_begin, near_end);
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
     F* __restrict carried = scratch_row(3 * POINTERS);"""
     + BEGINNINGS
@@ -220,18 +221,9 @@ for (int t = 0; t < height; ++t) {"""
     if (KEEPS) continue;
     F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
-    to_moments(to_weighted_sums, found_row, light_of, is_adding, 0, width);
-    if (is_adding || piece > 0) continue;
-    for (int c = 0; c < width; ++c) found_row[c] += inflow;
     // the change of the first two moments of light
-    for (int k = 0; k < 4 && k < count; ++k) {
-        const F* light = part_of(light_parts, k);
-        F* change = found_row + k * all;
-        if (!light) continue;
-        light += color * cells + at;
-        INDEPENDENT
-        for (int c = 0; c < width; ++c) change[c] -= light[c];
-    }
+    to_moments(to_weighted_sums, found_row, light_of, is_adding, piece > 0 ? F(0) : inflow,
+               piece > 0 ? nullptr : light_parts, color * cells + at, 0, width);
 }
 }
 """
