@@ -13,6 +13,7 @@ Where a step meets no medium, nothing returns to what scatters.
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.row_steps import (
     BEGINNINGS,
+    CARRY,
     DECAYED,
     DIRECTION,
     ENDS,
@@ -62,6 +63,7 @@ for (int g = group_to - 1; g >= group_from; --g) {"""
     + GROUP
     + "const int ahead = -y_way * width;"
     + MULTIPLY
+    + CARRY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
 for (int t = height - 1; t >= 0; --t) {"""
@@ -171,19 +173,20 @@ for (int t = height - 1; t >= 0; --t) {"""
                 bar[c] = returning_row[c] = far_row[c] = mass_row[c] = scattered_row[c] = F(0);
             }
         } else if (is_along) {
-            INDEPENDENT
-            for (int c = 0; c < width; ++c) {
-                const F mass = half_step * (e[c] + gather(Four(), e_from, part, c));
-                passing[c] = part[0] * decay(scale * mass);
-                source_bars[c] = bar[c] + gather(Four(), back_from, part, c);
-            }
-            F last = F(0);
-            for (int n = 0; n < width; ++n) {
-                const int c = x_way > 0 ? width - 1 - n : n;
-                source_bars[c] += last;
-                last = passing[c] * source_bars[c];
-            }
-            pass_all(Four(), Along());
+            auto begin_back = [&](auto points) {
+                INDEPENDENT
+                for (int c = 0; c < width; ++c) {
+                    const F mass = half_step * (e[c] + gather(points, e_from, part, c));
+                    passing[c] = part[0] * decay(scale * mass);
+                    source_bars[c] = bar[c] + gather(points, back_from, part, c);
+                }
+            };
+            passing[-1] = passing[width] = F(0);
+            if (point_count == 1) begin_back(One());
+            else begin_back(Four());
+            carry_on(source_bars, passing + x_way, -x_way);
+            if (point_count == 1) pass_all(One(), Along());
+            else pass_all(Four(), Along());
         }"""
     + ACROSS
     + """

@@ -18,6 +18,7 @@ from ddrecon.diffusion.rounds.fused.jobs import Job
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.row_steps import (
     BEGINNINGS,
+    CARRY,
     DECAYED,
     DIRECTION,
     ENDS,
@@ -138,6 +139,7 @@ for (int s = slice_before; s < slice_to; ++s) for (int g = group_from; g < group
     + GROUP
     + "const int ahead = y_way * width;"
     + MULTIPLY
+    + CARRY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
 for (int t = 0; t < height; ++t) {"""
@@ -198,14 +200,11 @@ for (int t = 0; t < height; ++t) {"""
     + """
         if (is_along) {
             // What comes along the row itself is carried on cell by cell.
-            for (int i = 0; i < 4; ++i)
+            for (int i = 0; i < used; ++i)
                 if (!point[3 * i] && !point[3 * i + 1]) light_from[i] = empty_row;
-            pass_all(Four(), Along());
-            F last = F(0);
-            for (int n = 0; n < width; ++n) {
-                const int c = x_way > 0 ? n : width - 1 - n;
-                last = light_row[c] = light_row[c] + carried[c] * last;
-            }
+            if (point_count == 1) pass_all(One(), Along());
+            else pass_all(Four(), Along());
+            carry_on(light_row, carried, x_way);
         }"""
     + ACROSS
     + """

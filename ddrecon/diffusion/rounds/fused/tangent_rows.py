@@ -156,9 +156,10 @@ for (int t = 0; t < height; ++t) {"""
     + """
         if (is_along) {
             // What comes along the row itself is carried on cell by cell.
-            for (int i = 0; i < 4; ++i)
+            for (int i = 0; i < used; ++i)
                 if (!point[3 * i] && !point[3 * i + 1]) light_from[i] = d_light_from[i] = empty_row;
-            pass_all(Four(), Along());
+            if (point_count == 1) pass_all(One(), Along());
+            else pass_all(Four(), Along());
             F last = F(0), d_last = F(0);
             for (int n = 0; n < width; ++n) {
                 const int c = x_way > 0 ? n : width - 1 - n;
