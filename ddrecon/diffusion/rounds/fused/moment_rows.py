@@ -5,6 +5,8 @@ direction and its mirror image in x, a pair, share sums over moments even and od
 """
 
 MULTIPLY = """
+struct Six { enum { value = 6 }; };
+struct Ten { enum { value = 10 }; };
 typedef F V __attribute__((vector_size(64), aligned(sizeof(F))));
 const int LANES = 64 / sizeof(F);
 auto multiply_block = [&](auto tall, auto wide, const F* matrix, int ins, F* const* out,
@@ -162,6 +164,10 @@ auto to_directions = [&](const F* matrix, auto terms, auto find_terms, auto ligh
         few_to_directions(Three(), One(), matrix, moment, light, from, to);
         return;
     }
+    if (even == 10 && odd == 6) {
+        few_to_directions(Ten(), Six(), matrix, moment, light, from, to);
+        return;
+    }
     const F* in[POINTERS];
     F* out[POINTERS];
     for (int k = 0; k < count; ++k) {
@@ -204,11 +210,15 @@ auto to_moments = [&](const F* matrix, F* begin, auto light, bool is_adding, F f
         if (decltype(cells)::count > 1) __builtin_prefetch(found[k] + ahead + c);
         return *(const T*)(found[k] + c);
     };
+    auto end = [&](auto cells, int k, int c, auto value) {
+        *(typename decltype(cells)::T*)(found[k] + c) = value;
+    };
     if (even == 3 && odd == 1) {
-        auto end = [&](auto cells, int k, int c, auto value) {
-            *(typename decltype(cells)::T*)(found[k] + c) = value;
-        };
         few_to_moments(Three(), One(), matrix, begun, end, light, from, to);
+        return;
+    }
+    if (even == 10 && odd == 6) {
+        few_to_moments(Ten(), Six(), matrix, begun, end, light, from, to);
         return;
     }
     const F *sums[POINTERS], *differences[POINTERS];
