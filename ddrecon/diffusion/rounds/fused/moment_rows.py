@@ -193,8 +193,8 @@ auto to_directions = [&](const F* matrix, auto terms, auto find_terms, auto ligh
         }
     }
 };
-// The transpose: moments that `begin` at a cell, or what is added to them, from radiance. Those that
-// nothing is in yet begin with `first` in the mean, less the parts that are `taken`.
+// The transpose: moments that `begin` at a cell, or what is added to them, from radiance. Those
+// that nothing is in yet begin with `first` in the mean, less the parts that are `taken`.
 auto to_moments = [&](const F* matrix, F* begin, auto light, bool is_adding, F first,
                       F* const* taken, long long at, int from, int to) {
     F* found[POINTERS];
