@@ -23,7 +23,7 @@ from ddrecon.march.fused.pixels import (
 
 pytestmark = pytest.mark.slow
 
-SHAPES = [(2, 9, 7), (6, 8, 11)]
+SHAPES = [(2, 9, 7), (6, 8, 21)]
 EXACT = {torch.float64: 1e-13, torch.float32: 1e-5}
 each_shape = pytest.mark.parametrize("shape", SHAPES)
 each_type = pytest.mark.parametrize("dtype", EXACT)
@@ -94,7 +94,7 @@ def test_the_same_pixels_are_rough(shape, light, tolerance):
     brightness = (scattered + light * (1 - opacity)).square().mean().sqrt()
     expected = is_rough(torch.cat([scattered, light * opacity]), tolerance * brightness, places)
     found = interpolate_pixels(values, places, hit, count, behind, tolerance)[1]
-    assert torch.equal(found, expected)
+    assert torch.equal(found.sort().values, expected.nonzero()[:, 0])
 
 
 def test_nothing_passes_derivatives_to_every_ray_of_the_lattice():

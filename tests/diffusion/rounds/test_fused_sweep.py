@@ -212,16 +212,17 @@ def test_some_derivatives_are_asked_for(varied: list[str]):
     )
 
 
+@pytest.mark.parametrize("function", [moments_of, moments_by_cells])
 @pytest.mark.parametrize("name", ["beam", "fields"])
-def test_the_adjoint_is_the_transpose_of_the_tangent(name: str):
+def test_the_adjoint_is_the_transpose_of_the_tangent(name: str, function):
     """<J v, w> = <v, J^T w>."""
     case = CASES[name]
-    _, found = gradients(case, "warp")
+    _, found = gradients(case, "warp", function)
     values = case.values()
     changes = {n: random_values(*v.shape, seed=30).to(v) for n, v in values.items()}
     with forward.dual_level():
         duals = {n: forward.make_dual(v, changes[n]) for n, v in values.items()}
-        moments = moments_of(case, duals, "warp")
+        moments = function(case, duals, "warp")
         tangents = [forward.unpack_dual(moment).tangent for moment in moments]
     along = sum(
         float((t * random_values(*t.shape, seed=9 + i)).sum()) for i, t in enumerate(tangents)
