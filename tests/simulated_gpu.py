@@ -11,7 +11,7 @@ import contextlib
 import ctypes
 import functools
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 from unittest.mock import patch
@@ -20,7 +20,6 @@ import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 wp = pytest.importorskip("warp")
 
@@ -197,13 +196,14 @@ def _new_tensor(like: Tensor, data: Any, dtype: torch.dtype | None = None) -> Te
 def _run(function: Any, arguments: Any, options: dict[str, Any]) -> Any:
     """An operation where its tensors are."""
     name = function._schema.name.removeprefix("aten::")
-    given = [one for one in tree_leaves((arguments, options)) if isinstance(one, Tensor)]
+    given = _tensors((*arguments, *options.values()))
     far = {id(one.near): one for one in given if isinstance(one, Distant)}
     device = torch.device(options.get("device") or (FAR if far else "cpu"))
     if far and name not in ("copy_", "_to_copy", *INDEXED):
         lost = [one for one in given if not isinstance(one, Distant) and one.ndim]
         assert not lost, f"{name}: tensors on two devices"
-    near_arguments, near_options = tree_map(_near, (arguments, options))
+    near_arguments = [_near(one) for one in arguments]
+    near_options = {key: _near(one) for key, one in options.items()}
     out = function(*near_arguments, **near_options)
     if device != FAR or name in READS - {"nonzero", "masked_select"}:
         return out
@@ -211,22 +211,40 @@ def _run(function: Any, arguments: Any, options: dict[str, Any]) -> Any:
         return arguments[0]
     if _program is not None:
         _note(function, near_arguments, near_options, out)
-    return tree_map(lambda one: _there(one, far) if isinstance(one, Tensor) else one, out)
+    return _there(out, far)
 
 
-def _there(near: Tensor, known: dict[int, Distant]) -> Distant:
+def _there(near: Any, known: dict[int, Distant]) -> Any:
+    """What is `near` on the simulated GPU, where some tensors are `known`."""
+    if isinstance(near, list | tuple):
+        return type(near)(_there(one, known) for one in near)
+    if not isinstance(near, Tensor):
+        return near
     return known[id(near)] if id(near) in known else Distant(near)
 
 
+def _tensors(values: Sequence[Any]) -> list[Tensor]:
+    """The tensors among `values`, and in lists among them."""
+    found = []
+    for one in values:
+        if isinstance(one, Tensor):
+            found.append(one)
+        elif isinstance(one, list | tuple):
+            found += [each for each in one if isinstance(each, Tensor)]
+    return found
+
+
 def _near(value: Any) -> Any:
-    if isinstance(value, torch.device):
-        return torch.device("cpu")
-    return value.near if isinstance(value, Distant) else value
+    if isinstance(value, Distant):
+        return value.near
+    if isinstance(value, list | tuple):
+        return type(value)(_near(one) for one in value)
+    return torch.device("cpu") if isinstance(value, torch.device) else value
 
 
 def _note(function: Any, arguments: Any, options: Any, out: Any) -> None:
     """Adds an operation to the program that is being recorded."""
-    sizes = [one.shape for one in tree_leaves((arguments, options)) if isinstance(one, Tensor)]
+    sizes = [one.shape for one in _tensors((*arguments, *options.values()))]
     _program.described.append((function, *sizes))
     marks = [result.alias_info for result in function._schema.returns]
     if any(mark is not None and not mark.is_write for mark in marks):
@@ -234,14 +252,14 @@ def _note(function: Any, arguments: Any, options: Any, out: Any) -> None:
     if any(mark is not None for mark in marks):
         _program.steps.append(lambda: function(*arguments, **options))
         return
-    made = [one for one in tree_leaves(out) if isinstance(one, Tensor)]
+    made = _tensors([out])
     if function._schema.name == "aten::_unsafe_view":
         return
     _program.made.extend(made)
 
     def do() -> None:
-        found = tree_leaves(function(*arguments, **options))
-        for one, new in zip(made, found, strict=True):
+        found = function(*arguments, **options)
+        for one, new in zip(made, _tensors([found]), strict=True):
             one.copy_(new)
 
     _program.steps.append(do)

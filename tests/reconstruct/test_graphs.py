@@ -43,13 +43,13 @@ def engine():
 
 
 @functools.cache
-def scene_of(**kind: Any) -> Scene:
-    """Three views of a medium of three colors, whose pictures are of a somewhat denser one."""
+def scene_of(eyes: tuple[Any, ...] = EYES[:2], **kind: Any) -> Scene:
+    """Views by `eyes` of a medium of three colors, whose pictures are of a somewhat denser one."""
     density = 2 * random_values(4, 5, 6, dtype=torch.float32)
-    settings = {"transport_rounds": 0, "tolerance": 1e-3, "g": 0.4, "directional": (3.0, 2.0, 1.0)}
+    settings = {"transport_rounds": 0, "tolerance": 1e-2, "g": 0.4, "directional": (3.0, 2.0, 1.0)}
     scene = make_scene(density, **settings | kind)
     size = (6, 7)
-    cameras = [make_camera(eye=eye, size=size, dtype=torch.float32) for eye in EYES]
+    cameras = [make_camera(eye=eye, size=size, dtype=torch.float32) for eye in eyes]
     view = scene.views[0]
     views = [replace(view, name=f"v{i}", camera=camera) for i, camera in enumerate(cameras)]
     denser = replace(scene, volume=replace(scene.volume, density=1.2 * density))
@@ -115,7 +115,7 @@ def test_a_run_by_replays_is_that_of_the_processor(monkeypatch: pytest.MonkeyPat
     """Two of three views an iteration; and of its tensors the two are read: verdicts and losses."""
     start = ParameterSettings(init=0.5, min=0.0)
     settings = OptimizeSettings({"density": start}, 6, refine_at=(), views_per_iteration=2)
-    scene = replace(scene_of(transport_rounds=1), optimize=settings)
+    scene = replace(scene_of(eyes=EYES, transport_rounds=1), optimize=settings)
     scene = replace(scene, starts={"density": torch.full_like(scene.volume.density, 0.5)})
     plain = Reconstruction(scene)
     expected = [plain.step() for _ in range(6)]
@@ -166,7 +166,7 @@ def test_two_recordings_do_the_same() -> None:
         for factor in (1.0, 1.3):
             iterate(put(scene), Graphs(noting), ("density",), (factor, factor))
     half = len(known) // 2
-    assert half == 5
+    assert half == 4
     assert known[:half] == known[half:]
 
 
