@@ -17,11 +17,11 @@ from ddrecon.march.fused.packet_runs import ROWS, RUNS, WINDOWS
 from ddrecon.march.fused.stretches import WALKS
 
 GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked;
+F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked, *dealt;
 int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride, words;
 """
 """As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells. Without `fronts`
-there is no mass before the rays.
+there is no mass before the rays. Item i is packet i, or `dealt` [packets] says which.
 """
 
 _RECORDS = """
@@ -48,6 +48,7 @@ struct Node {
 };
 """
 _BEGIN = """
+if (dealt) item = dealt[item];
 const int last = ray_count - 1, begin = item * LANES;
 const F* scale = numbers;
 const F* peaks = numbers + C;
