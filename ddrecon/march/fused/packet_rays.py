@@ -41,7 +41,7 @@ struct Node {
 #if !defined(__CUDA_ARCH__)
     Run run[LANES];
 #endif
-    V s, t, v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
+    V s, t, v[CHANNELS], bend[MASSES + 1], held[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
     Cubic point[BEAMS + 1];
     V curve[CURVES + 1], by_number[HAS_SLOPES * CURVES + 1], by_angle[HAS_SLOPES * CURVES + 1];
     Plain plain[IS_STEEP * BEAMS * PHASES + 1];
@@ -193,7 +193,8 @@ auto emit = [&](int n, Node& node, const W* m, bool turns = false) {
     if (FIRST_PEAK < CHANNELS) sample(node, n, FIRST_PEAK, CHANNELS);
     for (int k = 0; k < MASSES; ++k) {
         const V bent = bound * node.bend[k];
-        node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
+        node.held[k] = P::inverse_root(F(1) + bent * bent);
+        node.v[FIRST_MASS + k] -= node.bend[k] * node.held[k];
     }
     for (int c = 0; c < C; ++c) {
         const V scattering = node.v[FIRST_DIFFUSING + c * DIFFUSING_STEP];
