@@ -214,11 +214,11 @@ def total_variation(field: Tensor, grid: Grid) -> Tensor:
 def compress(field: Tensor, knee: float) -> Tensor:
     """What of the density `field` is penalized: log(1 + field / `knee`) / 3 (E47).
 
-    Density below 0 counts as 0. `knee` > 0 is in its unit.
+    `field` >= 0; `knee` > 0 is in its unit.
     """
-    return torch.log1p(field.clamp(min=0) / knee) / 3
+    return torch.log1p(field / knee) / 3
 
 
 def compressed_slope(field: Tensor, knee: float) -> Tensor:
     """The derivative of `compress` at `field`."""
-    return (field >= 0) / (3 * (field.clamp(min=0) + knee))
+    return (3 * (field + knee)).reciprocal()

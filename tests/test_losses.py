@@ -174,6 +174,6 @@ def test_total_variation_of_compressed_density_has_its_derivative() -> None:
 
 
 def test_the_slope_of_compression_is_its_derivative() -> None:
-    field = torch.tensor([-1.0, 0.0, 0.01, 0.3, 20.0], dtype=torch.float64, requires_grad=True)
+    field = torch.tensor([0.0, 0.01, 0.3, 20.0], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(compress(field, 0.2).sum(), field)
     torch.testing.assert_close(compressed_slope(field, 0.2), slope)

@@ -32,11 +32,13 @@ constexpr int LANES = 1;
 #define INLINE static __device__ __forceinline__
 #else
 constexpr int LANES = {lanes};
+constexpr unsigned ALL_LANES = (1u << LANES) - 1;
 typedef F V __attribute__((vector_size(LANES * sizeof(F))));
 typedef int I __attribute__((vector_size(LANES * sizeof(int))));
 typedef double W __attribute__((vector_size(LANES * sizeof(double))));
 typedef decltype(V{{}} < V{{}}) M;
 typedef I IM;
+typedef bool Bits __attribute__((ext_vector_type(LANES)));
 #define INLINE static inline __attribute__((always_inline))
 #endif
 struct P {{
@@ -58,6 +60,8 @@ struct P {{
     INLINE int lane_of(I x, int) {{ return x; }}
     INLINE W load_wide(const double* p, int first, int) {{ return p[first]; }}
     INLINE void put(V& x, int, F value) {{ x = value; }}
+    INLINE V read(const F* p) {{ return *p; }}
+    INLINE void write(F* p, V x) {{ *p = x; }}
     INLINE V gather(const F* p, I at) {{ return p[at]; }}
     INLINE void add(F* p, I at, V x) {{ atomicAdd(p + at, x); }}
     INLINE V decay(V depth) {{ return {exp}(-depth); }}
@@ -72,6 +76,18 @@ struct P {{
     INLINE V root(V x) {{ return __builtin_elementwise_sqrt(x); }}
     INLINE V size(V x) {{ return __builtin_elementwise_abs(x); }}
     INLINE bool every(M is) {{ return __builtin_reduce_and(is) != 0; }}
+    // Lanes in a mask as bits of a number, of which the first is the lowest; and back.
+    INLINE unsigned bits_of(IM is) {{
+        return __builtin_bit_cast(unsigned short, __builtin_convertvector(is, Bits));
+    }}
+    INLINE IM lanes_of(unsigned bits) {{
+        return ((I{{}} + (int)bits) >> numbers() & 1) != 0;
+    }}
+    INLINE I numbers() {{
+        I x;
+        for (int l = 0; l < LANES; ++l) x[l] = l;
+        return x;
+    }}
     INLINE F lane(V x, int l) {{ return x[l]; }}
     INLINE double lane_of(W x, int l) {{ return x[l]; }}
     INLINE int lane_of(I x, int l) {{ return x[l]; }}
@@ -81,6 +97,13 @@ struct P {{
         return x;
     }}
     INLINE void put(V& x, int l, F value) {{ x[l] = value; }}
+    // LANES numbers beside each other.
+    INLINE V read(const F* p) {{
+        V x;
+        __builtin_memcpy(&x, p, sizeof(V));
+        return x;
+    }}
+    INLINE void write(F* p, V x) {{ __builtin_memcpy(p, &x, sizeof(V)); }}
     INLINE V gather(const F* p, I at) {{
         V x;
         for (int l = 0; l < LANES; ++l) x[l] = p[at[l]];

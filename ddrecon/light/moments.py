@@ -6,6 +6,7 @@ Transport rounds go on to higher degrees (docs/theory.md E17).
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -88,14 +89,13 @@ class Moments:
 
     def weighted(self, factors: Tensor) -> Moments:
         """Moments of degree l times `factors`[l], which broadcast to `[C, z, y, x]`."""
-        by_harmonic = list(degrees_of_harmonics(len(factors) - 1))
         flux = factors[1] if self.flux is not None else 1.0
         if self.beam is not None and factors[0, 0].numel() == 1:
             radiance, of_beam = self.beam
             first = replace(self, beam=None).scaled(factors[0], flux)
-            return replace(first, beam=(radiance, factors[by_harmonic].flatten(1) * of_beam))
+            return replace(first, beam=(radiance, _by_harmonic(factors).flatten(1) * of_beam))
         light = self.spelled()
-        higher = 1.0 if light.higher is None else factors[by_harmonic[4:]]
+        higher = 1.0 if light.higher is None else _by_harmonic(factors)[4:]
         return light.scaled(factors[0], flux, higher)
 
     def plus(self, other: Moments) -> Moments:
@@ -136,6 +136,17 @@ class Moments:
         divisor = margin.clamp(min=1e6 * torch.finfo(margin.dtype).tiny)
         bent = margin * (1 + (radiance / divisor).clamp(-1, 1)) ** 2 / 4
         return torch.where(radiance >= margin, radiance, bent)
+
+
+def _by_harmonic(factors: Tensor) -> Tensor:
+    """`factors` [L + 1, ...] of degrees, of each harmonic [K, ...]."""
+    return factors.index_select(0, _degrees(len(factors) - 1, factors.device))
+
+
+@functools.cache
+@torch.inference_mode(False)
+def _degrees(degree: int, device: torch.device) -> Tensor:
+    return torch.tensor(degrees_of_harmonics(degree), device=device)
 
 
 def add_vectors(one: Vector | None, other: Vector | None) -> Vector | None:

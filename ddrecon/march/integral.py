@@ -62,8 +62,8 @@ def march(
         values = _spread(of_rays(emission, sampler, sight.rays, sight.crossing), sight)
     else:
         between = of_lattice(emission, sampler, sight.lattice)
-        values, is_rough = _interpolate(between, sight, sight.places, settings, behind)
-        rough = sight.crossing.select(is_rough.nonzero()[:, 0])
+        values, numbers = _interpolate(between, sight, sight.places, settings, behind)
+        rough = sight.crossing.select(numbers)
         if len(rough.hit):
             values = values.index_copy(1, *of_rays(emission, sampler, sight.rays, rough))
     scattered, opacity = values.split(emission.colors)
@@ -88,7 +88,7 @@ def _interpolate(
 ) -> Part:
     """`values` [2 C, r, c] of a lattice at the `places` of pixels, [2 C, R] along all rays.
 
-    And which of those that meet the box are not to be interpolated, bool [P].
+    And the numbers of those that meet the box which are not to be interpolated.
     """
     brightest = values.new_zeros(1) if behind is None else behind.detach().max().view(1)
     if current_engine() == "warp" and not is_varied(places):
@@ -99,7 +99,8 @@ def _interpolate(
             values, places, sight.crossing.hit, count, brightest, settings.tolerance
         )
     own = _needs_own_ray(values, places, settings.tolerance, brightest)
-    return _spread((sight.crossing.hit, interpolate_between(values, places)), sight), own
+    along = sight.crossing.hit, interpolate_between(values, places)
+    return _spread(along, sight), own.nonzero()[:, 0]
 
 
 def _needs_own_ray(values: Tensor, places: Tensor, tolerance: float, behind: Tensor) -> Tensor:

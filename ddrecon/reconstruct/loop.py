@@ -24,7 +24,8 @@ from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
-from ddrecon.reconstruct.gradients import Differentiated, differentiate
+from ddrecon.reconstruct.gradients import Differentiated
+from ddrecon.reconstruct.graphs import Graphs
 from ddrecon.reconstruct.joint import moves_together, step_together
 from ddrecon.reconstruct.levels import factors, resample_solutions, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
@@ -132,12 +133,11 @@ class Reconstruction:
     def _iterate(self, start: float) -> Row:
         """One iteration, begun at `start` [s]."""
         # See: which views this iteration compares.
-        views = self._views()
-        # Differentiate: the objective and its derivative by every parameter.
         compared = Comparison(
-            views, self.targets, self._is_test_due, noise_targets=self.noise_targets
+            self._views(), self.targets, self._is_test_due, noise_targets=self.noise_targets
         )
-        objective = self._differentiate(views, compared)
+        # Differentiate: the objective and its derivative by every parameter.
+        objective = self._differentiate(compared)
         loss, gradients = add_penalties(objective, self.parameters, self.power)
         # Check: a derivative that is not finite would spoil the parameters for good.
         numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
@@ -236,6 +236,7 @@ class Reconstruction:
         self.noise_targets = setup.noise_targets(self.train_level, self.train, self.noises)
         before, grid = self.parameters[0].grid, self.train_level.volume.grid
         self.memory.last = resample_solutions(self.memory.last, before, grid)
+        self.graphs = Graphs()
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
@@ -249,13 +250,13 @@ class Reconstruction:
     def _values(self) -> dict[str, Tensor]:
         return {parameter.name: parameter.value for parameter in self.parameters}
 
-    def _differentiate(self, views: list[View], compared: Comparison) -> Differentiated:
-        """The loss of `views` and its derivatives, solved no more exactly than the misfit asks."""
+    def _differentiate(self, compared: Comparison) -> Differentiated:
+        """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
         self.memory.records.clear()
         self.memory.tolerance_floor = solve_tolerances(self.misfit)
-        names = [view.name for view in views]
         try:
-            return differentiate(self.train_level, names, self._values(), compared, self.memory)
+            level = self.train_level
+            return self.graphs.differentiate(level, self._values(), compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
             compared.gather()

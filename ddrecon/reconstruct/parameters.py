@@ -11,7 +11,7 @@ from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.losses import KNEE, THIN, compress, total_variation
 from ddrecon.reconstruct.levels import resample
-from ddrecon.reconstruct.roughness import Roughness
+from ddrecon.reconstruct.roughness import stiffness_diagonal
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
 
@@ -122,8 +122,9 @@ class Parameter:
             gradient = gradient.mean((-3, -2, -1), keepdim=True).expand_as(gradient).contiguous()
         rate_now, smallest = rate * self.rate, self._smallest_size(gradient)
         if self.tv and power and not self.is_even:
-            factor = DAMPING * rate * self.largest_rate * power
-            smallest = self._add_stiffness(smallest, before, factor)
+            stiffness = stiffness_diagonal(before, self.grid, self.knee)
+            factor = DAMPING * rate * self.largest_rate * power * self.tv
+            smallest = torch.add(smallest, stiffness, alpha=factor)
         value, self.moments = self._step(before, gradient, rate_now, smallest)
         if self.is_direction:
             value.mul_(before.norm() / value.norm())
@@ -164,27 +165,6 @@ class Parameter:
         # Of the mean of the new second moments, before there are any.
         mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - BETAS[1])
         return (mean * (FLOOR**2 / (1 - BETAS[1] ** float(self.steps)))).sqrt() + EPSILON
-
-    def _add_stiffness(self, smallest: Tensor, value: Tensor, factor: float) -> Tensor:
-        """`smallest`, and by how much `factor` times the slope of smoothing rises with each cell.
-
-        That is the diagonal of R (E32) about `value`, with the slope of the compression there.
-        """
-        seen = value
-        if self.knee is not None:
-            # `compress`, whose slope is 1 over 3 (knee + density), in few operations.
-            dense = value.clamp(min=0).div_(self.knee)
-            seen = dense.log1p().div_(3)
-        if current_engine() == "warp":
-            from ddrecon.reconstruct.fused.passes import variation_diagonal
-
-            diagonal = variation_diagonal(seen, self.grid)
-        else:
-            diagonal = Roughness.about(seen, self.grid, 1.0).diagonal()
-        if self.knee is None:
-            return torch.add(smallest, diagonal, alpha=factor * self.tv)
-        weight = factor * self.tv / (3 * self.knee) ** 2
-        return torch.addcdiv(smallest, diagonal, dense.add_(1).square_(), value=weight)
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
 from ddrecon.losses import ROUNDING, compress, compressed_slope
 
@@ -70,6 +71,21 @@ class Roughness:
             total.narrow(axis, 0, held.shape[axis]).add_(held)
             total.narrow(axis, 1, held.shape[axis]).add_(held)
         return total
+
+
+def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
+    """c'^2 times the diagonal of R about c of `field` [..., z, y, x], which weighs 1 (E49).
+
+    c is the compression above `knee` (E47); None is without.
+    """
+    seen = field if knee is None else compress(field, knee)
+    if current_engine() == "warp":
+        from ddrecon.reconstruct.fused.passes import variation_diagonal
+
+        diagonal = variation_diagonal(seen, grid)
+    else:
+        diagonal = Roughness.about(seen, grid, 1.0).diagonal()
+    return diagonal if knee is None else diagonal.mul_(compressed_slope(field, knee).square_())
 
 
 def slopes(field: Tensor, grid: Grid) -> list[Tensor]:

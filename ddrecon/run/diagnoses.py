@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from statistics import mean, median
 
 import torch
@@ -25,10 +26,12 @@ SHIFT = 0.5
 """A render that fits better when moved by more pixels was seen by another camera."""
 EXPLAINED = 0.3
 """The part of a residual that such a move has to explain."""
-FALLING = 1.15
-"""The loss falls yet where it is smaller by this factor in the last part of a run than before."""
+WORTHWHILE = 0.1
+"""A run is unfinished where as many iterations again would take this part off its loss."""
+SURE = 3.0
+"""So many standard errors are no chance: the loss differs from view to view."""
 LATE = 0.25
-"""That part of a run, and as much before it."""
+"""The last part of a run."""
 DRIFT = 0.005
 """Relative changes over the last part of a run that are not rest."""
 BRIGHTNESS = ("irradiance", "radiance", "intensity", "scale")
@@ -139,21 +142,42 @@ def find_shift(views: Sequence[View], images: Mapping[str, Tensor]) -> str | Non
 
 
 def find_falling(rows: Sequence[Row]) -> str | None:
-    """Whether the loss still falls at the end, at the last resolution."""
-    last = [row for row in rows if row.cells == rows[-1].cells]
-    count = min(int(LATE * len(rows)), len(last) // 2)
-    if count < 3:
+    """Whether going on would lower the loss, by how it falls over the last half of the run.
+
+    Only what is of the last resolution tells: what falls after a refinement soon comes to rest.
+    """
+    last = [row.loss for row in rows if row.cells == rows[-1].cells]
+    count = min(len(rows) // 6, len(last) // 3)
+    if count < 3 or not min(last) > 0:
         return None
-    before, after = (
-        median(row.loss for row in part) for part in (last[-2 * count : -count], last[-count:])
-    )
-    if not after > 0 or before / after < FALLING:
+    gain = promised(last[-3 * count :], len(rows)) / mean(last[-count:])
+    if gain < WORTHWHILE:
         return None
-    total = rows[-1].iteration
     return (
-        f"unfinished: the loss fell by {100 * (1 - after / before):.0f} % over the last {count} "
-        f"iterations; go on with --resume --iterations {2 * total}"
+        f"unfinished: as it falls, the loss would be lower by some {100 * min(gain, 1):.0f} % "
+        f"after as many iterations again; go on with --resume --iterations {2 * rows[-1].iteration}"
     )
+
+
+def promised(losses: Sequence[float], more: int) -> float:
+    """By how much `more` iterations would lower a loss that comes to rest as `losses` do.
+
+    They are taken for c + a q^t: of the means m1, m2, m3 of their thirds, of w iterations each,
+    the falls m1 - m2 and m2 - m3 have the ratio q^w = Q (Aitken 1926), and so a q^t is at the end
+    (m2 - m3) w (1 - q) Q^2 / (q (1 - Q)^2). It is 0 where the second fall may be chance, by how
+    much neighbors differ.
+    """
+    count = len(losses) // 3
+    first, second, third = (losses[i * count : (i + 1) * count] for i in range(3))
+    fall = mean(second) - mean(third)
+    variance = mean((b - a) ** 2 for a, b in pairwise([*second, *third])) / 2
+    if fall <= SURE * math.sqrt(2 * variance / count):
+        return 0.0
+    # A fall that does not slow down is a straight line.
+    ratio = min(fall / max(mean(first) - mean(second), fall), 1 - 1e-6)
+    q = ratio ** (1 / count)
+    left = fall * count * (1 - q) * ratio**2 / (q * (1 - ratio) ** 2)
+    return left * (1 - q**more)
 
 
 def find_drift(moved: Mapping[str, float]) -> str | None:

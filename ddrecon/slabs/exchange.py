@@ -6,6 +6,7 @@ what one rank has lent to others is added up by those others' cotangents.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -27,7 +28,9 @@ from ddrecon.slabs.slab import Slab
 
 def add_halo(own: Tensor, slab: Slab) -> Tensor:
     """`own` cells [..., z, y, x] with those that neighbors of `slab` have beside them (E40)."""
-    field: Tensor = _AddHalo.apply(own, slab)
+    field: Tensor = _Exchange.apply(
+        lambda own: with_halo(own, slab), lambda field_bar: return_halo(field_bar, slab), own
+    )
     return field
 
 
@@ -43,19 +46,17 @@ def gather_slabs(field: Tensor, grid: Grid) -> Tensor:
 
 def gather_own(own: Tensor, slab: Slab) -> Tensor:
     """The same from the `own` layers of a slab, of any shape across its axis."""
-    field: Tensor = _Gather.apply(own, slab.axis - 3, slab.sizes, slab.rank)
-    return field
+    return _gather(own, slab.axis - 3, slab.sizes, slab.rank)
 
 
 def gather_parts(part: Tensor) -> Tensor:
     """What each rank has as `part`, any shape, one after the other along a new first axis (E40)."""
-    parts: Tensor = _Gather.apply(part[None], -part.ndim - 1, [1] * rank_count(), own_rank())
-    return parts
+    return _gather(part[None], -part.ndim - 1, [1] * rank_count(), own_rank())
 
 
 def sum_slabs(part: Tensor) -> Tensor:
     """The sum over ranks of `part`, any shape, differentiable (E40)."""
-    total: Tensor = _Sum.apply(part)
+    total: Tensor = _Exchange.apply(_sum, _sum, part)
     return total
 
 
@@ -64,7 +65,12 @@ def sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
 
     Those are the ranks below where ray R `is_upwards`, else the ranks above.
     """
-    total: Tensor = _SumBefore.apply(part, is_upwards)
+    total: Tensor = _Exchange.apply(
+        lambda part: _sum_before(part, is_upwards),
+        # Who are before one rank have it after them.
+        lambda total_bar: _sum_before(total_bar, ~is_upwards),
+        part,
+    )
     return total
 
 
@@ -73,7 +79,7 @@ def swap_layers(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
 
     All are of one shape; zero where no rank is. Differentiable (E40).
     """
-    layers: tuple[Tensor, Tensor] = _Swap.apply(below, above)
+    layers: tuple[Tensor, Tensor] = _Exchange.apply(_swap, _swap, below, above)
     return layers
 
 
@@ -90,25 +96,26 @@ def join_parts(own: Tensor, axis: int, sizes: list[int]) -> Tensor:
     return torch.cat([part.narrow(axis, 0, n) for part, n in zip(parts, sizes, strict=True)], axis)
 
 
-class _AddHalo(torch.autograd.Function):
-    """Neighbors' layers beside own ones; backwards, what these were lent for is added to them."""
+class _Exchange(torch.autograd.Function):
+    """`give(*tensors)`, one or several: a linear exchange, whose transpose is `back`."""
 
     @staticmethod
-    def forward(own: Tensor, slab: Slab) -> Tensor:
-        return with_halo(own, slab)
+    def forward(give: Callable[..., Any], back: Callable[..., Any], *tensors: Tensor) -> Any:
+        return give(*tensors)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Slab], output: Tensor) -> None:
-        ctx.slab = inputs[1]
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+        ctx.give, ctx.back = inputs[:2]
 
     @staticmethod
     @differentiate_once
-    def backward(ctx: Any, field_bar: Tensor) -> tuple[Tensor, None]:
-        return return_halo(field_bar, ctx.slab), None
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
+        back = ctx.back(*bars)
+        return None, None, *(back if isinstance(back, tuple) else (back,))
 
     @staticmethod
-    def jvp(ctx: Any, d_own: Tensor, _: None) -> Tensor:
-        return with_halo(d_own, ctx.slab)
+    def jvp(ctx: Any, _give: None, _back: None, *changes: Tensor) -> Any:
+        return ctx.give(*changes)
 
 
 def return_halo(field_bar: Tensor, slab: Slab) -> Tensor:
@@ -136,73 +143,27 @@ def with_halo(own: Tensor, slab: Slab) -> Tensor:
     return torch.cat([part for part in (got[0], own, got[1]) if part is not None], axis)
 
 
-class _Gather(torch.autograd.Function):
-    """All ranks' parts; backwards, the sum of what ranks make of one's own."""
-
-    @staticmethod
-    def forward(own: Tensor, axis: int, sizes: list[int], rank: int) -> Tensor:
-        return join_parts(own, axis, sizes)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        _, ctx.axis, ctx.sizes, ctx.rank = inputs
-
-    @staticmethod
-    @differentiate_once
-    def backward(ctx: Any, whole_bar: Tensor) -> tuple[Tensor | None, ...]:
-        begin, size = sum(ctx.sizes[: ctx.rank]), ctx.sizes[ctx.rank]
-        own_bar = sum_over_ranks([whole_bar])[0].narrow(ctx.axis, begin, size)
-        return own_bar, None, None, None
-
-    @staticmethod
-    def jvp(ctx: Any, d_own: Tensor, *_: None) -> Tensor:
-        return join_parts(d_own, ctx.axis, ctx.sizes)
+def _gather(own: Tensor, axis: int, sizes: list[int], rank: int) -> Tensor:
+    """All ranks' `own` parts along `axis` < 0, of `sizes`; this is that of `rank`."""
+    begin, size = sum(sizes[:rank]), sizes[rank]
+    whole: Tensor = _Exchange.apply(
+        lambda own: join_parts(own, axis, sizes),
+        lambda whole_bar: _sum(whole_bar).narrow(axis, begin, size),
+        own,
+    )
+    return whole
 
 
-class _Sum(torch.autograd.Function):
-    """The sum over ranks, which is its own transpose."""
-
-    @staticmethod
-    def forward(part: Tensor) -> Tensor:
-        return sum_over_ranks([part])[0]
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    @differentiate_once
-    def backward(ctx: Any, total_bar: Tensor) -> Tensor:
-        return sum_over_ranks([total_bar])[0]
-
-    @staticmethod
-    def jvp(ctx: Any, d_part: Tensor) -> Tensor:
-        return sum_over_ranks([d_part])[0]
-
-
-class _SumBefore(torch.autograd.Function):
-    """The sum over the ranks before; its transpose is that over the ranks after."""
-
-    @staticmethod
-    def forward(part: Tensor, is_upwards: Tensor) -> Tensor:
-        return _sum_before(part, is_upwards)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.is_upwards = inputs[1]
-
-    @staticmethod
-    @differentiate_once
-    def backward(ctx: Any, total_bar: Tensor) -> tuple[Tensor, None]:
-        return _sum_before(total_bar, ~ctx.is_upwards), None
-
-    @staticmethod
-    def jvp(ctx: Any, d_part: Tensor, _: None) -> Tensor:
-        return _sum_before(d_part, ctx.is_upwards)
+def _sum(part: Tensor) -> Tensor:
+    """The sum over ranks, without derivatives; it is its own transpose."""
+    return sum_over_ranks([part])[0]
 
 
 def _sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
-    """Each rank adds up some of the rays for all ranks: so bytes do not grow with their number."""
+    """What `sum_before` returns, without derivatives.
+
+    Each rank adds up some of the rays for all ranks: so bytes do not grow with their number.
+    """
     ranks, (fields, rays) = rank_count(), part.shape
     share = -(-rays // ranks)
 
@@ -217,28 +178,8 @@ def _sum_before(part: Tensor, is_upwards: Tensor) -> Tensor:
     return before.transpose(0, 1).reshape(fields, -1)[:, :rays]
 
 
-class _Swap(torch.autograd.Function):
-    """Layers that go to the neighbors and come from them: its own transpose."""
-
-    @staticmethod
-    def forward(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
-        return _swap(below, above)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, ...]) -> None:
-        pass
-
-    @staticmethod
-    @differentiate_once
-    def backward(ctx: Any, *layers_bar: Tensor) -> tuple[Tensor, Tensor]:
-        return _swap(*layers_bar)
-
-    @staticmethod
-    def jvp(ctx: Any, *d_layers: Tensor) -> tuple[Tensor, Tensor]:
-        return _swap(*d_layers)
-
-
 def _swap(below: Tensor, above: Tensor) -> tuple[Tensor, Tensor]:
+    """What `swap_layers` returns, without derivatives; it is its own transpose."""
     got = swap_with_neighbors(
         below if own_rank() > 0 else None, above if own_rank() + 1 < rank_count() else None
     )

@@ -1,4 +1,4 @@
-"""A small legal scene, and what is in a folder."""
+"""A small legal scene without transport rounds, which take long; and what is in a folder."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ views:
   - {name: side, image: side.npy, split: test,
      camera: {type: perspective, fov: 30,
      origin: [2.5, 0, 0], target: [0, 0, 0], resolution: [8, 6]}}
+diffusion: {transport_rounds: 0}
 optimize:
   iterations: 4
   parameters: {density: {init: 0}}

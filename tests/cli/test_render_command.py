@@ -17,6 +17,7 @@ from ddrecon.io.images.table import read_image
 
 Run = Callable[..., Result]
 RENDER = ["render", "scene.yaml", "-o", "out", "-q"]
+ROUND = ["-D", "diffusion.transport_rounds=1"]
 
 
 def pixels(name: str) -> np.ndarray:
@@ -65,7 +66,7 @@ def numbers(value: Any) -> list[float]:
 
 @pytest.mark.parametrize("g", [-0.4, 0, 0.6])
 def test_components_sum_to_the_image(succeed: Run, g: float) -> None:
-    succeed(*RENDER, "--components", "-D", f"volume.g={g}")
+    succeed(*RENDER, *ROUND, "--components", "-D", f"volume.g={g}")
     for name in ("front", "side"):
         parts = [pixels(f"{name}.{part}") for part in ("reduced", "single", "multiple")]
         assert np.array_equal(parts[0] + parts[1] + parts[2], pixels(name))
@@ -83,7 +84,7 @@ def test_components_do_not_change_the_image(succeed: Run) -> None:
 
 
 def test_the_report(succeed: Run) -> None:
-    result = succeed(*RENDER, "--json", "-D", "diffusion.tolerance=1e-5")
+    result = succeed(*RENDER, *ROUND, "--json", "-D", "diffusion.tolerance=1e-5")
     report = json.loads(Path("out/render.json").read_text())
     assert json.loads(result.stdout) == report
     assert len(numbers(report["seconds"])) == 3 and min(numbers(report["seconds"])) >= 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -18,6 +19,13 @@ from ddrecon.diffusion.solvers import SOLVERS, hierarchy
 CASES = [("conjugate_gradient", shape) for shape in [(2, 3, 2), (1, 2, 4), (1, 1, 1)]] + [
     (solver, (2, 1, 2)) for solver in SOLVERS
 ]
+TO_ROUNDING: dict[str, Any] = {
+    "eps": 1e-5,
+    "atol": 1e-8,
+    "rtol": 1e-7,
+    "check_forward_ad": True,
+    "fast_mode": True,
+}
 
 
 def solving(
@@ -52,24 +60,18 @@ def inputs():
 @pytest.mark.parametrize(("solver", "shape"), CASES, ids=str)
 def test_both_derivatives_agree_with_differences(solver: str, shape: tuple[int, int, int], inputs):
     arguments = [tensor.requires_grad_(tensor.numel() > 0) for tensor in inputs(shape)]
-    assert torch.autograd.gradcheck(
-        solving(solver=solver), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True
-    )
+    assert torch.autograd.gradcheck(solving(solver=solver), arguments, **TO_ROUNDING)
 
 
 @pytest.mark.parametrize("wanted", range(5))
 def test_each_argument_can_be_differentiated_by_itself(wanted: int, inputs):
     arguments = [tensor.requires_grad_(i == wanted) for i, tensor in enumerate(inputs())]
-    assert torch.autograd.gradcheck(
-        solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True
-    )
+    assert torch.autograd.gradcheck(solving(), arguments, **TO_ROUNDING)
 
 
 def test_a_gray_operator_serves_a_colored_source(inputs):
     arguments = [tensor.requires_grad_() for tensor in inputs(colors=1)]
-    assert torch.autograd.gradcheck(
-        solving(), arguments, eps=1e-5, atol=1e-8, rtol=1e-7, check_forward_ad=True
-    )
+    assert torch.autograd.gradcheck(solving(), arguments, **TO_ROUNDING)
 
 
 def test_the_tangent_is_the_transpose_of_the_adjoint(inputs):

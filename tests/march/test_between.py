@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 import torch.autograd.forward_ad as forward
+from graphics_cards import assert_compiles
 from media import random_values
 from torch import Tensor
 
 from ddrecon.march.lattice import interpolate_between, is_rough
 
-wp = pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.march.fused.between import interpolate_pixels  # noqa: E402
-from ddrecon.march.fused.pixels import (  # noqa: E402
+pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.march.fused.between import interpolate_pixels
+from ddrecon.march.fused.pixels import (
     interpolation_kernel,
     judge_kernel,
     spread_kernel,
@@ -22,7 +23,7 @@ from ddrecon.march.fused.pixels import (  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-SHAPES = [(2, 9, 7), (6, 8, 11)]
+SHAPES = [(2, 9, 7), (6, 8, 21)]
 EXACT = {torch.float64: 1e-13, torch.float32: 1e-5}
 each_shape = pytest.mark.parametrize("shape", SHAPES)
 each_type = pytest.mark.parametrize("dtype", EXACT)
@@ -93,7 +94,7 @@ def test_the_same_pixels_are_rough(shape, light, tolerance):
     brightness = (scattered + light * (1 - opacity)).square().mean().sqrt()
     expected = is_rough(torch.cat([scattered, light * opacity]), tolerance * brightness, places)
     found = interpolate_pixels(values, places, hit, count, behind, tolerance)[1]
-    assert torch.equal(found, expected)
+    assert torch.equal(found.sort().values, expected.nonzero()[:, 0])
 
 
 def test_nothing_passes_derivatives_to_every_ray_of_the_lattice():
@@ -121,9 +122,6 @@ def test_two_threads_find_the_same_and_always_the_same_bits(monkeypatch):
     torch.testing.assert_close(bars[0], bars[1], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("arch", [80, 90])
-def test_kernels_compile_for_graphics_cards(arch: int, tmp_path: Path):
-    for make in (judge_kernel, interpolation_kernel, spread_kernel):
-        module = make(32).module
-        wp.compile_aot_module(module, arch=arch, use_ptx=True, module_dir=tmp_path / make.__name__)
-        assert list((tmp_path / make.__name__).glob("*.ptx"))
+def test_kernels_compile_for_graphics_cards(tmp_path: Path):
+    makers = judge_kernel, interpolation_kernel, spread_kernel
+    assert_compiles([make(32) for make in makers], tmp_path)

@@ -1,4 +1,4 @@
-"""The ball scene, small enough to reconstruct in a test."""
+"""The ball scene, small enough to reconstruct in a test; without transport rounds."""
 
 from pathlib import Path
 
@@ -12,4 +12,4 @@ BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
 
 @pytest.fixture
 def ball_scene() -> Scene:
-    return load_scene(BALL, overrides=["optimize.iterations=8"])
+    return load_scene(BALL, overrides=["optimize.iterations=8", "diffusion.transport_rounds=0"])

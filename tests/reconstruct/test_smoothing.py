@@ -25,6 +25,7 @@ BALL = Path(__file__).parents[2] / "configs" / "ball.yaml"
 def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     monkeypatch.setattr(smoothing, "ITERATIONS", 2)
     small = ["volume.resolution=[8, 8, 8]", "optimize.refine_at=[]"]
+    small += ["diffusion.transport_rounds=0"]
     return load_scene(BALL, overrides=[*small, "optimize.parameters.density={tv: auto}"])
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import mean
 
 import pytest
 import torch
 
 from ddrecon.cameras import twist
 from ddrecon.losses import psnr
+from ddrecon.reconstruct.log import NO_ROWS, Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.renderer import render
-from ddrecon.run.diagnoses import LateMeans, best_shift, diagnose
+from ddrecon.run.diagnoses import LateMeans, best_shift, diagnose, find_falling, promised
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import load_scene
 from ddrecon.variables.values import with_values
@@ -123,3 +125,45 @@ def test_the_shift_of_a_smooth_picture_is_found(move: tuple[float, float]) -> No
     view = View("front", None, image=blob(*move), mask=(x > 5).float())  # type: ignore[arg-type]
     found, explained = best_shift(view, blob(0, 0))
     assert found == pytest.approx(move, abs=0.01) and explained > 0.99
+
+
+def rows_of(losses: Sequence[float], cells: int = 8) -> list[Row]:
+    """A log of these losses."""
+    return [replace(NO_ROWS, iteration=i + 1, loss=x, cells=cells) for i, x in enumerate(losses)]
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
+def test_what_a_geometric_decay_has_to_go_is_promised(share: float) -> None:
+    """Of c + a q^t over 60 iterations, which leave a `share` of a."""
+    q, more = share ** (1 / 60), 40
+    losses = [3 + 2 * q**t for t in range(60)]
+    coming = losses[-1] - (3 + 2 * q ** (59 + more))
+    assert promised(losses, more) == pytest.approx(coming, rel=1e-6)
+
+
+@pytest.mark.parametrize(("to_go", "is_told"), [(0.2, True), (0.05, False)])
+def test_a_run_is_unfinished_where_a_tenth_is_to_go(to_go: float, is_told: bool) -> None:
+    """At its end the loss is 1 + `to_go`, of which as many iterations again take nearly all."""
+    losses = [1 + to_go * 0.97 ** (t - 99) for t in range(100)]
+    told = find_falling(rows_of(losses))
+    assert (told is not None) == is_told
+    assert told is None or "--iterations 200" in told
+
+
+def test_what_follows_a_refinement_is_not_taken_for_a_run_that_goes_on() -> None:
+    """The loss leaps, and comes back: in as many iterations again it would end no lower."""
+    coarse = [1 + 0.5 * 0.9**t for t in range(96)]
+    bump = [1 + 0.02 * 0.99**t + 2 * 0.8**t for t in range(24)]
+    assert mean(bump[:12]) > 1.3 * mean(bump[12:])
+    assert find_falling([*rows_of(coarse, 1), *rows_of(bump, 8)]) is None
+
+
+def test_views_that_differ_are_not_taken_for_a_fall() -> None:
+    """Of logs at rest, which vary by a fifth or twofold from view to view, one in a hundred is."""
+    generator = torch.Generator().manual_seed(0)
+    logs = [
+        (spread * torch.randn(120, generator=generator)).exp().tolist()
+        for spread in (0.2, 0.7)
+        for _ in range(100)
+    ]
+    assert sum(find_falling(rows_of(losses)) is not None for losses in logs) <= 2

@@ -30,6 +30,7 @@ views:
     split: test
     camera: {type: orthographic, origin: [-2.5, 0, 0], target: [0, 0, 0], width: 1,
              resolution: [8, 6]}
+diffusion: {transport_rounds: 0}
 optimize:
   iterations: 10
   views_per_iteration: 1

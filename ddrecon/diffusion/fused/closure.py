@@ -69,7 +69,7 @@ def _inverse_distance(grid: Grid, *terms: Tensor) -> Tensor:
     # The masses of kappa_tr's terms and of the haze, and their potentials, which add up as they do.
     masses = [coarse_mean(field, grid) for field in terms[1::2]]
     potentials = haze(box) * _even(coarse, masses[0])
-    whole = potentials.new_tensor(haze(box) * coarse.cells)
+    whole = potentials.new_full((), haze(box) * coarse.cells)
     for scale, mass in zip(terms[::2], masses, strict=True):
         whole = whole + scale * mass.sum((1, 2, 3), keepdim=True)
         potentials = potentials + scale * potential(mass, coarse)

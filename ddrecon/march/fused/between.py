@@ -23,14 +23,16 @@ FEW = 1 << 14
 def interpolate_pixels(
     values: Tensor, places: Tensor, hit: Tensor, count: int, behind: Tensor, tolerance: float
 ) -> tuple[Tensor, Tensor]:
-    """Radiance and opacity [2 C, `count`] of all pixels, and which of those in `hit` are rough.
+    """Radiance and opacity [2 C, `count`] of all pixels, and the numbers [*] of the rough ones.
 
-    `values` [2 C, r, c] of lattice rays are interpolated at `places` [P, 2] to pixels `hit` [P];
-    others stay 0. Rough [P] are those that `lattice.is_rough` names for `tolerance` of what is
-    seen, with light `behind` [1].
+    `values` [2 C, r, c] of lattice rays are interpolated at `places` [P, 2] to pixels `hit` [P],
+    which ascend; others stay 0. Rough are those of `hit` that `lattice.is_rough` names for
+    `tolerance` of what is seen, with light `behind` [1]. They come in an order in which neighbors
+    are neighbors in the volume.
     """
-    out, is_rough = _Interpolate.apply(values, places, hit, count, behind, tolerance)
-    return out, is_rough
+    out, order = _Interpolate.apply(values, places, hit, count, behind, tolerance)
+    rough = order.nonzero()[:, 0]
+    return out, rough[order[rough].argsort(stable=True)]
 
 
 class _Interpolate(torch.autograd.Function):
@@ -51,12 +53,12 @@ class _Interpolate(torch.autograd.Function):
         brightness = (squares.sum() / (channels // 2 * rows * columns)).sqrt()
         bound = (tolerance / DOUBT * brightness).to(values.dtype).view(1)
         out = values.new_zeros(channels, count)
-        is_rough = hit.new_empty(hit.shape, dtype=torch.bool)
+        rough = hit.new_empty(hit.shape, dtype=torch.int32)
         items, given = _pixels(values, places, hit, count)
         given |= {"uneven": uneven, "bound": bound}
-        made = {"out": out, "rough": is_rough}
+        made = {"out": out, "rough": rough}
         interpolation_kernel(bits).launch(items, given, made, _threads(places, channels))
-        return out, is_rough
+        return out, rough
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:

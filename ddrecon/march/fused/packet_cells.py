@@ -45,64 +45,6 @@ struct Corners {
     }
 };
 """
-RUNS = """
-#if !defined(__CUDA_ARCH__)
-// Lanes `begin` to before `end`, whose nodes lie between the same two rows, and in columns `low` to
-// `high`, all within LANES columns from `first` on.
-struct Run { int begin, end, low, high, first; };
-// The runs of a packet; how many.
-auto find_runs = [](const Place& y, const Place& x, const Lines& lines, Run* runs) -> int {
-    const int most = lines.columns > LANES ? lines.columns - LANES : 0;
-    const int low = __builtin_reduce_min(x.m), high = __builtin_reduce_max(x.p);
-    if (high - low < LANES && __builtin_reduce_and(y.i == y.i[0])) {
-        runs[0] = {0, LANES, low, high, low < most ? low : most};
-        return 1;
-    }
-    const int *xm = (const int*)&x.m, *xp = (const int*)&x.p, *yi = (const int*)&y.i;
-    int count = 0;
-    for (int begin = 0, end; begin < LANES; begin = end) {
-        int low = xm[begin], high = xp[begin];
-        for (end = begin + 1; end < LANES; ++end) {
-            const int lower = xm[end] < low ? xm[end] : low;
-            const int higher = xp[end] > high ? xp[end] : high;
-            if (yi[end] != yi[begin] || higher - lower >= LANES) break;
-            low = lower;
-            high = higher;
-        }
-        runs[count++] = {begin, end, low, high, low < most ? low : most};
-    }
-    return count;
-};
-#endif
-"""
-# Of a run, columns of a row are read in one piece, and lanes pick theirs by a permutation.
-ROWS = """
-#if defined(__AVX512F__) && !defined(__CUDA_ARCH__)
-constexpr bool HAS_PERMUTATION = sizeof(F) == 4 && LANES == 16;
-typedef float V32 __attribute__((vector_size(64)));
-struct Rows {
-    INLINE V read(const F* row, int first, int stride) {
-        V x;
-        if (stride == 1) __builtin_memcpy(&x, row + first, sizeof(V));
-        else for (int j = 0; j < LANES; ++j) x[j] = row[(long long)(first + j) * stride];
-        return x;
-    }
-    INLINE V pick(V row, I at) {
-        V32 x;
-        __builtin_memcpy(&x, &row, sizeof(V32));
-        x = __builtin_ia32_permvarsf512(x, at);
-        __builtin_memcpy(&row, &x, sizeof(V32));
-        return row;
-    }
-};
-#else
-constexpr bool HAS_PERMUTATION = false;
-struct Rows {
-    INLINE V read(const F* row, int, int) { return P::all(row[0]); }
-    INLINE V pick(V row, I) { return row; }
-};
-#endif
-"""
 VALUES = """
 struct Values {
     INLINE V linear(const F* f, const Corners& q) {

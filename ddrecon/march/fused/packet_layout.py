@@ -9,7 +9,6 @@ from ddrecon.march.fused.layout import Layout
 def layout_constants(layout: Layout, has_slopes: bool) -> str:
     """Where in a node the channels of color c are: the first of a kind plus c times its step."""
     numbers = {
-        "MOST_RUNS": 5,
         "C": layout.colors,
         "EXTINCTION": layout.extinction,
         "BEAMS": len(layout.beams),

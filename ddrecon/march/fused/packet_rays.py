@@ -9,10 +9,11 @@ from __future__ import annotations
 from ddrecon.kernels.packets import packet_program
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.packet_cells import PLACES, ROWS, RUNS, VALUES
+from ddrecon.march.fused.packet_cells import PLACES, VALUES
 from ddrecon.march.fused.packet_cellwise import RUNGS, SEE
 from ddrecon.march.fused.packet_layout import layout_constants
 from ddrecon.march.fused.packet_optics import CUBICS, DECAYS, POINTS, POLYNOMIALS
+from ddrecon.march.fused.packet_runs import ROWS, RUNS, WINDOWS
 from ddrecon.march.fused.stretches import WALKS
 
 GIVEN = """
@@ -118,47 +119,17 @@ auto sample_lanes = [&](Node& node, long long offset, int from, int to) {
     }
 };
 #if !defined(__CUDA_ARCH__)
-I lanes_numbers;
-for (int l = 0; l < LANES; ++l) lanes_numbers[l] = l;
 auto sample_runs = [&](Node& node, long long offset, int from, int to) {
-    const Place &y = node.y, &x = node.x;
     for (int r = 0; r < node.runs; ++r) {
-        const Run& run = node.run[r];
-        const I xm = x.m - run.first, xi = x.i - run.first;
-        const I xj = x.j - run.first, xp = x.p - run.first;
-        const V number = P::real(lanes_numbers);
-        const M is_in = (number >= F(run.begin)) & (number < F(run.end));
-        const long long at_m = (long long)y.m[run.begin] * lines.row;
-        const long long at_i = (long long)y.i[run.begin] * lines.row;
-        const long long at_j = (long long)y.j[run.begin] * lines.row;
-        const long long at_p = (long long)y.p[run.begin] * lines.row;
+        const Window w = Window::of(node.run[r], node.y, node.x, lines);
         for (int c = from; c < to; ++c) {
             const F* field = fields[c] + offset;
             const int k = c - FIRST_MASS;
-            const V row_i = Rows::read(field + at_i, run.first, lines.column);
-            const V row_j = Rows::read(field + at_j, run.first, lines.column);
-            const V i0 = Rows::pick(row_i, xi), i1 = Rows::pick(row_i, xj);
-            const V j0 = Rows::pick(row_j, xi), j1 = Rows::pick(row_j, xj);
-            const V top = i0 + x.a * (i1 - i0), low = j0 + x.a * (j1 - j0);
-            const V value = top + y.a * (low - top);
-            node.v[c] = P::pick(is_in, value, node.v[c]);
-            if (k >= 0 && k < MASSES) {
-                const V row_m = Rows::read(field + at_m, run.first, lines.column);
-                const V row_p = Rows::read(field + at_p, run.first, lines.column);
-                const V m0 = Rows::pick(row_m, xi), p0 = Rows::pick(row_p, xi);
-                const V over = m0 + x.a * (Rows::pick(row_m, xj) - m0);
-                const V under = p0 + x.a * (Rows::pick(row_p, xj) - p0);
-                // Second differences along y, and along x in both rows.
-                const V along_y = (F(1) - y.a) * (over - F(2) * top + low)
-                                + y.a * (top - F(2) * low + under);
-                const V in_i = (F(1) - x.a) * (Rows::pick(row_i, xm) - F(2) * i0 + i1)
-                             + x.a * (i0 - F(2) * i1 + Rows::pick(row_i, xp));
-                const V in_j = (F(1) - x.a) * (Rows::pick(row_j, xm) - F(2) * j0 + j1)
-                             + x.a * (j0 - F(2) * j1 + Rows::pick(row_j, xp));
-                const V along_x = in_i + y.a * (in_j - in_i);
-                const V bend = y.excess * along_y + x.excess * along_x;
-                node.bend[k] = P::pick(is_in, bend, node.bend[k]);
-            }
+            V bend = P::all(F(0));
+            const bool is_bent = k >= 0 && k < MASSES;
+            const V v = is_bent ? w.curved(field, node.y, node.x, bend) : w.linear(field);
+            node.v[c] = P::pick(w.is_in, v, node.v[c]);
+            if (is_bent) node.bend[k] = P::pick(w.is_in, bend, node.bend[k]);
         }
     }
 };
@@ -282,7 +253,7 @@ def packet_kernel(
     given `all_fields`: `fields`, from which it samples, and their changes.
     """
     optics = DECAYS + POLYNOMIALS + CUBICS + POINTS + RUNGS
-    structs = PLACES + RUNS + ROWS + VALUES + optics + _RECORDS
+    structs = PLACES + VALUES + RUNS + ROWS + WINDOWS + optics + _RECORDS
     chosen = "const F* const* fields = all_fields;" if changes else ""
     constants = layout_constants(layout, has_slopes)
     text = constants + structs + chosen + WALKS + _BEGIN + SEE + _EMIT + walk

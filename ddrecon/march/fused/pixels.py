@@ -1,80 +1,122 @@
 """Kernels of pixels between the rays of a lattice: values, where they are in doubt, the adjoint.
 
-An item is `length` pixels, or a row of the lattice.
+An item is `length` pixels, or a row of the lattice. Pixels go in packets, as rays do; the lattice
+is a slice whose cells are its rays, and values are to third order (`numerics.third_order`).
 """
 
 from __future__ import annotations
 
 import functools
 
+from ddrecon.kernels.packets import packet_program
 from ddrecon.kernels.text import BLOCK, TextKernel
+from ddrecon.march.fused.packet_cells import PLACES, VALUES
+from ddrecon.march.fused.packet_runs import ROWS, RUNS, WINDOWS
+from ddrecon.march.fused.packet_spread import SHARES
+
+TILE = 2
+"""Rows of the lattice whose rough pixels are neighbors: as high as a voxel."""
 
 _LATTICE = "F *values; int channels, rows, columns;"
 _PIXELS = _LATTICE + "int length, total, pixels; F *places; long *hit;"
-# A pixel's 12 neighbors in the lattice, and their weights: linear weights less a (1 - a) / 2 times
-# second differences along each axis (`numerics.third_order`); beyond its ends the lattice repeats.
-_STENCIL = """
-struct Stencil { int index[12]; F weight[12]; int corner; };
-auto stencil_at = [](F row, F column, int rows, int columns) -> Stencil {
-    const F last_row = F(rows - 1), last_column = F(columns - 1);
-    row = row < F(0) ? F(0) : (row > last_row ? last_row : row);
-    column = column < F(0) ? F(0) : (column > last_column ? last_column : column);
-    int i = (int)row, j = (int)column;
-    i = i < rows - 1 ? i : (rows > 1 ? rows - 2 : 0);
-    j = j < columns - 1 ? j : (columns > 1 ? columns - 2 : 0);
-    const F a1 = row - F(i), a0 = F(1) - a1, b1 = column - F(j), b0 = F(1) - b1;
-    const F p = F(0.5) * a0 * a1, q = F(0.5) * b0 * b1;
-    const int i1 = i + 1 < rows ? i + 1 : i, j1 = j + 1 < columns ? j + 1 : j;
-    const int above = (i > 0 ? i - 1 : 0) * columns, below = (i + 2 < rows ? i + 2 : i1) * columns;
-    const int here = i * columns, next = i1 * columns;
-    const int left = j > 0 ? j - 1 : 0, right = j + 2 < columns ? j + 2 : j1;
-    const F down0 = p * (a0 + a0 - a1), down1 = p * (a1 + a1 - a0);
-    const F along0 = q * (b0 + b0 - b1), along1 = q * (b1 + b1 - b0);
-    return Stencil{
-        {above + j, above + j1, here + left, here + j, here + j1, here + right,
-         next + left, next + j, next + j1, next + right, below + j, below + j1},
-        {-p * a0 * b0, -p * a0 * b1,
-         -q * b0 * a0, (a0 + down0) * b0 + a0 * along0, (a0 + down0) * b1 + a0 * along1,
-         -q * b1 * a0,
-         -q * b0 * a1, (a1 + down1) * b0 + a1 * along0, (a1 + down1) * b1 + a1 * along1,
-         -q * b1 * a1,
-         -p * a1 * b0, -p * a1 * b1},
-        here + j};
+_PACKET = (
+    BLOCK
+    + PLACES
+    + VALUES
+    + RUNS
+    + ROWS
+    + WINDOWS
+    + """
+const int size = rows * columns, last = total - 1;
+const Lines lines = {rows, columns, columns, 1};
+struct Packet {
+    Place y, x;
+    Corners q;
+    int runs;
+#if !defined(__CUDA_ARCH__)
+    Run run[LANES];
+    bool is_in_runs;
+#endif
+};
+auto packet_at = [&](int n) -> Packet {
+    Packet packet;
+    packet.y = Place::at(P::load(places, n, 2, last), rows);
+    packet.x = Place::at(P::load(places + 1, n, 2, last), columns);
+    packet.q = Corners::of(packet.y, packet.x, lines);
+#if !defined(__CUDA_ARCH__)
+    packet.runs = find_runs(packet.y, packet.x, lines, packet.run);
+    packet.is_in_runs = HAS_PERMUTATION && columns >= LANES && packet.runs <= MOST_RUNS;
+#endif
+    return packet;
+};
+auto value_at = [&](const Packet& packet, const F* v) -> V {
+    V bend = P::all(F(0)), value = bend;
+#if !defined(__CUDA_ARCH__)
+    if (packet.is_in_runs) {
+        for (int r = 0; r < packet.runs; ++r) {
+            const Window w = Window::of(packet.run[r], packet.y, packet.x, lines);
+            const V found = w.curved(v, packet.y, packet.x, bend);
+            value = P::pick(w.is_in, found - bend, value);
+        }
+        return value;
+    }
+#endif
+    value = Values::curved(v, packet.q, packet.y, packet.x, lines, bend);
+    return value - bend;
+};
+// Whether pixels n on, as many as lanes, are neighbors in an image.
+auto is_whole = [&](int n) -> bool {
+    return n + LANES <= end && hit[n + LANES - 1] - hit[n] == LANES - 1;
 };
 """
+)
 _INTERPOLATE = """
-const int size = rows * columns;
-for (int n = begin; n < end; ++n) {
-    const long long r = hit[n];
-    const Stencil s = stencil_at(places[2 * n], places[2 * n + 1], rows, columns);
+for (int n = begin; n < end; n += LANES) {
+    const Packet packet = packet_at(n);
     for (int k = 0; k < channels; ++k) {
-        const F* __restrict v = &values[k * size];
-        F total = F(0);
-        for (int m = 0; m < 12; ++m) total += s.weight[m] * v[s.index[m]];
-        out[k * (long long)pixels + r] = total < F(0) ? F(0) : total;
+        const V found = value_at(packet, &values[k * size]);
+        const V value = P::pick(found < P::all(F(0)), P::all(F(0)), found);
+        F* row = &out[k * (long long)pixels];
+        if (is_whole(n)) P::write(row + hit[n], value);
+        else for (int l = 0; l < LANES && n + l < end; ++l) row[hit[n + l]] = P::lane(value, l);
     }
-    const F* __restrict u = &uneven[s.corner];
-    const F one = u[0] > u[1] ? u[0] : u[1], other = u[columns] > u[columns + 1] ? u[columns]
-        : u[columns + 1];
-    rough[n] = (one > other ? one : other) > bound[0];
+    const Corners& q = packet.q;
+    const V most = P::most(P::most(P::gather(uneven, q.at00), P::gather(uneven, q.at01)),
+                           P::most(P::gather(uneven, q.at10), P::gather(uneven, q.at11)));
+    for (int l = 0; l < LANES && n + l < end; ++l) {
+        const int row = P::lane_of(packet.y.i, l) / TILE;
+        const F column = F(P::lane_of(packet.x.i, l)) + P::lane(packet.x.a, l);
+        const int place = 1 + 16 * row * columns + (int)(F(16) * column);
+        rough[n + l] = P::lane(most, l) > bound[0] ? place : 0;
+    }
 }
 """
 _SPREAD = """
-const int size = rows * columns;
-for (int n = begin; n < end; ++n) {
-    const long long r = hit[n];
-    const Stencil s = stencil_at(places[2 * n], places[2 * n + 1], rows, columns);
-    for (int k = 0; k < channels; ++k) {
-        const F* __restrict v = &values[k * size];
-        F* __restrict v_bar = &values_bar[k * size];
-        F total = F(0);
-        for (int m = 0; m < 12; ++m) total += s.weight[m] * v[s.index[m]];
-        // What was held at zero does not move.
-        const F bar = total < F(0) ? F(0) : out_bar[k * (long long)pixels + r];
+constexpr int MOST = 6;
+for (int n = begin; n < end; n += LANES) {
+    const Packet packet = packet_at(n);
+    // So many channels at a time.
+    for (int first = 0; first < channels; first += MOST) {
+        const int count = channels - first < MOST ? channels - first : MOST;
+        V bars[MOST];
+        for (int k = 0; k < count; ++k) {
+            const F* row = &out_bar[(first + k) * (long long)pixels];
+            V bar = P::all(F(0));
+            if (is_whole(n)) bar = P::read(row + hit[n]);
+            else for (int l = 0; l < LANES && n + l < end; ++l) P::put(bar, l, row[hit[n + l]]);
+            // What was held at zero does not move.
+            const V found = value_at(packet, &values[(first + k) * size]);
+            bars[k] = P::pick(found < P::all(F(0)), P::all(F(0)), bar);
+        }
+        F* const field = &values_bar[first * size];
 #if defined(__CUDA_ARCH__)
-        for (int m = 0; m < 12; ++m) atomicAdd(&v_bar[s.index[m]], s.weight[m] * bar);
+        const Shares shares = Shares::of(packet.y, packet.x, lines);
+        for (int k = 0; k < count; ++k) shares.add(field + k * size, bars[k], -bars[k]);
 #else
-        for (int m = 0; m < 12; ++m) v_bar[s.index[m]] += s.weight[m] * bar;
+        for (int r = 0; r < packet.runs; ++r) {
+            const Shares shares = Shares::of(packet.run[r], packet.y, packet.x, lines, ones, true);
+            for (int k = 0; k < count; ++k) shares.add_bent(field + k * size, bars[k], -bars[k]);
+        }
 #endif
     }
 }
@@ -128,14 +170,16 @@ def judge_kernel(bits: int) -> TextKernel:
 def interpolation_kernel(bits: int) -> TextKernel:
     """The kernel of values at `places` [P, 2]: those of `out` [2 C, pixels] at rays `hit` [P].
 
-    And which of them are `rough` [P]: whose neighbors are more `uneven` than `bound` [1].
+    And which of them are `rough` [P], whose neighbors are more `uneven` than `bound` [1]: a number
+    that grows along rows of tiles, else 0.
     """
-    text, more = BLOCK + _STENCIL + _INTERPOLATE, "F *uneven, *bound, *out; bool *rough"
-    return TextKernel("interpolate", bits, text, _PIXELS + more)
+    text = f"constexpr int TILE = {TILE};" + _PACKET + _INTERPOLATE
+    more = "F *uneven, *bound, *out; int *rough"
+    return TextKernel("interpolate", bits, text, _PIXELS + more, packet_program)
 
 
 @functools.cache
 def spread_kernel(bits: int) -> TextKernel:
     """The kernel that adds to `values_bar` [2 C, r, c] what `out_bar` [2 C, pixels] is for them."""
-    text, more = BLOCK + _STENCIL + _SPREAD, "F *out_bar, *values_bar"
-    return TextKernel("spread", bits, text, _PIXELS + more)
+    text, more = _PACKET + SHARES + _SPREAD, "F *out_bar, *values_bar"
+    return TextKernel("spread", bits, text, _PIXELS + more, packet_program)

@@ -176,7 +176,7 @@ def errors_on(cells: int) -> tuple[float, float]:
 
 
 def test_a_manufactured_solution_is_approached_at_second_order():
-    counts = [12, 16, 24]
+    counts = [10, 14, 20]
     means, fluxes = zip(*(errors_on(cells) for cells in counts), strict=True)
     assert convergence_order([1 / cells for cells in counts], means) >= 1.75, means
     assert convergence_order([1 / cells for cells in counts], fluxes) >= 1.4, fluxes
@@ -200,10 +200,10 @@ def test_both_schemes_agree_as_the_grid_refines(lights: dict[str, None], least: 
         ours, theirs = (solve_light(scene, SolveMemory()).outgoing.mean for scene in scenes)
         return float((ours - theirs).norm() / theirs.norm())
 
-    counts = [6, 12, 18]
+    counts = [6, 9, 12]
     apart = [disagreement(cells) for cells in counts]
     assert (
-        convergence_order([1 / cells for cells in counts], apart) >= least and apart[-1] < 1e-3
+        convergence_order([1 / cells for cells in counts], apart) >= least and apart[-1] < 2e-3
     ), apart
 
 

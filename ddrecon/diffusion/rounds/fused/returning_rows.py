@@ -13,6 +13,7 @@ Where a step meets no medium, nothing returns to what scatters.
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.row_steps import (
     BEGINNINGS,
+    CARRY,
     DECAYED,
     DIRECTION,
     ENDS,
@@ -62,6 +63,7 @@ for (int g = group_to - 1; g >= group_from; --g) {"""
     + GROUP
     + "const int ahead = -y_way * width;"
     + MULTIPLY
+    + CARRY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
 for (int t = height - 1; t >= 0; --t) {"""
@@ -78,17 +80,12 @@ for (int t = height - 1; t >= 0; --t) {"""
     const int own = 3 * POINTERS;
     auto bar_of = [&](int j) -> F* { return scratch_row(own + 5 + j); };
     // E12 transposed: I_bar.
-    auto read = [&](int k, F* row, int from, int to) {
+    auto find = [&](int k, const F** rows, F* by) {
         const F* moment = part_of(bars, k);
-        if (!moment) {
-            for (int c = from; c < to; ++c) row[c] = F(0);
-            return;
-        }
-        moment += color * cells + at;
-        for (int c = from; c < to; ++c) row[c] = moment[c];
-        ask_for(moment, from, to);
+        rows[0] = moment ? moment + color * cells + at : empty_row;
+        by[0] = F(1);
     };
-    to_directions(to_weighted_light, read, bar_of, 0, width);
+    to_directions(to_weighted_light, One(), find, bar_of, 0, width);
     for (int j = 0; leaving_bar && s == last - 1 && j < members; ++j) {
         const F* row = leaving_bar + face_of(t, begin + j);
         F* bar = bar_of(j);
@@ -176,19 +173,20 @@ for (int t = height - 1; t >= 0; --t) {"""
                 bar[c] = returning_row[c] = far_row[c] = mass_row[c] = scattered_row[c] = F(0);
             }
         } else if (is_along) {
-            INDEPENDENT
-            for (int c = 0; c < width; ++c) {
-                const F mass = half_step * (e[c] + gather(Four(), e_from, part, c));
-                passing[c] = part[0] * decay(scale * mass);
-                source_bars[c] = bar[c] + gather(Four(), back_from, part, c);
-            }
-            F last = F(0);
-            for (int n = 0; n < width; ++n) {
-                const int c = x_way > 0 ? width - 1 - n : n;
-                source_bars[c] += last;
-                last = passing[c] * source_bars[c];
-            }
-            pass_all(Four(), Along());
+            auto begin_back = [&](auto points) {
+                INDEPENDENT
+                for (int c = 0; c < width; ++c) {
+                    const F mass = half_step * (e[c] + gather(points, e_from, part, c));
+                    passing[c] = part[0] * decay(scale * mass);
+                    source_bars[c] = bar[c] + gather(points, back_from, part, c);
+                }
+            };
+            passing[-1] = passing[width] = F(0);
+            if (point_count == 1) begin_back(One());
+            else begin_back(Four());
+            carry_on(source_bars, passing + x_way, -x_way);
+            if (point_count == 1) pass_all(One(), Along());
+            else pass_all(Four(), Along());
         }"""
     + ACROSS
     + """
@@ -225,7 +223,7 @@ for (int t = height - 1; t >= 0; --t) {"""
     }
     const bool is_adding = adds || g < group_to - 1;
     F* found_row = found + piece * count * all + color * cells + at;
-    to_moments(to_sums, found_row, bar_of, is_adding, 0, width);
+    to_moments(to_sums, found_row, bar_of, is_adding, F(0), nullptr, at, 0, width);
 }
 }
 """

@@ -4,7 +4,7 @@
 DIRECTION = """
 const int* point = points + 16 * (begin + j) + 3;
 const int point_count = point[-3], x_way = point[-2], is_along = point[-1];
-const int used = point_count == 1 && !is_along ? 1 : 4;
+const int used = point_count == 1 ? 1 : 4;
 const F half_step = parts[5 * (begin + j)];
 const bool is_thin_row = half_step * deepest < F(0.25);
 const F part[4] = {parts[5 * (begin + j) + 1], parts[5 * (begin + j) + 2],
@@ -68,3 +68,58 @@ const F depth_bar = is_empty ? lost_bar : line_bar * line_slope + lost_bar * pas
 const F scattering_depth_bar = source_bar * line_mean;
 const F scattered = half_step * (scattering_depth_bar * strength);
 """
+
+
+def _shift(lanes: int, by: int, is_up: bool) -> str:
+    """A step of a scan: numbers and what they are multiplied by, moved by so many lanes."""
+    moved = [i - by if is_up else i + by for i in range(lanes)]
+    places = ", ".join(str(m if 0 <= m < lanes else lanes + i) for i, m in enumerate(moved))
+    move = "__builtin_shufflevector({0}, {1}, " + places + ")"
+    return f"x += p * {move.format('x', 'none')}; p *= {move.format('p', 'all')};\n"
+
+
+def _scan(lanes: int, is_up: bool) -> str:
+    return "".join(_shift(lanes, 2**k, is_up) for k in range(lanes.bit_length() - 1))
+
+
+# What comes along a row is carried on from cell to cell, x_c + passed_c x_(c - way) in place: over
+# a vector in steps of 1, 2, 4 ... cells.
+CARRY = (
+    """
+auto scan = [](auto x, auto p, auto before, auto up) {
+    const decltype(x) none{}, all = none + F(1);
+    if constexpr (decltype(up)::value == 1) {
+        if constexpr (sizeof(F) == 4) {
+"""
+    + _scan(16, True)
+    + "} else {"
+    + _scan(8, True)
+    + "} } else if constexpr (sizeof(F) == 4) {"
+    + _scan(16, False)
+    + "} else {"
+    + _scan(8, False)
+    + """}
+    return x + p * before;
+};
+auto carry_on = [&](F* values, const F* passed, int way) __attribute__((noinline)) {
+    const int whole = width / LANES * LANES;
+    F last = F(0);
+    auto step = [&](int c) { last = values[c] = values[c] + passed[c] * last; };
+    if (way > 0) {
+        for (int c = 0; c < whole; c += LANES) {
+            const V found = scan(*(const V*)(values + c), *(const V*)(passed + c), last, One());
+            *(V*)(values + c) = found;
+            last = found[LANES - 1];
+        }
+        for (int c = whole; c < width; ++c) step(c);
+    } else {
+        for (int c = width - 1; c >= whole; --c) step(c);
+        for (int c = whole - LANES; c >= 0; c -= LANES) {
+            const V found = scan(*(const V*)(values + c), *(const V*)(passed + c), last, Two());
+            *(V*)(values + c) = found;
+            last = found[0];
+        }
+    }
+};
+"""
+)

@@ -18,6 +18,7 @@ from ddrecon.diffusion.rounds.fused.jobs import Job
 from ddrecon.diffusion.rounds.fused.moment_rows import MULTIPLY
 from ddrecon.diffusion.rounds.fused.row_steps import (
     BEGINNINGS,
+    CARRY,
     DECAYED,
     DIRECTION,
     ENDS,
@@ -75,6 +76,7 @@ struct Thin { enum { is_empty = 0, is_thin = 1 }; };
 struct Thick { enum { is_empty = 0, is_thin = 0 }; };
 struct One { enum { value = 1 }; };
 struct Two { enum { value = 2 }; };
+struct Three { enum { value = 3 }; };
 struct Four { enum { value = 4 }; };
 struct Along { enum { value = 1 }; };
 struct Across { enum { value = 0 }; };
@@ -137,6 +139,7 @@ for (int s = slice_before; s < slice_to; ++s) for (int g = group_from; g < group
     + GROUP
     + "const int ahead = y_way * width;"
     + MULTIPLY
+    + CARRY
     + """
 const int k = way > 0 ? s : depth - 1 - s;
 for (int t = 0; t < height; ++t) {"""
@@ -154,10 +157,10 @@ for (int t = 0; t < height; ++t) {"""
     + RANGE
     + """
     const int near_begin = KEEPS ? 0 : range[2], near_end = KEEPS ? width : range[3];
-    auto read = [&](int k, F* row, int from, int to) {
-        read_scattering(color * cells + at, k, row, from, to);
+    auto find = [&](int k, const F** rows, F* by) {
+        find_scattering(color * cells + at, k, rows, by);
     };
-    to_directions(to_light, read, near_of, near_begin, near_end);
+    to_directions(to_light, Two(), find, near_of, near_begin, near_end);
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
     F* __restrict carried = scratch_row(3 * POINTERS);"""
     + BEGINNINGS
@@ -197,14 +200,11 @@ for (int t = 0; t < height; ++t) {"""
     + """
         if (is_along) {
             // What comes along the row itself is carried on cell by cell.
-            for (int i = 0; i < 4; ++i)
+            for (int i = 0; i < used; ++i)
                 if (!point[3 * i] && !point[3 * i + 1]) light_from[i] = empty_row;
-            pass_all(Four(), Along());
-            F last = F(0);
-            for (int n = 0; n < width; ++n) {
-                const int c = x_way > 0 ? n : width - 1 - n;
-                last = light_row[c] = light_row[c] + carried[c] * last;
-            }
+            if (point_count == 1) pass_all(One(), Along());
+            else pass_all(Four(), Along());
+            carry_on(light_row, carried, x_way);
         }"""
     + ACROSS
     + """
@@ -220,18 +220,9 @@ for (int t = 0; t < height; ++t) {"""
     if (KEEPS) continue;
     F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
-    to_moments(to_weighted_sums, found_row, light_of, is_adding, 0, width);
-    if (is_adding || piece > 0) continue;
-    for (int c = 0; c < width; ++c) found_row[c] += inflow;
     // the change of the first two moments of light
-    for (int k = 0; k < 4 && k < count; ++k) {
-        const F* light = part_of(light_parts, k);
-        F* change = found_row + k * all;
-        if (!light) continue;
-        light += color * cells + at;
-        INDEPENDENT
-        for (int c = 0; c < width; ++c) change[c] -= light[c];
-    }
+    to_moments(to_weighted_sums, found_row, light_of, is_adding, piece > 0 ? F(0) : inflow,
+               piece > 0 ? nullptr : light_parts, color * cells + at, 0, width);
 }
 }
 """

@@ -33,16 +33,14 @@ _GIVEN = """
 F *d_light_parts[5], *d_source_parts[5], *d_factors, *d_scales, *d_entering, *d_leaving
 """
 # The change of one of the moments that scatter, from a cell on.
-_READ_CHANGE = """
-auto read_change = [&](long long at, int k, F* __restrict row, int from, int to) {
+_FIND_CHANGE = """
+auto find_change = [&](long long at, int k, const F** rows, F* by) {
     const F* terms[3] = {part_of(d_source_parts, k), part_of(d_light_parts, k),
                          part_of(light_parts, k)};
-    const F by[3] = {F(1), factors[k * colors + color], d_factors[k * colors + color]};
-    for (int c = from; c < to; ++c) row[c] = F(0);
+    const F factor[3] = {F(1), factors[k * colors + color], d_factors[k * colors + color]};
     for (int i = 0; i < 3; ++i) {
-        if (!terms[i] || by[i] == F(0)) continue;
-        const F* __restrict term = terms[i] + at;
-        for (int c = from; c < to; ++c) row[c] += by[i] * term[c];
+        rows[i] = terms[i] ? terms[i] + at : empty_row;
+        by[i] = factor[i];
     }
 };
 """
@@ -90,7 +88,7 @@ for (int s = slice_from; s < slice_to; ++s) for (int g = group_from; g < group_t
     + GROUP
     + "const int ahead = y_way * width;"
     + MULTIPLY
-    + _READ_CHANGE
+    + _FIND_CHANGE
     + """
 const int k = way > 0 ? s : depth - 1 - s;
 for (int t = 0; t < height; ++t) {"""
@@ -106,14 +104,14 @@ for (int t = 0; t < height; ++t) {"""
     // Where steps meet a medium or its change, and where what scatters is asked for."""
     + RANGE
     + """
-    auto read = [&](int k, F* row, int from, int to) {
-        read_scattering(color * cells + at, k, row, from, to);
+    auto find = [&](int k, const F** rows, F* by) {
+        find_scattering(color * cells + at, k, rows, by);
     };
-    auto read_changes = [&](int k, F* row, int from, int to) {
-        read_change(color * cells + at, k, row, from, to);
+    auto find_changes = [&](int k, const F** rows, F* by) {
+        find_change(color * cells + at, k, rows, by);
     };
-    to_directions(to_light, read, near_of, range[2], range[3]);
-    to_directions(to_light, read_changes, d_near_of, range[2], range[3]);
+    to_directions(to_light, Two(), find, near_of, range[2], range[3]);
+    to_directions(to_light, Three(), find_changes, d_near_of, range[2], range[3]);
     const F *__restrict e = e_cells + row, *__restrict sc = sc_cells + row;
     const F *__restrict d_e = d_e_cells + row, *__restrict d_sc = d_sc_cells + row;
     F *__restrict carried = scratch_row(3 * POINTERS);
@@ -158,9 +156,10 @@ for (int t = 0; t < height; ++t) {"""
     + """
         if (is_along) {
             // What comes along the row itself is carried on cell by cell.
-            for (int i = 0; i < 4; ++i)
+            for (int i = 0; i < used; ++i)
                 if (!point[3 * i] && !point[3 * i + 1]) light_from[i] = d_light_from[i] = empty_row;
-            pass_all(Four(), Along());
+            if (point_count == 1) pass_all(One(), Along());
+            else pass_all(Four(), Along());
             F last = F(0), d_last = F(0);
             for (int n = 0; n < width; ++n) {
                 const int c = x_way > 0 ? n : width - 1 - n;
@@ -176,9 +175,8 @@ for (int t = 0; t < height; ++t) {"""
     }
     F* found_row = found + piece * count * all + color * cells + at;
     const bool is_adding = adds || g > group_from;
-    to_moments(to_weighted_sums, found_row, d_light_of, is_adding, 0, width);
-    if (!is_adding && piece == 0)
-        for (int c = 0; c < width; ++c) found_row[c] += d_inflow;
+    to_moments(to_weighted_sums, found_row, d_light_of, is_adding, piece > 0 ? F(0) : d_inflow,
+               nullptr, at, 0, width);
 }
 }
 }

@@ -89,9 +89,9 @@ class CellTangents(Cells):
         """The change of the moments of radiance [K, C, z, y, x]."""
         found = torch.zeros_like(self.like)
         changes = self.changes
-        for steps, values, weights in self._parts(arrays=4):
-            given = self._follow(steps, values)
-            d_near = torch.tensordot(values.T.to(self.like), self.d_moments, 1).contiguous()
+        for some in self._parts(arrays=4):
+            given = self._follow(some)
+            d_near = torch.tensordot(some.spreading.T, self.d_moments, 1).contiguous()
             d_fields = changes.extinction, changes.scattering
             d_given = {
                 "near": d_near, "extinction": d_fields[0], "scales": changes.scales,
@@ -103,9 +103,8 @@ class CellTangents(Cells):
             light = whole.pop("light")
             made = {"d_light": d_light, "light": light}
             for number in range(max(self.shape)):
-                count = len(steps) * self.colors * self.most
+                count = some.count * self.colors * self.most
                 kernel.launch(count, whole | {"slice": number}, made)
-            weighted = self.units * values * weights
-            found += torch.tensordot(weighted.to(d_light), d_light, 1)
-            found[0] += float(weights.sum()) * changes.scales[2].view(-1, 1, 1, 1)
+            found += torch.tensordot(some.summing, d_light, 1)
+            found[0] += some.weight * changes.scales[2].view(-1, 1, 1, 1)
         return found
