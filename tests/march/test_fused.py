@@ -218,10 +218,19 @@ def test_single_precision():
 
 
 @pytest.mark.parametrize("eye", [(0.3, 0.4, 3.0), (3.0, 0.5, 0.2), (0.2, -3.0, -0.4)], ids=str)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_packets_read_and_write_whole_rows(eye: tuple[float, float, float], dtype: torch.dtype):
-    """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it."""
-    camera = make_camera(size=(24, 25), dtype=dtype, half_width=0.4, eye=eye)
+@pytest.mark.parametrize(
+    ("dtype", "half_width"),
+    [(torch.float32, 0.4), (torch.float32, 0.2), (torch.float64, 0.4)],
+    ids=str,
+)
+def test_packets_read_and_write_whole_rows(
+    eye: tuple[float, float, float], dtype: torch.dtype, half_width: float
+):
+    """From all sides, of a volume as wide as a packet: its lanes share rows, or columns, of it.
+
+    In a narrow view neighbors lie right of the same column, and at its ends beside the volume.
+    """
+    camera = make_camera(size=(24, 33), dtype=dtype, half_width=half_width, eye=eye)
     density = half_empty(18, 21, 19, dtype=dtype)
     scene = make_scene(density, g=0.5, camera=camera)
     names = ["density", "sigma_s"]
