@@ -23,6 +23,9 @@ SMALL = [
     "volume.resolution=[6, 5, 4]",
     "views.0.camera.resolution=[7, 6]",
     "views.1.camera.resolution=[6, 5]",
+    "views.2.camera.resolution=[5, 6]",
+    "views.3.camera.resolution=[6, 5]",
+    "lights.2.directions=6",
 ]
 NAMES = tuple(load_scene(CONFIG).starts)
 
