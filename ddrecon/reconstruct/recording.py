@@ -94,6 +94,8 @@ class Recording:
         self.memory = self._new_memory()
         self._give(values, memory)
         self.light = Program(*record(self._light))
+        # Views are recorded with light that there can be.
+        self.light.again()
         self.inputs = [*self.values.values(), *self.light.made.cut.leaves]
         self.sums = [torch.zeros_like(one) for one in self.inputs]
         self.views: dict[tuple[str, float], Program] = {}
