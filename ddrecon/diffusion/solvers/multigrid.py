@@ -62,8 +62,9 @@ def solve_by_torch(
         relative, count, has_strong_axes = run.verdict().tolist()
     if not has_strong_axes:
         # Once more, with levels that coarsen the axes they should.
-        del operator.prepared[Level.of], _axes[operator.loss.shape]
-        return solve_by_torch(operator, source, guess, tolerance, is_ahead)
+        del operator.prepared[Level.of]
+        _axes.pop(operator.loss.shape, None)
+        return solve_by_torch(operator, source, guess, tolerance, is_ahead=False)
     if is_ahead:
         _counts[source.shape].append(int(count))
     return run.system.solution(run.y, int(count), relative)
