@@ -9,7 +9,8 @@ A call is an operation of torch, views of tensors not counted; on a GPU each cos
 microseconds. A launch is that of a fused kernel. A read hands a tensor's numbers, or a size that
 depends on them, to Python: there the processor waits for a GPU. A write makes a tensor of Python's
 numbers, for which it waits as well. All are counted alike on a machine without a GPU, but for the
-diffusion's solves, which on a GPU are torch's operations with either engine.
+diffusion's solves, which on a GPU are torch's operations with either engine, and for the sweeps of
+rounds: docs/benchmarks.md has what a simulated GPU is asked for.
 """
 
 from __future__ import annotations

@@ -53,6 +53,7 @@ struct P {{
     INLINE W wide(V x) {{ return (double)x; }}
     INLINE V narrow(W x) {{ return F(x); }}
     INLINE V root(V x) {{ return sqrt(x); }}
+    INLINE V inverse_root(V x) {{ return F(1) / sqrt(x); }}
     INLINE V size(V x) {{ return x < F(0) ? -x : x; }}
     INLINE bool every(M is) {{ return is; }}
     INLINE F lane(V x, int) {{ return x; }}
@@ -74,6 +75,21 @@ struct P {{
     INLINE W wide(V x) {{ return __builtin_convertvector(x, W); }}
     INLINE V narrow(W x) {{ return __builtin_convertvector(x, V); }}
     INLINE V root(V x) {{ return __builtin_elementwise_sqrt(x); }}
+    // 1 / root of x; by a step of Newton's from 14 bits where the processor has these.
+    INLINE V inverse_root(V x) {{
+#if defined(__AVX512F__)
+        if (sizeof(V) == 64 && sizeof(F) == 4) {{
+            typedef float V32 __attribute__((vector_size(64)));
+            V32 known;
+            __builtin_memcpy(&known, &x, sizeof(V32));
+            known = __builtin_ia32_rsqrt14ps512_mask(known, known, (unsigned short)-1);
+            V r;
+            __builtin_memcpy(&r, &known, sizeof(V));
+            return r * (F(1.5) - F(0.5) * x * r * r);
+        }}
+#endif
+        return F(1) / root(x);
+    }}
     INLINE V size(V x) {{ return __builtin_elementwise_abs(x); }}
     INLINE bool every(M is) {{ return __builtin_reduce_and(is) != 0; }}
     // Lanes in a mask as bits of a number, of which the first is the lowest; and back.

@@ -6,7 +6,6 @@ Transport rounds go on to higher degrees (docs/theory.md E17).
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from ddrecon.numerics.harmonics import (
     count_harmonics,
-    degrees_of_harmonics,
+    degrees_on,
     each_harmonic,
     harmonics,
 )
@@ -140,13 +139,7 @@ class Moments:
 
 def _by_harmonic(factors: Tensor) -> Tensor:
     """`factors` [L + 1, ...] of degrees, of each harmonic [K, ...]."""
-    return factors.index_select(0, _degrees(len(factors) - 1, factors.device))
-
-
-@functools.cache
-@torch.inference_mode(False)
-def _degrees(degree: int, device: torch.device) -> Tensor:
-    return torch.tensor(degrees_of_harmonics(degree), device=device)
+    return factors.index_select(0, degrees_on(factors.device, len(factors) - 1))
 
 
 def add_vectors(one: Vector | None, other: Vector | None) -> Vector | None:

@@ -109,8 +109,7 @@ def light_shares(
     diffusion = replace(scene.diffusion, tolerance=min(scene.diffusion.tolerance, TOLERANCE))
     scene, lacking = replace(scene, diffusion=diffusion), []
     for light in lights:
-        memory = SolveMemory()
-        memory.last = dict(solutions)
+        memory = SolveMemory(last=dict(solutions))
         dark = with_values(scene, {**values, light.name: torch.zeros_like(light.value)})
         rest = render_each(dark, [dark.view(name) for name in names], memory)
         others = dict(zip(names, rest, strict=True))

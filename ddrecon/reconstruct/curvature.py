@@ -145,6 +145,4 @@ class Curvature:
 
     def new_memory(self) -> SolveMemory:
         """What solves begin from: the same each time, so that a product depends on nothing else."""
-        memory = SolveMemory()
-        memory.last = dict(self.solutions)
-        return memory
+        return SolveMemory(last=dict(self.solutions))

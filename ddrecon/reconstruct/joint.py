@@ -1,4 +1,4 @@
-"""All that is sought, moved together: steps of Gauss and Newton over cells and numbers (E43).
+"""Joint steps: Gauss and Newton's, over all cells and numbers that are sought (E43).
 
 A volume learns what is wrong with its cameras, exposures and lights, and then holds them there:
 moved in turn, each finds that the others are right. Together they go to what fits the pictures
@@ -34,9 +34,9 @@ LENGTHS = (1.0, 0.5, 0.25, 0.125)
 
 
 def moves_together(parameters: Sequence[Parameter], loss: str) -> bool:
-    """Whether a run takes such steps: where a field and what cameras are or do are solved for.
+    """Whether a run takes joint steps: its `loss` is a sum of squares, and it seeks a field.
 
-    And its `loss` is a sum of squares.
+    And it solves for poses, exposures or offsets of cameras.
     """
     has_cameras = any(p.is_fitted and p.view is not None for p in parameters)
     return has_cameras and any(p.is_field for p in parameters) and loss in QUADRATIC
@@ -50,10 +50,10 @@ def step_together(
     gauges: Sequence[Gauge],
     solutions: Mapping[tuple[str, int], Tensor],
 ) -> None:
-    """Takes `parameters` part of the way, or all, to what fits best, and fields to the least there.
+    """Moves `parameters` towards the least misfit, then fields to the least of the objective (E51).
 
     `targets` are those of the views of `scene`, `power` is the unit of penalties; `solutions` are
-    near to the light. Nothing moves by pictures where these would not be fitted better.
+    near to the light. Each of the two moves is left out where it would make nothing less.
     """
     curvature = Curvature(scene, parameters, targets, power, solutions)
     objective = _Objective(curvature, targets, power)
@@ -89,7 +89,7 @@ def _descend(
 
 
 class _Objective:
-    """What a step makes less: the loss of all views, how far cameras are moved, and penalties.
+    """The objective of joint steps: the loss of all views, of moved cameras, and penalties.
 
     The views are those of `curvature`, and so are the parameters; `targets` are by view, `power` is
     the unit of penalties. `held` [6, 6] is how strongly each camera's calibration counts, by name.

@@ -19,7 +19,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import RanksError, SolveError
 from ddrecon.losses import QUADRATIC
-from ddrecon.ranks import cells_are_shared
+from ddrecon.ranks import cells_are_shared, from_first
 from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
@@ -88,7 +88,7 @@ class Reconstruction:
         self.schedule = Schedule(self.settings, weights)
         self.total = NO_ROWS
         self.misfit = 1.0
-        self.seed = torch.initial_seed()
+        self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
         self.memory = SolveMemory(scene.diffusion.warm_start)
         self.before_step: dict[str, Any] | None = None
         self.smoothing: Smoothing | None = None

@@ -148,7 +148,7 @@ class Posterior:
         for _ in range(ROUNDS):
             is_fixed = self.is_kept | self._is_held(change, residual)
             ready = self._precondition(residual, is_fixed)
-            left = self._size(residual, ready, is_fixed)
+            left = self.size(residual, is_fixed, ready)
             if left <= self.tolerance or products >= self.most:
                 break
             most, tolerance = self.most - products, self.tolerance / left
@@ -217,15 +217,12 @@ class Posterior:
         """About H times `vector`: J^T W J by its `information`."""
         return self.information.product(vector) + self.prior.product(vector)
 
-    def size(self, residual: Tensor, is_fixed: Tensor) -> float:
-        """How large `residual` is, about 1 being what a right side is on average."""
-        return self._size(residual, self._precondition(residual, is_fixed), is_fixed)
-
-    def _size(self, residual: Tensor, ready: Tensor, is_fixed: Tensor) -> float:
+    def size(self, residual: Tensor, is_fixed: Tensor, ready: Tensor | None = None) -> float:
         """How large `residual` is, about 1 being what a right side is on average.
 
-        `ready` is what the preconditioner makes of it.
+        `ready` is `residual` preconditioned, where that is known.
         """
+        ready = self._precondition(residual, is_fixed) if ready is None else ready
         free = int((~is_fixed).sum())
         return (max(float(residual @ ready), 0.0) / (self.temperature * max(free, 1))) ** 0.5
 

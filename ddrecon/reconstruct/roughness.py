@@ -74,9 +74,9 @@ class Roughness:
 
 
 def stiffness_diagonal(field: Tensor, grid: Grid, knee: float | None = None) -> Tensor:
-    """c'^2 times the diagonal of R about c of `field` [..., z, y, x], which weighs 1 (E49).
+    """h of E49, where smoothing weighs 1, at `field` [..., z, y, x] compressed above `knee` (E47).
 
-    c is the compression above `knee` (E47); None is without.
+    That is the diagonal of R (E32); None is without compression.
     """
     seen = field if knee is None else compress(field, knee)
     if current_engine() == "warp":

@@ -116,11 +116,9 @@ def solve_poses(
     """
     lacking = [pose for pose in poses if pose.curvature is None]
     if lacking:
-        memory = SolveMemory()
-        memory.last = dict(solutions)
         with torch.no_grad():
             world = with_values(scene, values)
-            light_field = solve_light(world, memory)
+            light_field = solve_light(world, SolveMemory(last=dict(solutions)))
         found = []
         for pose in lacking:
             assert pose.view is not None

@@ -153,9 +153,10 @@ def find_falling(rows: Sequence[Row]) -> str | None:
     gain = promised(last[-3 * count :], len(rows)) / mean(last[-count:])
     if gain < WORTHWHILE:
         return None
+    much = f"some {100 * gain:.0f} %" if gain < 0.5 else "more than half"
     return (
-        f"unfinished: as it falls, the loss would be lower by some {100 * min(gain, 1):.0f} % "
-        f"after as many iterations again; go on with --resume --iterations {2 * rows[-1].iteration}"
+        f"unfinished: as it falls, the loss would be lower by {much} after as many iterations "
+        f"again; go on with --resume --iterations {2 * rows[-1].iteration}"
     )
 
 

@@ -101,7 +101,7 @@ def drive_uncertainty(
         raise error.with_advice(f"{found.count} samples are kept: go on with --resume") from error
     # What is left the first rank does by itself.
     leave_ranks()
-    return folder.finish(run, found, [] if ranking is None else ranking.rank())
+    return folder.finish(found, [] if ranking is None else ranking.rank())
 
 
 def follow_uncertainty(run: Reconstruction, samples: int, request: Request) -> None:

@@ -14,7 +14,6 @@ from torch import Tensor
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear
 from ddrecon.io.volumes.table import write_field
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.next_view import Candidate, NextView
 from ddrecon.reconstruct.posterior import Sample
 from ddrecon.reconstruct.uncertainty import Uncertainty
@@ -60,9 +59,7 @@ class UncertaintyFolder:
             state["ranking"] = ranking.state()
         save_checkpoint(self.checkpoints, state, self.described)
 
-    def finish(
-        self, run: Reconstruction, found: Uncertainty, ranked: Sequence[Candidate]
-    ) -> dict[str, Any]:
+    def finish(self, found: Uncertainty, ranked: Sequence[Candidate]) -> dict[str, Any]:
         """What `uncertainty.json` says; writes it, volumes and report of what was `found`."""
         stated = {"std": found.deviations, "mean": found.means, "told": found.told}
         fields = dict[str, Any]()
@@ -94,7 +91,7 @@ class UncertaintyFolder:
             "next_views": [candidate.described() for candidate in ranked],
         }
         write_json(self.path / RECORD, record)
-        write_uncertainty_report(self.path / "report.html", run, found, record)
+        write_uncertainty_report(self.path / "report.html", found, record)
         return record
 
 

@@ -9,7 +9,6 @@ from typing import Any
 from torch import Tensor
 
 from ddrecon.io.images.table import png_of
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.report.error_bar import draw_error_bar
 from ddrecon.report.page import paragraph, picture, section, table, write_page
@@ -20,10 +19,8 @@ STRONG = 0.5
 """Correlations above this are told of."""
 
 
-def write_uncertainty_report(
-    path: Path, run: Reconstruction, found: Uncertainty, record: Mapping[str, Any]
-) -> None:
-    """Writes the page about what was `found` of `run`, whose `record` has it in numbers."""
+def write_uncertainty_report(path: Path, found: Uncertainty, record: Mapping[str, Any]) -> None:
+    """Writes the page about what was `found`, which `record` has in numbers."""
     means, deviations, told = found.means, found.deviations, found.told
     sections = [
         section(

@@ -6,6 +6,7 @@ all of them at once.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,7 +16,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor
 
-from ddrecon.errors import UsageError
+from ddrecon.errors import SolveError, UsageError
 from ddrecon.progress import Progress
 from ddrecon.scene import Scene
 from ddrecon.scene_file.problems import suggestion
@@ -35,6 +36,8 @@ NEGLIGIBLE = 1e-6
 """Errors are relative to the derivative they are of, or to this part of the parameter's largest
 where that is more. What the last digits of the loss can make is no error.
 """
+SHORTER, MORE = 0.1, 3
+"""Where no step agrees, so many more are tried, each shorter than the last by this factor."""
 TOGETHER = "all at once"
 """What the check of all parameters together is called."""
 
@@ -239,27 +242,42 @@ def _tangent(loss: Loss, values: Mapping[str, Tensor], direction: Mapping[str, T
 
 
 def _check_way(loss: Loss, values: Mapping[str, Tensor], way: _Way) -> EntryCheck:
-    """The check along `way`, with the step whose difference agrees best."""
-    differences, roundings = zip(
-        *(_difference(loss, values, way.direction, step) for step in way.steps), strict=True
-    )
-    tiny = torch.finfo(torch.float64).tiny
-    errors = [
-        abs(difference - way.adjoint)
-        / max(abs(difference), abs(way.adjoint), way.floor, rounding / AGREE_DIFFERENCES, tiny)
-        for difference, rounding in zip(differences, roundings, strict=True)
-    ]
-    best = min(range(len(errors)), key=lambda i: errors[i])
+    """The check along `way`, with the step whose difference agrees best.
+
+    Where none agrees, shorter ones follow: in thick cells, or beside an albedo of 1, all of the
+    usual ones may be too long.
+    """
+    steps, differences, errors = list[float](), list[float](), list[float]()
+    shorter = [way.steps[-1] * SHORTER**power for power in range(1, MORE + 1)]
+    for step in (*way.steps, *shorter):
+        if len(steps) >= len(way.steps) and min(errors) <= AGREE_DIFFERENCES:
+            break
+        steps.append(step)
+        differences.append(math.nan)
+        errors.append(math.inf)
+        # A step that leaves what is physical may have no solution.
+        with contextlib.suppress(SolveError):
+            differences[-1], rounding = _difference(loss, values, way.direction, step)
+            errors[-1] = _error(differences[-1], way, rounding)
+    best = errors.index(min(errors))
     return EntryCheck(
         way.label,
         way.value,
         way.adjoint,
         differences[best],
-        way.steps[best],
+        steps[best],
         errors[best],
-        way.steps,
-        differences,
+        tuple(steps),
+        tuple(differences),
     )
+
+
+def _error(difference: float, way: _Way, rounding: float) -> float:
+    """The relative error of a `difference` along `way`, infinite where it is not a number."""
+    tiny = torch.finfo(torch.float64).tiny
+    sizes = abs(difference), abs(way.adjoint), way.floor, rounding / AGREE_DIFFERENCES, tiny
+    error = abs(difference - way.adjoint) / max(sizes)
+    return error if math.isfinite(error) else math.inf
 
 
 def _difference(

@@ -56,6 +56,7 @@ def quick(command: str) -> list[str]:
     _, name, *rest = shlex.split(command, comments=True)
     added = {
         "optimize": lambda: ["--iterations", "2", *fewer_cells(rest[0])],
+        "render": lambda: ["--ring", "2"] if "--ring" in rest else [],
         "reference": lambda: ["--spp", "4"],
         "gradcheck": lambda: ["--samples", "2"],
     }

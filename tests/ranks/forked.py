@@ -5,7 +5,7 @@
 JOBS is a JSON list of {"ranks": N, "arguments": [...], "failing": [...], "samples": S}. What rank
 R of job J prints goes to FOLDER/J.R.out and J.R.err; FOLDER/codes.json has the exit codes, job by
 job. "failing" [rank, iteration, how] ends a rank before that iteration: "killed", or by an error.
-So many "samples" are what `optimize --uncertainty` draws.
+So many "samples" are what `optimize --uncertainty` draws. With "seeds": true each rank has its own.
 """
 
 from __future__ import annotations
@@ -75,8 +75,9 @@ def do(job: dict[str, Any], rank: int) -> int:
     if job.get("failing", [None])[0] == rank:
         fail_before(*job["failing"][1:])
     ddrecon.cli.uncertainty.SAMPLES = job.get("samples", 0)
+    seed = ["--seed", str(rank)] if job.get("seeds") else []
     try:
-        main(job["arguments"], standalone_mode=False)
+        main([*job["arguments"], *seed], standalone_mode=False)
         code = 0
     except SystemExit as error:
         code = int(error.code or 0)

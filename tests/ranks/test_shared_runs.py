@@ -10,7 +10,7 @@ from ddrecon.run.checkpoint import read_state
 
 JOBS = {
     "one": job(1, "one"),
-    "four": job(4, "four"),
+    "four": job(4, "four", seeds=True),
     "killed": job(2, "broken", failing=[1, 3, "killed"]),
     "resumed": job(3, "broken", "--resume"),
     "first killed": job(2, "headless", failing=[0, 2, "killed"]),

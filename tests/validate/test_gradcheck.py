@@ -2,6 +2,7 @@
 derivative that is wrong.
 """
 
+import math
 from pathlib import Path
 
 import pytest
@@ -47,6 +48,15 @@ def test_the_other_pair_of_cross_sections_passes(name: str) -> None:
 def test_g_of_each_cell_passes() -> None:
     (result,) = check("g", overrides=("optimize.parameters.g={init: -0.6, field: true}",))
     assert result.has_passed, "\n".join(result.lines())
+
+
+def test_albedo_1_of_thick_cells_passes() -> None:
+    # Longer steps ask for a medium that makes light, and such systems have no solution.
+    thick = "volume.sigma_a=0", "volume.sigma_s=1e3", "diffusion.transport_rounds=0"
+    plain = "lights=[{type: ambient, radiance: 1}]", "optimize={parameters: {albedo: {}}}"
+    (result,) = check("albedo", overrides=(*thick, *plain))
+    assert result.has_passed, "\n".join(result.lines())
+    assert any(math.isnan(value) for entry in result.entries for value in entry.differences)
 
 
 def test_all_at_once_pass() -> None:

@@ -34,13 +34,20 @@ def follow(
 
     These are the slope by rows and by columns, the path in a slice [u] and the `bound`.
     """
+    shears, numbers = _cross(grid, directions)
+    bounds = torch.as_tensor(bound).to(numbers).expand(len(numbers), 1)
+    return shears, torch.cat([numbers, bounds], 1)
+
+
+@remember
+def _cross(grid: Grid, directions: Tensor) -> tuple[tuple[Shear | SlabShear, ...], Tensor]:
+    """The same without bounds: directions are read, whatever the `bound` is made of."""
     speed = directions / directions.new_tensor(whole_of(grid).spacing)
     slicings = [Slicing.of(each) for each in speed.tolist()]
     order = [[*across(slicing.axis), slicing.axis] for slicing in slicings]
     ordered = speed.gather(1, torch.tensor(order, device=speed.device))
     fastest = ordered[:, 2:].abs()
     slope = ordered[:, :2] / fastest
-    bounds = torch.as_tensor(bound).to(speed).expand(len(speed), 1)
     slopes = [(row, column) for row, column in slope.tolist()]
     shears: list[Shear | SlabShear]
     if isinstance(grid, Slab):
@@ -49,7 +56,7 @@ def follow(
         shears = [SlabShear(grid, slicing, one, is_upwards) for slicing, one, is_upwards in each]
     else:
         shears = [Shear(grid, *each) for each in zip(slicings, slopes, strict=True)]
-    return tuple(shears), torch.cat([slope, 1 / fastest, bounds], 1)
+    return tuple(shears), torch.cat([slope, 1 / fastest], 1)
 
 
 class _SumMass(torch.autograd.Function):

@@ -25,6 +25,11 @@ from ddrecon.march.fused.rays import ray_types
 from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
+NEIGHBORS, TURNS = 128, 8
+"""Packets that one thread does after each other, at least, as they meet the same cells; and how
+often each thread has its turn, at most.
+"""
+
 
 class Integrate(torch.autograd.Function):
     """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `rays.Bundle` has.
@@ -221,7 +226,23 @@ def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -
     given |= {"ray_count": len(varied[0]), "node_count": len(cells.planes)}
     walked = cells.walked(varied[0])
     given |= {"walked": walked, "words": 0 if walked is None else walked.shape[1]}
+    packets, _ = cut(len(varied[0]), LANES, varied[0])
+    given["dealt"] = deal(packets, thread_count(varied[0]))
     return given | {"fields": _channels(fields, fields)}
+
+
+@functools.lru_cache(maxsize=8)
+def deal(packets: int, threads: int) -> Tensor | None:
+    """Packets in the order of the threads that do them [packets]; None: as they are.
+
+    Threads take turns: where there is more to be seen, all have to do.
+    """
+    if threads == 1:
+        return None
+    with torch.inference_mode(False):
+        length = max(NEIGHBORS, packets // (TURNS * threads))
+        blocks = torch.arange(packets, dtype=torch.int32).split(length)
+        return torch.cat([block for i in range(threads) for block in blocks[i::threads]])
 
 
 def _channels(tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[Tensor | None]:

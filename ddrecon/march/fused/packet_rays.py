@@ -17,11 +17,11 @@ from ddrecon.march.fused.packet_runs import ROWS, RUNS, WINDOWS
 from ddrecon.march.fused.stretches import WALKS
 
 GIVEN = """
-F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked;
+F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked, *dealt;
 int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride, words;
 """
 """As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells. Without `fronts`
-there is no mass before the rays.
+there is no mass before the rays. Item i is packet i, or `dealt` [packets] says which.
 """
 
 _RECORDS = """
@@ -41,13 +41,14 @@ struct Node {
 #if !defined(__CUDA_ARCH__)
     Run run[LANES];
 #endif
-    V s, t, v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
+    V s, t, v[CHANNELS], bend[MASSES + 1], held[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
     Cubic point[BEAMS + 1];
     V curve[CURVES + 1], by_number[HAS_SLOPES * CURVES + 1], by_angle[HAS_SLOPES * CURVES + 1];
     Plain plain[IS_STEEP * BEAMS * PHASES + 1];
 };
 """
 _BEGIN = """
+if (dealt) item = dealt[item];
 const int last = ray_count - 1, begin = item * LANES;
 const F* scale = numbers;
 const F* peaks = numbers + C;
@@ -192,7 +193,8 @@ auto emit = [&](int n, Node& node, const W* m, bool turns = false) {
     if (FIRST_PEAK < CHANNELS) sample(node, n, FIRST_PEAK, CHANNELS);
     for (int k = 0; k < MASSES; ++k) {
         const V bent = bound * node.bend[k];
-        node.v[FIRST_MASS + k] -= node.bend[k] / P::root(F(1) + bent * bent);
+        node.held[k] = P::inverse_root(F(1) + bent * bent);
+        node.v[FIRST_MASS + k] -= node.bend[k] * node.held[k];
     }
     for (int c = 0; c < C; ++c) {
         const V scattering = node.v[FIRST_DIFFUSING + c * DIFFUSING_STEP];

@@ -51,7 +51,7 @@ struct Ones {
 };
 Ones ones = {};
 ones.values[LANES - 1] = F(1);
-constexpr int MOST_ALIKE = 4;
+constexpr int MOST_ALIKE = 8;
 // What the lanes of a run count for columns `first` to `first` + LANES - 1 of cells.
 struct Shares {
     Run run;

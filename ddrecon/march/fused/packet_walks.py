@@ -151,7 +151,7 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
 auto spread = [&](int n, const Node& node, const V* v_bar, V t_bar) {
     V bend_bar[MASSES + 1];
     for (int k = 0; k < MASSES; ++k) {
-        const V bent = bound * node.bend[k], inverse = F(1) / P::root(F(1) + bent * bent);
+        const V bent = bound * node.bend[k], inverse = node.held[k];
         bend_bar[k] = -v_bar[FIRST_MASS + k] * inverse * inverse * inverse;
         bound_bar -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
     }

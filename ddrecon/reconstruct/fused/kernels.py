@@ -106,9 +106,9 @@ def step_kernel(bits: int, is_each: bool) -> TextKernel:
 def variation_kernel(bits: int) -> TextKernel:
     """The kernel of lengths of the gradient of `field`, summed over each item, less `rounding`.
 
-    And of `slope`: what their sum over all cells changes with each, and of the `diagonal` of its
-    second derivative while lengths stay (E32). `kz`, `ky`, `kx`: one over the
-    spacing of cells; an item is `length` cells of a row.
+    And of `slope`, the derivative of the sum over all cells by each, and of the `diagonal` of its
+    second derivative with lengths held (E32). `kz`, `ky`, `kx`: one over the spacing of cells; an
+    item is `length` cells of a row.
     """
     given = (
         "int length, nz, ny, nx; F kz, ky, kx, rounding, *field, *slope, *diagonal; double *totals"

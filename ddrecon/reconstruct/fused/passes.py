@@ -76,7 +76,7 @@ def variation_diagonal(field: Tensor, grid: Grid) -> Tensor:
 
 
 def _vary(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
-    """What `variation_kernel` makes of `field` [..., z, y, x]: `totals`, `slope`, `diagonal`."""
+    """`totals`, `slope` and `diagonal` of `field` [..., z, y, x], by `variation_kernel`."""
     side, (nz, ny, nx) = min(grid.extent), field.shape[-3:]
     slope, diagonal = field.new_empty(field.shape), field.new_empty(field.shape)
     length = PART if field.is_cuda else nx
@@ -91,7 +91,7 @@ def _vary(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class _Variation(torch.autograd.Function):
-    """The derivative is found with the value: it is what a penalty is for."""
+    """Total variation and its derivative, found together: a penalty needs both."""
 
     @staticmethod
     def forward(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:

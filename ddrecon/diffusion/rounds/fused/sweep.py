@@ -24,7 +24,7 @@ from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
-from ddrecon.numerics.harmonics import degrees_of_harmonics
+from ddrecon.numerics.harmonics import degrees_on
 from ddrecon.numerics.remember import remember
 from ddrecon.slabs.slab import Slab
 
@@ -93,7 +93,7 @@ def _scales(extinction: Tensor, scattering: Tensor, inflow: Tensor | None, color
 @remember
 def _spread_factors(factors: Tensor, colors: int) -> Tensor:
     """`factors` [L + 1, 1 or C, 1, 1, 1] by harmonic, [K, C]."""
-    degrees = torch.tensor(degrees_of_harmonics(len(factors) - 1), device=factors.device)
+    degrees = degrees_on(factors.device, len(factors) - 1)
     return factors.reshape(len(factors), -1).expand(-1, colors).index_select(0, degrees)
 
 
