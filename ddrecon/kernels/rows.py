@@ -49,6 +49,15 @@ def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") 
     return TextKernel(name, bits, _ROW + text, given)
 
 
+def with_long_rows(grid: Grid) -> Grid:
+    """`grid` whose slices are rows, for texts that know neither neighbors nor places.
+
+    Of many arrays, a processor sees sooner that they are gone through.
+    """
+    depth, height, width = grid.shape
+    return Grid((1, depth, height * width), grid.lower, grid.upper)
+
+
 def launch_rows(
     kernel: Callable[[int], TextKernel],
     grid: Grid,

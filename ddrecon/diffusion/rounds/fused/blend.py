@@ -12,7 +12,7 @@ from ddrecon.diffusion.rounds.fused.share import SHARE, SHARE_SLOPE, numbers_by_
 from ddrecon.grid import Grid
 from ddrecon.kernels.dual import launch_row_tangents, split
 from ddrecon.kernels.native import ROW_SUM
-from ddrecon.kernels.rows import launch_rows, row_kernel
+from ddrecon.kernels.rows import launch_rows, row_kernel, with_long_rows
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
@@ -130,7 +130,7 @@ def blend_fused(
     numbers = numbers.expand(-1, len(light.mean))
     first = (part for one in (light, made) for part in (one.mean, *(one.flux or ())))
     mean, z, y, x, higher = _Blend.apply(
-        medium.grid, numbers, medium.extinction.field, light.higher, swept, *first
+        with_long_rows(medium.grid), numbers, medium.extinction.field, light.higher, swept, *first
     )
     return Moments(mean, (z, y, x), higher)
 
