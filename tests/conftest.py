@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from click.testing import CliRunner, Result
+from hypothesis import settings
 
 from ddrecon.cli.commands import main
 from ddrecon.io.volumes.table import FORMATS
@@ -20,6 +21,8 @@ from ddrecon.io.volumes.table import FORMATS
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ.setdefault("DDRECON_ENGINE", "torch")  # compiles nothing
 torch.set_num_threads(1)  # tests run side by side, one a core
+settings.register_profile("patient", deadline=None)  # how loaded the machine is does not matter
+settings.load_profile("patient")
 
 
 @pytest.fixture(autouse=True)

@@ -188,7 +188,6 @@ def scenes(draw: Any, dtype: torch.dtype) -> Scene:
 def test_engines_agree_on_scenes_drawn_at_random(dtype: torch.dtype) -> None:
     @settings(
         max_examples=12,
-        deadline=None,
         derandomize=True,
         database=None,
         phases=[Phase.generate],

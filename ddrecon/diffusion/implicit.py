@@ -120,7 +120,8 @@ class SolverWithMemory(Generic[AnyOperator]):
         self, unread: Unread, kind: str, operator: Any, source: Tensor, guess: Tensor | None
     ) -> Tensor:
         key = kind, self.round_index
-        given = guess, unread.tolerances[kind], unread.iterations[key]
+        # One that was never made before begins with one iteration: the verdict tells.
+        given = guess, unread.tolerances[kind], unread.iterations.get(key, 1)
         value, unread.verdicts[key] = solve_unread(operator, source, *given)
         self.memory.last[key] = value.detach()
         return value

@@ -11,7 +11,7 @@ depth that is left, T - t:
     F = (exp(-lambda t) - r^2 exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
     G = r (exp(-lambda t) - exp(-lambda (T + u))) / (1 - r^2 exp(-2 lambda T))
 
-Where albedo varies from cell to cell, beta is that of the cell; where b does, see `turning.py`.
+Where beta differs from cell to cell, since albedo or b does, see `turning.py`.
 """
 
 from __future__ import annotations
@@ -85,17 +85,18 @@ def follow_pair(medium: Medium, light: DirectionalLight) -> tuple[Beam, Pair]:
     extinction = medium.extinction
     direction = array_order(torch.nn.functional.normalize(light.direction, dim=0))
     irradiance = light.irradiance.view(-1, 1, 1, 1)
-    ways = (direction,) if medium.is_cellwise else (direction, -direction)
+    is_uniform = extinction.field is medium.scattering.field and not medium.is_cellwise
+    ways = (direction, -direction) if is_uniform else (direction,)
     (entered, step), *behind = (
         recompute(sum_mass_to_cells, extinction.field, medium.grid, way, extinction.mass_bound)
         for way in ways
     )
     beam = Beam(entered + 0.5 * step * extinction.field, direction, irradiance)
     turned = backward_fraction(medium)
-    if medium.is_cellwise:
-        shares = recompute(_pair_in_cells, medium, entered, step, turned, direction)
-    else:
+    if is_uniform:
         shares = recompute(_pair, medium, entered, behind[0][0], step, turned)
+    else:
+        shares = recompute(_pair_in_cells, medium, entered, step, turned, direction)
     received, along, against = (irradiance / (4 * math.pi) * share for share in shares)
     return beam, Pair(direction, received, along, against)
 
@@ -123,7 +124,7 @@ def _pair(
 def _pair_in_cells(
     medium: Medium, entered: Tensor, step: Tensor, turned: Tensor, direction: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """As `_pair`, where the part that is `turned` differs from cell to cell (E37)."""
+    """As `_pair`, where beta differs from cell to cell (E37); b is `turned`."""
     extinction, back = medium.extinction.value, turned * medium.scattering.value
     forth, against = turn_in_cells(extinction, back, medium.grid, direction)
     tau = medium.extinction.mean_transmittance(entered, step)
@@ -131,11 +132,9 @@ def _pair_in_cells(
 
 
 def _turned_part(medium: Medium, turned: Tensor) -> Tensor:
-    """beta = b kappa_s / kappa_t, [C, 1, 1, 1] or [C, z, y, x]; 0 where there is no medium."""
-    extinction, scattering = medium.extinction, medium.scattering
-    if extinction.field is scattering.field:
-        above, below = turned * scattering.scale, extinction.scale
-    else:
-        above, below = torch.broadcast_tensors(turned * scattering.value, extinction.value)
+    """beta = b kappa_s / kappa_t, [C, 1, 1, 1]; 0 where there is no medium."""
+    above, below = torch.broadcast_tensors(
+        turned * medium.scattering.scale, medium.extinction.scale
+    )
     is_there = below > 0
     return torch.where(is_there, above / torch.where(is_there, below, 1), 0)

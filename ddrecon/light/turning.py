@@ -16,6 +16,8 @@ from ddrecon.numerics.decay import decay_mean
 from ddrecon.slabs.exchange import gather_slabs
 from ddrecon.slabs.slab import Slab
 
+SMALLEST = 1e-30
+"""The least that k^2 is: its root has a slope there, and what is made of it is even in k."""
 MOST = 1e30
 """The most that F may be of what was never scattered: deeper in, both are nothing."""
 
@@ -33,15 +35,13 @@ def turn_in_cells(
     fields = [slicing.lay(gather_slabs(field, grid)) for field in (extinction, turned)]
     shear = Shear.of(fields[0].shape[0], fields[0].shape[2:], slope)
     depth, back = (shear.to_rays(field, 0.0) * step for field in fields)
-    is_there = depth > 0
-    beta = torch.where(is_there, back / torch.where(is_there, depth, 1), 0)
 
-    # Each layer: what it lets pass and what it turns back, of light from either side.
-    rate = (1 - beta * beta).sqrt()
-    reflected = beta / (1 + rate)
-    lost = torch.exp(-rate * depth)
-    norm = 1 / (1 - (reflected * lost) ** 2)
-    passing, turning = (1 - reflected**2) * lost * norm, reflected * (1 - lost * lost) * norm
+    # Each layer: what it lets pass and what it turns back, of light from either side. Hyperbolic
+    # functions of k over exp(k), in terms that are smooth where a layer is empty.
+    rate = ((depth - back) * (depth + back)).clamp(min=SMALLEST).sqrt()
+    sinh, cosh = decay_mean(2 * rate), 0.5 * (1 + torch.exp(-2 * rate))
+    norm = 1 / (cosh + depth * sinh)
+    passing, turning = torch.exp(-rate) * norm, back * sinh * norm
 
     # From the far end, what all layers beyond turn back: no light comes from outside there.
     beyond = [torch.zeros_like(depth[0])]
@@ -51,17 +51,18 @@ def turn_in_cells(
 
     # From the near end, F over exp(-t): exp(depth) more than what a layer lets pass.
     leaving = passing / (1 - turning * behind)
-    kept = torch.exp((1 - rate) * depth) * (1 - reflected**2) * norm / (1 - turning * behind)
+    kept = torch.exp(depth - rate) * norm / (1 - turning * behind)
     entering = [torch.ones_like(depth[0])]
     for factor in kept[:-1]:
         entering.append((entering[-1] * factor).clamp(max=MOST))
 
-    # In a layer F = near exp(-rate t) + reflected far exp(-rate (depth - t)), and G the mirror.
+    # Means over a layer, of what enters it from either side: of its own way, and turned back.
     incoming = behind * leaving
-    near = (1 - reflected * lost * incoming) * norm
-    far = (incoming - reflected * lost) * norm
-    share = torch.stack(entering) * decay_mean(rate * depth) / decay_mean(depth)
-    along, against = (near + reflected * far) * share, (reflected * near + far) * share
+    middle = 0.5 * decay_mean(rate).square()
+    onward, turned_back = sinh + depth * middle, back * middle
+    share = torch.stack(entering) * norm / decay_mean(depth)
+    along = (onward + turned_back * incoming) * share
+    against = (onward * incoming + turned_back) * share
     found = (slicing.lift(shear.to_cells(values)) for values in (along, against))
     forth, back = (grid.cut(field) if isinstance(grid, Slab) else field for field in found)
     return forth, back

@@ -65,7 +65,7 @@ def march(
         values, numbers = _interpolate(between, sight, sight.places, settings, behind)
         rough = sight.crossing.select(numbers)
         if len(rough.hit):
-            values = values.index_copy(1, *of_rays(emission, sampler, sight.rays, rough))
+            values = values.index_copy_(1, *of_rays(emission, sampler, sight.rays, rough))
     scattered, opacity = values.split(emission.colors)
     return scattered, 1 - opacity
 

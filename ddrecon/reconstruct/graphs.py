@@ -23,6 +23,8 @@ from ddrecon.reconstruct.recording import Recording
 from ddrecon.scene import Scene
 
 LOG = logging.getLogger(engine.LOG)
+_told: set[str] = set()
+"""Why iterations run without graphs, as far as a line has said so."""
 
 
 class Graphs:
@@ -68,7 +70,9 @@ class Graphs:
             self.is_first = False
             self._turn_off(_reason(scene, values))
             return None
-        if self.recording is None or not self.recording.fits(scene, memory):
+        if self.recording is not None and not self.recording.fits(scene, memory):
+            self.recording = None  # whose memory the next one needs
+        if self.recording is None:
             self.recording = Recording(scene, values, memory, self.record)
         found = self.recording.replay(values, compared, memory)
         if found is None:
@@ -78,7 +82,9 @@ class Graphs:
     def _turn_off(self, reason: str | None) -> None:
         if reason is not None:
             self.is_off, self.recording = True, None
-            LOG.warning("iterations run without CUDA graphs: %s", reason)
+            if reason not in _told:
+                _told.add(reason)
+                LOG.warning("iterations run without CUDA graphs: %s", reason)
 
 
 def _reason(scene: Scene, values: Mapping[str, Tensor]) -> str | None:

@@ -89,11 +89,14 @@ class Recording:
         self.values = {name: one.detach().clone().requires_grad_() for name, one in values.items()}
         self.guesses = {key: last.clone() for key, last in memory.last.items()}
         like = next(iter(self.values.values()))
-        self.tolerances = {kind: like.new_zeros(()) for kind in ("forward", "adjoint")}
+        zero = like.new_zeros((), dtype=torch.float64)
+        self.tolerances = {kind: zero.clone() for kind in ("forward", "adjoint")}
         self.iterations = {key: count + SPARE for key, count in memory.iterations.items()}
         self.memory = self._new_memory()
         self._give(values, memory)
         self.light = Program(*record(self._light))
+        # Views are recorded with light that there can be.
+        self.light.again()
         self.inputs = [*self.values.values(), *self.light.made.cut.leaves]
         self.sums = [torch.zeros_like(one) for one in self.inputs]
         self.views: dict[tuple[str, float], Program] = {}
@@ -126,8 +129,8 @@ class Recording:
                 # A view that comes twice is seen twice.
                 seen.append(_copied(program.made))
                 loss = loss + program.made.loss
-        verdicts = self.light.made.verdicts | back.made.verdicts
-        if not self._note(verdicts, self.light.made.solutions | back.made.solutions, memory):
+        solves = self._read(self.light.made.verdicts | back.made.verdicts, memory)
+        if solves is None:
             return None
         gradients = {name: bar.clone() for name, bar in back.made.gradients.items()}
         found = Differentiated([one.image for one in seen], loss, gradients)
@@ -135,6 +138,11 @@ class Recording:
             self._check(found, compared)
         for program in programs:
             program.unchecked -= 1
+        for key, solve in solves.items():
+            memory.records.append(solve)
+            memory.iterations[key] = solve.iterations
+        solutions = self.light.made.solutions | back.made.solutions
+        memory.last |= {key: solution.clone() for key, solution in solutions.items()}
         for one in seen:
             compared.pictures |= one.compared.pictures
             compared.losses += one.compared.losses
@@ -209,19 +217,17 @@ class Recording:
     def _tolerance(self, kind: str, memory: SolveMemory) -> float:
         return max(self.scene.diffusion.tolerance, memory.tolerance_floor.get(kind, 0.0))
 
-    def _note(
-        self, verdicts: Verdicts, solutions: Mapping[tuple[str, int], Tensor], memory: SolveMemory
-    ) -> bool:
-        """Leaves `solutions` in `memory`, and records; False where they are not exact enough."""
+    def _read(
+        self, verdicts: Verdicts, memory: SolveMemory
+    ) -> dict[tuple[str, int], SolveRecord] | None:
+        """The records of solves; None where one is not as exact as `memory` asks. One read."""
         numbers = torch.stack(list(verdicts.values())).tolist() if verdicts else []
-        for (kind, _), (residual, _, has_strong_axes) in zip(verdicts, numbers, strict=True):
-            if not residual <= self._tolerance(kind, memory) or not has_strong_axes:
-                return False
-        for key, (residual, count, _) in zip(verdicts, numbers, strict=True):
-            memory.records.append(SolveRecord(key[0], int(count), residual, 0.0))
-            memory.iterations[key] = int(count)
-        memory.last |= {key: solution.clone() for key, solution in solutions.items()}
-        return True
+        found = {}
+        for key, (residual, count, has_strong_axes) in zip(verdicts, numbers, strict=True):
+            if not residual <= self._tolerance(key[0], memory) or not has_strong_axes:
+                return None
+            found[key] = SolveRecord(key[0], int(count), residual, 0.0)
+        return found
 
     def _check(self, found: Differentiated, compared: Comparison) -> None:
         """Raises NotFixedError where what was `found` is off a plain run by more than rounding."""

@@ -95,7 +95,7 @@ def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.Mo
     assert "'cuda' is not one of 'auto', 'torch', 'warp'" in refuse(2, *command, "cuda")[-1]
     monkeypatch.setenv("DDRECON_ENGINE", "cuda")
     assert refuse(2, *command[:-1]) == [
-        "DDRECON_ENGINE=cuda: no such engine; known: auto, torch, warp"
+        "DDRECON_ENGINE=cuda: no such engine; known: auto, torch, warp, warp-graph"
     ]
 
 

@@ -262,7 +262,7 @@ def test_iterations_beyond_those_needed_change_nothing():
     operator = uneven((16, 5, 11), contrast=1e4)
     source = random_values(2, 16, 5, 11)
     looked = solve_by_torch(operator, source, None, 1e-8, is_ahead=False)
-    tolerance = torch.tensor(1e-8)
+    tolerance = torch.tensor(1e-8, dtype=torch.float64)
     found = [solve_unread(operator, source, None, tolerance, looked.iterations + n) for n in (0, 3)]
     for value, verdict in found:
         assert torch.equal(value, looked.value)

@@ -86,3 +86,35 @@ def test_energy_that_enters_leaves_is_absorbed_or_scatters(g: float) -> None:
     memory = SolveMemory()
     solve_light(scene, memory)
     assert balance_of(scene, memory.last["forward", 0]).energy < 1e-11
+
+
+@pytest.mark.parametrize("varied", ["g", "sigma_s"])
+def test_an_empty_cell_is_the_limit_of_thin_ones(varied: str) -> None:
+    """So are derivatives there: what cells that are not there yet would turn back is known."""
+    torch.manual_seed(2)
+    density, share = torch.rand(2, 5, 4, 3, dtype=torch.float64)
+    density[1:3] = 0
+    scene = make_scene(
+        density,
+        grid=Grid((5, 4, 3), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+        sigma_a=(0.5,),
+        sigma_s=(6.0,),
+        g=-0.7,
+        directional=(IRRADIANCE,),
+        travel=(0.5, -0.3, 2.0),
+    )
+    volume = scene.volume
+    if varied == "g":
+        volume.g = -0.9 * share
+    else:
+        volume.sigma_s = 6 * share[None]
+
+    def pair_at(least: float) -> tuple[torch.Tensor, torch.Tensor]:
+        volume.density = density.clamp(min=least).requires_grad_()
+        _, pair = follow_pair(scale_medium(volume, 3), scene.lights[0])
+        both = torch.stack([pair.along, pair.against])
+        weights = torch.arange(1.0, both.numel() + 1, dtype=torch.float64).view_as(both).cos()
+        return both.detach(), torch.autograd.grad((weights * both).sum(), volume.density)[0]
+
+    for empty, thin in zip(pair_at(0.0), pair_at(1e-9), strict=True):
+        torch.testing.assert_close(empty, thin, rtol=1e-7, atol=1e-7)

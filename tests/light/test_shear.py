@@ -217,7 +217,7 @@ def test_the_depth_of_a_smooth_blob_converges_at_second_order(direction: tuple[f
     assert convergence_order([1 / count for count in counts], errors) >= 1.8, errors
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.permutations(range(3)), st.tuples(*[st.sampled_from([1, -1])] * 3), st.integers(0, 2))
 def test_a_mirrored_or_turned_world_is_mirrored_or_turned(order_of_axes, signs, seed: int):
     """Entered mass commutes with every symmetry of the cube, cells being turned with the field."""

@@ -39,7 +39,6 @@ PICTURE = np.random.default_rng(1).random((6, 8, 3), np.float32)
 CASES = settings(
     derandomize=True,
     database=None,
-    deadline=None,
     max_examples=70,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )

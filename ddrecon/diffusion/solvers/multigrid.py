@@ -62,8 +62,9 @@ def solve_by_torch(
         relative, count, has_strong_axes = run.verdict().tolist()
     if not has_strong_axes:
         # Once more, with levels that coarsen the axes they should.
-        del operator.prepared[Level.of], _axes[operator.loss.shape]
-        return solve_by_torch(operator, source, guess, tolerance, is_ahead)
+        del operator.prepared[Level.of]
+        _axes.pop(operator.loss.shape, None)
+        return solve_by_torch(operator, source, guess, tolerance, is_ahead=False)
     if is_ahead:
         _counts[source.shape].append(int(count))
     return run.system.solution(run.y, int(count), relative)
@@ -75,7 +76,7 @@ def solve_unread(
     """What so many `iterations` find, and the verdict on it, which nobody has read yet.
 
     It is the residual that is left, how many iterations were needed, and whether levels coarsen the
-    axes they should, [3]. `tolerance` is a number where `source` lies.
+    axes they should, [3]. `tolerance` is a number where `source` lies, in double precision.
     """
     run = _Run(operator, source, guess, tolerance, is_ahead=True)
     run.iterate(iterations)
@@ -107,7 +108,8 @@ class _Run:
         """Makes `count` more iterations, and returns that."""
         matrix, tiny = self.system.matrix, torch.finfo(self.y.dtype).tiny
         for _ in range(count):
-            is_open = self.relative > self.tolerance
+            # Compared as the verdict is: rounded, the tolerance might be another.
+            is_open = self.relative.double() > self.tolerance
             preconditioned = self._level().cycle(self.residual)
             previous, self.square = self.square, matrix.inner(self.residual, preconditioned)
             self.direction.mul_(self.square / previous.clamp(min=tiny)).add_(preconditioned)

@@ -45,13 +45,8 @@ class Unscattered(torch.autograd.Function):
         moments, masses = receiver.new_moments(), []
         laid = _Laid(field)
         for lights in _batches(shears, field):
-            entered = field.new_empty(len(lights), *field.shape)
-            for light, to in zip(lights, entered, strict=True):
-                to.copy_(
-                    shears[light].lift(
-                        shears[light].sum(laid.of(shears[light]), numbers, light).entered
-                    )
-                )
+            beams = [(i, shears[i]) for i in lights]
+            entered = _stack([s.lift(s.sum(laid.of(s), numbers, i).entered) for i, s in beams])
             receiver.receive(lights[0], entered, moments, adds=lights[0] > 0)
             if has_mass:
                 masses += [
@@ -73,7 +68,9 @@ class Unscattered(torch.autograd.Function):
         varies = any(ctx.needs_input_grad[3:])
         receiver = Receiver(field, scale, numbers, weights)
         moments_bar, masses_bar = bars[: receiver.moments], bars[receiver.moments :]
-        laid, laid_bar = _Laid(field), _Laid(field.new_zeros(field.shape))
+        laid = _Laid(field)
+        is_laid = any(shear.axis == 2 for shear in ctx.shears)
+        laid_bar = _Laid(field.new_zeros(field.shape)) if is_laid else None
         field_bar = field.new_zeros(field.shape)
         scale_bar = torch.zeros_like(scale, dtype=torch.float64)
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
@@ -83,7 +80,7 @@ class Unscattered(torch.autograd.Function):
             sums = [
                 s.sum(laid.of(s), numbers, i, True) for i, s in zip(lights, shears, strict=True)
             ]
-            entered = torch.stack([each.shear.lift(each.entered) for each in sums])
+            entered = _stack([each.shear.lift(each.entered) for each in sums])
             entered_bars, found = receiver.adjoint(
                 lights[0], entered, moments_bar, field_bar, varies
             )
@@ -92,7 +89,7 @@ class Unscattered(torch.autograd.Function):
                 if mass_bar is not None:
                     entered_bars[i] += mass_bar
                     field_bar.addcmul_(mass_bar, 0.5 * numbers[light, 2])
-                to = field_bar if shear.axis != 2 else laid_bar.of(shear)
+                to = field_bar if laid_bar is None or shear.axis != 2 else laid_bar.of(shear)
                 by_beam = each.adjoint(shear.lay(entered_bars[i]), to, varies)
                 if by_beam is not None and found is not None:
                     numbers_bar[light] += by_beam
@@ -103,7 +100,7 @@ class Unscattered(torch.autograd.Function):
                 scale_bar += found[:, 1 : 1 + len(scale)].sum(0)
                 by_weights = found[:, 1 + len(scale) :].view(len(lights), 4, -1)
                 weights_bar[lights[0] : lights[-1] + 1] = by_weights[:, : receiver.moments]
-        field_bar = laid_bar.add_to(field_bar)
+        field_bar = field_bar if laid_bar is None else laid_bar.add_to(field_bar)
         if not varies:
             return None, None, field_bar, None, None, None
         by_numbers = (bar.to(field) for bar in (scale_bar, numbers_bar, weights_bar))
@@ -131,6 +128,11 @@ class Unscattered(torch.autograd.Function):
 
         d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_found
+
+
+def _stack(fields: list[Tensor]) -> Tensor:
+    """`fields` as one tensor: one alone as it is, without a copy."""
+    return fields[0][None] if len(fields) == 1 else torch.stack(fields)
 
 
 def _batches(shears: Sequence[Shear | SlabShear], field: Tensor) -> list[range]:

@@ -104,7 +104,7 @@ def save(folder: Path, body: bytes, size: str, header: bytes = HEADER) -> Path:
 
 
 @pytest.mark.parametrize("encoder", ENCODERS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     height=st.integers(1, 4),
     width=st.one_of(st.integers(1, 20), st.integers(120, 700)),
@@ -284,7 +284,7 @@ def test_a_file_cut_anywhere_is_damaged(tmp_path: Path, encoder: str):
             read_hdr(path)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(body=st.binary(max_size=120), width=st.integers(1, 40))
 def test_garbage_is_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, body: bytes, width: int

@@ -34,7 +34,7 @@ WRITERS = {".exr": write_exr, ".tif": write_tiff, ".tiff": write_tiff, ".npy": w
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(size=SIZES, seed=st.integers(0, 2**32 - 1))
 def test_float_images_come_back_bit_for_bit(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, size: tuple[int, int], seed: int

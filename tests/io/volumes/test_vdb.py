@@ -117,22 +117,22 @@ def test_grids_of_other_programs_share_the_box_of_what_is_active(tmp_path: Path)
 CATCH = """
 import sys; from pathlib import Path; from ddrecon.errors import FormatError
 from ddrecon.io.volumes.table import read_field
-try: read_field(Path(sys.argv[1]), sys.argv[2])
-except FormatError as error: print(error.reason)
+for path, name in zip(sys.argv[1::2], sys.argv[2::2]):
+    try: read_field(Path(path), name)
+    except FormatError as error: print(error.reason)
 """
 
 
 def test_what_cannot_be_read_is_refused_by_name(tmp_path: Path) -> None:
-    path = tmp_path / "other.vdb"
+    path, none, half = (tmp_path / f"{name}.vdb" for name in ("other", "none", "half"))
     openvdb_python.run(MAKE, path)
-    assert "'turned' is turned" in openvdb_python.run(CATCH, path, "turned")
-    assert (
-        openvdb_python.run(CATCH, path, "lwc")
-        == "has no grid 'lwc'; it has 'density', 'heat', 'turned'\n"
-    )
-    assert "No such file" in openvdb_python.run(CATCH, tmp_path / "none.vdb", "density")
-    path.write_bytes(path.read_bytes()[:300])
-    assert "not an OpenVDB file that can be read" in openvdb_python.run(CATCH, path, "density")
+    half.write_bytes(path.read_bytes()[:300])
+    asked = (path, "turned"), (path, "lwc"), (none, "density"), (half, "density")
+    told = openvdb_python.run(CATCH, *(word for words in asked for word in words)).splitlines()
+    turned, unknown, missing, damaged = told
+    assert "'turned' is turned" in turned and "No such file" in missing
+    assert unknown == "has no grid 'lwc'; it has 'density', 'heat', 'turned'"
+    assert "not an OpenVDB file that can be read" in damaged
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from ddrecon.io.volumes.table import read_field, write_field
 BOUNDS = np.array([[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]])
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     shape=st.tuples(*[st.integers(1, 4)] * 3), colors=st.booleans(), seed=st.integers(0, 2**32 - 1)
 )
