@@ -145,7 +145,7 @@ auto few_to_moments = [&](auto evens, auto odds, const F* matrix, auto begin, au
 };
 // Radiance of a group's directions, `light(j)`, from moments that are sums of so many `terms`.
 auto to_directions = [&](const F* matrix, auto terms, auto find_terms, auto light, int from,
-                         int to) {
+                         int to) __attribute__((noinline)) {
     constexpr int N = decltype(terms)::value;
     Terms sums;
     for (int k = 0; k < count; ++k) find_terms(order[k], sums.rows[k], sums.by[k]);
