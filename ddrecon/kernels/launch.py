@@ -26,9 +26,9 @@ wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
 QUICK = 1.5e-4
 """Handing a share to another thread takes about 50 microseconds; a launch, 20."""
 _seconds: dict[tuple[Any, int], float] = {}
-"""What a launch of a kernel takes in one thread [s], by the digits of its items' number in base 2.
+"""What a launch of a kernel took last in one thread [s], by the digits of its number of items.
 
-It is the least that was seen. Numbers of rays differ from view to view: the table stays small.
+Numbers of rays differ from view to view: the table stays small.
 """
 
 
@@ -55,12 +55,14 @@ def launch(
 
     On a processor the items are cut into so many shares as there are `threads` (None: as many as
     torch has); a function of a share's number gives it `arguments` of its own. Which thread does a
-    share is left to chance, and changes no result: the one that asks does all where that is quick,
-    and those that no other has begun by the time it has done its own. `work`: a number that tells
-    how long it takes, where that of items does not.
+    share is left to chance, and changes no result: the one that asks does those that no other has
+    begun by the time it has done its own. It does all where that was quick last time, but for
+    `threads` that are given without `work`: a number that tells how long it takes, where that of
+    items does not.
     """
     if not count:
         return
+    goes_by_time = threads is None or work is not None
     threads = thread_count(like) if threads is None else threads
     device = _device(like.device)
     if is_rehearsed(kernel, device.alias):
@@ -75,12 +77,15 @@ def launch(
 
     # What was seen to be quick is not worth another thread.
     size = kernel, (count if work is None else work).bit_length()
-    if threads == 1 or _seconds.get(size, math.inf) < QUICK:
+    if threads == 1:
+        run(0)
+    elif goes_by_time and _seconds.get(size, math.inf) < QUICK:
+        start = perf_counter()
         for i in range(threads):
             run(i)
+        _seconds[size] = perf_counter() - start
     else:
-        seconds = threads * _share(run, threads)
-        _seconds[size] = min(seconds, _seconds.get(size, math.inf))
+        _seconds[size] = threads * _share(run, threads)
 
 
 def _share(run: Callable[[int], None], threads: int) -> float:
