@@ -14,6 +14,8 @@ from ddrecon.variables.values import extinction_of, with_values
 
 THICKEST, THINNEST = 3e3, 1e-3
 """Optical depths beyond these look like a wall, or like nothing."""
+THICK_FACES = 2.0
+"""Optical depths of a cell at a face beyond which images are off (docs/hard_cases.md)."""
 SMALLEST = 2.0
 """A box of fewer pixels than this, along its diagonal, shows nothing."""
 UNITS = "are volume.bounds, cross sections and cameras in the same unit?"
@@ -24,7 +26,7 @@ def find_doubts(scene: Scene) -> list[str]:
 
     Where the density starts as nothing, optical depths are those of a density of 1.
     """
-    return [*_doubt_depth(scene), *_doubt_cameras(scene)]
+    return [*_doubt_depth(scene), *_doubt_faces(scene), *_doubt_cameras(scene)]
 
 
 def _doubt_depth(scene: Scene) -> list[str]:
@@ -39,6 +41,28 @@ def _doubt_depth(scene: Scene) -> list[str]:
     if min(depths) > THICKEST or max(depths) < THINNEST:
         return [f"volume: the optical depth across the box is {max(depths):.3g} {where}; {UNITS}"]
     return []
+
+
+def _doubt_faces(scene: Scene) -> list[str]:
+    """Whether a medium that scatters is thick in cells at the faces of the box."""
+    volume = with_values(scene, scene.starts).volume
+    if not bool((volume.sigma_s > 0).any()):
+        return []
+    extinction = extinction_of(volume)
+    # Per cell, also where cross sections are the same everywhere; of the color that is thickest.
+    extinction = (extinction.view(-1, 1, 1, 1) if extinction.ndim == 1 else extinction).amax(0)
+    depth = extinction * volume.density
+    thickest = max(
+        float(depth.select(axis, end).max()) * size
+        for axis, size in enumerate(volume.grid.spacing)
+        for end in (0, -1)
+    )
+    if thickest <= THICK_FACES:
+        return []
+    return [
+        f"volume: cells at the faces of the box are up to {thickest:.3g} optical depths thick; "
+        "images may be off by a fifth and more: take smaller cells, and leave a layer of empty ones"
+    ]
 
 
 def _doubt_cameras(scene: Scene) -> list[str]:

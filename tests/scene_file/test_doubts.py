@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -40,3 +41,14 @@ def test_a_box_in_kilometers() -> None:
     depth, small = doubts(*tiny, "volume.density=1", "optimize=null")
     assert "the optical depth across the box is 0.00095 through the densest part" in depth
     assert "smaller than a pixel or two to camera front" in small
+
+
+def test_thick_cells_at_the_faces() -> None:
+    """They are told where a medium fills its box, scatters, and is coarse; empty layers help."""
+    filled = "volume.density=1", "volume.sigma_a=1", "volume.sigma_s=89", "optimize=null"
+    grid = "volume.resolution=[{0}, {0}, {0}]"
+    size = load_scene(BALL).volume.grid.extent[0]
+    (line,) = doubts(*filled, grid.format(10))
+    assert f"are up to {9 * size:.3g} optical depths thick" in line
+    assert doubts(*filled, grid.format(10), "volume.sigma_s=0") == []
+    assert doubts(*filled, grid.format(math.ceil(45 * size))) == []
