@@ -97,5 +97,5 @@ def record_graph(computation: Callable[[], T]) -> tuple[T, Callable[[], None]]:
 
 @functools.cache
 def _pool() -> Any:
-    """The memory of all graphs: they run one after another, and none needs what another made."""
+    """The memory of all graphs, which run in turn; what later ones read of others is not freed."""
     return torch.cuda.graph_pool_handle()

@@ -245,12 +245,13 @@ def _check_way(loss: Loss, values: Mapping[str, Tensor], way: _Way) -> EntryChec
     """The check along `way`, with the step whose difference agrees best.
 
     Where none agrees, shorter ones follow: in thick cells, or beside an albedo of 1, all of the
-    usual ones may be too long.
+    usual ones may be too long. What rounding makes of those is no excuse.
     """
     steps, differences, errors = list[float](), list[float](), list[float]()
     shorter = [way.steps[-1] * SHORTER**power for power in range(1, MORE + 1)]
     for step in (*way.steps, *shorter):
-        if len(steps) >= len(way.steps) and min(errors) <= AGREE_DIFFERENCES:
+        is_usual = len(steps) < len(way.steps)
+        if not is_usual and min(errors) <= AGREE_DIFFERENCES:
             break
         steps.append(step)
         differences.append(math.nan)
@@ -258,7 +259,7 @@ def _check_way(loss: Loss, values: Mapping[str, Tensor], way: _Way) -> EntryChec
         # A step that leaves what is physical may have no solution.
         with contextlib.suppress(SolveError):
             differences[-1], rounding = _difference(loss, values, way.direction, step)
-            errors[-1] = _error(differences[-1], way, rounding)
+            errors[-1] = _error(differences[-1], way, rounding if is_usual else 0.0)
     best = errors.index(min(errors))
     return EntryCheck(
         way.label,
