@@ -33,6 +33,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import ddrecon
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.io.volumes.table import read_field
+from ddrecon.kernels.capture import INDEXED, READS
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
@@ -41,8 +42,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = Path(ddrecon.__file__).parent
 HELPERS = "kernels", "numerics"
 """Rooms whose calls count for whoever asked."""
-READS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_dim"}
-"""Operations of torch whose result a processor waits for."""
 CONVERSIONS = (
     *((Tensor, name, "read") for name in ("tolist", "numpy", "__array__")),
     *((torch, name, "write") for name in ("tensor", "as_tensor")),
@@ -121,7 +120,7 @@ def is_view(function: Any) -> bool:
 def is_read(function: Any, arguments: Sequence[Any]) -> bool:
     """Whether an operation's result, or its size, is needed by the processor."""
     name = function._schema.name.removeprefix("aten::")
-    if name in ("index", "index_put", "index_put_", "_index_put_impl_"):
+    if name in INDEXED:
         masks = (torch.bool, torch.uint8)
         return any(isinstance(part, Tensor) and part.dtype in masks for part in arguments[1])
     return name in READS

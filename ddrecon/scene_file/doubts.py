@@ -48,10 +48,7 @@ def _doubt_faces(scene: Scene) -> list[str]:
     volume = with_values(scene, scene.starts).volume
     if not bool((volume.sigma_s > 0).any()):
         return []
-    extinction = extinction_of(volume)
-    # Per cell, also where cross sections are the same everywhere; of the color that is thickest.
-    extinction = (extinction.view(-1, 1, 1, 1) if extinction.ndim == 1 else extinction).amax(0)
-    depth = extinction * volume.density
+    depth = extinction_of(volume).amax(0) * volume.density
     thickest = max(
         float(depth.select(axis, end).max()) * size
         for axis, size in enumerate(volume.grid.spacing)
