@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-LONGEST, WIDEST = 300, 100
+LONGEST, WIDEST = 600, 100
 SOURCES = sorted((ROOT / "ddrecon").rglob("*.py"))
 
 
