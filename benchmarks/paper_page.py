@@ -7,14 +7,23 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
+from figures import keep, read_store
+
 ROOT = Path(__file__).parents[1]
 CONFIGS, SHAPES, PICTURES = (
     ROOT / "configs" / "paper",
     ROOT / "data" / "shapes",
     ROOT / "docs" / "pictures" / "paper",
 )
-PAGE = ROOT / "docs" / "experiments.md"
-END = "<!-- end of table -->"
+NAMES = {
+    "paper.py": "paper",
+    "paper.py fig13": "fig13",
+    "paper_g.py": "fig10",
+    "paper_gradients.py": "fig08",
+    "paper_gradients.py (parts)": "fig08_parts",
+    "paper_path_replay.py": "fig07",
+}
+"""The figure (`figures.py`) of each script."""
 
 
 def ddrecon(*arguments: str | Path) -> None:
@@ -30,18 +39,11 @@ def as_options(overrides: list[str]) -> list[str]:
 
 
 def read_table(script: str) -> str:
-    """The table on the page that `script` rewrites."""
-    return _around(script)[1]
+    """The table that `script` kept last, or nothing."""
+    known = read_store().get(NAMES[script], {"table": []})
+    return "".join(f"{line}\n" for line in known["table"])
 
 
 def rewrite_table(script: str, table: str) -> None:
-    """Puts `table` in place of that one."""
-    before, _, after = _around(script)
-    PAGE.write_text(before + table + after)
-
-
-def _around(script: str) -> tuple[str, str, str]:
-    begin = f"<!-- table: python benchmarks/{script} -->\n"
-    before, rest = PAGE.read_text().split(begin)
-    table, after = rest.split(END, 1)
-    return before + begin, table, END + after
+    """Keeps `table` in place of that one."""
+    keep(NAMES[script], f"python benchmarks/{script}", table.splitlines())

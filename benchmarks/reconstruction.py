@@ -1,53 +1,170 @@
-"""How far the density that `ddrecon optimize configs/plume.yaml -o RUN_DIR` found is from the true
-one.
+"""What reconstructions come to: held-out PSNR, errors of the density, seconds; of the capture also
+exposures, lamp and cameras.
 
-python benchmarks/reconstruction.py RUN_DIR [RUN_DIR ...]
+    python benchmarks/reconstruction.py plume|gallery|capture [-o FOLDER]
+
+Every run is a process of its own, `ddrecon optimize`, after one that compiled its kernels. Tables
+are Markdown. Runs are left in FOLDER.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
-from torch.nn.functional import max_pool3d
 
 from ddrecon.io.volumes.table import read_field
 
-TRUTH = Path(__file__).parents[1] / "data/plume/density.npz"
+ROOT = Path(__file__).parents[1]
+CAPTURE = ROOT / "data/capture"
+LAMP = (7.3, 7.0, 6.4)
+"""Irradiance by which the pictures of the capture were made."""
+PLUME = {
+    "as the config has it": (),
+    "30 iterations": ("--iterations", "30", "-D", "optimize.refine_at=[0.5, 0.9]"),
+    "300 iterations": ("--iterations", "300"),
+    "diffusion alone": ("-D", "diffusion.transport_rounds=0"),
+    "two rounds": ("-D", "diffusion.transport_rounds=2"),
+    "all views in every iteration": ("-D", "optimize.views_per_iteration=0"),
+    "loss: display": ("-D", "optimize.loss=display"),
+    "loss: photon": ("-D", "optimize.loss=photon"),
+    "engine torch": ("--engine", "torch"),
+}
+GALLERY = {"plume": "plume", "cumulus_field": "cumulus_field", "smoke_sky": "", "photograph": ""}
+"""Configs, and the folder of data that holds the true density, if any does."""
+
+
+def optimize(
+    config: str, folder: Path, options: Sequence[str] = ()
+) -> tuple[dict[str, Any], float]:
+    """The summary of a run in `folder`, and the seconds of its process."""
+    command = ["ddrecon", "optimize", str(ROOT / f"configs/{config}.yaml"), "-o", str(folder)]
+    start = time.perf_counter()
+    subprocess.run([*command, "-q", "--overwrite", *options], check=True)
+    seconds = time.perf_counter() - start
+    return json.loads((folder / "summary.json").read_text()), seconds
+
+
+def read_density(path: Path) -> np.ndarray:
+    return read_field(path, "density").values.astype(np.float64)
+
+
+def coarsened(density: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Means of `density` over cells of a grid of `shape`, which divides its own."""
+    parts = [
+        n for pair in ((n, m // n) for n, m in zip(shape, density.shape, strict=True)) for n in pair
+    ]
+    return density.reshape(parts).mean((1, 3, 5))
+
+
+def density_errors(run: Path, truth: Path) -> tuple[float, float, float]:
+    """Relative L1 and L2 errors of the density of `run`, and its correlation with the truth."""
+    found = read_density(run / "volumes" / "density.npz")
+    true = coarsened(read_density(truth), found.shape)
+    away = found - true
+    return (
+        float(np.abs(away).sum() / np.abs(true).sum()),
+        float(np.linalg.norm(away) / np.linalg.norm(true)),
+        float(np.corrcoef(found.flat, true.flat)[0, 1]),
+    )
+
+
+def print_row(*cells: object) -> None:
+    shown = (f"{cell:.3f}" if isinstance(cell, float) else str(cell) for cell in cells)
+    print(f"| {' | '.join(shown)} |", flush=True)
+
+
+def print_runs(runs: dict[str, tuple[str, str, Sequence[str]]], folder: Path) -> None:
+    """Prints a row for each run: by its name the config, where its truth is, and options."""
+    print_row("run", "held out", "L1", "L2", "correlation", "seconds")
+    print_row(*["---"] * 6)
+    for name, (config, truth, options) in runs.items():
+        place = folder / name.replace(" ", "_").replace(":", "")
+        summary, seconds = optimize(config, place, options)
+        psnr = summary.get("test_psnr")
+        errors = (
+            density_errors(place, ROOT / "data" / truth / "density.npz") if truth else ("",) * 3
+        )
+        print_row(name, f"{psnr:.1f} dB" if psnr else "", *errors, f"{seconds:.0f}")
+
+
+def rotation_between(found: np.ndarray, true: np.ndarray) -> float:
+    """The angle [degrees] by which the poses [3, 4] `found` and `true` are turned."""
+    chord = np.linalg.norm(found[:, :3] - true[:, :3]) / 8**0.5
+    return float(np.degrees(2 * np.arcsin(min(chord, 1))))
+
+
+def pixels_off(found: np.ndarray, true: np.ndarray, focal: float) -> float:
+    """How far the camera `found` sees the smoke from where `true` does [pixels], on average."""
+    density = read_density(CAPTURE / "density.npz")
+    low, high = np.load(CAPTURE / "density.npz")["bounds"]
+    cells = np.argwhere(density > 0)
+    points = low + (cells[:, ::-1] + 0.5) / density.shape[::-1] * (high - low)
+    rays = []
+    for pose in (found, true):
+        places = (points - pose[:, 3]) @ pose[:, :3]
+        rays.append(places / np.linalg.norm(places, axis=1, keepdims=True))
+    angles = np.linalg.norm(np.cross(*rays), axis=1)
+    return float(focal * np.average(angles, weights=density[density > 0]))
+
+
+def print_capture(folder: Path) -> None:
+    """Runs the capture, and prints what it found beside what its cameras were told."""
+    summary, seconds = optimize("capture", folder)
+    error = density_errors(folder, CAPTURE / "density.npz")[0]
+    values = json.loads((folder / "parameters.json").read_text())
+    told, truth = (
+        json.loads((CAPTURE / name).read_text())["frames"]
+        for name in ("transforms.json", "truth.json")
+    )
+    gains, turns, shifts = [], [], []
+    for start, frame in zip(told[:-1], truth[:-1], strict=True):
+        name, true = Path(frame["file_path"]).stem, np.array(frame["transform_matrix"])[:3]
+        gain = np.divide(values[f"views.{name}.exposure"], frame["exposure"])
+        gains.append(100 * np.abs(gain - 1))
+        poses = start["transform_matrix"], values[f"views.{name}.camera"]["matrix"]
+        both = [np.array(pose)[:3] for pose in poses]
+        turns.append([rotation_between(pose, true) for pose in both])
+        shifts.append([pixels_off(pose, true, frame["fl_x"]) for pose in both])
+    lamp = 100 * (np.divide(values["lights.0.irradiance"], LAMP) - 1)
+    span = "{:.2f} to {:.2f}".format
+    print_row("what", "given", "found")
+    print_row("---", "---", "---")
+    print_row("held-out picture, as displayed", "", f"{summary['test_psnr']:.1f} dB")
+    print_row("density, relative L1 error", "", error)
+    print_row("exposures, mean error", "", f"{np.mean(gains):.1f} %")
+    print_row("exposures, worst error", "", f"{np.max(gains):.1f} %")
+    print_row("lamp, error by color", "", ", ".join(f"{part:+.0f} %" for part in lamp))
+    for what, pairs in (
+        ("where cameras see the smoke [pixels]", shifts),
+        ("turn [degrees]", turns),
+    ):
+        print_row(what, *(span(min(part), max(part)) for part in zip(*pairs, strict=True)))
+    print_row("seconds of the process", "", f"{seconds:.0f}")
 
 
 def main() -> None:
-    """Prints a row for each run."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN_DIR")
-    parser.add_argument(
-        "--truth", type=Path, default=TRUTH, help="the true density; the plume's unless given"
-    )
-    arguments = parser.parse_args()
-    true = read_field(arguments.truth, "density").values.astype(np.float64)
-    print(
-        "| run | L1 | L2 | correlation | haze | far | held-out PSNR [dB] | seconds |\n"
-        "|---|---|---|---|---|---|---|---|"
-    )
-    empty = true == 0
-    near = max_pool3d(torch.as_tensor(~empty)[None].double(), 3, 1, 1)[0].numpy() > 0
-    for run in arguments.runs:
-        found = read_field(run / "volumes" / "density.npz", "density").values.astype(np.float64)
-        summary = json.loads((run / "summary.json").read_text())
-        away = found - true
-        errors = (
-            np.abs(away).sum() / np.abs(true).sum(),
-            np.linalg.norm(away) / np.linalg.norm(true),
-            np.corrcoef(found.flat, true.flat)[0, 1],
-        )
-        shown = " | ".join(f"{error:.3f}" for error in errors)
-        # What lies where truth is empty, and what of it is more than a cell away, of the whole.
-        hazes = found[empty].sum() / found.sum(), found[~near].sum() / found.sum()
-        shown += "".join(f" | {haze:.2%}" for haze in hazes)
-        print(f"| {run} | {shown} | {summary['test_psnr']:.2f} | {summary['seconds']:.1f} |")
+    """Runs what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("plume", "gallery", "capture"))
+    parser.add_argument("-o", "--output", type=Path)
+    given = parser.parse_args()
+    folder = given.output or Path(tempfile.mkdtemp())
+    if given.what == "capture":
+        print_capture(folder / "capture")
+    elif given.what == "plume":
+        optimize("plume", folder / "first", ("--iterations", "6"))
+        runs = {name: ("plume", "plume", options) for name, options in PLUME.items()}
+        print_runs(runs, folder)
+    else:
+        print_runs({name: (name, truth, ()) for name, truth in GALLERY.items()}, folder)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,31 @@
-"""How far images are from the truth where cells are optically thick: a table for docs/accuracy.md.
+"""How far images are from the truth where cells are optically thick: a table in Markdown.
+
+    python benchmarks/thick_cells.py
 
 The truth is our own, on a grid six times as fine: the same density, linear between the centers of
-the coarse grid, with angles to degree 5 and five rounds. Rays have so many samples a coarse cell.
-
-    python benchmarks/thick_cells.py [-g -0.8]... [--depth 4]... [--samples 2]
+the coarse grid, with angles to degree 5 and five rounds. `default` is what a scene file gets.
 """
 
 from __future__ import annotations
 
-import argparse
-import math
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import torch
-from accuracy import FAR, FRONT, SIDE, Case, Vector, around, sun, together
+from accuracy import (
+    FAR,
+    FRONT,
+    SIDE,
+    Case,
+    Vector,
+    around,
+    perspective,
+    print_header,
+    print_row,
+    sun,
+    together,
+)
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -21,6 +33,7 @@ from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
+from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import RenderSettings
 
 CELLS, FINER, PIXELS = 12, 6, 16
@@ -30,21 +43,20 @@ LIGHTS: dict[str, tuple[Vector, Vector]] = {
     "eye": ((2.0, -1.2, 2.2), FAR),
 }
 """By where light comes from, the way it travels and the eye."""
-ROUNDS = (0, 1, 2, 3, 6)
-
-
-def coarse_scene(g: float, depth: float, lit: str, samples: int = 8, **diffusion: int) -> Scene:
-    """Merged balls with `depth` optical depths a cell, lit from the `side` or from the `eye`."""
-    travel, eye = LIGHTS[lit]
-    width = math.tan(math.radians(11))
-    case = Case(lit, BALLS, depth * CELLS, 0.95, g, [sun(travel)], eye, half_width=width)
-    scene = case.scene(CELLS, tolerance=1e-5, **diffusion)
-    views = [replace(view, camera=replace(view.camera, size=(PIXELS,) * 2)) for view in scene.views]
-    return replace(scene, views=views, render=RenderSettings(4, samples, 0.0))
+EXACT = "diffusion.transport_rounds=5", "diffusion.degree=5"
+MODELS = {
+    "n = 0": ("diffusion.transport_rounds=0",),
+    "n = 1, L = 1": ("diffusion.transport_rounds=1", "diffusion.degree=1"),
+    "n = 1, L = 3": ("diffusion.transport_rounds=1", "diffusion.degree=3"),
+    "n = 3, L = 3": ("diffusion.transport_rounds=3", "diffusion.degree=3"),
+    "default, one sample": ("render.steps_per_voxel=1",),
+    "default": (),
+}
+"""Overrides by column: n transport rounds of degree L, samples of rays as by default."""
 
 
 def refine(scene: Scene) -> Scene:
-    """`scene` in finer cells."""
+    """`scene` in finer cells, two samples in each."""
     volume = scene.volume
     density = interpolate(volume.density[None, None], scale_factor=FINER, mode="trilinear")[0, 0]
     grid = Grid(tuple(density.shape), volume.grid.lower, volume.grid.upper)
@@ -57,29 +69,28 @@ def error(image: Tensor, truth: Tensor) -> float:
     return float((image - truth).norm() / truth.norm())
 
 
+def print_case(g: float, depth: float, lit: str, folder: Path) -> None:
+    """A row: merged balls with `depth` optical depths a cell, lit from the `side` or the `eye`."""
+    travel, eye = LIGHTS[lit]
+    case = Case(lit, BALLS, depth * CELLS, 0.95, g, (sun(travel),), perspective(eye, 22.0))
+    path = case.write(folder, CELLS)
+    views = f"views.0.camera.resolution={[PIXELS] * 2}"
+    truth = render(refine(load_scene(path, overrides=(views, *EXACT))))
+    errors = (
+        error(render(load_scene(path, overrides=(views, *model))), truth)
+        for model in MODELS.values()
+    )
+    print_row(g, f"{depth:g}", lit, *(f"{part:.3f}" for part in errors))
+
+
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("-g", type=float, action="append")
-    parser.add_argument("--depth", type=float, action="append")
-    parser.add_argument("--samples", type=int, default=8)
-    given = parser.parse_args()
-    columns = " | ".join(f"n = {rounds}" for rounds in ROUNDS)
-    print(f"| g | depth of a cell | lit from the | {columns} |\n|{'---|' * (3 + len(ROUNDS))}")
-    for g in given.g or (-0.8, -0.4, 0.0, 0.4, 0.8):
-        for depth in given.depth or (1.0, 4.0, 8.0, 20.0):
-            for lit in LIGHTS:
-                with torch.no_grad():
-                    fine = refine(coarse_scene(g, depth, lit, transport_rounds=5, degree=5))
-                    truth = render(fine)
-                    scenes = (
-                        coarse_scene(g, depth, lit, given.samples, transport_rounds=n, degree=3)
-                        for n in ROUNDS
-                    )
-                    errors = (f"{error(render(scene), truth):.3f}" for scene in scenes)
-                    print(f"| {g} | {depth:g} | {lit} | {' | '.join(errors)} |", flush=True)
+    print_header("g", "depth of a cell", "lit from the", *MODELS)
+    with tempfile.TemporaryDirectory() as name, torch.no_grad():
+        for g in (-0.8, 0.0, 0.6, 0.8):
+            for depth in (1.0, 4.0, 8.0):
+                for lit in LIGHTS:
+                    print_case(g, depth, lit, Path(name))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Every function that the package differentiates by hand, beside its plain formula.
 
-`tests/numerics/test_by_hand.py` holds the derivatives of both against each other, and
-`benchmarks/by_hand.py` what the ones by hand gain.
+`tests/numerics/test_by_hand.py` holds the derivatives of both against each other.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ what a cell gives up to absorption and through the faces of the box. Every flux 
 enters its neighbor, so energy is kept to rounding.
 
 Neighbors are combined by slicing: conv3d with fixed difference kernels gives the same result 30 to
-50 times slower on a CPU (`benchmarks/stencil.py` measures both).
+50 times slower on a CPU.
 """
 
 from __future__ import annotations

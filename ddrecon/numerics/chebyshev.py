@@ -2,8 +2,7 @@
 
 They take a few products where a closed form takes many. By interpolation at Chebyshev's extrema
 (Trefethen 2019, Approximation Theory and Approximation Practice, chapter 2,
-doi:10.1137/1.9781611975949). Their values are differentiated by hand, in both modes:
-`benchmarks/by_hand.py` has what that gains.
+doi:10.1137/1.9781611975949). Their values are differentiated by hand, in both modes.
 """
 
 from __future__ import annotations

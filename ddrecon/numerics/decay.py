@@ -9,7 +9,7 @@ Over depths from a to b >= a the mean of exp(-depth) is exp(-a) phi(b - a), with
 so its derivatives are -exp(-a) psi by a, and exp(-a) (psi - phi) by b.
 
 All functions here are differentiated by hand, in both modes: autograd keeps and revisits seven to
-eleven times as many numbers and takes two to four times as long (`benchmarks/by_hand.py`). In the
+eleven times as many numbers and takes two to four times as long. In the
 small, it would divide differences of nearly equal numbers.
 """
 

@@ -1,7 +1,7 @@
 """Sums along the first axis, slice by slice.
 
 torch's `cumsum` strides through memory there, and reverses arrays in its backward pass: it takes
-three to five times as long (`benchmarks/by_hand.py`).
+three to five times as long.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ numbering, with d for a derivative and kappa = 3 D:
 - Sigma7, div Q1, is `divergence`, Sigma8 the same of d Q1; Sigma6 and Sigma9 are the derivatives of
   S and of L1, which autograd takes.
 
-Convolution is 30 to 50 times slower than slicing on a CPU (`benchmarks/stencil.py`); it is how the
+Convolution is 30 to 50 times slower than slicing on a CPU; it is how the
 paper's sums are written down here.
 """
 

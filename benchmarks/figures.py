@@ -1,0 +1,190 @@
+"""Every figure that README.md and docs/ quote: measures it, and writes it where it is quoted.
+
+    python benchmarks/figures.py --references FOLDER [NAME]...     all of them, or some
+    python benchmarks/figures.py --write                           no measuring: pages anew
+
+A figure is a table that one command prints. What was measured lies in benchmarks/figures.json with
+its commit, day and machine. A page quotes it between `<!-- figure: NAME -->` and
+`<!-- end of figure -->`; a house test compares. Run it on idle cores. Path tracing needs the extra
+`reference` and DRJIT_LIBLLVM_PATH; FOLDER keeps what was traced, and holds `images/cases.json` of
+the eleven cases.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+STORE = Path(__file__).with_suffix(".json")
+COMMANDS = {
+    "eleven": "python benchmarks/accuracy.py eleven --references FOLDER",
+    "angles": "python benchmarks/accuracy.py angles --references FOLDER",
+    "volumes": "python benchmarks/accuracy.py volumes --references FOLDER",
+    "thick": "python benchmarks/thick_cells.py",
+    "derivative": "python benchmarks/accuracy.py derivative --references FOLDER",
+    "rounds": "python benchmarks/rounds.py",
+    "plume": "python benchmarks/reconstruction.py plume",
+    "gallery": "python benchmarks/reconstruction.py gallery",
+    "capture": "python benchmarks/reconstruction.py capture",
+    "replay": "python benchmarks/replay.py --paths 4 16",
+    "engines": "python benchmarks/engines.py",
+    "tangents": "python benchmarks/engines.py --tangents",
+    "launches": "python benchmarks/launches.py",
+    "solvers": "python benchmarks/solver.py",
+    "memory": "python benchmarks/memory.py --cells 96",
+    "numbers": "python benchmarks/memory.py --count",
+    "scale": "python benchmarks/scaling.py",
+    "speed": "ddrecon bench --quick",
+    "hard": "ddrecon bench --hard",
+    "gradcheck": "ddrecon gradcheck configs/gradcheck_all.yaml",
+    "uncertainty": "python benchmarks/uncertainty.py real --samples 16",
+    "fig10": "python benchmarks/paper_g.py",
+    "paper": "python benchmarks/paper.py",
+}
+"""By the name of a figure, what prints it."""
+KEPT_BY_THEMSELVES = ("fig10", "paper")
+"""Scripts that keep their tables: the paper's, of one experiment or of all."""
+SUMMARY = (
+    ("images against path tracing, eleven cases: mean error", "eleven", "mean", "default"),
+    ("the same, worst", "eleven", "worst", "default"),
+    ("the same by diffusion alone (`transport_rounds: 0`): mean error", "eleven", "mean", "n = 0"),
+    ("the plume above: held-out PSNR", "plume", "as the config has it", "held out"),
+    ("relative L1 error of its density", "plume", "as the config has it", "L1"),
+    ("seconds of the whole process", "plume", "as the config has it", "seconds"),
+    (
+        "image of 512 x 512 and its derivative by 64 x 96 x 64 cells: seconds",
+        "replay",
+        "ours",
+        "both s",
+    ),
+    (
+        "Mitsuba's path replay with 16 paths a pixel: times as long",
+        "replay",
+        "Mitsuba, 16 paths a pixel",
+        "times ours",
+    ),
+)
+"""The README's table: what it says, and the figure, row and column that say it."""
+PLACE = re.compile(r"(<!-- figure: (\w+) -->\n).*?(<!-- end of figure -->)", re.DOTALL)
+
+
+def read_store() -> dict[str, Any]:
+    """What was measured, by the name of its figure."""
+    return json.loads(STORE.read_text()) if STORE.exists() else {}
+
+
+def describe_machine() -> str:
+    """The processor, its cores and their load."""
+    known = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    name = re.search(r"model name\s*: (.*)", known)
+    vectors = ", AVX-512" if "avx512f" in known else ""
+    return f"{os.cpu_count()} cores ({name[1].strip() if name else 'unknown'}{vectors})"
+
+
+def measure(name: str, references: Path) -> None:
+    """Runs the command of a figure, and keeps the table that it prints."""
+    command = COMMANDS[name]
+    words = [str(references) if word == "FOLDER" else word for word in command.split()]
+    words[:1] = [sys.executable] if words[0] == "python" else words[:1]
+    run = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    lines = [line for line in run.stdout.splitlines() if line.startswith("|")]
+    if run.returncode or not lines:
+        raise SystemExit(f"{name}: exit {run.returncode}\n{run.stderr[-2000:]}")
+    if name not in KEPT_BY_THEMSELVES:
+        keep(name, command, lines)
+
+
+def keep(name: str, command: str, lines: list[str]) -> None:
+    """Stores a table with what made it, where and when, and writes it into the pages."""
+    figure = {
+        "command": command,
+        "commit": ask_git("rev-parse", "--short", "HEAD"),
+        "day": datetime.date.today().isoformat(),
+        "machine": describe_machine(),
+        "table": lines,
+    }
+    STORE.write_text(json.dumps(read_store() | {name: figure}, indent=1) + "\n")
+    write_pages()
+
+
+def ask_git(*words: str) -> str:
+    return subprocess.run(
+        ["git", *words], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def split_row(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+
+
+def pick(figure: dict[str, Any], row: str, column: str) -> str:
+    """One cell of a table."""
+    heads = split_row(figure["table"][0])
+    (found,) = (split_row(line) for line in figure["table"] if split_row(line)[0] == row)
+    return found[heads.index(column)]
+
+
+def show_summary(store: dict[str, Any]) -> str:
+    """The table of the README."""
+    rows = [
+        (text, store[name], pick(store[name], row, column))
+        for text, name, row, column in SUMMARY
+        if name in store
+    ]
+    lines = [f"| {text} | {value} | `{figure['commit']}` |" for text, figure, value in rows]
+    return "\n".join(["| what | measured | commit |", "|---|---|---|", *lines, ""])
+
+
+def show(name: str, store: dict[str, Any]) -> str:
+    """What stands on a page for a figure: its table, then what made it; nothing before it is
+    measured.
+    """
+    if name == "summary":
+        return show_summary(store)
+    if name not in store:
+        return ""
+    figure = store[name]
+    made = f"`{figure['command']}`, commit `{figure['commit']}`, {figure['day']}"
+    return "\n".join([*figure["table"], "", f"*{made}, {figure['machine']}.*", ""])
+
+
+def pages() -> list[Path]:
+    """Where figures may be quoted."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def rewrite(text: str, store: dict[str, Any]) -> str:
+    """A page with the figures as they were measured."""
+    return PLACE.sub(lambda found: found[1] + show(found[2], store) + found[3], text)
+
+
+def write_pages() -> None:
+    """Puts the stored figures into the pages that quote them."""
+    store = read_store()
+    for page in pages():
+        page.write_text(rewrite(page.read_text(), store))
+
+
+def main() -> None:
+    """Measures what is asked for, and writes it into the pages."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", choices=[[], *COMMANDS], metavar="NAME")
+    parser.add_argument("--references", type=Path, default=Path("references"))
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args()
+    for name in [] if given.write else given.names or COMMANDS:
+        print(name, flush=True)
+        measure(name, given.references.resolve())
+    write_pages()
+
+
+if __name__ == "__main__":
+    main()
