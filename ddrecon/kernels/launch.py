@@ -32,12 +32,6 @@ Numbers of rays differ from view to view: the table stays small.
 """
 
 
-def array(tensor: Tensor) -> Any:
-    """`tensor` as Warp's array, contiguous: in the same memory where it is so already."""
-    _start()
-    return wp.from_torch(tensor.detach().contiguous(), requires_grad=False)
-
-
 def thread_count(like: Tensor) -> int:
     """In how many threads kernels on tensors `like` this run: on a GPU one."""
     return 1 if like.is_cuda else torch.get_num_threads()

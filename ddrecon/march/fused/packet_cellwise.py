@@ -140,6 +140,18 @@ auto angle_of = [&](const Node& node, int b, V& cosine) -> Cubic {
 auto number_of = [&](const Node& node, int h) -> V {
     return node.v[FIRST_NUMBER + h * NUMBER_STEP];
 };
+// How light from a point turns along the ray; and how p changes with the place of its angle in
+// tables, at a `place` on the curve.
+auto turning_of = [&](const Node& node, int b) -> Point::Turning {
+    return Point::turning(ray.foot[b], ray.across[b], node.t);
+};
+auto by_turn = [&](const Node& node, int b, int c, V place) -> V {
+    const V* by_angle = node.by_angle + (b * PHASES + c * PHASE_STEP) * TERMS;
+    if (HAS_RUNGS) return Polynomial::at(by_angle, place);
+    V curve[TERMS];
+    Point::curve(node.point[b], table + c * PHASE_STEP * TABLE_STEP, curve, true);
+    return Polynomial::at(curve, place);
+};
 // p of beam b at a node, by the number there; its change with the angle if that `turns`.
 auto see_number = [&](Node& node, int b, bool turns) {
     V cosine;
