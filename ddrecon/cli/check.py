@@ -8,7 +8,7 @@ import torch
 
 from ddrecon.engine import engine_of_parts, name_engines
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.memory import Needs, gibibytes, memory_of
+from ddrecon.memory import Needs, count_threads, gibibytes, memory_of
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.reconstruct.setup import select_views, start_support
 from ddrecon.reconstruct.support import describe_support, support_text
@@ -40,6 +40,8 @@ def memory_estimate(scene: Scene) -> int:
         varied=None
         if scene.optimize is None
         else sum(field.numel() for field in fields) / grid.cells,
+        lights=len(scene.lights),
+        threads=count_threads(volume.density.device),
     )
     return memory_of(needs)
 

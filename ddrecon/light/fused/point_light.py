@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
@@ -59,7 +60,8 @@ class _Integral(torch.autograd.Function):
         varies = any(ctx.needs_input_grad[1:4])
         bars = [each.new_zeros(each.shape) if varies else None for each in (first, last, length)]
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        shares = [field.new_zeros(field.shape) for _ in range(thread_count(field))]
+        threads = count_shares(thread_count(field), field.nbytes)
+        shares = [field.new_zeros(field.shape) for _ in range(threads)]
         given = _ways(*ways) | {"varies": varies, "totals": total_bar}
         made = dict(zip(("firsts_bar", "lasts_bar", "lengths_bar"), bars, strict=True))
         own = [{"fields_bar": share} for share in shares]

@@ -12,6 +12,7 @@ from torch import Tensor
 from ddrecon.kernels.dual import split
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.packets import LANES
+from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import cut
 from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
@@ -51,7 +52,8 @@ class Integrate(torch.autograd.Function):
         out = rays.new_empty(layout.outputs, len(rays))
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
         varied = rays, angles, coefficients, numbers, table, fronts
-        given, made = _packets(cells, varied, fields), {"out": out, "masses": masses}
+        given = _packets(cells, varied, fields, thread_count(rays))
+        made = {"out": out, "masses": masses}
         kernel = packet_integral_kernel(layout, cells.is_sliced)
         kernel.launch(cut(len(rays), LANES, rays)[0], given, made)
         return out, masses.to(rays.dtype, copy=True), masses
@@ -92,7 +94,7 @@ def _change(
     rays, fields = values[0], values[6:]
     d_out, d_masses = _empty(layout, rays)
     d_rays, d_angles, d_coefficients, d_numbers, d_table, d_fronts, *d_fields = d_values
-    given = _packets(cells, values[:6], fields)
+    given = _packets(cells, values[:6], fields, thread_count(rays))
     nothing = torch.zeros_like(fields[0][0])
     of_changes = _channels(d_fields, fields)
     channels = [nothing if one is None else one for one in of_changes]
@@ -123,12 +125,16 @@ def _transpose(ctx: Any, out_bar: Tensor, masses_bar: Tensor) -> list[Tensor | N
     numbers_bar = masses.new_empty(len(numbers), packets)
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
     wanted = list(zip(fields, needs_fields, strict=True))
+    numbers_of_one = sum(field.numel() for field, is_needed in wanted if is_needed)
+    numbers_of_one += table.numel() if needs_table else 0
+    threads = count_shares(thread_count(rays), rays.element_size() * numbers_of_one)
     shares = [
         [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
-        for _ in range(thread_count(rays))
+        for _ in range(threads)
     ]
     fronts_bar = fronts.new_empty(fronts.shape) if fronts.numel() else None
-    given = _packets(cells, (rays, angles, coefficients, numbers, table, fronts), fields)
+    varied = rays, angles, coefficients, numbers, table, fronts
+    given = _packets(cells, varied, fields, threads)
     given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
     rays_bar = rays.new_empty(rays.shape) if needs_rays else None
     made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar, "rays_bar": rays_bar}
@@ -151,8 +157,10 @@ def _transpose(ctx: Any, out_bar: Tensor, masses_bar: Tensor) -> list[Tensor | N
     return [rays_bar, angles_bar, polynomials_bar, numbers_bar, table_bar, fronts_bar, *shares[0]]
 
 
-def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -> dict[str, Any]:
-    """What kernels are given, by name."""
+def _packets(
+    cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor], threads: int
+) -> dict[str, Any]:
+    """What kernels in so many `threads` are given, by name."""
     *varied, fronts = varied
     names = "planes", "slices", "rays", "angles", "coefficients", "numbers", "table"
     given: dict[str, Any] = dict(zip(names, (cells.planes, cells.order, *varied), strict=True))
@@ -162,7 +170,7 @@ def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -
     walked = cells.walked(varied[0])
     given |= {"walked": walked, "words": 0 if walked is None else walked.shape[1]}
     packets, _ = cut(len(varied[0]), LANES, varied[0])
-    given["dealt"] = deal(packets, thread_count(varied[0]))
+    given["dealt"] = deal(packets, threads)
     return given | {"fields": _channels(fields, fields)}
 
 
