@@ -107,11 +107,12 @@ F *fields, *firsts, *lasts, *lengths, *fraction, *totals;
 @functools.cache
 def way_kernel(bits: int) -> TextKernel:
     """The kernel of integrals along ways."""
-    return TextKernel("integrate_ways", bits, INTEGRATE, _GIVEN)
+    return TextKernel("integrate_ways", bits, INTEGRATE, _GIVEN, "totals")
 
 
 @functools.cache
 def way_adjoint_kernel(bits: int) -> TextKernel:
     """Its adjoint, from cotangents `totals`; of ends and lengths where ways vary."""
     more = "int varies; F *fields_bar, *firsts_bar, *lasts_bar, *lengths_bar"
-    return TextKernel("ways_adjoint", bits, ADJOINT, _GIVEN + more)
+    made = "fields_bar firsts_bar lasts_bar lengths_bar"
+    return TextKernel("ways_adjoint", bits, ADJOINT, _GIVEN + more, made)

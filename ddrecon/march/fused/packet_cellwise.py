@@ -13,6 +13,10 @@ from ddrecon.numerics.angle_table import STEPS
 
 RUNGS = f"""
 constexpr F ANGLE_STEP = F({math.pi / STEPS!r});
+#if !defined(__CUDA_ARCH__)
+// A vector read from a row ends within the next one: behind the last row there is one more.
+static_assert(!HAS_RUNGS || (TERMS <= LANES && LANES <= 2 * TERMS), "terms of a row, by lanes");
+#endif
 constexpr int LAST_RUNG = IS_STEEP ? {STEEP_STEPS} : {EVEN_STEPS};
 struct Rungs {{
     // At which rung a number is, and how that changes with it.

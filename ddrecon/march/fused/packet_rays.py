@@ -59,6 +59,10 @@ struct Node : Spot {
     Plain plain[IS_STEEP * BEAMS * PHASES + 1];
 };
 """
+ROW_OF = """
+// Where row k of an array begins that has a number of each ray.
+auto row_of = [&](int k) -> long long { return (long long)k * ray_count; };
+"""
 _BEGIN = """
 if (dealt) item = dealt[item];
 const int last = ray_count - 1, begin = item * LANES;
@@ -66,8 +70,6 @@ const F* scale = numbers;
 const F* peaks = numbers + C;
 const F bound = numbers[2 * C];
 Ray ray;
-// Where the numbers of all rays that are `k` of theirs begin.
-auto row_of = [&](int k) -> long long { return (long long)k * ray_count; };
 const V none = P::all(F(0));
 ray.o0 = P::load(rays, begin, 8, last);
 ray.o1 = P::load(rays + 1, begin, 8, last);
@@ -291,19 +293,21 @@ def packet_kernel(
     case: Case,
     walk: str,
     given: str,
+    made: str,
     has_slopes: bool = True,
     changes: bool = False,
 ) -> TextKernel:
     """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`.
 
-    It `has_slopes` of p at nodes, which the integral itself does not need. With `changes` it is
-    given `all_fields`: `fields`, from which it samples, and their changes.
+    `made` names what of that it writes. It `has_slopes` of p at nodes, which the integral itself
+    does not need. With `changes` it is given `all_fields`: `fields`, from which it samples, and
+    their changes.
     """
     optics = DECAYS + POLYNOMIALS + CUBICS + POINTS + RUNGS
     structs = PLACES + VALUES + RUNS + ROWS + WINDOWS + optics + _RECORDS
     chosen = "const F* const* fields = all_fields;" if changes else ""
     constants = layout_constants(layout, case, has_slopes)
-    text = constants + structs + chosen + WALKS + _BEGIN + SEE + _EMIT + walk
+    text = constants + structs + chosen + WALKS + ROW_OF + _BEGIN + SEE + _EMIT + walk
     fields = f"all_fields[{2 * layout.channels}]" if changes else f"fields[{layout.channels}]"
     declared = f"{GIVEN} F *{fields}; {given}"
-    return TextKernel(name, layout.bits, text, declared, packet_program)
+    return TextKernel(name, layout.bits, text, declared, made, packet_program)

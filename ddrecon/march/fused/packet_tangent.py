@@ -205,4 +205,5 @@ def packet_tangent_kernel(layout: Layout, case: Case) -> TextKernel:
     F *d_angles, *d_coefficients, *d_numbers, *d_table, *d_fronts, *d_out, *d_masses, *d_rays
     """
     moving = SLOPES + MOVE_TANGENT if case.varies_rays else STAY_TANGENT
-    return packet_kernel("integrate_tangent", layout, case, moving + _WALK, given, changes=True)
+    text, made = moving + _WALK, "d_out d_masses"
+    return packet_kernel("integrate_tangent", layout, case, text, given, made, changes=True)

@@ -269,7 +269,9 @@ if (varies_polynomials)
 def packet_integral_kernel(layout: Layout, is_sliced: bool) -> TextKernel:
     """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
     given = "F *out; double *masses"
-    return packet_kernel("integrate", layout, Case(is_sliced), _INTEGRATE, given, False)
+    return packet_kernel(
+        "integrate", layout, Case(is_sliced), _INTEGRATE, given, "out masses", False
+    )
 
 
 @functools.cache
@@ -286,4 +288,5 @@ def packet_adjoint_kernel(layout: Layout, case: Case) -> TextKernel:
     F *rays_bar, *angles_bar
     """
     moving = SLOPES + MOVE if case.varies_rays else STAY
-    return packet_kernel("transpose", layout, case, SPREAD + moving + _TRANSPOSE, given)
+    made = "numbers_bar polynomials_bar table_bar fronts_bar bars rays_bar angles_bar"
+    return packet_kernel("transpose", layout, case, SPREAD + moving + _TRANSPOSE, given, made)

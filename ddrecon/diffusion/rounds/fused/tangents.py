@@ -97,7 +97,7 @@ class CellTangents(Cells):
                 "near": d_near, "extinction": d_fields[0], "scales": changes.scales,
                 "scattering": d_fields[0] if d_fields[1] is None else d_fields[1],
             }  # fmt: skip
-            kernel = tangent_of(self.kernels(False)[0], "", "light")
+            kernel = tangent_of(self.kernels(False)[0], "light")
             d_light = torch.empty_like(given["light"])
             whole: dict[str, Any] = given | with_changes(given, d_given)
             light = whole.pop("light")
