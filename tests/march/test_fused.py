@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
@@ -28,6 +29,7 @@ from ddrecon.validate.hard_cases import CASES
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_layout import Case
 from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
@@ -301,6 +303,15 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     packets += [packet_integral_kernel(steep, False), packet_tangent_kernel(one, inside)]
     packets += [packet_adjoint_kernel(one, moved), packet_adjoint_kernel(several, Case(False))]
     assert_compiles(packets, tmp_path)
+
+
+def test_places_beyond_the_numbers_of_an_int_are_refused():
+    planes, shape = torch.zeros(2), (3, 2048, 1024, 1024)
+    order = torch.zeros(2, dtype=torch.int32)
+    assert Cells(planes, 0, order).strides(shape)["plane_stride"] == 2**20
+    for cells in (Cells(planes), Cells(planes, 1, order)):
+        with pytest.raises(UsageError, match=r"2\^31"):
+            cells.strides(shape)
 
 
 def test_empty_space_and_rays_that_miss():

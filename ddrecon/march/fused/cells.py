@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from ddrecon.kernels.launch import MOST, too_many
 from ddrecon.march.bands import Bands
 from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.fused.stretches import find_walked
@@ -38,6 +40,9 @@ class Cells:
 
     def strides(self, shape: Sequence[int]) -> dict[str, int]:
         """How many cells on the next one is, and how many there are; of fields of `shape`."""
+        # Slices across z are found by long offsets; other places are numbers of 32 bits.
+        if (self.axis or not self.is_sliced) and (cells := math.prod(shape[-3:])) >= MOST:
+            raise too_many("cells seen along x or y, or from inside", cells)
         along = (shape[-2] * shape[-1], shape[-1], 1)
         row, column = across(self.axis)
         return {
