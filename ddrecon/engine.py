@@ -2,11 +2,8 @@
 
 An engine is an implementation of the inner loops. `torch` is the readable definition and has them
 all; `warp` (package warp-lang, the extra `fast`) fuses a loop into one kernel. Both compute the
-same formulas, so their numbers agree to rounding. Torch's are, with either engine: point lights but
-for the mass on the way to them, the scattering of skies towards a camera, tangents in forward mode
-by where lights are, the model `flux_limited`, the scheme `printed`, and solvers other than
-`multigrid`. So is of light and of rounds what has the phase function in it, where that differs from
-cell to cell. So are, on GPUs whose ranks share out cells, the sweeps of rounds.
+same formulas, so their numbers agree to rounding. What is torch's with either engine is what
+`terms.parts_in_torch` finds in a scene, and tangents in forward mode by where lights are.
 """
 
 from __future__ import annotations
@@ -65,9 +62,19 @@ def has_graphs() -> bool:
 
 
 def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
-    """The engine that runs each part of the renderer: the current one, but for those `in_torch`."""
-    engine = current_engine()
-    return {part: "torch" if part in in_torch else engine for part in PARTS}
+    """The engine that runs each part of the renderer: the current one, but for those `in_torch`.
+
+    These may be other parts than `PARTS`, within them.
+    """
+    return dict.fromkeys(PARTS, current_engine()) | dict.fromkeys(in_torch, "torch")
+
+
+def has_kernels(part: str, is_on_gpu: bool, has_slabs: bool = False) -> bool:
+    """Whether warp has kernels for `part` on such a device, of whole grids or in slabs.
+
+    On a GPU multigrid is torch's, and kernels sweep whole grids alone.
+    """
+    return not is_on_gpu or (part != "diffusion" and not (part == "transport rounds" and has_slabs))
 
 
 def name_engines(engines: Mapping[str, str]) -> str:

@@ -9,11 +9,16 @@ from pathlib import Path
 
 import torch
 
+from ddrecon.diffusion.rounds.fused.jobs import piece_numbers
+from ddrecon.engine import current_engine
+from ddrecon.kernels import shares
 from ddrecon.kernels.spare import LARGEST, give_freed_memory
 from ddrecon.march.integral import CHUNK_NODES
 
 SMALL = 2**24
 """Bytes of arrays that are small beside what else the process holds."""
+MATTER = 4
+"""Fields of each color that view rays meet besides the masses to lights, at most as a rule."""
 SHORTAGES = (
     "not enough memory",
     "out of memory",
@@ -30,7 +35,7 @@ class Needs:
 
     `resolution` (x, y, z), `colors` (1 or 3), `size`: bytes of a number, `pixels` of all views.
     `moments` is how many of light rounds keep. `varied` is how many fields are optimized, each
-    color counted; None where nothing is.
+    color counted; None where nothing is. `threads` are those of fused kernels (`count_threads`).
     """
 
     resolution: tuple[int, int, int]
@@ -42,6 +47,8 @@ class Needs:
     moments: int = 1
     is_limited: bool = False
     varied: float | None = None
+    lights: int = 1
+    threads: int = 1
 
     @property
     def cells(self) -> int:
@@ -102,7 +109,26 @@ def memory_of(needs: Needs, is_short: bool = False) -> int:
     in_cells = needs.cells * sum(number * counts[name] for name, number in arrays.cell.items())
     at_nodes = CHUNK_NODES * sum(number * counts[name] for name, number in arrays.node.items())
     held = (in_cells + at_nodes) * _overhead(needs, is_short)
-    return int(needs.size * (held + arrays.pixel * needs.pixels))
+    return int(needs.size * (held + arrays.pixel * needs.pixels)) + shared_memory(needs)
+
+
+def count_threads(device: torch.device) -> int:
+    """In how many threads the engine's kernels add to copies of the same numbers on `device`."""
+    is_shared = device.type == "cpu" and current_engine() == "warp"
+    return torch.get_num_threads() if is_shared else 1
+
+
+def shared_memory(needs: Needs) -> int:
+    """Bytes of such copies at most, beyond those of two threads (`kernels.shares`)."""
+    if needs.threads <= 2:
+        return 0
+    x, y, z = needs.resolution
+    # What view rays meet: fields of matter and light, and the mass to each light.
+    of_cells = needs.size * needs.cells * needs.colors * (MATTER + needs.lights)
+    of_rays = min(shares.MOST_BYTES, (needs.threads - 2) * of_cells)
+    piece = needs.size * piece_numbers((z, y, x), needs.colors, needs.moments)
+    pieces = shares.count_shares(max(1, needs.threads // (2 * needs.colors)), piece, 1)
+    return max(of_rays * (needs.varied is not None), pieces * piece * needs.has_rounds)
 
 
 def _overhead(needs: Needs, is_short: bool) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
+from ddrecon.engine import engine_of_parts, has_kernels
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 from ddrecon.light.sky import count_suns
 from ddrecon.march.steps import greatest_depth
@@ -26,17 +27,32 @@ def needed_terms(scene: Scene) -> list[str]:
     return [*_light_in(scene), f"view rays: {samples} a cell of at most {depth} optical depths"]
 
 
-def parts_in_torch(scene: Scene, has_slabs: bool) -> tuple[str, ...]:
+def engine_of_scene(scene: Scene, has_slabs: bool) -> dict[str, str]:
+    """The engine that runs each part of rendering `scene`."""
+    return engine_of_parts(parts_in_torch(scene, has_slabs, scene.volume.density.is_cuda))
+
+
+def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str, ...]:
     """The parts that are torch's with every engine, for what `scene` asks of them.
 
-    `has_slabs`: ranks share out its cells.
+    `has_slabs`: ranks share out its cells. Of point lights that is all but the mass on the way to
+    them; of phase functions by cell, what light and rounds are at cells: view rays look them up.
     """
-    settings = scene.diffusion
+    settings, medium = scene.diffusion, scale_medium(scene.volume, scene.diffusion.angles)
     is_fused = settings.model != "flux_limited" and settings.scheme == "conservative"
-    parts = () if is_fused and settings.solver == "multigrid" else ("diffusion",)
-    # On a GPU, kernels sweep whole grids alone.
-    sweeps_slabs = has_slabs and settings.rounds > 0 and scene.volume.density.is_cuda
-    return (*parts, "transport rounds") if sweeps_slabs else parts
+    is_fused = is_fused and settings.solver == "multigrid" and has_kernels("diffusion", is_on_gpu)
+    has_skies = any(isinstance(light, AmbientLight | EnvironmentLight) for light in scene.lights)
+    is_diffuse, has_rounds = multiply_scatters(medium, settings), settings.rounds > 0
+    parts = {
+        "diffusion": not is_fused,
+        "transport rounds": has_rounds
+        and not has_kernels("transport rounds", is_on_gpu, has_slabs),
+        "point lights": any(isinstance(light, PointLight) for light in scene.lights),
+        "pairs of beams": is_diffuse and _has_pairs(medium, scene),
+        "phases by cell": medium.is_cellwise,
+        "skies towards cameras": has_skies and medium.is_anisotropic and not is_diffuse,
+    }
+    return tuple(part for part, is_in_torch in parts.items() if is_in_torch)
 
 
 def _light_in(scene: Scene) -> list[str]:
@@ -69,11 +85,16 @@ def _round_terms(medium: Medium, scene: Scene) -> list[str]:
     if medium.degree > 1:
         left = remaining_moments(medium)[2].abs().max().item()
         terms[0] += f"; each leaves up to {left:.2g} of what diffusion lacks"
-    if has_backward_peak(medium) and _has_beams(scene.lights):
+    if _has_pairs(medium, scene):
         part = backward_fraction(medium).max().item()
         most = "up to " if medium.is_cellwise else ""
         terms.append(f"beams in pairs: a backward peak turns {most}{part:.3g} of scattering back")
     return terms
+
+
+def _has_pairs(medium: Medium, scene: Scene) -> bool:
+    """Whether backward peaks turn beams back and forth (E20)."""
+    return has_backward_peak(medium) and _has_beams(scene.lights)
 
 
 def _has_beams(lights: Sequence[Light]) -> bool:

@@ -6,16 +6,16 @@ from typing import Any
 
 import torch
 
-from ddrecon.engine import engine_of_parts, name_engines
+from ddrecon.engine import name_engines
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.memory import Needs, gibibytes, memory_of
+from ddrecon.memory import Needs, count_threads, gibibytes, memory_of
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.reconstruct.setup import select_views, start_support
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.doubts import find_doubts
-from ddrecon.terms import needed_terms, parts_in_torch
+from ddrecon.terms import engine_of_scene, needed_terms
 from ddrecon.variables.values import with_values
 
 
@@ -40,6 +40,8 @@ def memory_estimate(scene: Scene) -> int:
         varied=None
         if scene.optimize is None
         else sum(field.numel() for field in fields) / grid.cells,
+        lights=len(scene.lights),
+        threads=count_threads(volume.density.device),
     )
     return memory_of(needs)
 
@@ -64,7 +66,7 @@ def describe(scene: Scene, has_slabs: bool = False) -> dict[str, Any]:
         "optimizes": {name: scene.starts[name].numel() for name in parameters},
         "loss": _describe_loss(scene),
         "support": _describe_support(scene),
-        "engine": engine_of_parts(parts_in_torch(scene, has_slabs)),
+        "engine": engine_of_scene(scene, has_slabs),
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
     }

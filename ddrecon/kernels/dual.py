@@ -5,7 +5,7 @@ the text of a kernel, in which `F` is a dual number, computes the tangent of exa
 computes. Pairs of arrays stand for its arrays, one of values and one of changes, and what it writes
 are changes alone: a compiler leaves out of the values what these do not need.
 
-    change = tangent_of(scale_kernel(32), "scaled")
+    change = tangent_of(scale_kernel(32))
     change.launch(count, {"field": field, "d_field": d_field}, {"d_scaled": d_scaled})
 """
 
@@ -71,6 +71,7 @@ struct In {
     const R *v, *d;
     HERE Dual operator[](long long i) const { return {v[i], d[i]}; }
     HERE In operator+(long long i) const { return {v + i, d + i}; }
+    HERE explicit operator bool() const { return v; }
     HERE In operator-(long long i) const { return {v - i, d - i}; }
 };
 // Where changes are written.
@@ -81,6 +82,7 @@ struct Change {
 };
 struct Out {
     R* d;
+    HERE explicit operator bool() const { return d; }
     HERE Change operator[](long long i) const { return {d[i]}; }
     HERE Out operator+(long long i) const { return {d + i}; }
 };
@@ -94,6 +96,7 @@ struct Both {
         HERE Dual operator*(const Dual& o) const { return Dual(v, d) * o; }
     };
     HERE Place operator[](long long i) const { return {v[i], d[i]}; }
+    HERE explicit operator bool() const { return v; }
     HERE Both operator+(long long i) const { return {v + i, d + i}; }
 };
 """
@@ -110,8 +113,8 @@ _POINTER = r"F ?\* ?(?:const )?(?:__restrict )?"
 
 
 @functools.cache
-def tangent_of(kernel: TextKernel, made: str, kept: str = "") -> TextKernel:
-    """The kernel of the changes that `kernel` makes of arrays `made`, by their names.
+def tangent_of(kernel: TextKernel, kept: str = "") -> TextKernel:
+    """The kernel of the changes of arrays that `kernel` makes.
 
     It is given all that `kernel` is, and changes `d_x` of arrays and of each `x` made; of those
     `kept`, which the text reads again, values too. Numbers have no changes.
@@ -127,13 +130,16 @@ def tangent_of(kernel: TextKernel, made: str, kept: str = "") -> TextKernel:
             inner.append(f"const F {name} = outer_{name};")
             continue
         given.append(f"F *d_{name}")
-        if name in made.split():
+        if name in kernel.made - set(kept.split()):
             inner.append(f"const Out {name} = {{d_{name}}};")
         else:
             kind = "Both" if name in kept.split() else "In"
             inner.append(f"const {kind} {name} = {{outer_{name}, d_{name}}};")
+    made = " ".join([kept, *(f"d_{name}" for name in sorted(kernel.made))])
     parts = [_DUAL, *outer, "{", _FUNCTIONS, *inner, _in_dual_numbers(kernel.text), "}"]
-    return TextKernel(f"{kernel.name}_tangent", kernel.bits, "\n".join(parts), ";".join(given))
+    return TextKernel(
+        f"{kernel.name}_tangent", kernel.bits, "\n".join(parts), ";".join(given), made
+    )
 
 
 @functools.cache
@@ -146,11 +152,13 @@ def interleaved_tangent_of(kernel: TextKernel) -> TextKernel:
     for word, is_array, name, _ in declarations(kernel.given):
         if word == "F":
             outer.append(f"const auto outer_{name} = {name};")
-            kind, cast = ("F*", "(F*)") if is_array else ("F", "")
-            inner.append(f"{kind} const {name} = {cast}outer_{name};")
+            kind = f"{'' if name in kernel.made else 'const '}F{'*' * is_array}"
+            inner.append(f"{kind} const {name} = {f'({kind})' * is_array}outer_{name};")
     text = kernel.text.replace("wp::sqrt", "root_of")
     parts = [_DUAL, *outer, "{", _FUNCTIONS, *inner, text, "}"]
-    return TextKernel(f"{kernel.name}_tangent", kernel.bits, "\n".join(parts), kernel.given)
+    return TextKernel(
+        f"{kernel.name}_tangent", kernel.bits, "\n".join(parts), kernel.given, " ".join(kernel.made)
+    )
 
 
 def _in_dual_numbers(text: str) -> str:
@@ -190,16 +198,17 @@ def launch_row_tangents(
     """Runs the tangent of `kernel` on all cells of `grid`, as `rows.launch_rows` runs the kernel.
 
     `given` is what `kernel` is; `changes` those of arrays given, by the arrays' names, zero where
-    there is none; `made` gets the changes of what `kernel` makes. Arrays `kept` it reads again.
+    there is none; `made` gets the changes of what `kernel` makes. Arrays `kept` it reads again;
+    they get their changes.
     """
     kept = kept or {}
-    names = " ".join(made), " ".join(kept)
+    changed = {f"d_{name}": array for name, array in {**made, **kept}.items()}
     launch_rows(
-        lambda bits: tangent_of(kernel(bits), *names),
+        lambda bits: tangent_of(kernel(bits), " ".join(kept)),
         grid,
         colors,
         {**given, **with_changes(given, changes)},
-        {f"d_{name}": array for name, array in {**made, **kept}.items()},
+        changed | {name: array.new_empty(array.shape) for name, array in kept.items()},
     )
 
 

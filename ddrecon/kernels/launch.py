@@ -19,10 +19,13 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from ddrecon.errors import UsageError
 from ddrecon.kernels.compiling import is_rehearsed, load
 from ddrecon.kernels.spare import keep_freed_memory
 
 wp.config.log_level = wp.LOG_ERROR  # one line of ours says what is compiled
+MOST = 2**31
+"""Items of a launch are fewer."""
 QUICK = 1.5e-4
 """Handing a share to another thread takes about 50 microseconds; a launch, 20."""
 _seconds: dict[tuple[Any, int], float] = {}
@@ -32,10 +35,12 @@ Numbers of rays differ from view to view: the table stays small.
 """
 
 
-def array(tensor: Tensor) -> Any:
-    """`tensor` as Warp's array, contiguous: in the same memory where it is so already."""
-    _start()
-    return wp.from_torch(tensor.detach().contiguous(), requires_grad=False)
+def too_many(what: str, count: int) -> UsageError:
+    """What to say of so many items, or numbers, that kernels do not count so far."""
+    return UsageError(
+        f"{what}: {count} is too many for fused kernels, which count to 2^31; "
+        "take fewer cells or pixels, or --engine torch"
+    )
 
 
 def thread_count(like: Tensor) -> int:
@@ -62,6 +67,8 @@ def launch(
     """
     if not count:
         return
+    if count >= MOST:
+        raise too_many(kernel.key, count)
     goes_by_time = threads is None or work is not None
     threads = thread_count(like) if threads is None else threads
     device = _device(like.device)

@@ -5,7 +5,7 @@ memory is therefore written in C++, which Warp compiles for processors (where it
 instructions) and for GPUs (where a thread does one turn of it):
 
     TextKernel("scale", bits, BLOCK + "for (int i = begin; i < end; ++i) y[i] = 2 * x[i];",
-               "int length, total; F *x, *y")
+               "int length, total; F *x, *y", "y")
 
 In the text `F` is the type of numbers, and there are the functions below.
 """

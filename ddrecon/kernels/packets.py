@@ -5,7 +5,8 @@ over numbers beside each other does not do. Then every value is a vector `V` of 
 of each item, and the text reads as that for a single item does: `a * b`, `pick(a < b, a, b)`. On a
 GPU a packet is one item, `V` a plain number, and a thread does it.
 
-    TextKernel(name, bits, "V y = P::load(x, item * LANES, 1, last); ...", "F *x", packet_program)
+    text = "V y = P::load(x, item * LANES, 1, last); ..."
+    TextKernel(name, bits, text, "F *x, *z", "z", packet_program)
 
 `V` are numbers of type `F`, `I` whole numbers, `W` numbers in double precision; `P` has the
 functions below.

@@ -33,20 +33,25 @@ const long long plane = (long long)ny * nx, size = plane * nz, start = (long lon
 auto color = [=](int colors, long long entries) -> long long {
     return colors > 1 ? c * entries : 0;
 };
+// The place `count` numbers on in an array, if there is one.
+auto behind = [](auto array, long long count) { return array ? array + count : array; };
 """
 
 
 @functools.cache
-def row_kernel(name: str, bits: int, text: str, arrays: str, numbers: str = "") -> TextKernel:
+def row_kernel(
+    name: str, bits: int, text: str, arrays: str, made: str, numbers: str = ""
+) -> TextKernel:
     """The kernel `name` that does `text` for each part of a row.
 
     The text has the color `c`; the cells `begin` to `end` of row `z`, `y`, which lie `start` behind
-    the first of a color's `size`; pointers called as the `arrays`; and whole `numbers`.
+    the first of a color's `size`; pointers called as the `arrays`, and as those `made`; and whole
+    `numbers`.
     """
-    given = _GRID + f"F {', '.join('*' + one for one in arrays.split())};"
+    given = _GRID + f"F {', '.join('*' + one for one in f'{arrays} {made}'.split())};"
     if numbers:
         given += f"int {', '.join(numbers.split())}"
-    return TextKernel(name, bits, _ROW + text, given)
+    return TextKernel(name, bits, _ROW + text, given, made)
 
 
 def with_long_rows(grid: Grid) -> Grid:

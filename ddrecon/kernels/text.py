@@ -1,11 +1,13 @@
 """Kernels whose items do a text in C++, which finds all it is given by name.
 
-    scale = TextKernel("scale", bits, "out[item] = factor * x[item];", "F *x, *out; F factor")
+    text = "out[item] = factor * x[item];"
+    scale = TextKernel("scale", bits, text, "F *x, *out; F factor", "out")
     scale.launch(count, {"x": x, "factor": 2.0}, {"out": out})
 
 What the text is given is declared as in C: pointers and numbers of type `F` (the kernel's own),
-`double`, `int`, `long` or `bool`; `F *fields[3]` are three pointers. It all goes into one record:
-a launch takes the same few microseconds, however much that is.
+`double`, `int`, `long` or `bool`; `F *fields[3]` are three pointers. Those that are named as made
+it writes; others point to constants. It all goes into one record: a launch takes the same few
+microseconds, however much that is.
 """
 
 import re
@@ -18,7 +20,7 @@ import warp as wp
 from torch import Tensor
 
 from ddrecon.kernels.compiling import clear_in_rehearsal
-from ddrecon.kernels.launch import launch
+from ddrecon.kernels.launch import MOST, launch, too_many
 from ddrecon.kernels.native import number_type, program
 
 _TYPES = {
@@ -36,7 +38,8 @@ const int begin = item * length, end = begin + length < total ? begin + length :
 class TextKernel:
     """The kernel `name` that does `text` for each `item`, in numbers of so many `bits`.
 
-    `given` declares what the text has besides; `write` puts before it what both need.
+    `given` declares what the text has besides, and `made` names the arrays of that which it writes,
+    whether it reads them or not; `write` puts before it what both need.
     """
 
     def __init__(
@@ -45,18 +48,20 @@ class TextKernel:
         bits: int,
         text: str,
         given: str,
+        made: str,
         write: Callable[[int, str], str] = program,
     ):
         F = number_type(bits)
         types = _TYPES | {"F": ("F", F, torch.float64 if bits == 64 else torch.float32)}
         members, locals_, self.arrays = {}, [], {}
         self.lists: dict[str, list[str]] = {}
+        self.made = set(made.split())
         for word, is_array, one, count in declarations(given):
             written, number, dtype = types[word]
             entries = [f"{one}_{k}" for k in range(count)] or [one]
             members |= dict.fromkeys(entries, wp.uint64 if is_array else number)
             if is_array:
-                written += "*"
+                written = f"{written}*" if one in self.made else f"const {written}*"
                 self.arrays |= dict.fromkeys(entries, dtype)
             casts = ", ".join(f"({written})given.{entry}" for entry in entries)
             if count:
@@ -101,12 +106,19 @@ class TextKernel:
         own = [self.new_record.from_buffer_copy(bound.record) for _ in shares]
         for record, share in zip(own, shares, strict=True):
             for name, value in share.items():
+                assert name in self.made, name
                 self.write(record, name, value)
         launch(self.kernel, count, lambda i: [own[i]], bound.like, len(own))
 
     def bind(self, given: Mapping[str, Any], made: Mapping[str, Any]) -> "Bound":
-        """The kernel with all that `launch` is given, for many launches."""
+        """The kernel with all that `launch` is given, for many launches.
+
+        Raises ValueError for an array that it writes and that is not `made`: of a copy of that
+        nobody would see what is written. And for one that is, and that it does not write.
+        """
         record, held = self.new_record(), []
+        if wrong := (self.made & given.keys()) | (made.keys() - self.made):
+            raise ValueError(f"{self.name} writes {self.made}: {wrong} are handed over as others")
         for name, value in given.items():
             ready = value
             if name in self.lists:
@@ -138,6 +150,8 @@ class TextKernel:
                 self.write(record, entry, each)
         elif name in self.names:
             setattr(record, name, 0 if value is None else value)
+            if isinstance(value, int) and value >= MOST and getattr(record, name) != value:
+                raise too_many(f"{self.name}, {name}", value)
         else:
             raise ValueError(f"the kernel declares no {name}")
 

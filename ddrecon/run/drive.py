@@ -19,6 +19,7 @@ from ddrecon.progress import bar_settings
 from ddrecon.ranks import alone, cells_are_shared, from_first, is_any, leave_ranks
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
@@ -30,6 +31,7 @@ from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
 from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.load import SceneFile
+from ddrecon.terms import engine_of_scene
 
 
 @contextmanager
@@ -52,7 +54,8 @@ def open_run(
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
     with claim_folder(path, may_exist=may_exist or resume):
-        folder = RunFolder(path, scene_file, result_of, environment | {"seed": run.seed})
+        of_run = {"seed": run.seed, "engines": engine_of_scene(scene, has_slabs(scene))}
+        folder = RunFolder(path, scene_file, result_of, environment | of_run)
         if loaded is None:
             folder.start(run)
         else:

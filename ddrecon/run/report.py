@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
-from ddrecon.engine import engine_of_parts, name_engines
+from ddrecon.engine import name_engines
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.report.curve import draw_curve
@@ -24,7 +24,7 @@ from ddrecon.report.page import (
 from ddrecon.run.findings import Findings
 from ddrecon.run.report_views import view_section
 from ddrecon.run.report_volume import turntable, volume_section
-from ddrecon.terms import needed_terms, parts_in_torch
+from ddrecon.terms import engine_of_scene, needed_terms
 
 TIMING_HEAD = [
     "cells",
@@ -40,8 +40,8 @@ TIMING_HEAD = [
 def write_run_report(path: Path, findings: Findings) -> None:
     """Writes the report of `findings` to `path`."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
-    engines = name_engines(engine_of_parts(parts_in_torch(scene, has_slabs(scene))))
-    versions = [(key, _format(value)) for key, value in findings.environment.items()]
+    engines = name_engines(engine_of_scene(scene, has_slabs(scene)))
+    versions = [(k, _format(v)) for k, v in findings.environment.items() if k != "engines"]
     diagnoses = [diagnosis["text"] for diagnosis in findings.summary["diagnoses"]]
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),

@@ -20,7 +20,7 @@ from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend
-from ddrecon.memory import Needs, make_room
+from ddrecon.memory import Needs, count_threads, make_room
 from ddrecon.numerics.harmonics import count_harmonics
 from ddrecon.scene_file.agree import agree_on_grid
 from ddrecon.scene_file.build_phase import build_phase
@@ -62,7 +62,7 @@ def build_volume(scene_file: SceneFile, dtype: torch.dtype, device: torch.device
         )
         for medium, each in media.items()
     }
-    if too_much := make_room(_needs(scene_file, media, grid, phases, dtype), device):
+    if too_much := make_room(_needs(scene_file, media, grid, phases, dtype, device), device):
         raise scene_file.refused("volume.resolution", too_much)
     volumes = {
         medium.removeprefix("media.").strip("."): each.build(grid, phases[medium], dtype, device)
@@ -139,6 +139,7 @@ def _needs(
     grid: Grid,
     phases: Mapping[str, PhaseFunction],
     dtype: torch.dtype,
+    device: torch.device,
 ) -> Needs:
     """What the scene's memory depends on.
 
@@ -165,6 +166,8 @@ def _needs(
         varied=sum(_varied(name, settings, media, colors) for name, settings in optimized.items())
         if tree.optimize
         else None,
+        lights=len(tree.lights),
+        threads=count_threads(device),
     )
 
 

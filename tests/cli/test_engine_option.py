@@ -7,16 +7,17 @@ import logging
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from click.testing import Result
+from media import half_empty, make_scene
 
 from ddrecon import engine, terms
 from ddrecon.cli import check
 from ddrecon.cli.session import open_session, show_compilations
-from ddrecon.settings import DiffusionSettings
+from ddrecon.light.lights import PointLight
+from ddrecon.medium.phase import HenyeyGreenstein
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -79,12 +80,39 @@ def test_check_names_what_slabs_leave_to_torch(succeed: Run) -> None:
     command = "check", "scene.yaml", "--engine", "warp", "--share", "cells"
     line = "engine: warp (view rays, light, diffusion, transport rounds)"
     assert line in succeed(*command).stdout.splitlines()
-    scene: Any = SimpleNamespace(
-        volume=SimpleNamespace(density=SimpleNamespace(is_cuda=True)),
-        diffusion=DiffusionSettings(transport_rounds=1),
-    )
-    assert terms.parts_in_torch(scene, has_slabs=True) == ("transport rounds",)
-    assert terms.parts_in_torch(scene, has_slabs=False) == ()
+
+
+DENSITY = half_empty(3, 4, 5)
+PLACE, POWER = DENSITY.new_tensor([0.9, 0.7, 0.2]), DENSITY.new_tensor([1.0])
+LEFT: list[tuple[dict[str, Any], list[Any], bool, tuple[str, ...]]] = [
+    ({"transport_rounds": 1}, [], False, ()),
+    ({"transport_rounds": 1}, [], True, ("diffusion",)),
+    ({"model": "flux_limited"}, [PointLight(PLACE, POWER)], False, ("diffusion", "point lights")),
+    ({"g": -0.6, "degree": 3, "transport_rounds": 2}, [], False, ("pairs of beams",)),
+    ({"g": -0.6, "degree": 3, "transport_rounds": 2, "directional": None}, [], False, ()),
+    ({"g": 0.4, "ambient": (0.3,), "model": "none"}, [], False, ("skies towards cameras",)),
+]
+"""Scenes, more lights, whether on a GPU, and what of them torch runs."""
+
+
+@pytest.mark.parametrize(("settings", "lights", "is_on_gpu", "parts"), LEFT)
+def test_what_is_left_to_torch_depends_on_scene_and_device(
+    settings: dict[str, Any], lights: list[Any], is_on_gpu: bool, parts: tuple[str, ...]
+) -> None:
+    scene = make_scene(DENSITY, **settings)
+    scene.lights += lights
+    assert terms.parts_in_torch(scene, False, is_on_gpu) == parts
+    more = ("transport rounds",) if is_on_gpu and scene.diffusion.rounds else ()
+    assert set(terms.parts_in_torch(scene, True, is_on_gpu)) == {*parts, *more}
+    scene.volume.phase = HenyeyGreenstein(DENSITY - 0.5)
+    assert "phases by cell" in terms.parts_in_torch(scene, False, is_on_gpu)
+
+
+def test_a_run_notes_the_engine_of_each_part(succeed: Run) -> None:
+    command = "optimize", "scene.yaml", "-o", "out", "-q", "--iterations", "1"
+    succeed(*command, "--engine", "warp", "-D", "diffusion.solver=jacobi")
+    noted = json.loads(Path("out/environment.json").read_text())["engines"]
+    assert noted == dict.fromkeys(engine.PARTS, "warp") | {"diffusion": "torch"}
 
 
 def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:

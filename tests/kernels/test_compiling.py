@@ -65,7 +65,7 @@ def test_kernels_do_nothing_in_a_rehearsal(loads: Loads, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(launching, "_call", fail)
     monkeypatch.setattr(compiling.wp, "load_module", lambda module, **_: loads.append(module))
-    kernels = [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out") for k in range(3)]
+    kernels = [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out", "out") for k in range(3)]
     found = []
 
     def computation() -> None:

@@ -16,9 +16,11 @@ from ddrecon.kernels.dual import interleaved_tangent_of, pair, tangent_of, with_
 from ddrecon.kernels.text import BLOCK, TextKernel
 from ddrecon.light.fused.shear import shear_kernels
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_layout import Case
 from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 
 COUNT = 37
+MADE = "half out other"
 GIVEN = "int length, total; F shift, *x, *y, *half, *out, *other"
 TEXT = """
 const F *first = x, two = F(2), *second = y;
@@ -46,7 +48,7 @@ def plain(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 @pytest.fixture(scope="module")
 def kernel() -> TextKernel:
-    return TextKernel("bend", 64, BLOCK + TEXT, GIVEN)
+    return TextKernel("bend", 64, BLOCK + TEXT, GIVEN, MADE)
 
 
 def numbers() -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
@@ -63,7 +65,7 @@ def test_changes_are_those_of_the_text(kernel: TextKernel) -> None:
     d_given = with_changes(given, dict(zip("xy", changes, strict=True)))
     half, d_half, d_out, d_other = (torch.empty_like(values[0]) for _ in range(4))
     made = {"d_out": d_out, "d_other": d_other, "d_half": d_half, "half": half}
-    tangent_of(kernel, "out other", "half").launch(1, given | d_given, made)
+    tangent_of(kernel, "half").launch(1, given | d_given, made)
     for one, other in zip((d_out, d_other), known, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11)
     assert torch.equal(half, 0.5 * values[0] ** 2)
@@ -73,7 +75,7 @@ def test_changes_are_those_of_the_text(kernel: TextKernel) -> None:
 def test_pairs_of_value_and_change_are_numbers_too() -> None:
     """Of a text that declares no lists of pointers."""
     text = TEXT.replace("F* const outs[2] = {out, other};", "F* outs[2] = {out, other};")
-    kernel = TextKernel("bend_pairs", 64, BLOCK + text, GIVEN)
+    kernel = TextKernel("bend_pairs", 64, BLOCK + text, GIVEN, MADE)
     values, changes = numbers()
     arrays = {name: pair(*both) for name, *both in zip("xy", values, changes, strict=True)}
     found = {name: torch.empty(COUNT, 2, dtype=torch.float64) for name in ("out", "other", "half")}
@@ -92,19 +94,18 @@ def test_arrays_without_change_have_changes_of_zero() -> None:
 
 
 def test_lists_of_arrays_are_refused() -> None:
-    listed = TextKernel("listed", 64, "out[item] = fields[0][item];", "F *fields[2], *out")
-    for find in (lambda: tangent_of(listed, "out"), lambda: interleaved_tangent_of(listed)):
+    listed = TextKernel("listed", 64, "out[item] = fields[0][item];", "F *fields[2], *out", "out")
+    for find in (lambda: tangent_of(listed), lambda: interleaved_tangent_of(listed)):
         with pytest.raises(ValueError, match="fields"):
             find()
 
 
 @pytest.mark.slow
 def test_tangents_compile_for_graphics_cards(tmp_path: Path) -> None:
-    names = "conductance_z conductance_y conductance_x loss right"
     layout = Layout(3, 1, 3, (False, True), 0, 0, 1, 32)
     kernels = [
-        tangent_of(system_kernel(True, 32), names),
+        tangent_of(system_kernel(True, 32)),
         interleaved_tangent_of(shear_kernels(64).rays),
-        packet_tangent_kernel(layout, True),
+        packet_tangent_kernel(layout, Case(True, True)),
     ]
     assert_compiles(kernels, tmp_path)

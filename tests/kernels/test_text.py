@@ -8,7 +8,9 @@ from media import random_values
 
 pytest.importorskip("warp")
 
+from ddrecon.errors import UsageError
 from ddrecon.kernels.text import BLOCK, TextKernel, cut
+from ddrecon.march.fused.packet_rays import ROW_OF
 
 TEXT = """
 for (int i = begin; i < end; ++i) {
@@ -23,7 +25,7 @@ GIVEN = "int length, total; F shift, *fields[2], *out; double *weights; bool *is
 
 @pytest.fixture(scope="module")
 def kernel() -> TextKernel:
-    return TextKernel("weighted_sum", 64, BLOCK + TEXT, GIVEN)
+    return TextKernel("weighted_sum", 64, BLOCK + TEXT, GIVEN, "out is_large")
 
 
 def given(fields: list[torch.Tensor | None], weights: torch.Tensor, shift: float = 0.0) -> dict:
@@ -94,11 +96,46 @@ def test_a_bound_kernel_takes_other_numbers(kernel):
     [
         ({"out": torch.empty(37)}, "out is declared as torch.float64"),
         ({"out": torch.empty(37, 2, dtype=torch.float64)[:, 0]}, "is to be contiguous"),
-        ({"other": torch.empty(37)}, "other is declared as None"),
-        ({"other": 3}, "declares no other"),
+        ({"other": torch.empty(37)}, "other"),
+        ({"shift": 3}, "shift"),
     ],
     ids=["type", "stride", "array", "number"],
 )
 def test_what_does_not_fit_is_refused(kernel, wrong, message):
     with pytest.raises(ValueError, match=message):
         kernel.launch(1, given([None, None], random_values(2)) | {"length": 37}, made() | wrong)
+
+
+def test_what_it_writes_is_handed_over_as_made(kernel):
+    """A copy of it, were it not contiguous, would be written to in vain."""
+    found = made()
+    wrong = given([None, None], random_values(2)) | {"length": 37, "out": found.pop("out")}
+    with pytest.raises(ValueError, match="out"):
+        kernel.launch(1, wrong, found)
+    with pytest.raises(ValueError, match="shift"):
+        kernel.launch(1, {"length": 37}, made() | {"shift": 3})
+
+
+@pytest.mark.slow
+def test_what_it_only_reads_it_cannot_write(capfd):
+    kernel = TextKernel("read_alone", 64, "x[item] = out[item];", "F *x, *out", "out")
+    x, out = torch.ones(2, 1, dtype=torch.float64)
+    with pytest.raises(Exception, match="build failed"):
+        kernel.launch(1, {"x": x}, {"out": out})
+    assert "const-qualified" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_rows_of_many_rays_begin_beyond_the_numbers_of_an_int():
+    text, given = ROW_OF + "place[item] = row_of(row);", "int ray_count, row; long *place"
+    found = torch.empty(1, dtype=torch.int64)
+    kernel = TextKernel("find_row", 32, text, given, "place")
+    kernel.launch(1, {"ray_count": 33_000_000, "row": 71}, {"place": found})
+    assert found.item() == 33_000_000 * 71 > 2**31
+
+
+def test_counts_beyond_the_numbers_of_an_int_are_refused(kernel):
+    arrays = given([None, None], random_values(2)) | {"length": 37}
+    for count, numbers in ((2**31, {}), (1, {"total": 2**32 + 1})):
+        with pytest.raises(UsageError, match=r"2\^31"):
+            kernel.launch(count, arrays | numbers, made(), threads=1)

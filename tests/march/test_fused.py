@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
@@ -28,14 +29,15 @@ from ddrecon.validate.hard_cases import CASES
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.march.fused.adjoint import adjoint_kernel
+from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_layout import Case
+from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 from ddrecon.march.fused.packet_walks import (
     packet_adjoint_kernel,
     packet_integral_kernel,
 )
 from ddrecon.march.fused.stretches import mark_kernel
-from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
 
 pytestmark = pytest.mark.slow
 
@@ -136,6 +138,8 @@ EMISSIONS = [
     ("backward", OUTSIDE, [*LIGHT, "albedo"]),
     ("fields", OUTSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
     ("fields", INSIDE, [*LIGHT, *POINT, "sigma_a", "sigma_s", *POSE]),
+    ("g by cell", INSIDE, ["density", "g", *POSE]),
+    ("weight by cell", INSIDE, ["density", "phase.weight", *POINT, *POSE]),
     # With all rays where they are, packets of them are marched back.
     ("gray", OUTSIDE, ["density", "g", "sigma_a", "sigma_s"]),
     ("backward", OUTSIDE, LIGHT),
@@ -294,10 +298,20 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     one = Layout(1, 1, 1, (False, True), 0, 0, 1, 32)
     several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 1, 3, 3)
     steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1, 1, 1)
-    walks = [integral_kernel(steep), tangent_kernel(one, True), adjoint_kernel(one, True, True)]
-    adjoints = [packet_adjoint_kernel(one, True), packet_adjoint_kernel(several)]
-    packets = [mark_kernel(32), packet_integral_kernel(several), *adjoints]
-    assert_compiles([*walks, *packets], tmp_path)
+    moved, inside = Case(True, True, True), Case(False, True, True)
+    packets = [mark_kernel(32), packet_integral_kernel(several, True)]
+    packets += [packet_integral_kernel(steep, False), packet_tangent_kernel(one, inside)]
+    packets += [packet_adjoint_kernel(one, moved), packet_adjoint_kernel(several, Case(False))]
+    assert_compiles(packets, tmp_path)
+
+
+def test_places_beyond_the_numbers_of_an_int_are_refused():
+    planes, shape = torch.zeros(2), (3, 2048, 1024, 1024)
+    order = torch.zeros(2, dtype=torch.int32)
+    assert Cells(planes, 0, order).strides(shape)["plane_stride"] == 2**20
+    for cells in (Cells(planes), Cells(planes, 1, order)):
+        with pytest.raises(UsageError, match=r"2\^31"):
+            cells.strides(shape)
 
 
 def test_empty_space_and_rays_that_miss():

@@ -82,29 +82,31 @@ def geometric_kernel(has_two: bool, bits: int) -> Any:
     from its number `lower` to the next.
     """
     text = _text(_SPREADING + _GEOMETRIC, has_two)
-    arrays = _GIVEN + "inverse_distance lower part diffusion"
-    return row_kernel("geometric", bits, text, arrays, _NUMBERS + "coarse")
+    arrays = _GIVEN + "inverse_distance lower part"
+    return row_kernel("geometric", bits, text, arrays, "diffusion", _NUMBERS + "coarse")
 
 
 @functools.cache
 def geometric_adjoint_kernel(has_two: bool, bits: int) -> Any:
     """The kernel of the cotangents of kappa_tr, by its color's `factor`, and of 1 / distance."""
     text = _text(_SPREADING + _GEOMETRIC_ADJOINT, has_two)
-    arrays = "inverse_distance lower part diffusion_bar factor field_bar inverse_distance_bar"
-    return row_kernel("geometric_adjoint", bits, text, _GIVEN + arrays, _NUMBERS + "coarse")
+    arrays = "inverse_distance lower part diffusion_bar factor"
+    made = "field_bar inverse_distance_bar"
+    return row_kernel("geometric_adjoint", bits, text, _GIVEN + arrays, made, _NUMBERS + "coarse")
 
 
 @functools.cache
 def smooth_kernel(has_two: bool, bits: int) -> Any:
     """The kernel of D by `smooth`: kappa_tr is at `least` that of empty space."""
-    return row_kernel("smooth", bits, _text(_SMOOTH, has_two), _GIVEN + "least diffusion", _NUMBERS)
+    text, arrays = _text(_SMOOTH, has_two), _GIVEN + "least"
+    return row_kernel("smooth", bits, text, arrays, "diffusion", _NUMBERS)
 
 
 @functools.cache
 def smooth_adjoint_kernel(has_two: bool, bits: int) -> Any:
     """The kernel of the cotangent of kappa_tr, by its color's `factor`."""
-    text, arrays = _text(_SMOOTH_ADJOINT, has_two), "least diffusion_bar factor field_bar"
-    return row_kernel("smooth_adjoint", bits, text, _GIVEN + arrays, _NUMBERS)
+    text, arrays = _text(_SMOOTH_ADJOINT, has_two), _GIVEN + "least diffusion_bar factor"
+    return row_kernel("smooth_adjoint", bits, text, arrays, "field_bar", _NUMBERS)
 
 
 def _text(body: str, has_two: bool) -> str:

@@ -47,7 +47,7 @@ F *adjoint, *light, *loss_bar, *z_bar, *y_bar, *x_bar;
 @functools.cache
 def cotangents_kernel(bits: int) -> TextKernel:
     """loss_bar and c_bar of a row of cells, for all colors."""
-    return TextKernel("find_cotangents", bits, _ROW, _GIVEN)
+    return TextKernel("find_cotangents", bits, _ROW, _GIVEN, "loss_bar z_bar y_bar x_bar")
 
 
 def find_cotangents(like: tuple[Tensor, ...], adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:

@@ -107,7 +107,7 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
 def flux_kernel(is_directed: bool, bits: int) -> Any:
     """The kernel of L1; without Q1 where it is not `is_directed`."""
     text = _text(_FLUX, is_directed)
-    return row_kernel("flux", bits, text, _GIVEN + "light_z light_y light_x", _NUMBERS)
+    return row_kernel("flux", bits, text, _GIVEN, "light_z light_y light_x", _NUMBERS)
 
 
 @functools.cache
@@ -117,12 +117,9 @@ def flux_adjoint_kernel(is_directed: bool, bits: int) -> Any:
     They have all colors. `field_bar` is that of kappa_s by its color's `scattering_factor`; more of
     Q1 has the cotangent of Q1.
     """
-    arrays = """
-    light_z_bar light_y_bar light_x_bar scattering_factor
-    mean_bar diffusion_bar field_bar flux_z_bar flux_y_bar flux_x_bar
-    """
-    text = _text(_ADJOINT, is_directed)
-    return row_kernel("flux_adjoint", bits, text, _GIVEN + arrays, _NUMBERS)
+    arrays = _GIVEN + "light_z_bar light_y_bar light_x_bar scattering_factor"
+    made = "mean_bar diffusion_bar field_bar flux_z_bar flux_y_bar flux_x_bar"
+    return row_kernel("flux_adjoint", bits, _text(_ADJOINT, is_directed), arrays, made, _NUMBERS)
 
 
 def _text(body: str, is_directed: bool) -> str:

@@ -111,6 +111,6 @@ class _Imbalance(torch.autograd.Function):
 @functools.cache
 def product_kernel(bits: int) -> Any:
     """The kernel of A u; loss and conductances have all colors or one."""
-    arrays = "light loss conductance_z conductance_y conductance_x begun product"
+    arrays = "light loss conductance_z conductance_y conductance_x begun"
     numbers = "loss_colors z_colors y_colors x_colors sign"
-    return row_kernel("multiply_operator", bits, FACES + _PRODUCT, arrays, numbers)
+    return row_kernel("multiply_operator", bits, FACES + _PRODUCT, arrays, "product", numbers)

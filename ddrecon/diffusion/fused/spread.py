@@ -157,12 +157,12 @@ def _given(diffusion: Tensor, scale: Tensor, field: Tensor, *others: Tensor) -> 
 def spread_kernel(bits: int) -> Any:
     """The kernel of what a flux adds to what is begun."""
     text = FACES + _ROWS + _SPREAD
-    return row_kernel("spread_flux", bits, text, _GIVEN + "spread", "own scattering_fields")
+    return row_kernel("spread_flux", bits, text, _GIVEN, "spread", "own scattering_fields")
 
 
 @functools.cache
 def spread_adjoint_kernel(bits: int) -> Any:
     """The kernel of cotangents, in all colors; `field_bar` as in `system_kernels.py`."""
-    arrays = "spread_bar scattering_factor diffusion_bar field_bar flux_z_bar flux_y_bar flux_x_bar"
-    text = FACES + _ROWS + _ADJOINT
-    return row_kernel("spread_adjoint", bits, text, _GIVEN + arrays, "own scattering_fields")
+    text, arrays = FACES + _ROWS + _ADJOINT, _GIVEN + "spread_bar scattering_factor"
+    made = "diffusion_bar field_bar flux_z_bar flux_y_bar flux_x_bar"
+    return row_kernel("spread_adjoint", bits, text, arrays, made, "own scattering_fields")

@@ -134,12 +134,12 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
 @functools.cache
 def system_kernel(is_directed: bool, bits: int) -> Any:
     """The kernel of E7; without Q1 where it is not `is_directed`."""
-    arrays = _GIVEN + "conductance_z conductance_y conductance_x loss right"
     return row_kernel(
         "assemble_system",
         bits,
         FACES + _SYSTEM.replace("DIRECTED", str(is_directed).lower()),
-        arrays,
+        _GIVEN,
+        "conductance_z conductance_y conductance_x loss right",
         "own absorption_fields scattering_fields sources",
     )
 
@@ -154,12 +154,12 @@ def system_adjoint_kernel(is_directed: bool, bits: int) -> Any:
     arrays = """
     conductance_z_bar conductance_y_bar conductance_x_bar loss_bar right_bar
     scattering_factor absorption_factor
-    diffusion_bar field_bar mean_bar flux_z_bar flux_y_bar flux_x_bar
     """
     return row_kernel(
         "system_adjoint",
         bits,
         FACES + _ADJOINT.replace("DIRECTED", str(is_directed).lower()),
         _GIVEN + arrays,
+        "diffusion_bar field_bar mean_bar flux_z_bar flux_y_bar flux_x_bar",
         "own absorption_fields scattering_fields sources",
     )

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Direction, radiance_along
 from ddrecon.diffusion.rounds.slabs import REACH, pass_on, radiance_through, ways_through
+from ddrecon.engine import has_kernels
 from ddrecon.grid import Grid
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Coefficient, Medium
@@ -142,8 +143,8 @@ def sweep_change(
     if len(factors) > medium.degree + 1:
         # A slice is another tensor each time, of which nothing can be remembered.
         factors = factors[: medium.degree + 1]
-    # On a GPU, fused kernels go through whole grids alone.
-    runs_fused = is_fused() and not (isinstance(medium.grid, Slab) and light.mean.is_cuda)
+    where = light.mean.is_cuda, isinstance(medium.grid, Slab)
+    runs_fused = is_fused() and has_kernels("transport rounds", *where)
     if runs_fused and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.hierarchy import Level
 from ddrecon.diffusion.solvers.scaled import ScaledSystem, Solution, give_up
-from ddrecon.engine import current_engine
+from ddrecon.engine import current_engine, has_kernels
 
 MAX_ITERATIONS = 2_000
 _counts: dict[torch.Size, deque[int]] = defaultdict(lambda: deque([3], maxlen=6))
@@ -33,7 +33,7 @@ def multigrid(
     Raises SolveError when it is not reached.
     """
     # Fused, a thread does slices. On a GPU it does a cell, by torch's operations.
-    if current_engine() == "warp" and not source.is_cuda:
+    if current_engine() == "warp" and has_kernels("diffusion", source.is_cuda):
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)

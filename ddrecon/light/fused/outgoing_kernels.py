@@ -18,11 +18,11 @@ _NUMBERS = "is_eye mean_colors flux_colors higher_colors colors"
 _TERMS = """
 const F* u = mean + color(mean_colors, size) + start;
 const long long q = color(flux_colors, size) + start;
-const F *qz = flux_z + q, *qy = flux_y + q, *qx = flux_x + q;
-const F* const moments = higher + color(higher_colors, size) + start;
+const F *qz = behind(flux_z, q), *qy = behind(flux_y, q), *qx = behind(flux_x, q);
+const F* const moments = behind(higher, color(higher_colors, size) + start);
 const long long step = higher_colors * size;  // from one of the higher moments to the next
 const F isotropic = factors[c], directed = DIRECTED ? factors[colors + c] : F(0);
-const F* added = more + c * size + start;
+const F* added = behind(more, c * size + start);
 const F dz = is_eye ? point[0] - (lz + hz * (F(z) + F(0.5))) : point[0];
 const F dy = is_eye ? point[1] - (ly + hy * (F(y) + F(0.5))) : point[1];
 auto to_x = [&](int i) INLINE -> F {
@@ -74,9 +74,9 @@ _ADJOINT = (
     + """
 const long long to = c * size + start;
 const F* bar = radiance_bar + to;
-F *u_bars = mean_bar + to, *along_bars = along_bar + to;
-F *qz_bars = flux_z_bar + to, *qy_bars = flux_y_bar + to, *qx_bars = flux_x_bar + to;
-F* const moment_bars = higher_bar + to;
+F *u_bars = mean_bar + to, *along_bars = behind(along_bar, to);
+F *qz_bars = behind(flux_z_bar, to), *qy_bars = behind(flux_y_bar, to);
+F *qx_bars = behind(flux_x_bar, to), *const moment_bars = behind(higher_bar, to);
 const long long step_bar = colors * size;
 F factor_bar[DEGREE + 1] = {};
 #pragma clang loop vectorize(assume_safety)
@@ -128,7 +128,7 @@ def scatter_kernel(degree: int, has_more: bool, bits: int) -> Any:
     With `has_more` there is radiance besides.
     """
     text = _text(_SCATTER, degree, has_more, bits)
-    return row_kernel("scatter_towards", bits, text, _GIVEN + "radiance", _NUMBERS)
+    return row_kernel("scatter_towards", bits, text, _GIVEN, "radiance", _NUMBERS)
 
 
 @functools.cache
@@ -137,10 +137,11 @@ def scatter_adjoint_kernel(degree: int, has_more: bool, with_along: bool, bits: 
 
     And `with_along` of what all but the mean adds.
     """
-    arrays = "radiance_bar mean_bar flux_z_bar flux_y_bar flux_x_bar higher_bar along_bar sums"
+    arrays = _GIVEN + "radiance_bar"
+    made = "mean_bar flux_z_bar flux_y_bar flux_x_bar higher_bar along_bar sums"
     body = _ADJOINT.replace("WITH_ALONG", str(with_along).lower())
     text = _text(body, degree, has_more, bits)
-    return row_kernel("scatter_towards_adjoint", bits, text, _GIVEN + arrays, _NUMBERS)
+    return row_kernel("scatter_towards_adjoint", bits, text, arrays, made, _NUMBERS)
 
 
 def _text(body: str, degree: int, has_more: bool, bits: int) -> str:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
@@ -59,7 +60,8 @@ class _Integral(torch.autograd.Function):
         varies = any(ctx.needs_input_grad[1:4])
         bars = [each.new_zeros(each.shape) if varies else None for each in (first, last, length)]
         # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-        shares = [field.new_zeros(field.shape) for _ in range(thread_count(field))]
+        threads = count_shares(thread_count(field), field.nbytes)
+        shares = [field.new_zeros(field.shape) for _ in range(threads)]
         given = _ways(*ways) | {"varies": varies, "totals": total_bar}
         made = dict(zip(("firsts_bar", "lasts_bar", "lengths_bar"), bars, strict=True))
         own = [{"fields_bar": share} for share in shares]
@@ -105,11 +107,12 @@ F *fields, *firsts, *lasts, *lengths, *fraction, *totals;
 @functools.cache
 def way_kernel(bits: int) -> TextKernel:
     """The kernel of integrals along ways."""
-    return TextKernel("integrate_ways", bits, INTEGRATE, _GIVEN)
+    return TextKernel("integrate_ways", bits, INTEGRATE, _GIVEN, "totals")
 
 
 @functools.cache
 def way_adjoint_kernel(bits: int) -> TextKernel:
     """Its adjoint, from cotangents `totals`; of ends and lengths where ways vary."""
     more = "int varies; F *fields_bar, *firsts_bar, *lasts_bar, *lengths_bar"
-    return TextKernel("ways_adjoint", bits, ADJOINT, _GIVEN + more)
+    made = "fields_bar firsts_bar lasts_bar lengths_bar"
+    return TextKernel("ways_adjoint", bits, ADJOINT, _GIVEN + more, made)

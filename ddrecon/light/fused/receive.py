@@ -137,13 +137,13 @@ F *entered_bar, *field_bar; double *sums
 @functools.cache
 def receive_kernel(bits: int) -> TextKernel:
     """The kernel of moments received of `lights` from number `light` on; or it `adds` to them."""
-    return TextKernel("receive", bits, _RECEIVE, _GIVEN)
+    return TextKernel("receive", bits, _RECEIVE, _GIVEN, " ".join(MOMENTS))
 
 
 @functools.cache
 def receive_adjoint_kernel(bits: int) -> TextKernel:
     """Its adjoint; `has_bar` says which moments have cotangents, a bit each."""
-    return TextKernel("receive_adjoint", bits, _ADJOINT, _GIVEN)
+    return TextKernel("receive_adjoint", bits, _ADJOINT, _GIVEN, "entered_bar field_bar sums")
 
 
 class Receiver:

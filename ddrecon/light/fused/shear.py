@@ -140,18 +140,22 @@ F *numbers, *field, *entered, *masses, *refinements, *entered_bar, *corrections_
 F *before, *after, *before_bar, *after_bar;
 double *by_cells, *by_rays, *by_field
 """
+_RETURNED = "masses refinements corrections_bar field_bar before_bar by_cells by_rays by_field"
+"""What one adjoint after the other writes, and the next reads."""
 
 
 @functools.cache
 def shear_kernels(bits: int) -> SimpleNamespace:
     """The kernels for numbers of so many `bits`."""
     texts = {
-        "rays": code.RAYS,
-        "cells": code.CELLS,
-        "cells_adjoint": adjoint_code.CELLS_ADJOINT,
-        "rays_adjoint": adjoint_code.RAYS_ADJOINT,
-        "field_adjoint": adjoint_code.FIELD_ADJOINT,
+        "rays": (code.RAYS, "masses refinements after"),
+        "cells": (code.CELLS, "entered"),
+        "cells_adjoint": (adjoint_code.CELLS_ADJOINT, _RETURNED),
+        "rays_adjoint": (adjoint_code.RAYS_ADJOINT, _RETURNED),
+        "field_adjoint": (adjoint_code.FIELD_ADJOINT, _RETURNED),
     }
-    return SimpleNamespace(
-        **{name: TextKernel(f"shear_{name}", bits, text, _GIVEN) for name, text in texts.items()}
-    )
+    kernels = {
+        name: TextKernel(f"shear_{name}", bits, text, _GIVEN, made)
+        for name, (text, made) in texts.items()
+    }
+    return SimpleNamespace(**kernels)

@@ -57,6 +57,6 @@ def change_received(
     by the names of `Receiver.given`, and of `entered`.
     """
     given = receiver.given | {"light": light, "lights": 1, "adds": light > 0, "entered": entered}
-    kernel = tangent_of(receive_kernel(receiver.bits), " ".join(MOMENTS))
+    kernel = tangent_of(receive_kernel(receiver.bits))
     made = {f"d_{name}": one for name, one in zip(MOMENTS, d_moments, strict=False)}
     kernel.launch(receiver.items, given | with_changes(given, changes), made)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.launch import thread_count
+from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import cut
 from ddrecon.march.fused.pixels import interpolation_kernel, judge_kernel, spread_kernel
 from ddrecon.march.lattice import DOUBT, interpolate
@@ -71,6 +72,7 @@ class _Interpolate(torch.autograd.Function):
     def backward(ctx: Any, out_bar: Tensor, _: None) -> tuple[Tensor | None, ...]:
         values, places, hit = ctx.saved_tensors
         bits, threads = torch.finfo(values.dtype).bits, _threads(places, len(values))
+        threads = count_shares(threads, values.nbytes)
         shares = [values.new_zeros(values.shape) for _ in range(threads)]
         items, given = _pixels(values, places, hit, ctx.count)
         own = [{"values_bar": share} for share in shares]

@@ -24,7 +24,7 @@ from ddrecon.numerics.slicing import across
 
 
 class Packed(NamedTuple):
-    """Rays: `bundle` [R, 8] as `rays.Bundle` has them; `origin` and `direction` [R, 3] in u."""
+    """Rays: `bundle` [R, 8] as of `packet_rays.GIVEN`; `origin` and `direction` [R, 3] in u."""
 
     bundle: Tensor
     origin: Tensor

@@ -1,13 +1,15 @@
-"""The cells that nodes of rays lie in, as kernels are given them: in place, or packed."""
+"""The cells that nodes of rays lie in, as kernels are given them: in place."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from ddrecon.kernels.launch import MOST, too_many
 from ddrecon.march.bands import Bands
 from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.fused.stretches import find_walked
@@ -38,9 +40,13 @@ class Cells:
 
     def strides(self, shape: Sequence[int]) -> dict[str, int]:
         """How many cells on the next one is, and how many there are; of fields of `shape`."""
+        # Slices across z are found by long offsets; other places are numbers of 32 bits.
+        if (self.axis or not self.is_sliced) and (cells := math.prod(shape[-3:])) >= MOST:
+            raise too_many("cells seen along x or y, or from inside", cells)
         along = (shape[-2] * shape[-1], shape[-1], 1)
         row, column = across(self.axis)
         return {
+            "depth": shape[self.axis - 3],
             "plane_stride": along[self.axis],
             "row_stride": along[row],
             "column_stride": along[column],
@@ -53,24 +59,6 @@ class Cells:
         if self.support is not None and not self._found:
             self._found.append(find_walked(self.support, self.planes, rays))
         return self._found[0] if self._found else None
-
-    def pack(self, fields: Sequence[Tensor]) -> Tensor:
-        """Values [n, h, w, channels] of all `fields`, in the order in which rays meet them."""
-        values = torch.cat(list(fields)).permute(self._dims)
-        return (values if self.order is None else values[self.order.long()]).contiguous()
-
-    def unpack(self, bars: Tensor, fields: Sequence[Tensor]) -> list[Tensor]:
-        """Cotangents of `fields` from those [n, h, w, channels] of what `pack` made of them."""
-        shape = [fields[0].shape[dim] for dim in self._dims[:3]]
-        if self.order is not None:
-            bars = bars.new_zeros(*shape, bars.shape[3]).index_add_(0, self.order, bars)
-        inverse = [self._dims.index(dim) for dim in range(4)]
-        return list(bars.permute(inverse).split([len(field) for field in fields]))
-
-    @property
-    def _dims(self) -> tuple[int, int, int, int]:
-        row, column = across(self.axis)
-        return (1 + self.axis, 1 + row, 1 + column, 0)
 
 
 @remember

@@ -82,10 +82,11 @@ for (int c = 0; c < colors; ++c) {
 @functools.cache
 def compose_kernel(bits: int) -> TextKernel:
     """The kernel of `composed` [2 C, R] from `out` [C (1 + beams), R] and `masses` [K, R]."""
-    return TextKernel("compose", bits, _COMPOSE, _GIVEN)
+    return TextKernel("compose", bits, _COMPOSE, _GIVEN, "composed")
 
 
 @functools.cache
 def decompose_kernel(bits: int) -> TextKernel:
     """Its transpose: the kernel of `out` and `masses_bar` from `composed`, all cotangents."""
-    return TextKernel("decompose", bits, _DECOMPOSE, _GIVEN + "F *masses_bar")
+    given = _GIVEN + "F *masses_bar"
+    return TextKernel("decompose", bits, _DECOMPOSE, given, "out masses_bar")

@@ -10,19 +10,18 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.dual import split
-from ddrecon.kernels.launch import array, launch, thread_count
+from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.packets import LANES
+from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import cut
-from ddrecon.march.fused.adjoint import adjoint_kernel
 from ddrecon.march.fused.cells import Cells
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_layout import Case
 from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 from ddrecon.march.fused.packet_walks import (
     packet_adjoint_kernel,
     packet_integral_kernel,
 )
-from ddrecon.march.fused.rays import ray_types
-from ddrecon.march.fused.walks import integral_kernel, tangent_kernel
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 NEIGHBORS, TURNS = 128, 8
@@ -32,7 +31,7 @@ often each thread has its turn, at most.
 
 
 class Integrate(torch.autograd.Function):
-    """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `rays.Bundle` has.
+    """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `packet_rays.GIVEN` has.
 
     The masses come once more in double precision, for the walk back. Differentiable in both modes
     with respect to all tensors.
@@ -53,13 +52,10 @@ class Integrate(torch.autograd.Function):
         out = rays.new_empty(layout.outputs, len(rays))
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
         varied = rays, angles, coefficients, numbers, table, fronts
-        if cells.is_sliced:
-            given, made = _packets(cells, varied, fields), {"out": out, "masses": masses}
-            packet_integral_kernel(layout).launch(cut(len(rays), LANES, rays)[0], given, made)
-        else:
-            bundle = _bundle(layout, cells.planes, cells.pack(fields), *varied)
-            arguments = [bundle, array(out), array(masses)]
-            launch(integral_kernel(layout), len(rays), arguments, rays)
+        given = _packets(cells, varied, fields, thread_count(rays))
+        made = {"out": out, "masses": masses}
+        kernel = packet_integral_kernel(layout, cells.is_sliced)
+        kernel.launch(cut(len(rays), LANES, rays)[0], given, made)
         return out, masses.to(rays.dtype, copy=True), masses
 
     @staticmethod
@@ -76,71 +72,39 @@ class Integrate(torch.autograd.Function):
             room.zero_() if bar is None else bar
             for bar, room in zip(bars, _empty(ctx.layout, ctx.saved_tensors[1]), strict=False)
         )
-        needs_rays, needs_angles, needs_polynomials = ctx.needs_input_grad[2:5]
-        varies_rays = needs_rays or (needs_angles and any(ctx.layout.beams))
-        if _go_in_packets(ctx.layout, ctx.cells, varies_rays):
-            needs = needs_rays, needs_polynomials, ctx.needs_input_grad[6], ctx.needs_input_grad[8:]
-            found = _transpose_packets(ctx, needs, out_bar, masses_bar)
-        else:
-            varies_rays = varies_rays or needs_angles or needs_polynomials
-            found = _transpose(ctx, varies_rays, out_bar, masses_bar)
-        return None, None, *found
+        return None, None, *_transpose(ctx, out_bar, masses_bar)
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
-        d_rays, d_angles = changes[2:4]
-        varies_rays = d_rays is not None or (d_angles is not None and any(ctx.layout.beams))
-
         def change(*tensors: Any) -> tuple[Tensor, Tensor]:
-            values, d_values = split(tensors)
-            if _go_in_packets(ctx.layout, ctx.cells, varies_rays):
-                return _change_packets(ctx.layout, ctx.cells, values, d_values)
-            return _change(ctx.layout, ctx.cells, values, d_values)
+            return _change(ctx.layout, ctx.cells, *split(tensors))
 
         return *run_plainly(change, *ctx.saved_tensors[1:], *changes[2:]), None
 
 
-def _go_in_packets(layout: Layout, cells: Cells, varies_rays: bool) -> bool:
-    """Whether derivatives are found in packets: where rays vary and light is from points, not."""
-    return cells.is_sliced and not (varies_rays and any(layout.beams))
+def _case(layout: Layout, cells: Cells, rays: bool, angles: bool) -> Case:
+    """What kernels are compiled for where `rays`, or `angles`, are varied."""
+    return Case(cells.is_sliced, rays, any(layout.beams) and (rays or angles))
 
 
 def _change(
     layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
 ) -> tuple[Tensor, Tensor]:
-    """The changes of outputs and masses with those of all tensors, a ray a thread."""
-    d_out, d_masses = _empty(layout, values[0])
-    whole = [
-        torch.zeros_like(value) if change is None else change
-        for value, change in zip(values, d_values, strict=True)
-    ]
-    bundles = [
-        _bundle(layout, cells.planes, cells.pack(part[6:]), *part[:6]) for part in (values, whole)
-    ]
-    _leave_out(cells, values[0], bundles[0])
-    arguments = [*bundles, array(d_out), array(d_masses)]
-    launch(tangent_kernel(layout, cells.is_sliced), len(d_out[0]), arguments, d_out)
-    return d_out, d_masses
-
-
-def _change_packets(
-    layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
-) -> tuple[Tensor, Tensor]:
-    """The same in packets."""
-    rays, d_rays, fields = values[0], d_values[0], values[6:]
+    """The changes of outputs and masses with those of all tensors."""
+    rays, fields = values[0], values[6:]
     d_out, d_masses = _empty(layout, rays)
-    d_coefficients, d_numbers, d_table, d_fronts, *d_fields = d_values[2:]
-    given = _packets(cells, values[:6], fields)
+    d_rays, d_angles, d_coefficients, d_numbers, d_table, d_fronts, *d_fields = d_values
+    given = _packets(cells, values[:6], fields, thread_count(rays))
     nothing = torch.zeros_like(fields[0][0])
     of_changes = _channels(d_fields, fields)
     channels = [nothing if one is None else one for one in of_changes]
     given["all_fields"] = [*given.pop("fields"), *channels]
     given |= {"d_coefficients": d_coefficients, "d_table": d_table, "d_fronts": d_fronts}
     given["d_numbers"] = torch.zeros_like(values[3]) if d_numbers is None else d_numbers
-    given["d_rays"] = d_rays
+    given |= {"d_rays": d_rays, "d_angles": d_angles}
     made = {"d_out": d_out, "d_masses": d_masses}
-    kernel = packet_tangent_kernel(layout, d_rays is not None)
-    kernel.launch(cut(len(rays), LANES, rays)[0], given, made)
+    case = _case(layout, cells, d_rays is not None, d_angles is not None)
+    packet_tangent_kernel(layout, case).launch(cut(len(rays), LANES, rays)[0], given, made)
     return d_out, d_masses
 
 
@@ -150,62 +114,39 @@ def _empty(layout: Layout, rays: Tensor) -> tuple[Tensor, Tensor]:
     return rays.new_empty(layout.outputs, count), rays.new_empty(layout.extinction, count)
 
 
-def _transpose(
-    ctx: Any, varies_rays: bool, out_bar: Tensor, masses_bar: Tensor
-) -> list[Tensor | None]:
-    """Cotangents of all tensors, a ray a thread; those of rays only where it `varies_rays`."""
+def _transpose(ctx: Any, out_bar: Tensor, masses_bar: Tensor) -> list[Tensor | None]:
+    """Cotangents of all tensors whose gradients are asked for; of numbers and fronts always."""
     layout, cells = ctx.layout, ctx.cells
-    masses, rays, angles, coefficients, numbers, table, fronts, *fields = ctx.saved_tensors
-    varied = rays, angles, coefficients, numbers, table, fronts
-    packed, fronts_bar = cells.pack(fields), torch.zeros_like(fronts)
-    given = _bundle(layout, cells.planes, packed, *varied)
-    _leave_out(cells, rays, given)
-    bars = [torch.zeros_like(x if varies_rays else x[:0]) for x in (rays, angles, coefficients)]
-    numbers_bar = rays.new_empty(len(numbers), len(rays))
-    # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-    shares = [torch.zeros_like(packed) for _ in range(thread_count(rays))]
-    fixed = [given, *map(array, (masses, out_bar, masses_bar))]
-    tables = [torch.zeros_like(table if ctx.needs_input_grad[6] else table[:0]) for _ in shares]
-    bundles = [
-        _bundle(layout, cells.planes, share, *bars, numbers, own, fronts_bar)
-        for share, own in zip(shares, tables, strict=True)
-    ]
-    kernel = adjoint_kernel(layout, cells.is_sliced, varies_rays)
-    launch(kernel, len(rays), lambda i: [*fixed, bundles[i], array(numbers_bar)], rays)
-    found = bars if varies_rays else [None, None, None]
-    fields_bar = cells.unpack(functools.reduce(Tensor.add_, shares), fields)
-    table_bar = functools.reduce(Tensor.add_, tables) if ctx.needs_input_grad[6] else None
-    return [*found, numbers_bar.sum(1), table_bar, fronts_bar, *fields_bar]
-
-
-def _transpose_packets(
-    ctx: Any, needs: tuple[bool, bool, bool, Sequence[bool]], out_bar: Tensor, masses_bar: Tensor
-) -> list[Tensor | None]:
-    """The same in packets; of rays, polynomials, table and fields those it `needs`."""
-    layout, cells = ctx.layout, ctx.cells
-    needs_rays, needs_polynomials, needs_table, needs_fields = needs
+    needs_rays, needs_angles, needs_polynomials, _, needs_table, _ = ctx.needs_input_grad[2:8]
+    needs_fields = ctx.needs_input_grad[8:]
     masses, rays, angles, coefficients, numbers, table, fronts, *fields = ctx.saved_tensors
     packets, _ = cut(len(rays), LANES, rays)
     polynomials_bar = rays.new_empty(coefficients.shape) if needs_polynomials else None
     numbers_bar = masses.new_empty(len(numbers), packets)
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
     wanted = list(zip(fields, needs_fields, strict=True))
+    numbers_of_one = sum(field.numel() for field, is_needed in wanted if is_needed)
+    numbers_of_one += table.numel() if needs_table else 0
+    threads = count_shares(thread_count(rays), rays.element_size() * numbers_of_one)
     shares = [
         [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
-        for _ in range(thread_count(rays))
+        for _ in range(threads)
     ]
     fronts_bar = fronts.new_empty(fronts.shape) if fronts.numel() else None
-    given = _packets(cells, (rays, angles, coefficients, numbers, table, fronts), fields)
+    varied = rays, angles, coefficients, numbers, table, fronts
+    given = _packets(cells, varied, fields, threads)
     given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
     rays_bar = rays.new_empty(rays.shape) if needs_rays else None
     made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar, "rays_bar": rays_bar}
-    made["fronts_bar"] = fronts_bar
+    angles_bar = angles.new_empty(angles.shape) if needs_angles and any(layout.beams) else None
+    made |= {"fronts_bar": fronts_bar, "angles_bar": angles_bar}
     tables = [torch.zeros_like(table if needs_table else table[:0]) for _ in shares]
     own = [
         {"bars": _channels(share, fields), "table_bar": table_bar if needs_table else None}
         for share, table_bar in zip(shares, tables, strict=True)
     ]
-    packet_adjoint_kernel(layout, needs_rays).launch(packets, given, made, shares=own)
+    kernel = packet_adjoint_kernel(layout, _case(layout, cells, needs_rays, needs_angles))
+    kernel.launch(packets, given, made, shares=own)
     for share in shares[1:]:
         for total, part in zip(shares[0], share, strict=True):
             if total is not None:
@@ -213,11 +154,13 @@ def _transpose_packets(
     numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
     found = [table_bar for table_bar in tables if table_bar is not None]
     table_bar = functools.reduce(torch.add, found) if found else None
-    return [rays_bar, None, polynomials_bar, numbers_bar, table_bar, fronts_bar, *shares[0]]
+    return [rays_bar, angles_bar, polynomials_bar, numbers_bar, table_bar, fronts_bar, *shares[0]]
 
 
-def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -> dict[str, Any]:
-    """What kernels of packets are given, by name."""
+def _packets(
+    cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor], threads: int
+) -> dict[str, Any]:
+    """What kernels in so many `threads` are given, by name."""
     *varied, fronts = varied
     names = "planes", "slices", "rays", "angles", "coefficients", "numbers", "table"
     given: dict[str, Any] = dict(zip(names, (cells.planes, cells.order, *varied), strict=True))
@@ -227,7 +170,7 @@ def _packets(cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor]) -
     walked = cells.walked(varied[0])
     given |= {"walked": walked, "words": 0 if walked is None else walked.shape[1]}
     packets, _ = cut(len(varied[0]), LANES, varied[0])
-    given["dealt"] = deal(packets, thread_count(varied[0]))
+    given["dealt"] = deal(packets, threads)
     return given | {"fields": _channels(fields, fields)}
 
 
@@ -252,20 +195,3 @@ def _channels(tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[
         for tensor, field in zip(tensors, like, strict=True)
         for channel in ([None] * len(field) if tensor is None else tensor.unbind())
     ]
-
-
-def _bundle(layout: Layout, *tensors: Tensor) -> Any:
-    """`tensors`, in the order of its fields, as the record that kernels are given."""
-    bundle = ray_types(layout).Bundle()
-    names = "planes", "cells", "rays", "angles", "coefficients", "numbers", "table", "fronts"
-    for name, tensor in zip(names, tensors, strict=True):
-        setattr(bundle, name, array(tensor))
-    return bundle
-
-
-def _leave_out(cells: Cells, rays: Tensor, bundle: Any) -> None:
-    """Tells the record `bundle` which segments of `rays` are to be walked, unless all are."""
-    walked = cells.walked(rays)
-    if walked is not None:
-        bundle.walked = array(walked)
-        bundle.lanes = cut(len(rays), LANES, rays)[1]

@@ -1,7 +1,7 @@
 """C++ of packets of rays: where a node lies among cells, and the values there.
 
-As `lines` and `planes` have it for one ray: linear interpolation in a slice, beams' masses to third
-order. Fields are read in place, by strides.
+Linear interpolation in a slice, or between slices; beams' masses to third order. Fields are read in
+place, by strides.
 """
 
 PLACES = """
@@ -27,6 +27,11 @@ struct Place {
         q.excess = P::pick((y > none) & (y < end), F(0.5) * q.a * (F(1) - q.a), none);
         return q;
     }
+    // The same place of lines that begin `by` cells on.
+    INLINE Place behind(Place q, I by) {
+        q.m += by; q.i += by; q.j += by; q.p += by;
+        return q;
+    }
 };
 // The four cells around a place in a slice, and their weights.
 struct Corners {
@@ -43,6 +48,18 @@ struct Corners {
         q.w00 = (F(1) - y.a) - q.w01;
         return q;
     }
+};
+// A place between slices as places in the four around: what a value in each counts for linear ones
+// (all but `is_outer`), and for what these are off by.
+struct Layers {
+    I at[4];
+    V linear[4], across[4];
+    INLINE Layers of(const Place& z) {
+        const V none = P::all(F(0)), w1 = z.a, w0 = F(1) - w1, e = z.excess;
+        return {{z.m, z.i, z.j, z.p}, {none, w0, w1, none},
+                {e * w0, e * (w1 - F(2) * w0), e * (w0 - F(2) * w1), e * w1}};
+    }
+    INLINE bool is_outer(int i) { return i == 0 || i == 3; }
 };
 """
 VALUES = """

@@ -13,6 +13,10 @@ from ddrecon.numerics.angle_table import STEPS
 
 RUNGS = f"""
 constexpr F ANGLE_STEP = F({math.pi / STEPS!r});
+#if !defined(__CUDA_ARCH__)
+// A vector read from a row ends within the next one: behind the last row there is one more.
+static_assert(!HAS_RUNGS || (TERMS <= LANES && LANES <= 2 * TERMS), "terms of a row, by lanes");
+#endif
 constexpr int LAST_RUNG = IS_STEEP ? {STEEP_STEPS} : {EVEN_STEPS};
 struct Rungs {{
     // At which rung a number is, and how that changes with it.
@@ -139,6 +143,18 @@ auto angle_of = [&](const Node& node, int b, V& cosine) -> Cubic {
 };
 auto number_of = [&](const Node& node, int h) -> V {
     return node.v[FIRST_NUMBER + h * NUMBER_STEP];
+};
+// How light from a point turns along the ray; and how p changes with the place of its angle in
+// tables, at a `place` on the curve.
+auto turning_of = [&](const Node& node, int b) -> Point::Turning {
+    return Point::turning(ray.foot[b], ray.across[b], node.t);
+};
+auto by_turn = [&](const Node& node, int b, int c, V place) -> V {
+    const V* by_angle = node.by_angle + (b * PHASES + c * PHASE_STEP) * TERMS;
+    if (HAS_RUNGS) return Polynomial::at(by_angle, place);
+    V curve[TERMS];
+    Point::curve(node.point[b], table + c * PHASE_STEP * TABLE_STEP, curve, true);
+    return Polynomial::at(curve, place);
 };
 // p of beam b at a node, by the number there; its change with the angle if that `turns`.
 auto see_number = [&](Node& node, int b, bool turns) {

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from ddrecon.march.fused.cellwise import table_rows
 from ddrecon.march.fused.layout import Layout
 
 
-def layout_constants(layout: Layout, has_slopes: bool) -> str:
+class Case(NamedTuple):
+    """What else it is compiled for: whether nodes lie in slices, and which derivatives it finds.
+
+    Those by rays, and by the angles at which they see point lights, which turn with them.
+    """
+
+    is_sliced: bool
+    varies_rays: bool = False
+    varies_angles: bool = False
+
+
+def layout_constants(layout: Layout, case: Case, has_slopes: bool) -> str:
     """Where in a node the channels of color c are: the first of a kind plus c times its step."""
     numbers = {
         "C": layout.colors,
@@ -38,6 +51,9 @@ def layout_constants(layout: Layout, has_slopes: bool) -> str:
         "NUMBER_STEP": layout.number_step,
     }
     answers = {
+        "IS_SLICED": case.is_sliced,
+        "VARIES_RAYS": case.varies_rays,
+        "VARIES_ANGLES": case.varies_angles,
         "HAS_NUMBERS": layout.form is not None,
         "HAS_RUNGS": layout.has_rungs,
         "IS_STEEP": layout.form == "steep",

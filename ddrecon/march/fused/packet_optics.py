@@ -1,4 +1,7 @@
-"""C++ of packets of rays: the formulas of the view-ray integral, as `optics` has them for one."""
+"""C++ of packets of rays: the formulas of the view-ray integral.
+
+They are those of `numerics.decay`, `numerics.chebyshev` and `light.point_light` for tensors.
+"""
 
 import math
 
@@ -88,10 +91,12 @@ struct Point {{
             P::put(place, l, wp::atan2(P::lane(apart, l), P::lane(away, l)));
         return Cubic::at(place * F({STEPS / math.pi!r}), STEPS);
     }}
-    // The coefficients of p over the depth of the peak; `table` is that of the color.
-    INLINE void curve(const Cubic& angle, const F* table, V* out) {{
+    // The coefficients of p over the depth of the peak; `table` is that of the color. Or how they
+    // change with the place in it.
+    INLINE void curve(const Cubic& angle, const F* table, V* out, bool slopes = false) {{
         V weights[4];
-        Cubic::weights(angle, F({math.pi / STEPS!r}), weights);
+        if (slopes) Cubic::slopes(angle, F({math.pi / STEPS!r}), weights);
+        else Cubic::weights(angle, F({math.pi / STEPS!r}), weights);
         const I at = 2 * TERMS * angle.first;
         for (int k = 0; k < TERMS; ++k) {{
             V total = weights[0] * P::gather(table + k, at);
@@ -117,6 +122,23 @@ struct Point {{
         for (int l = 0; l < LANES; ++l)
             P::put(angle, l, wp::atan2(P::lane(opposite, l), P::lane(adjacent, l)));
         return angle / apart;
+    }}
+    // And its derivatives.
+    struct Slopes {{ V foot, across, t0, t1; }};
+    INLINE Slopes subtended_slopes(V foot, V across, V t0, V t1) {{
+        const V s0 = foot + t0, s1 = foot + t1;
+        const V r0 = F(1) / (across + s0 * s0), r1 = F(1) / (across + s1 * s1);
+        const V angle = subtended(foot, across, t0, t1);
+        return {{r1 - r0, -(angle + s1 * r1 - s0 * r0) / (across + across), -r0, r1}};
+    }}
+    // How the place in tables changes with the way along the ray, and with `across`; and by that
+    // place the cosine.
+    struct Turning {{ V along, across, cosine; }};
+    INLINE Turning turning(V foot, V across, V t) {{
+        const V apart = P::root(across), away = foot + t, square = across + away * away;
+        const V per = P::all(F({STEPS / math.pi!r}));
+        return {{per * apart / square, F(-0.5) * per * away / (apart * square),
+                 -apart / (per * P::root(square))}};
     }}
 }};
 """

@@ -11,17 +11,26 @@ from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_cells import PLACES, VALUES
 from ddrecon.march.fused.packet_cellwise import RUNGS, SEE
-from ddrecon.march.fused.packet_layout import layout_constants
+from ddrecon.march.fused.packet_layout import Case, layout_constants
 from ddrecon.march.fused.packet_optics import CUBICS, DECAYS, POINTS, POLYNOMIALS
 from ddrecon.march.fused.packet_runs import ROWS, RUNS, WINDOWS
 from ddrecon.march.fused.stretches import WALKS
 
 GIVEN = """
 F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked, *dealt;
-int ray_count, node_count, rows, columns, plane_stride, row_stride, column_stride, words;
+int ray_count, node_count, depth, rows, columns, words;
+int plane_stride, row_stride, column_stride;
 """
-"""As `rays.Bundle`; nodes lie in `slices` [N] of `fields`, channels of cells. Without `fronts`
-there is no mass before the rays. Item i is packet i, or `dealt` [packets] says which.
+"""Nodes lie in `slices` [N] of `fields`, channels of cells, at `planes` [N] across them [u]; or,
+where these are not IS_SLICED, anywhere: at such parts of the way from near to far.
+
+`rays` [R, 8]: origin and direction (in cells; across slices in u), near, far [u]. `angles`
+[2 beams, R]: the cosine to directional light, or the foot of a point light, then its square
+distance. `coefficients` [beams * phases * COEFFICIENTS, R]: the polynomials of E13, or what
+`cellwise` has. `numbers`: scale and peak by color, bound of third-order corrections. `table`
+[phases * (steps + 1) * 2, terms]: polynomials of point lights by angle. `fronts` [K, R]: the mass
+before the rays, if any. `walked` [packets, words]: bits of the segments to be walked. Item i is
+packet i, or `dealt` [packets] says which.
 """
 
 _RECORDS = """
@@ -29,23 +38,30 @@ struct Ray {
     V o0, o1, o2, d0, d1, d2, near, far;
     V foot[BEAMS + 1], across[BEAMS + 1], coefficients[BEAMS * RAY_TERMS + 1];
 };
+// Where a node lies among cells.
+struct Spot {
+    Place z, y, x;
+    Corners q;
+    int runs;
+#if !defined(__CUDA_ARCH__)
+    Run run[LANES];
+#endif
+};
 // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled at
 // and `t` held in the box; values; emission, depth, exp(-depth), and p; of light from points their
 // angle, and the coefficients of p over the depth of the peak. Where p differs from cell to cell,
 // how these change with the number and with the angle's place in tables; and p without a peak.
-struct Node {
-    Place y, x;
-    Corners q;
-    int runs;
+struct Node : Spot {
     bool is_empty, is_lit;
-#if !defined(__CUDA_ARCH__)
-    Run run[LANES];
-#endif
     V s, t, v[CHANNELS], bend[MASSES + 1], held[MASSES + 1], w[OUT], u[OUT], decay[OUT], p[OUT];
     Cubic point[BEAMS + 1];
     V curve[CURVES + 1], by_number[HAS_SLOPES * CURVES + 1], by_angle[HAS_SLOPES * CURVES + 1];
     Plain plain[IS_STEEP * BEAMS * PHASES + 1];
 };
+"""
+ROW_OF = """
+// Where row k of an array begins that has a number of each ray.
+auto row_of = [&](int k) -> long long { return (long long)k * ray_count; };
 """
 _BEGIN = """
 if (dealt) item = dealt[item];
@@ -54,6 +70,7 @@ const F* scale = numbers;
 const F* peaks = numbers + C;
 const F bound = numbers[2 * C];
 Ray ray;
+const V none = P::all(F(0));
 ray.o0 = P::load(rays, begin, 8, last);
 ray.o1 = P::load(rays + 1, begin, 8, last);
 ray.o2 = P::load(rays + 2, begin, 8, last);
@@ -63,15 +80,17 @@ ray.d2 = P::load(rays + 5, begin, 8, last);
 ray.near = P::load(rays + 6, begin, 8, last);
 ray.far = P::load(rays + 7, begin, 8, last);
 for (int b = 0; b < BEAMS; ++b) {
-    ray.foot[b] = P::load(angles + b * (last + 1), begin, 1, last);
-    ray.across[b] = P::load(angles + (BEAMS + b) * (last + 1), begin, 1, last);
+    ray.foot[b] = P::load(angles + row_of(b), begin, 1, last);
+    ray.across[b] = P::load(angles + row_of(BEAMS + b), begin, 1, last);
 }
 if (HAS_PEAK || HAS_NUMBERS)
     for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
-        ray.coefficients[k] = P::load(coefficients + k * (last + 1), begin, 1, last);
-auto distance = [&](int n) -> V { return (planes[n] - ray.o0) / ray.d0; };
+        ray.coefficients[k] = P::load(coefficients + row_of(k), begin, 1, last);
+auto distance = [&](int n) -> V {
+    return IS_SLICED ? (planes[n] - ray.o0) / ray.d0 : ray.near + planes[n] * (ray.far - ray.near);
+};
 auto front_of = [&](const F* masses, int k) -> V {
-    return masses ? P::load(masses + (long long)k * (last + 1), begin, 1, last) : P::all(F(0));
+    return masses ? P::load(masses + row_of(k), begin, 1, last) : P::all(F(0));
 };
 // Nodes before the box and behind it are held at its faces: between them nothing is added.
 int first_node = 0, last_node = node_count - 1;
@@ -93,7 +112,7 @@ auto stretch_before = [&](int& from, int& to) -> bool {
 // Along y the packet's rays are closer together than along x; it `is_turned` where y are columns.
 bool is_turned = false;
 Lines lines = {rows, columns, row_stride, column_stride};
-if (LANES > 1) {
+if (LANES > 1 && IS_SLICED) {
     const V s = distance((first_node + last_node) / 2);
     const V y = ray.o1 + s * ray.d1, x = ray.o2 + s * ray.d2;
     const int end = begin + LANES <= last ? LANES - 1 : last - begin;
@@ -135,7 +154,29 @@ auto sample_runs = [&](Node& node, long long offset, int from, int to) {
     }
 };
 #endif
+auto sample_between = [&](Node& node, int from, int to) {
+    const Layers layers = Layers::of(node.z);
+    for (int c = from; c < to; ++c) {
+        const int k = c - FIRST_MASS;
+        const bool is_bent = k >= 0 && k < MASSES;
+        V total = P::all(F(0)), total_bend = P::all(F(0));
+        for (int i = 0; i < 4; ++i) {
+            if (Layers::is_outer(i) && !is_bent) continue;
+            const Place y = Place::behind(node.y, layers.at[i] * lines.rows);
+            const Corners q = Corners::of(y, node.x, lines);
+            V bend = P::all(F(0));
+            const V v = is_bent && !Layers::is_outer(i)
+                ? Values::curved(fields[c], q, y, node.x, lines, bend)
+                : Values::linear(fields[c], q);
+            total += layers.linear[i] * v;
+            total_bend += layers.linear[i] * bend + layers.across[i] * v;
+        }
+        node.v[c] = total;
+        if (is_bent) node.bend[k] = total_bend;
+    }
+};
 auto sample = [&](Node& node, int n, int from, int to) {
+    if (!IS_SLICED) return sample_between(node, from, to);
 #if !defined(__CUDA_ARCH__)
     if (HAS_PERMUTATION && node.runs <= MOST_RUNS && lines.columns >= LANES)
         sample_runs(node, slice(n), from, to);
@@ -143,16 +184,21 @@ auto sample = [&](Node& node, int n, int from, int to) {
 #endif
         sample_lanes(node, slice(n), from, to);
 };
+// The cells around a place in a slice.
+auto find_cells = [&](Spot& spot) {
+    spot.q = Corners::of(spot.y, spot.x, lines);
+#if !defined(__CUDA_ARCH__)
+    spot.runs = find_runs(spot.y, spot.x, lines, spot.run);
+#endif
+};
 // Where node n lies, and the matter there.
 auto locate = [&](int n, Node& node) {
     node.s = distance(n);
     node.t = P::least(P::most(node.s, ray.near), ray.far);
     node.y = Place::at(ray.o1 + node.s * ray.d1, lines.rows);
     node.x = Place::at(ray.o2 + node.s * ray.d2, lines.columns);
-    node.q = Corners::of(node.y, node.x, lines);
-#if !defined(__CUDA_ARCH__)
-    node.runs = find_runs(node.y, node.x, lines, node.run);
-#endif
+    if (IS_SLICED) find_cells(node);
+    else node.z = Place::at(ray.o0 + node.s * ray.d0, depth);
     sample(node, n, 0, EXTINCTION);
     if (SCATTERING) sample(node, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
     node.is_empty = true;
@@ -208,7 +254,7 @@ auto emit = [&](int n, Node& node, const W* m, bool turns = false) {
                 Point::curve(node.point[b], table + h * TABLE_STEP,
                              node.curve + (b * PHASES + h) * TERMS);
         }
-        if (HAS_RUNGS || IS_STEEP) see_number(node, b, turns && !IS_POINT[b]);
+        if (HAS_RUNGS || IS_STEEP) see_number(node, b, IS_POINT[b] ? VARIES_ANGLES : turns);
         for (int c = 0; c < C; ++c) {
             const int i = C + b * C + c;
             const V mass = P::narrow(m[c * MASS_STEP]);
@@ -244,21 +290,24 @@ auto measure = [&](const Node& a, const Node& b, int i) -> V {
 def packet_kernel(
     name: str,
     layout: Layout,
+    case: Case,
     walk: str,
     given: str,
+    made: str,
     has_slopes: bool = True,
     changes: bool = False,
 ) -> TextKernel:
     """The kernel `name` of `walk` along a packet of rays; `given` besides `GIVEN`.
 
-    It `has_slopes` of p at nodes, which the integral itself does not need. With `changes` it is
-    given `all_fields`: `fields`, from which it samples, and their changes.
+    `made` names what of that it writes. It `has_slopes` of p at nodes, which the integral itself
+    does not need. With `changes` it is given `all_fields`: `fields`, from which it samples, and
+    their changes.
     """
     optics = DECAYS + POLYNOMIALS + CUBICS + POINTS + RUNGS
     structs = PLACES + VALUES + RUNS + ROWS + WINDOWS + optics + _RECORDS
     chosen = "const F* const* fields = all_fields;" if changes else ""
-    constants = layout_constants(layout, has_slopes)
-    text = constants + structs + chosen + WALKS + _BEGIN + SEE + _EMIT + walk
+    constants = layout_constants(layout, case, has_slopes)
+    text = constants + structs + chosen + WALKS + ROW_OF + _BEGIN + SEE + _EMIT + walk
     fields = f"all_fields[{2 * layout.channels}]" if changes else f"fields[{layout.channels}]"
     declared = f"{GIVEN} F *{fields}; {given}"
-    return TextKernel(name, layout.bits, text, declared, packet_program)
+    return TextKernel(name, layout.bits, text, declared, made, packet_program)

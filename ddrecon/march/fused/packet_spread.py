@@ -197,9 +197,9 @@ SHARES = f"""
 SPREAD = (
     SHARES
     + """
-auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, const V* bend_bar) {
+auto spread_to_cells = [&](const Spot& spot, long long offset, const V* v_bar, const V* bend_bar) {
 #if defined(__CUDA_ARCH__)
-    const Shares shares = Shares::of(node.y, node.x, lines);
+    const Shares shares = Shares::of(spot.y, spot.x, lines);
     for (int c = 0; c < CHANNELS; ++c) {
         const int k = c - FIRST_MASS;
         if (bars[c])
@@ -216,12 +216,12 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
     }
     // Lanes outside of the box count for nothing.
     const unsigned counting = ~P::bits_of(__builtin_convertvector(is_zero, I));
-    for (int r = 0; r < node.runs; ++r) {
-        Run run = node.run[r];
+    for (int r = 0; r < spot.runs; ++r) {
+        Run run = spot.run[r];
         run.lanes &= counting;
         if (!run.lanes) continue;
         run.lane = __builtin_ctz(run.lanes);
-        const Shares shares = Shares::of(run, node.y, node.x, lines, ones, is_bent);
+        const Shares shares = Shares::of(run, spot.y, spot.x, lines, ones, is_bent);
         #pragma clang loop unroll(disable)
         for (int c = 0; c < CHANNELS; ++c) {
             const int k = c - FIRST_MASS;
@@ -231,6 +231,22 @@ auto spread_to_cells = [&](const Node& node, long long offset, const V* v_bar, c
         }
     }
 #endif
+};
+auto spread_between = [&](const Node& node, const V* v_bar, const V* bend_bar) {
+    const Layers layers = Layers::of(node.z);
+    for (int i = 0; i < 4; ++i) {
+        if (Layers::is_outer(i) && !MASSES) continue;
+        V value_bar[CHANNELS], bent_bar[MASSES + 1];
+        for (int c = 0; c < CHANNELS; ++c) value_bar[c] = layers.linear[i] * v_bar[c];
+        for (int k = 0; k < MASSES; ++k) {
+            value_bar[FIRST_MASS + k] += layers.across[i] * bend_bar[k];
+            bent_bar[k] = layers.linear[i] * bend_bar[k];
+        }
+        Spot spot = node;
+        spot.y = Place::behind(node.y, layers.at[i] * lines.rows);
+        find_cells(spot);
+        spread_to_cells(spot, 0, value_bar, bent_bar);
+    }
 };
 """
 )

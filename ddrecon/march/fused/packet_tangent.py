@@ -1,6 +1,7 @@
 """The walk along packets of rays that finds the change of their integral.
 
-With those of fields, numbers, polynomials and the table of p, and of the rays themselves. A node
+With those of fields, numbers, polynomials and the table of p, of the rays themselves, and of the
+angles at which they see point lights. A node
 and its change are two records of the same kind: that of the change has changes for distances,
 values, emission and depth.
 """
@@ -11,6 +12,7 @@ import functools
 
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_layout import Case
 from ddrecon.march.fused.packet_rays import packet_kernel
 from ddrecon.march.fused.packet_slopes import MOVE_TANGENT, SLOPES, STAY_TANGENT
 
@@ -21,7 +23,21 @@ V d_coefficients_of[BEAMS * RAY_TERMS + 1];
 const bool turns = HAS_NUMBERS && d_coefficients;
 if ((HAS_PEAK || HAS_NUMBERS) && d_coefficients)
     for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
-        d_coefficients_of[k] = P::load(d_coefficients + k * (last + 1), begin, 1, last);
+        d_coefficients_of[k] = P::load(d_coefficients + row_of(k), begin, 1, last);
+V d_foot[BEAMS + 1], d_across[BEAMS + 1];
+for (int b = 0; b < BEAMS; ++b) {
+    d_foot[b] = d_angles ? P::load(d_angles + row_of(b), begin, 1, last) : none;
+    d_across[b] = d_angles ? P::load(d_angles + row_of(BEAMS + b), begin, 1, last) : none;
+}
+// The change of what output i is integrated by.
+auto change_measure = [&](const Node& a, const Node& b, const Node& d_a, const Node& d_b, int i) {
+    const int beam = i / C - 1;
+    if (i < C || !IS_POINT[beam]) return d_b.t - d_a.t;
+    const Point::Slopes slopes
+        = Point::subtended_slopes(ray.foot[beam], ray.across[beam], a.t, b.t);
+    return slopes.foot * d_foot[beam] + slopes.across * d_across[beam] + slopes.t0 * d_a.t
+         + slopes.t1 * d_b.t;
+};
 auto sample_change = [&](Node& change, int n, int from, int to) {
     fields = all_fields + CHANNELS;
     sample(change, n, from, to);
@@ -30,14 +46,8 @@ auto sample_change = [&](Node& change, int n, int from, int to) {
 };
 // The change of the matter at node n, where that is known: the same place.
 auto locate_change = [&](int n, Node& node, Node& change) {
-    change.y = node.y;
-    change.x = node.x;
-    change.q = node.q;
-    change.runs = node.runs;
-#if !defined(__CUDA_ARCH__)
-    for (int r = 0; r < node.runs && r < LANES; ++r) change.run[r] = node.run[r];
-#endif
-    move_node(node, change);
+    (Spot&)change = node;
+    move_node(n, node, change);
     sample_change(change, n, 0, EXTINCTION);
     if (SCATTERING) sample_change(change, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
     for (int c = 0; c < EXTINCTION; ++c)
@@ -66,7 +76,12 @@ auto changing_curve = [&](const Node& node, int b, int c, V* d_curve) -> const V
 auto change_of_p = [&](const Node& node, const Node& change, int b, int c, V way, V d_depth) -> V {
     const int phase = b * PHASES + c * PHASE_STEP;
     const V d_number = HAS_NUMBERS ? change.v[FIRST_NUMBER + c * NUMBER_STEP] : none;
-    V d_p = none, d_plain = none;
+    V d_p = none, d_plain = none, d_turn = none, d_cosine = none;
+    if (VARIES_ANGLES && IS_POINT[b]) {
+        const Point::Turning turning = turning_of(node, b);
+        d_turn = turning.along * (d_foot[b] + change.t) + turning.across * d_across[b];
+        d_cosine = turning.cosine * d_turn;
+    }
     if (has_curve(b)) {
         V d_curve[TERMS];
         const V place = place_of(node, c, way), *curve = curve_of(node, b, c);
@@ -75,6 +90,7 @@ auto change_of_p = [&](const Node& node, const Node& change, int b, int c, V way
         if (HAS_PEAK) d_p += d_depth * Polynomial::slope(curve, place);
         if (IS_LINEAR) d_p += d_number * curve[TERMS - 1];
         if (HAS_RUNGS) d_p += d_number * Polynomial::at(node.by_number + phase * TERMS, place);
+        if (VARIES_ANGLES && IS_POINT[b]) d_p += d_turn * by_turn(node, b, c, place);
         if (HAS_RUNGS && turns && !IS_POINT[b])
             d_p += d_coefficients_of[b * RAY_TERMS + 2]
                  * Polynomial::at(node.by_angle + phase * TERMS, place);
@@ -84,6 +100,7 @@ auto change_of_p = [&](const Node& node, const Node& change, int b, int c, V way
     d_plain = node.plain[phase].by_g * d_number;
     if (turns && !IS_POINT[b])
         d_plain += node.plain[phase].by_cosine * d_coefficients_of[b * RAY_TERMS];
+    if (VARIES_ANGLES && IS_POINT[b]) d_plain += node.plain[phase].by_cosine * d_cosine;
     return HAS_PEAK ? P::pick(is_peaked(node, c), d_p, d_plain) : d_plain;
 };
 // The change of all else at node n, behind the mass `m` and its change.
@@ -158,8 +175,9 @@ for (int from, to = first_node; next_stretch(from, to);) {
                 const V brighter = (d_a->w[i] + d_b->w[i]) * decay;
                 const V deeper = (a->w[i] + b->w[i]) * (by_a * d_a->u[i] + by_b * d_b->u[i]);
                 total[i] += F(0.5) * measure(*a, *b, i) * (brighter + deeper);
-                if (VARIES_RAYS)
-                    total[i] += F(0.5) * (a->w[i] + b->w[i]) * decay * (d_b->t - d_a->t);
+                if (VARIES_RAYS || VARIES_ANGLES)
+                    total[i] += F(0.5) * (a->w[i] + b->w[i]) * decay
+                              * change_measure(*a, *b, *d_a, *d_b, i);
             }
         }
         Node *passed = a, *d_passed = d_a;
@@ -169,21 +187,23 @@ for (int from, to = first_node; next_stretch(from, to);) {
 }
 for (int l = 0; l < LANES && begin + l <= last; ++l) {
     for (int i = 0; i < OUT; ++i)
-        d_out[(long long)i * (last + 1) + begin + l] = P::lane(total[i], l);
+        d_out[row_of(i) + begin + l] = P::lane(total[i], l);
     for (int k = 0; k < EXTINCTION; ++k)
-        d_masses[(long long)k * (last + 1) + begin + l] = P::lane(d_m[k], l);
+        d_masses[row_of(k) + begin + l] = P::lane(d_m[k], l);
 }
 """
 
 
 @functools.cache
-def packet_tangent_kernel(layout: Layout, varies_rays: bool = False) -> TextKernel:
+def packet_tangent_kernel(layout: Layout, case: Case) -> TextKernel:
     """The kernel of the changes `d_out` [outputs, R] and `d_masses` [K, R] of packets of rays.
 
-    `d_coefficients`, `d_table` and `d_fronts`, as what they are changes of, may be left out. Where
-    it `varies_rays` it is given their changes, `d_rays` [R, 8]; point lights there are none then.
+    `d_angles`, `d_coefficients`, `d_table` and `d_fronts`, as what they are changes of, may be left
+    out. Where it `varies_rays` it is given their changes, `d_rays` [R, 8].
     """
-    given = "F *d_coefficients, *d_numbers, *d_table, *d_fronts, *d_out, *d_masses, *d_rays"
-    begin = f"constexpr bool VARIES_RAYS = {int(varies_rays)};\nconst V none = P::all(F(0));"
-    moving = SLOPES + MOVE_TANGENT if varies_rays else STAY_TANGENT
-    return packet_kernel("integrate_tangent", layout, begin + moving + _WALK, given, changes=True)
+    given = """
+    F *d_angles, *d_coefficients, *d_numbers, *d_table, *d_fronts, *d_out, *d_masses, *d_rays
+    """
+    moving = SLOPES + MOVE_TANGENT if case.varies_rays else STAY_TANGENT
+    text, made = moving + _WALK, "d_out d_masses"
+    return packet_kernel("integrate_tangent", layout, case, text, given, made, changes=True)

@@ -1,7 +1,7 @@
-"""The walks along packets of rays that meet slices: the integral, and its adjoint.
+"""The walks along packets of rays: the integral, from the camera into the volume, and its adjoint.
 
-They compute what `walks` and `adjoint` do for one ray a thread, in vector lanes; derivatives by
-rays beside light from points are left to those.
+Of the walk out nothing is kept but the mass behind each ray: on the walk back values are sampled
+anew, and masses are those behind less those of the segments in between.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import functools
 
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.fused.packet_layout import Case
 from ddrecon.march.fused.packet_rays import packet_kernel
 from ddrecon.march.fused.packet_slopes import MOVE, SLOPES, STAY
 from ddrecon.march.fused.packet_spread import SPREAD
@@ -47,9 +48,9 @@ for (int from, to = first_node; next_stretch(from, to);) {
 }
 for (int l = 0; l < LANES && begin + l <= last; ++l) {
     for (int i = 0; i < OUT; ++i)
-        out[(long long)i * (last + 1) + begin + l] = P::lane(total[i], l);
+        out[row_of(i) + begin + l] = P::lane(total[i], l);
     for (int k = 0; k < EXTINCTION; ++k)
-        masses[(long long)k * (last + 1) + begin + l] = P::lane_of(m[k], l);
+        masses[row_of(k) + begin + l] = P::lane_of(m[k], l);
 }
 """
 _TRANSPOSE = """
@@ -58,16 +59,17 @@ for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
 V bar[OUT], m_bar[EXTINCTION], scale_bar[C], peak_bar[C], bound_bar = none;
 V polynomial_bar[BEAMS * RAY_TERMS + 1];
 const bool varies_polynomials = polynomials_bar;
+V foot_bar[BEAMS + 1], across_bar[BEAMS + 1];
+for (int b = 0; b < BEAMS; ++b) foot_bar[b] = across_bar[b] = none;
 bool is_asked = false;
 for (int i = 0; i < OUT; ++i) {
-    bar[i] = inside * P::load(out_bar + (long long)i * (last + 1), begin, 1, last);
+    bar[i] = inside * P::load(out_bar + row_of(i), begin, 1, last);
     is_asked = is_asked || !P::every(bar[i] == none);
 }
 W m[EXTINCTION];
 for (int k = 0; k < EXTINCTION; ++k) {
-    const long long row = (long long)k * (last + 1);
-    m_bar[k] = inside * P::load(masses_bar + row, begin, 1, last);
-    m[k] = P::load_wide(masses + row, begin, last);
+    m_bar[k] = inside * P::load(masses_bar + row_of(k), begin, 1, last);
+    m[k] = P::load_wide(masses + row_of(k), begin, last);
     is_asked = is_asked || !P::every(m_bar[k] == none);
 }
 // Pixels that nothing is asked of, masked ones for instance, need no walk.
@@ -90,7 +92,7 @@ auto spread_to_rungs = [&](const Node& node, int b, int c, const V* curve_bar) {
 };
 // What node b emits, and its values go back to the cells. Its mass is that behind it, `m_b`.
 auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_bar, const V* u_bar,
-                  V* m_bar) {
+                  V* m_bar, V& t_bar) {
     for (int c = 0; c < C; ++c) {
         const int k = c * MASS_STEP, s = FIRST_DIFFUSING + c * DIFFUSING_STEP;
         const int d = FIRST_DIFFUSE + c * DIFFUSE_STEP;
@@ -110,7 +112,7 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
             scale_bar[c] += u_bar[i] * way;
             v_bar[s] += w_bar[i] * node.p[i];
             const V p_bar = w_bar[i] * scattering;
-            V depth_bar = none;
+            V depth_bar = none, turn_bar = none;
             // What scatters nothing has no phase function to vary.
             if (has_curve(b) && !node.is_empty) {
                 const V place = place_of(node, c, way), *curve = curve_of(node, b, c);
@@ -119,6 +121,7 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
                 if (HAS_PEAK) depth_bar = power * Polynomial::slope(curve, place);
                 if (IS_LINEAR) v_bar[FIRST_NUMBER + c * NUMBER_STEP] += power * curve[TERMS - 1];
                 if (HAS_RUNGS) finish_rungs(node, b, c, power, place, v_bar);
+                if (VARIES_ANGLES && IS_POINT[b]) turn_bar = power * by_turn(node, b, c, place);
                 V powers[TERMS];
                 for (int k = 0; k < TERMS; ++k) {
                     powers[k] = power;
@@ -137,6 +140,14 @@ auto finish = [&](int n, const Node& node, const W* m_b, V* v_bar, const V* w_ba
                 v_bar[FIRST_NUMBER + c * NUMBER_STEP] += plain_bar * plain.by_g;
                 if (!IS_POINT[b] && varies_polynomials)
                     polynomial_bar[b * RAY_TERMS] += plain_bar * plain.by_cosine;
+                if (VARIES_ANGLES && IS_POINT[b])
+                    turn_bar += plain_bar * plain.by_cosine * turning_of(node, b).cosine;
+            }
+            if (VARIES_ANGLES && IS_POINT[b]) {
+                const Point::Turning turning = turning_of(node, b);
+                foot_bar[b] += turn_bar * turning.along;
+                across_bar[b] += turn_bar * turning.across;
+                t_bar += turn_bar * turning.along;
             }
             if (HAS_PEAK) {
                 way_bar += depth_bar * peak_of(node, c);
@@ -155,7 +166,8 @@ auto spread = [&](int n, const Node& node, const V* v_bar, V t_bar) {
         bend_bar[k] = -v_bar[FIRST_MASS + k] * inverse * inverse * inverse;
         bound_bar -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
     }
-    spread_to_cells(node, slice(n), v_bar, bend_bar);
+    if (IS_SLICED) spread_to_cells(node, slice(n), v_bar, bend_bar);
+    else spread_between(node, v_bar, bend_bar);
     move(n, node, v_bar, bend_bar, t_bar);
 };
 Node nodes[2];
@@ -179,7 +191,7 @@ for (int from = last_node, to; stretch_before(from, to);) {
         }
         emit(n, *a, m, varies_polynomials);
         const bool is_empty = a->is_empty && b->is_empty;
-        V length_bar = none;
+        V length_bar = none, begin_bar = none, end_bar = none;
         for (int i = 0; i < OUT; ++i) {
             V by_a = none, by_b = none;
             const V decay = is_empty
@@ -191,9 +203,21 @@ for (int from = last_node, to; stretch_before(from, to);) {
             wb_bar[i] += wa_bar[i];
             ua_bar[i] = both * by_a;
             ub_bar[i] += both * by_b;
-            if (VARIES_RAYS) length_bar += F(0.5) * bar[i] * (a->w[i] + b->w[i]) * decay;
+            const int beam = i / C - 1;
+            if (VARIES_ANGLES && i >= C && IS_POINT[beam]) {
+                const V by = F(0.5) * bar[i] * (a->w[i] + b->w[i]) * decay;
+                const Point::Slopes slopes = Point::subtended_slopes(
+                    ray.foot[beam], ray.across[beam], a->t, b->t);
+                foot_bar[beam] += by * slopes.foot;
+                across_bar[beam] += by * slopes.across;
+                begin_bar += by * slopes.t0;
+                end_bar += by * slopes.t1;
+            } else if (VARIES_RAYS) {
+                length_bar += F(0.5) * bar[i] * (a->w[i] + b->w[i]) * decay;
+            }
         }
-        finish(n + 1, *b, m_b, b_bar, wb_bar, ub_bar, m_bar);
+        if (VARIES_ANGLES) tb_bar += end_bar;
+        finish(n + 1, *b, m_b, b_bar, wb_bar, ub_bar, m_bar, tb_bar);
         // Its mass is that of node a and half the sum of extinctions, by the length.
         for (int c = 0; c < CHANNELS; ++c) a_bar[c] = none;
         for (int k = 0; k < EXTINCTION; ++k) {
@@ -202,6 +226,7 @@ for (int from = last_node, to; stretch_before(from, to);) {
             if (VARIES_RAYS) length_bar += F(0.5) * m_bar[k] * (a->v[k] + b->v[k]);
         }
         ta_bar = -length_bar;
+        if (VARIES_ANGLES) ta_bar += begin_bar;
         spread(n + 1, *b, b_bar, tb_bar + length_bar);
         tb_bar = ta_bar;
         for (int c = 0; c < CHANNELS; ++c) b_bar[c] = a_bar[c];
@@ -213,7 +238,7 @@ for (int from = last_node, to; stretch_before(from, to);) {
         b = a;
         a = passed;
     }
-    finish(from, *b, m, b_bar, wb_bar, ub_bar, m_bar);
+    finish(from, *b, m, b_bar, wb_bar, ub_bar, m_bar, tb_bar);
     spread(from, *b, b_bar, tb_bar);
 }
 for (int c = 0; c < C; ++c) {
@@ -222,37 +247,46 @@ for (int c = 0; c < C; ++c) {
 }
 numbers_bar[2 * C * packets + item] = P::sum(bound_bar);
 store_ray();
+if (angles_bar)
+    for (int b = 0; b < BEAMS; ++b)
+        for (int l = 0; l < LANES && begin + l <= last; ++l) {
+            angles_bar[row_of(b) + begin + l] = P::lane(foot_bar[b], l);
+            angles_bar[row_of(BEAMS + b) + begin + l] = P::lane(across_bar[b], l);
+        }
 if (fronts_bar)
     for (int k = 0; k < EXTINCTION; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
-            fronts_bar[(long long)k * (last + 1) + begin + l] = P::lane(m_bar[k], l);
+            fronts_bar[row_of(k) + begin + l] = P::lane(m_bar[k], l);
 if (varies_polynomials)
     for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
         for (int l = 0; l < LANES && begin + l <= last; ++l)
-            polynomials_bar[(long long)k * (last + 1) + begin + l] =
+            polynomials_bar[row_of(k) + begin + l] =
                 P::lane(polynomial_bar[k], l);
 """
 
 
 @functools.cache
-def packet_integral_kernel(layout: Layout) -> TextKernel:
+def packet_integral_kernel(layout: Layout, is_sliced: bool) -> TextKernel:
     """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
-    return packet_kernel("integrate", layout, _INTEGRATE, "F *out; double *masses", False)
+    given = "F *out; double *masses"
+    return packet_kernel(
+        "integrate", layout, Case(is_sliced), _INTEGRATE, given, "out masses", False
+    )
 
 
 @functools.cache
-def packet_adjoint_kernel(layout: Layout, varies_rays: bool = False) -> TextKernel:
+def packet_adjoint_kernel(layout: Layout, case: Case) -> TextKernel:
     """The kernel that adds to `bars`, of `fields`, what bars of outputs and masses are for them.
 
     These are left out where none are asked for. Each packet has its own `numbers_bar`
-    [2 C + 1, packets]; `polynomials_bar` and `table_bar`, as what they are of, may be left out.
-    Where it `varies_rays` there are `rays_bar` [R, 8] as well; point lights there are none then.
+    [2 C + 1, packets]; `polynomials_bar`, `table_bar` and, if it `varies_angles`, `angles_bar`, as
+    what they are of, may be left out. Where it `varies_rays` there are `rays_bar` [R, 8] as well.
     """
     given = f"""
     double *masses, *numbers_bar; int packets;
     F *out_bar, *masses_bar, *polynomials_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
-    F *rays_bar
+    F *rays_bar, *angles_bar
     """
-    begin = f"constexpr bool VARIES_RAYS = {int(varies_rays)};\nconst V none = P::all(F(0));"
-    moving = SLOPES + MOVE if varies_rays else STAY
-    return packet_kernel("transpose", layout, begin + SPREAD + moving + _TRANSPOSE, given)
+    moving = SLOPES + MOVE if case.varies_rays else STAY
+    made = "numbers_bar polynomials_bar table_bar fronts_bar bars rays_bar angles_bar"
+    return packet_kernel("transpose", layout, case, SPREAD + moving + _TRANSPOSE, given, made)

@@ -163,7 +163,8 @@ def judge_kernel(bits: int) -> TextKernel:
 
     Of `values` [2 C, r, c], radiance and opacity, with light `behind` [1].
     """
-    return TextKernel("judge", bits, _JUDGE, _LATTICE + "F *behind, *uneven; double *squares")
+    given = _LATTICE + "F *behind, *uneven; double *squares"
+    return TextKernel("judge", bits, _JUDGE, given, "uneven squares")
 
 
 @functools.cache
@@ -175,11 +176,11 @@ def interpolation_kernel(bits: int) -> TextKernel:
     """
     text = f"constexpr int TILE = {TILE};" + _PACKET + _INTERPOLATE
     more = "F *uneven, *bound, *out; int *rough"
-    return TextKernel("interpolate", bits, text, _PIXELS + more, packet_program)
+    return TextKernel("interpolate", bits, text, _PIXELS + more, "out rough", packet_program)
 
 
 @functools.cache
 def spread_kernel(bits: int) -> TextKernel:
     """The kernel that adds to `values_bar` [2 C, r, c] what `out_bar` [2 C, pixels] is for them."""
     text, more = _PACKET + SHARES + _SPREAD, "F *out_bar, *values_bar"
-    return TextKernel("spread", bits, text, _PIXELS + more, packet_program)
+    return TextKernel("spread", bits, text, _PIXELS + more, "values_bar", packet_program)

@@ -64,7 +64,7 @@ def mark_kernel(bits: int) -> TextKernel:
     F *planes, *rays; bool *touched; int *walked;
     int ray_count, node_count, rows, columns, words;
     """
-    return TextKernel("mark", bits, PLACES + _MARK, given, packet_program)
+    return TextKernel("mark", bits, PLACES + _MARK, given, "walked", packet_program)
 
 
 @remember

@@ -99,7 +99,7 @@ def step_kernel(bits: int, is_each: bool) -> TextKernel:
     int length, total; F forget_first, forget_second, root, ahead, rate, low, high, *smallest;
     F *value, *gradient, *first_moment, *second_moment, *new_value, *new_first, *new_second
     """
-    return TextKernel("step", bits, BLOCK + _ROOT + text, given)
+    return TextKernel("step", bits, BLOCK + _ROOT + text, given, "new_value new_first new_second")
 
 
 @functools.cache
@@ -113,4 +113,4 @@ def variation_kernel(bits: int) -> TextKernel:
     given = (
         "int length, nz, ny, nx; F kz, ky, kx, rounding, *field, *slope, *diagonal; double *totals"
     )
-    return TextKernel("vary", bits, _ROOT + _VARIATION, given)
+    return TextKernel("vary", bits, _ROOT + _VARIATION, given, "slope diagonal totals")

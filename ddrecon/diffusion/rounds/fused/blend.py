@@ -102,10 +102,10 @@ sums[(long long)rows * parts * colors + item] = far_sum;
 """
 )
 _GIVEN = [
-    "extinction", "numbers", "shares", "swept_higher", "light_higher",
+    "extinction", "numbers", "swept_higher", "light_higher",
     *(f"{of}_{part}" for of in ("light", "made") for part in _FIRST),
 ]  # fmt: skip
-_TENSORS = "numbers", "extinction", "light_higher", "swept_higher", *_GIVEN[5:]
+_TENSORS = "numbers", "extinction", "light_higher", "swept_higher", *_GIVEN[4:]
 _FOUND = [f"new_{part}" for part in _PARTS]
 _BARS = [
     "extinction_bar", "share_bar", "swept_higher_bar", "light_higher_bar",
@@ -142,7 +142,8 @@ class _Blend(torch.autograd.Function):
     def forward(grid: Grid, *tensors: Any) -> tuple[Tensor, ...]:
         given, mean, swept = _given(*tensors)
         found = _empty(mean, swept)
-        launch_rows(blend_kernel, grid, len(mean), given, found)
+        shares = {"shares": mean.new_empty(mean.shape)}
+        launch_rows(blend_kernel, grid, len(mean), given, found | shares)
         return tuple(found.values())
 
     @staticmethod
@@ -155,7 +156,7 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, *bars: Tensor) -> tuple[Any, ...]:
         numbers, extinction, old, swept, *_ = ctx.saved_tensors
         given, mean, _ = _given(*ctx.saved_tensors)
-        found = {name: mean.new_empty(mean.shape) for name in _BARS}
+        found = {name: mean.new_empty(mean.shape) for name in (*_BARS, "shares")}
         found["swept_higher_bar"] = swept.new_empty(swept.shape)
         if old is not None:
             found["light_higher_bar"] = old.new_empty(old.shape)
@@ -206,7 +207,7 @@ def _given(
     names = (f"{of}_{part}" for of in ("light", "made") for part in _FIRST)
     given = {
         "numbers": numbers, "extinction": extinction, "swept_higher": swept,
-        "light_higher": mean if old is None else old, "shares": mean.new_empty(mean.shape),
+        "light_higher": mean if old is None else old,
         "extinction_colors": len(extinction), "colors": len(mean), "higher": len(swept),
         "is_begun": int(old is not None), **dict(zip(names, first, strict=True)),
     }  # fmt: skip
@@ -216,11 +217,13 @@ def _given(
 @functools.cache
 def blend_kernel(bits: int) -> Any:
     """The kernel of new light. What `light` had of higher moments counts if it `is_begun`."""
-    return row_kernel("blend", bits, _BLEND, " ".join([*_GIVEN, *_FOUND]), _NUMBERS)
+    made = " ".join([*_FOUND, "shares"])
+    return row_kernel("blend", bits, _BLEND, " ".join(_GIVEN), made, _NUMBERS)
 
 
 @functools.cache
 def blend_adjoint_kernel(bits: int) -> Any:
     """The kernel of the cotangents of all that new light is of."""
-    arrays = [*_GIVEN, *(f"{name}_bar" for name in _FOUND), *_BARS, "sums"]
-    return row_kernel("blend_adjoint", bits, _ADJOINT, " ".join(arrays), _NUMBERS)
+    arrays = " ".join([*_GIVEN, *(f"{name}_bar" for name in _FOUND)])
+    made = " ".join([*_BARS, "shares", "sums"])
+    return row_kernel("blend_adjoint", bits, _ADJOINT, arrays, made, _NUMBERS)

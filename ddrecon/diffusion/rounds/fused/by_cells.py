@@ -129,8 +129,8 @@ class Cells:
         return given
 
     def _launch(self, kernel: TextKernel, values: dict[str, Any], count: int) -> None:
-        given = dict(values)
-        kernel.launch(count, given, {"light": given.pop("light")})
+        made = {name: value for name, value in values.items() if name in kernel.made}
+        kernel.launch(count, {n: v for n, v in values.items() if n not in made}, made)
 
 
 @functools.cache
@@ -170,5 +170,12 @@ def _directions(
 def cell_kernels(bits: int, shares_field: bool, varies_numbers: bool) -> list[TextKernel]:
     """The kernels that follow radiance, follow it back, and collect what steps from a cell have."""
     fixed = constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers)
-    texts = {"follow": FOLLOW_CELL, "return": RETURN_CELL, "collect": COLLECT_CELL}
-    return [TextKernel(f"{n}_cells", bits, fixed + text, GIVEN) for n, text in texts.items()]
+    texts = {
+        "follow": (FOLLOW_CELL, "light"),
+        "return": (RETURN_CELL, " ".join(("bar", *BARS, *NUMBER_BARS))),
+        "collect": (COLLECT_CELL, "q_bars returning light"),
+    }
+    return [
+        TextKernel(f"{name}_cells", bits, fixed + text, GIVEN, made)
+        for name, (text, made) in texts.items()
+    ]

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.jobs import Lanes, Phase, plan
+from ddrecon.diffusion.rounds.fused.jobs import MOST, MOST_OF_FEW, SLABS, Lanes, Phase, plan
 from ddrecon.diffusion.rounds.fused.kernels import follow_kernel, return_kernel
 from ddrecon.diffusion.rounds.fused.rows import MARGIN, POINTERS
 from ddrecon.diffusion.rounds.fused.schedule import make_tables
@@ -20,17 +20,7 @@ from ddrecon.diffusion.rounds.fused.turned import Faces, Turned, pass_chunks
 from ddrecon.kernels.spare import borrow, give_back
 from ddrecon.kernels.text import TextKernel
 
-MOST_OF_FEW, MOST = 9, 16
-"""Directions at most that go through the cells together: of few moments, and of many.
-
-More read many moments less often; fewer leave more of a cache to each.
-"""
 FEW = 4
-SLABS = 4, 8
-"""Slices at most of which all lines are kept for the adjoint; the second in large volumes.
-
-Fewer fit into a cache, but more is saved before them.
-"""
 LARGE = 2**20
 """Cells of a large volume."""
 
@@ -53,7 +43,9 @@ class Rows:
         self.pitch = -(-(self.width + 2) // MARGIN) * MARGIN
         self.slab = SLABS[swept.grid.cells > LARGE]
         most = MOST_OF_FEW if self.count <= FEW else MOST
-        whole, axis, self.lanes = swept.grid, 0, Lanes.of(threads, self.colors)
+        size = self.like.element_size()
+        lanes = Lanes.that_fit(threads, self.colors, swept.grid.shape, self.count, size)
+        whole, axis, self.lanes = swept.grid, 0, lanes
         if isinstance(swept.grid, Turned):
             whole, axis = swept.grid.whole, swept.grid.axis
             self.lanes = Lanes.of_colors(threads, self.colors)

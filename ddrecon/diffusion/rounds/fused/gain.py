@@ -43,16 +43,16 @@ const long long at = c * size + start;
 const F *e_row = extinction + color(extinction_colors, size) + start;
 const F *s_row = scattering + color(scattering_colors, size) + start;
 const F strength = numbers[colors + c], cosine = numbers[2 * colors + c];
-const F *mean_change = change + at, *imbalance = off + at;
-const F *const fluxes[6] = {change_z + at, change_y + at, change_x + at,
-    off_z + at, off_y + at, off_x + at};
+const F *mean_change = behind(change, at), *imbalance = behind(off, at);
+const F *const fluxes[6] = {behind(change_z, at), behind(change_y, at), behind(change_x, at),
+    behind(off_z, at), behind(off_y, at), behind(off_x, at)};
 """
 _GAIN = (
     _ROWS
     + """
-F *source_row = source + at, *gain_row = gain + at;
-F *const gains[3] = {gain_z + at, gain_y + at, gain_x + at};
-F *const turns[3] = {turned_z + at, turned_y + at, turned_x + at};
+F *source_row = behind(source, at), *gain_row = behind(gain, at);
+F *const gains[3] = {behind(gain_z, at), behind(gain_y, at), behind(gain_x, at)};
+F *const turns[3] = {behind(turned_z, at), behind(turned_y, at), behind(turned_x, at)};
 INDEPENDENT
 for (int i = begin; i < end; ++i) {"""
     + SHARE
@@ -72,13 +72,14 @@ _ADJOINT = (
     ROW_SUM
     + _ROWS
     + """
-const F *source_bars = source_bar + at, *gain_bars = gain_bar + at;
-const F *const flux_bars[6] = {gain_z_bar + at, gain_y_bar + at, gain_x_bar + at,
-    turned_z_bar + at, turned_y_bar + at, turned_x_bar + at};
-F *change_bars = change_bar + at, *off_bars = off_bar + at;
-F *const to[6] = {change_z_bar + at, change_y_bar + at, change_x_bar + at,
-    off_z_bar + at, off_y_bar + at, off_x_bar + at};
-F *e_bars = extinction_bar + at, *s_bars = scattering_bar + at;
+const F *source_bars = behind(source_bar, at), *gain_bars = behind(gain_bar, at);
+const F *const flux_bars[6] = {
+    behind(gain_z_bar, at), behind(gain_y_bar, at), behind(gain_x_bar, at),
+    behind(turned_z_bar, at), behind(turned_y_bar, at), behind(turned_x_bar, at)};
+F *change_bars = behind(change_bar, at), *off_bars = behind(off_bar, at);
+F *const to[6] = {behind(change_z_bar, at), behind(change_y_bar, at), behind(change_x_bar, at),
+    behind(off_z_bar, at), behind(off_y_bar, at), behind(off_x_bar, at)};
+F *e_bars = behind(extinction_bar, at), *s_bars = behind(scattering_bar, at);
 F depth_sum = F(0), strength_sum = F(0), cosine_sum = F(0);
 INDEPENDENT
 for (int i = begin; i < end; ++i) {"""
@@ -159,7 +160,7 @@ class _Gain(torch.autograd.Function):
         given, is_so = _given(is_off, *tensors)
         like, found = given["change"], _empty(given, is_so)
         kernel = functools.partial(gain_kernel, is_so)
-        launch_rows(kernel, grid, len(like), given | dict.fromkeys(_FOUND, like), found)
+        launch_rows(kernel, grid, len(like), given, found)
         return tuple(found.values())
 
     @staticmethod
@@ -179,9 +180,8 @@ class _Gain(torch.autograd.Function):
         rows = len(like) * depth * height * (width if like.is_cuda else 1)
         found["sums"] = like.new_zeros(3, rows)
         given |= {f"{name}_bar": bar for name, bar in zip(_FOUND, bars, strict=False)}
-        unused = {f"{name}_bar": like for name in (*_FOUND, *_CHANGE, *_OFF, *_OF_MEDIUM)}
         kernel = functools.partial(gain_adjoint_kernel, is_so)
-        launch_rows(kernel, ctx.grid, len(like), unused | given, found)
+        launch_rows(kernel, ctx.grid, len(like), given, found)
         e_bar = found["extinction_bar"].sum_to_size(extinction.shape)
         s_bar = (
             None if scattering is None else found["scattering_bar"].sum_to_size(scattering.shape)
@@ -200,9 +200,7 @@ class _Gain(torch.autograd.Function):
             d_given = dict(zip(names, d_values, strict=True))
             if is_so.SHARES_FIELD:
                 d_given["scattering"] = d_given["extinction"]
-            # What is not found, without flux, is not written to either.
-            unused = dict.fromkeys((name for name in _FOUND if name not in found), found["source"])
-            launch_row_tangents(kernel, ctx.grid, len(like), given, d_given, found | unused)
+            launch_row_tangents(kernel, ctx.grid, len(like), given, d_given, found)
             return tuple(found.values())
 
         d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
@@ -228,17 +226,13 @@ def _given(
     scattering: Tensor | None,
     *light: Tensor,
 ) -> tuple[dict[str, Any], GainCase]:
-    """What both kernels are given, and what is so.
-
-    The mean's change stands for arrays that are not.
-    """
+    """What both kernels are given, and what is so."""
     is_so = GainCase(len(light) > 1 + is_off, scattering is None, is_off)
     scattering = extinction if scattering is None else scattering
     given = {
         "numbers": numbers, "extinction": extinction, "scattering": scattering,
         "extinction_colors": len(extinction), "scattering_colors": len(scattering),
-        "colors": len(light[0]), **dict.fromkeys((*_CHANGE, *_OFF), light[0]),
-        **dict(zip(_light_names(is_so), light, strict=True)),
+        "colors": len(light[0]), **dict(zip(_light_names(is_so), light, strict=True)),
     }  # fmt: skip
     return given, is_so
 
@@ -250,16 +244,15 @@ _COLORS = "extinction_colors scattering_colors colors"
 @functools.cache
 def gain_kernel(is_so: GainCase, bits: int) -> Any:
     """The kernel of gains."""
-    arrays = f"{_ARRAYS} {' '.join(_FOUND)}"
-    return row_kernel("gain", bits, _told(is_so) + _GAIN, arrays, _COLORS)
+    return row_kernel("gain", bits, _told(is_so) + _GAIN, _ARRAYS, " ".join(_FOUND), _COLORS)
 
 
 @functools.cache
 def gain_adjoint_kernel(is_so: GainCase, bits: int) -> Any:
     """The kernel of the cotangents of all that gains are of."""
-    bars = (f"{name}_bar" for name in f"{_ARRAYS} {' '.join(_FOUND)}".split())
-    arrays = f"{_ARRAYS} {' '.join(bars)} sums"
-    return row_kernel("gain_adjoint", bits, _told(is_so) + _ADJOINT, arrays, _COLORS)
+    arrays = " ".join([_ARRAYS, *(f"{name}_bar" for name in _FOUND)])
+    made = " ".join(["sums", *(f"{name}_bar" for name in _ARRAYS.split())])
+    return row_kernel("gain_adjoint", bits, _told(is_so) + _ADJOINT, arrays, made, _COLORS)
 
 
 def _told(is_so: GainCase) -> str:

@@ -14,6 +14,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ddrecon.kernels.shares import count_shares
+
+MOST_OF_FEW, MOST = 9, 16
+"""Directions at most that go through the cells together: of few moments, and of many.
+
+More read many moments less often; fewer leave more of a cache to each.
+"""
+SLABS = 4, 8
+"""Slices at most of which all lines are kept for the adjoint; the second in large volumes.
+
+Fewer fit into a cache, but more is saved before them.
+"""
 Chunks = tuple[tuple[tuple[tuple[int, int], ...], ...], ...]
 """By way, and then by piece, ranges of groups that go through the cells together."""
 
@@ -65,6 +77,26 @@ class Lanes(NamedTuple):
         together = max(1, min(threads // 2, colors))
         pieces = max(1, threads // (2 * colors))
         return Lanes(colors, together, pieces, 1 if threads == 1 else 2 * together * pieces)
+
+    @staticmethod
+    def that_fit(
+        threads: int, colors: int, shape: tuple[int, int, int], moments: int, size: int
+    ) -> Lanes:
+        """The same, with no more pieces than have room, of numbers of `size` bytes."""
+        lanes = Lanes.of(threads, colors)
+        one = size * piece_numbers(shape, colors, moments)
+        pieces = count_shares(lanes.pieces, one, 1)
+        return lanes if pieces == lanes.pieces else Lanes.of(2 * colors * pieces, colors)
+
+
+def piece_numbers(shape: tuple[int, int, int], colors: int, moments: int) -> int:
+    """Numbers, at most, that a piece of directions has of its own.
+
+    Those of moments and of two fields' cotangents, and lines of its lanes.
+    """
+    depth, height, width = shape
+    lines = 2 * MOST * (SLABS[1] + 1) * height * width
+    return colors * (depth * height * width * (moments + 2) + 2 * lines)
 
 
 class Phase(NamedTuple):

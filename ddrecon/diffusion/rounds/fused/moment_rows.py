@@ -60,7 +60,7 @@ auto multiply = [&](const F* matrix, int outs, int ins, F* const* out, const F* 
 auto moment_row = [&](int k) -> F* { return scratch_row(k); };
 auto pair_row = [&](int i) -> F* { return scratch_row(POINTERS + i); };
 // A moment of light; light is given as mean, flux along z, y, x, and what is higher.
-auto part_of = [&](F* const* parts, int k) -> const F* {
+auto part_of = [&](const F* const* parts, int k) -> const F* {
     const int places[4] = {0, 2, 1, 3};
     return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
 };
@@ -196,7 +196,7 @@ auto to_directions = [&](const F* matrix, auto terms, auto find_terms, auto ligh
 // The transpose: moments that `begin` at a cell, or what is added to them, from radiance. Those
 // that nothing is in yet begin with `first` in the mean, less the parts that are `taken`.
 auto to_moments = [&](const F* matrix, F* begin, auto light, bool is_adding, F first,
-                      F* const* taken, long long at, int from, int to) {
+                      const F* const* taken, long long at, int from, int to) {
     F* found[POINTERS];
     const F* less[POINTERS];
     for (int k = 0; k < count; ++k) {

@@ -232,7 +232,7 @@ for (int t = height - 1; t >= 0; --t) {"""
 RETURN = f"""{PLACES}
 for (int slice_from, slice_to = job_to; slice_to > job_from; slice_to = slice_from) {{
 slice_from = slab_of(slice_to - 1);
-{{ const bool KEEPS = true; {FOLLOW_ROWS} }}
+{{ const bool KEEPS = true; {FOLLOW_ROWS.replace("SAVE_ROW", "")} }}
 {{ {_RETURN_ROWS} }}
 }}
 }}

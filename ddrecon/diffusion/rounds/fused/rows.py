@@ -38,6 +38,8 @@ GIVEN = """
     int directions, extinction_channels, scattering_channels
 """
 """What kernels of rows are given; what is not used, is none."""
+SCRATCH = "lines scratch nothing"
+"""Of that what all of them work in."""
 
 _NUMBERS = ", ".join(f"{name} = job[{i}]" for i, name in enumerate(Job._fields))
 # For each job of a lane.
@@ -208,14 +210,7 @@ for (int t = 0; t < height; ++t) {"""
         }"""
     + ACROSS
     + """
-        if (!KEEPS && saved && s + 1 < depth && slab_of(s + 1) == s + 1) {
-            F* row = saved + save_of(s + 1, t, begin + j);
-            for (int c = 0; c < width; ++c) row[c] = light_row[c];
-        }
-        if (!KEEPS && leaving && s == last - 1) {
-            F* row = leaving + face_of(t, begin + j);
-            for (int c = 0; c < width; ++c) row[c] = light_row[c];
-        }
+        SAVE_ROW
     }
     if (KEEPS) continue;
     F* found_row = found + piece * count * all + color * cells + at;
@@ -227,4 +222,15 @@ for (int t = 0; t < height; ++t) {"""
 }
 """
 )
-FOLLOW = f"{PLACES} const int slice_from = job_from, slice_to = job_to; {FOLLOW_ROWS} }}"
+_SAVE_ROW = """
+        if (saved && s + 1 < depth && slab_of(s + 1) == s + 1) {
+            F* row = saved + save_of(s + 1, t, begin + j);
+            for (int c = 0; c < width; ++c) row[c] = light_row[c];
+        }
+        if (leaving && s == last - 1) {
+            F* row = leaving + face_of(t, begin + j);
+            for (int c = 0; c < width; ++c) row[c] = light_row[c];
+        }
+"""
+_ROWS = FOLLOW_ROWS.replace("SAVE_ROW", _SAVE_ROW)
+FOLLOW = f"{PLACES} const int slice_from = job_from, slice_to = job_to; {_ROWS} }}"

@@ -112,5 +112,6 @@ def surround_kernels(bits: int) -> tuple[TextKernel, TextKernel]:
     int fields, extinction_channels, scattering_channels, depth, height, width, pitch
     """
     texts = {"surround_rows": _SURROUND, "reach_rows": _REACH}
-    one, other = (TextKernel(name, bits, text, given) for name, text in texts.items())
+    made = "larger occupied ranges tops densest"
+    one, other = (TextKernel(name, bits, text, given, made) for name, text in texts.items())
     return one, other

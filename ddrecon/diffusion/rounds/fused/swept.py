@@ -197,8 +197,8 @@ for (int k = 0; k < count; ++k) {
 @functools.cache
 def light_bar_kernel(bits: int) -> Any:
     """The kernel of cotangents of light's mean and flux, of which the same were taken away."""
-    arrays = "factors found bar_0 bar_1 bar_2 bar_3 light"
-    return row_kernel("light_bars", bits, _LIGHT_BARS, arrays, "colors count")
+    arrays = "factors found bar_0 bar_1 bar_2 bar_3"
+    return row_kernel("light_bars", bits, _LIGHT_BARS, arrays, "light", "colors count")
 
 
 _BEAM_BAR = """
@@ -215,4 +215,4 @@ for (int k = 0; k < count; ++k) {
 @functools.cache
 def beam_bar_kernel(bits: int) -> Any:
     """The kernel of the cotangent of a beam, of which all moments of the source are parts."""
-    return row_kernel("beam_bar", bits, _BEAM_BAR, "factors found beam", "colors count")
+    return row_kernel("beam_bar", bits, _BEAM_BAR, "factors found", "beam", "colors count")

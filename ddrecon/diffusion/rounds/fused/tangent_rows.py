@@ -25,6 +25,7 @@ from ddrecon.diffusion.rounds.fused.rows import (
     PLACES,
     RANGE,
     ROW,
+    SCRATCH,
 )
 from ddrecon.diffusion.rounds.fused.share import constants
 from ddrecon.kernels.text import TextKernel
@@ -191,4 +192,5 @@ def tangent_kernel(bits: int, shares_field: bool) -> TextKernel:
     `shares_field`: whether extinction and scattering have the same field.
     """
     text = constants(SHARES_FIELD=shares_field, KEEPS=False) + _FOLLOW
-    return TextKernel("change_rows", bits, text, f"{GIVEN}; {_GIVEN}")
+    made = "found leaving d_leaving " + SCRATCH
+    return TextKernel("change_rows", bits, text, f"{GIVEN}; {_GIVEN}", made)

@@ -239,4 +239,5 @@ if (leg == UP) {
 @functools.cache
 def cycle_kernel(bits: int) -> TextKernel:
     """A `leg` of the cycle, for one of the `parts` of the slices of a color."""
-    return TextKernel("cycle", bits, BODY, GIVEN + "int leg, parts; F *coarser; long share")
+    given = GIVEN + "int leg, parts; F *coarser; long share"
+    return TextKernel("cycle", bits, BODY, given, "vectors scratch sums coarser")

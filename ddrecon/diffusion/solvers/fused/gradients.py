@@ -133,4 +133,4 @@ if (act == ADVANCE) {
 def gradient_kernel(bits: int) -> TextKernel:
     """An `act` of conjugate gradients, for one of the `shares` of the slices of a color."""
     given = GIVEN + "int act, has_guess; F *source, *guess"
-    return TextKernel("advance", bits, BODY, given)
+    return TextKernel("advance", bits, BODY, given, "vectors scratch sums")

@@ -206,4 +206,4 @@ double *strengths, *dense;
 @functools.cache
 def prepare_kernel(bits: int) -> TextKernel:
     """A step of making a hierarchy, for a share of the cells of a color."""
-    return TextKernel("prepare", bits, BODY, _GIVEN)
+    return TextKernel("prepare", bits, BODY, _GIVEN, "data work scratch strengths dense")
