@@ -10,7 +10,7 @@ microseconds. A launch is that of a fused kernel. A read hands a tensor's number
 depends on them, to Python: there the processor waits for a GPU. A write makes a tensor of Python's
 numbers, for which it waits as well. All are counted alike on a machine without a GPU, but for the
 diffusion's solves, which on a GPU are torch's operations with either engine, and for the sweeps of
-rounds: docs/benchmarks.md has what a simulated GPU is asked for.
+rounds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import ddrecon
 from ddrecon.engine import ENGINES, use_engine
 from ddrecon.io.volumes.table import read_field
-from ddrecon.kernels.capture import INDEXED, READS
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
@@ -48,6 +47,10 @@ CONVERSIONS = (
     (Tensor, "new_tensor", "write"),
 )
 """The same by functions that reach no operation of torch."""
+READS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_dim"}
+"""Operations of torch whose result, or its size, a processor waits for."""
+INDEXED = "index", "index_put", "index_put_", "_index_put_impl_"
+"""Operations that take indices, or masks, whose sum is a size."""
 WARM_UP = 2
 """Iterations before the one that is counted."""
 FEWEST = 10

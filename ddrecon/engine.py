@@ -17,9 +17,7 @@ from ddrecon.extras import advice
 
 ENGINES = ("torch", "warp")
 """The engines there are."""
-GRAPHS = "warp-graph"
-"""Asks for warp, and that iterations on a GPU are recorded as CUDA graphs and replayed."""
-CHOICES = ("auto", *ENGINES, GRAPHS)
+CHOICES = ("auto", *ENGINES)
 """What can be asked for; `auto` is warp where it is installed, else torch."""
 PARTS = "view rays", "light", "diffusion", "transport rounds"
 """The parts of the renderer, which every engine has."""
@@ -30,17 +28,16 @@ LOG = "ddrecon.engine"
 
 _engine: str | None = None
 """The engine of this process, once it is known."""
-_has_graphs = False
-"""Whether CUDA graphs were asked for with it."""
 
 
 def use_engine(name: str) -> None:
-    """Chooses the engine of this process: `auto`, `torch`, `warp` or `warp-graph`.
+    """Chooses the engine of this process: `auto`, `torch` or `warp`.
 
-    `auto` takes warp where it is installed, else torch; `warp-graph` is warp with CUDA graphs.
-    Raises MissingExtraError for `warp` where it is not installed; UsageError for another name.
+    `auto` takes warp where it is installed, else torch. Raises MissingExtraError for `warp` where
+    it is not installed; UsageError for another name.
     """
-    _choose(name, f"engine {name}")
+    global _engine
+    _engine = _resolve(name, f"engine {name}")
 
 
 def current_engine() -> str:
@@ -49,16 +46,11 @@ def current_engine() -> str:
     Where `use_engine` was not called, the environment variable DDRECON_ENGINE chooses it. Raises
     what `use_engine` raises.
     """
+    global _engine
     if _engine is None:
         name = os.environ.get(VARIABLE) or "auto"
-        _choose(name, f"{VARIABLE}={name}")
-    assert _engine is not None
+        _engine = _resolve(name, f"{VARIABLE}={name}")
     return _engine
-
-
-def has_graphs() -> bool:
-    """Whether iterations on a GPU are to be recorded as CUDA graphs and replayed."""
-    return current_engine() == "warp" and _has_graphs
 
 
 def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
@@ -93,23 +85,19 @@ def engine_versions() -> dict[str, str]:
 
     if current_engine() == "torch":
         return {"engine": "torch"}
-    return {"engine": GRAPHS if has_graphs() else "warp", "warp-lang": version("warp-lang")}
-
-
-def _choose(name: str, asked: str) -> None:
-    """Makes the engine that `name` stands for that of this process."""
-    global _engine, _has_graphs
-    _engine, _has_graphs = _resolve(name, asked), name == GRAPHS
+    return {"engine": "warp", "warp-lang": version("warp-lang")}
 
 
 def _resolve(name: str, asked: str) -> str:
     """The engine that `name` stands for; `asked` begins the message of an error."""
+    if name == "warp-graph":
+        raise UsageError(f"{asked}: CUDA graphs are no longer there; take warp")
     if name not in CHOICES:
         raise UsageError(f"{asked}: no such engine; known: {', '.join(CHOICES)}")
     if name == "torch":
         return name
     # Looked for, not imported: that takes a third of a second.
     is_installed = find_spec("warp") is not None
-    if name in ("warp", GRAPHS) and not is_installed:
+    if name == "warp" and not is_installed:
         raise MissingExtraError(f"{asked} {advice('warp')}")
     return "warp" if is_installed else "torch"

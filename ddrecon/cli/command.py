@@ -29,7 +29,8 @@ COMMON = (
     ),
     click.option(
         "--engine",
-        type=click.Choice(CHOICES),
+        metavar=f"[{'|'.join(CHOICES)}]",
+        shell_complete=lambda _, __, begun: [name for name in CHOICES if name.startswith(begun)],
         help="Kernels; auto: warp where it is installed. DDRECON_ENGINE or auto unless given.",
     ),
     click.option(

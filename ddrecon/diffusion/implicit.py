@@ -13,7 +13,7 @@ function's own jvp.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Generic, Protocol, Self, TypeVar
@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.multigrid import solve_unread
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.numerics.autodiff import keep
 
@@ -57,25 +56,12 @@ class SolveRecord:
 
 
 @dataclass
-class Unread:
-    """Solves of which nothing is read: so many `iterations` each, by kind and transport round.
-
-    `tolerances` by kind are numbers where the solves run; `verdicts` [3] are as of `solve_unread`.
-    """
-
-    iterations: Mapping[tuple[str, int], int]
-    tolerances: Mapping[str, Tensor]
-    verdicts: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-
-
-@dataclass
 class SolveMemory:
     """What solves remember between renders: last solutions, to start from, and a record of each.
 
     `last`, and the `iterations` these took: by kind and transport round. With `is_warm` False every
     solve starts from zero. `tolerance_floor`: by kind, the tolerance below which nothing is gained;
-    no solve goes below it, whatever it is asked for. With `unread`, solves leave no record but
-    verdicts there.
+    no solve goes below it, whatever it is asked for.
     """
 
     is_warm: bool = True
@@ -83,7 +69,6 @@ class SolveMemory:
     iterations: dict[tuple[str, int], int] = field(default_factory=dict)
     records: list[SolveRecord] = field(default_factory=list)
     tolerance_floor: dict[str, float] = field(default_factory=dict)
-    unread: Unread | None = None
 
 
 @dataclass(frozen=True)
@@ -110,21 +95,9 @@ class SolverWithMemory(Generic[AnyOperator]):
         if guess is None and kind == "adjoint":
             later = self.last_solution(kind, self.round_index + 1)
             guess = None if later is None else -later
-        if self.memory.unread is not None:
-            return self._solve_unread(self.memory.unread, kind, operator, source, guess)
         solution = self.solver(operator, source, guess, self.tolerance_of(kind))
         self.remember(kind, solution, began)
         return solution.value
-
-    def _solve_unread(
-        self, unread: Unread, kind: str, operator: Any, source: Tensor, guess: Tensor | None
-    ) -> Tensor:
-        key = kind, self.round_index
-        # One that was never made before begins with one iteration: the verdict tells.
-        given = guess, unread.tolerances[kind], unread.iterations.get(key, 1)
-        value, unread.verdicts[key] = solve_unread(operator, source, *given)
-        self.memory.last[key] = value.detach()
-        return value
 
     def tolerance_of(self, kind: str) -> float:
         """How exactly to solve."""
@@ -176,12 +149,9 @@ class ImplicitSolve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, u_bar: Tensor) -> tuple[Tensor | None, ...]:
         u, *tensors = ctx.saved_tensors
-        # E9: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time,
-        # but in a recording: several solves may share it, and with the last of them its memory is
-        # free again.
-        prepared = ctx.prepared
-        if ctx.solve.memory.unread is None:
-            ctx.prepared = {}
+        # E9: A^T lambda = u_bar, then S_bar = lambda. Here `prepared` is used for the last time:
+        # several solves may share it, and with the last of them its memory is free again.
+        prepared, ctx.prepared = ctx.prepared, {}
         adjoint = ctx.solve("adjoint", ctx.assemble(prepared, *tensors).transposed(), u_bar)
         del prepared
         # E9: p_bar, the entries of A_bar = -lambda u^T that depend on p.

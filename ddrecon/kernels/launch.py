@@ -76,7 +76,7 @@ def launch(
         return
     load(kernel, device.alias)
     bounds = [i * count // threads for i in range(threads + 1)]
-    stream = _stream(torch.cuda.current_stream(like.device)) if like.is_cuda else None
+    stream = wp.stream_from_torch(torch.cuda.current_stream(like.device)) if like.is_cuda else None
 
     def run(i: int) -> None:
         given = arguments(i) if callable(arguments) else arguments
@@ -138,12 +138,6 @@ def _start() -> None:
 def _device(device: torch.device) -> Any:
     _start()
     return wp.device_from_torch(device)
-
-
-@functools.cache
-def _stream(stream: Any) -> Any:
-    """Torch's `stream` as Warp knows it, made once: while a graph is captured, less is allowed."""
-    return wp.stream_from_torch(stream)
 
 
 def _call(kernel: Any, device: Any, items: int, given: list[Any], stream: Any) -> None:

@@ -46,7 +46,9 @@ def differentiate(
     same on all of them. Of a light field in slabs each rank has a part: it goes that part's way
     back, and the derivatives by `values` are summed.
     """
-    light_field, cut = follow_light(scene, values, memory)
+    # Cut the graph at the light field: leaves stand for those of its tensors that have a graph.
+    cut = _Cut()
+    light_field = cut.cut(solve_light(with_values(scene, values), memory))
     outside = {name: value for name, value in values.items() if not is_of_volume(name)}
     inputs = [*values.values(), *cut.leaves]
     own, has_slabs = own_views(scene, names), isinstance(light_field.medium.grid, Slab)
@@ -65,8 +67,12 @@ def differentiate(
     # Nobody else holds it on its way: its memory is free as soon as it has been of use.
     del light_field, cut, inputs, sums, leaf_bars
     if reached:
+        bars = [bar for _, bar in reached]
+        product = _Product.apply(bars, *(tensor for tensor, _ in reached))
+        reached.clear()
+        through_light = torch.autograd.grad(product, list(values.values()), allow_unused=True)
         # The derivative is the sum of both ways.
-        direct = _add(direct, follow_back(reached, list(values.values())))
+        direct = _add(direct, through_light)
     if has_slabs:
         direct = sum_found(direct, list(values.values()))
     gradients = {
@@ -74,51 +80,6 @@ def differentiate(
         for name, bar in zip(values, direct, strict=True)
     }
     return Differentiated(images, loss if total is None else total, agree_on(gradients))
-
-
-def follow_light(
-    scene: Scene, values: Mapping[str, Tensor], memory: SolveMemory
-) -> tuple[LightField, Cut]:
-    """The light inside `scene` with its `values`, and where its graph is cut off from it.
-
-    Leaves stand for those of its tensors that have a graph.
-    """
-    cut = Cut()
-    light_field = cut.cut(solve_light(with_values(scene, values), memory))
-    return light_field, cut
-
-
-def differentiate_view(
-    light_field: LightField,
-    scene: Scene,
-    name: str,
-    loss_of: Callable[[View, Tensor], Tensor],
-    inputs: Sequence[Tensor],
-) -> tuple[Tensor, Tensor, list[Tensor | None]]:
-    """The image of a view, its loss, and the derivatives of that by `inputs`; None is zero."""
-    view = scene.view(name)
-    image = view_picture(light_field, scene, view, _derivatives(scene))
-    loss, bars = loss_of(view, image), list[Tensor | None]([None] * len(inputs))
-    if loss.requires_grad:
-        bars = list(torch.autograd.grad(loss, inputs, allow_unused=True))
-    return image.detach(), loss.detach(), bars
-
-
-def follow_back(
-    reached: list[tuple[Tensor, Tensor]], values: Sequence[Tensor], is_last: bool = True
-) -> Sequence[Tensor | None]:
-    """What cotangents that have `reached` tensors of the light are by `values`; None is zero.
-
-    `reached` is empty afterwards, and so is the graph, where this `is_last`.
-    """
-    bars = [bar for _, bar in reached]
-    product = _Product.apply(bars, *(tensor for tensor, _ in reached))
-    reached.clear()
-    return torch.autograd.grad(product, values, retain_graph=not is_last, allow_unused=True)
-
-
-def _derivatives(scene: Scene) -> str:
-    return scene.optimize.derivatives if scene.optimize else "all"
 
 
 def _differentiate_views(
@@ -136,14 +97,17 @@ def _differentiate_views(
     sums: list[Tensor | None] = [None] * len(inputs)
     images, loss = list[Tensor](), light_field.diffuse.mean.new_zeros(())
     for scene, name in worlds:
+        view = scene.view(name)
+        derivatives = scene.optimize.derivatives if scene.optimize else "all"
+        image = view_picture(light_field, scene, view, derivatives)
         if name not in own:
-            image = view_picture(light_field, scene, scene.view(name), _derivatives(scene))
             sums = _add(sums, torch.autograd.grad(0 * image.sum(), inputs, allow_unused=True))
             continue
-        image, view_loss, bars = differentiate_view(light_field, scene, name, loss_of, inputs)
-        sums = _add(sums, bars)
-        images.append(image)
-        loss = loss + view_loss
+        view_loss = loss_of(view, image)
+        if view_loss.requires_grad:
+            sums = _add(sums, torch.autograd.grad(view_loss, inputs, allow_unused=True))
+        images.append(image.detach())
+        loss = loss + view_loss.detach()
     return images, loss, sums
 
 
@@ -173,7 +137,7 @@ def _add(sums: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> list[T
     ]
 
 
-class Cut:
+class _Cut:
     """Where a graph is cut: the `tensors` before it, and the `leaves` that stand for them."""
 
     def __init__(self) -> None:

@@ -24,8 +24,7 @@ from ddrecon.reconstruct import setup
 from ddrecon.reconstruct.ahead import compile_ahead
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
 from ddrecon.reconstruct.gauges import find_gauges
-from ddrecon.reconstruct.gradients import Differentiated
-from ddrecon.reconstruct.graphs import Graphs
+from ddrecon.reconstruct.gradients import Differentiated, differentiate
 from ddrecon.reconstruct.joint import moves_together, step_together
 from ddrecon.reconstruct.levels import factors, resample_solutions, scene_at_level
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
@@ -236,7 +235,6 @@ class Reconstruction:
         self.noise_targets = setup.noise_targets(self.train_level, self.train, self.noises)
         before, grid = self.parameters[0].grid, self.train_level.volume.grid
         self.memory.last = resample_solutions(self.memory.last, before, grid)
-        self.graphs = Graphs()
         for parameter in self.parameters:
             if parameter.grid != grid:
                 parameter.refine(grid)
@@ -254,9 +252,9 @@ class Reconstruction:
         """The loss of views and its derivatives, solved no more exactly than the misfit asks."""
         self.memory.records.clear()
         self.memory.tolerance_floor = solve_tolerances(self.misfit)
+        names = [view.name for view in compared.views]
         try:
-            level = self.train_level
-            return self.graphs.differentiate(level, self._values(), compared, self.memory)
+            return differentiate(self.train_level, names, self._values(), compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
             compared.gather()

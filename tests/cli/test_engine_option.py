@@ -120,11 +120,14 @@ def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.Mo
     command = "optimize", "scene.yaml", "-o", "out", "--engine"
     (line,) = refuse(3, *command, "warp")
     assert line == 'engine warp needs warp: pip install "ddrecon[fast]"'
-    assert "'cuda' is not one of 'auto', 'torch', 'warp'" in refuse(2, *command, "cuda")[-1]
-    monkeypatch.setenv("DDRECON_ENGINE", "cuda")
-    assert refuse(2, *command[:-1]) == [
-        "DDRECON_ENGINE=cuda: no such engine; known: auto, torch, warp, warp-graph"
-    ]
+    gone = "CUDA graphs are no longer there; take warp"
+    for name, answer in {
+        "cuda": "no such engine; known: auto, torch, warp",
+        "warp-graph": gone,
+    }.items():
+        assert refuse(2, *command, name) == [f"engine {name}: {answer}"]
+        monkeypatch.setenv("DDRECON_ENGINE", name)
+        assert refuse(2, *command[:-1]) == [f"DDRECON_ENGINE={name}: {answer}"]
 
 
 @pytest.mark.parametrize(("quiet", "expected"), [((), [COMPILING]), (("-q",), [])])

@@ -16,8 +16,7 @@ import pytest
 import torch
 from click.testing import Result
 
-from ddrecon.reconstruct import objective
-from ddrecon.reconstruct.graphs import Graphs
+from ddrecon.reconstruct import loop, objective
 from ddrecon.reconstruct.parameters import Parameter
 
 Run = Callable[..., Result]
@@ -54,7 +53,7 @@ def press_ctrl_c_in(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, call
 @pytest.mark.parametrize(
     ("owner", "name", "call"),
     [
-        pytest.param(Graphs, "differentiate", 3, id="after a render at a new resolution"),
+        pytest.param(loop, "differentiate", 3, id="after a render at a new resolution"),
         pytest.param(Parameter, "step", 1, id="after the first step"),
         pytest.param(Parameter, "step", 3, id="after a later step"),
     ],

@@ -15,7 +15,7 @@ from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductanc
 from ddrecon.diffusion.solvers.coarsening import coarsen
 from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level
-from ddrecon.diffusion.solvers.multigrid import multigrid, solve_by_torch, solve_unread
+from ddrecon.diffusion.solvers.multigrid import multigrid, solve_by_torch
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.grid import Grid
 
@@ -255,20 +255,6 @@ def test_what_is_made_of_an_operator_is_made_once(monkeypatch: pytest.MonkeyPatc
     assert made.matrix is operator.once(ScaledMatrix.of)
     multigrid(operator, 2 * source, None, 1e-6)
     assert operator.once(Level.of) is made
-
-
-def test_iterations_beyond_those_needed_change_nothing():
-    """Colors take different numbers; the verdict counts what the slowest needed."""
-    operator = uneven((16, 5, 11), contrast=1e4)
-    source = random_values(2, 16, 5, 11)
-    looked = solve_by_torch(operator, source, None, 1e-8, is_ahead=False)
-    tolerance = torch.tensor(1e-8, dtype=torch.float64)
-    found = [solve_unread(operator, source, None, tolerance, looked.iterations + n) for n in (0, 3)]
-    for value, verdict in found:
-        assert torch.equal(value, looked.value)
-        assert verdict.tolist() == [looked.residual, looked.iterations, 1.0]
-    _, verdict = solve_unread(operator, source, None, tolerance, looked.iterations - 1)
-    assert verdict[0] > 1e-8
 
 
 def test_a_solve_ahead_ends_as_one_that_is_looked_at():

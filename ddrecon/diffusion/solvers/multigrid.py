@@ -70,19 +70,6 @@ def solve_by_torch(
     return run.system.solution(run.y, int(count), relative)
 
 
-def solve_unread(
-    operator: Operator, source: Tensor, guess: Tensor | None, tolerance: Tensor, iterations: int
-) -> tuple[Tensor, Tensor]:
-    """What so many `iterations` find, and the verdict on it, which nobody has read yet.
-
-    It is the residual that is left, how many iterations were needed, and whether levels coarsen the
-    axes they should, [3]. `tolerance` is a number where `source` lies, in double precision.
-    """
-    run = _Run(operator, source, guess, tolerance, is_ahead=True)
-    run.iterate(iterations)
-    return run.system.matrix.scale * run.y, run.verdict()
-
-
 class _Run:
     """A solve under way: the scaled solution `y`, its `residual`, and how large this is by color.
 
@@ -94,7 +81,7 @@ class _Run:
         operator: Operator,
         source: Tensor,
         guess: Tensor | None,
-        tolerance: float | Tensor,
+        tolerance: float,
         is_ahead: bool,
     ):
         self.operator, self.tolerance, self.is_ahead = operator, tolerance, is_ahead
