@@ -19,7 +19,7 @@ from ddrecon.kernels.text import TextKernel, cut
 CHUNK = 512
 """Cells that one item does on a processor; on a GPU it is one."""
 
-MOST_BEAMS = 8
+MOST_BEAMS = 16
 """So many beams at most are received at once."""
 MOST_SUMS = 1 << 25
 """So many numbers are summed at once, where weights vary: on a GPU every cell has its own."""
@@ -29,9 +29,9 @@ MOMENTS = "mean", "flux_z", "flux_y", "flux_x", "higher"
 
 _ITEM = """
 #if defined(__CUDA_ARCH__)
-enum { CHUNK = 1, BEAMS = 8 };
+enum { CHUNK = 1, BEAMS = 16 };
 #else
-enum { CHUNK = 512, BEAMS = 8 };
+enum { CHUNK = 512, BEAMS = 16 };
 #endif
 const size_t begin = size_t(item + first_item) * CHUNK;
 const int count = begin + CHUNK < cells ? CHUNK : (int)(cells - begin);

@@ -143,9 +143,8 @@ def _batches(
 
     In slabs one by one: all ranks exchange in the same order.
     """
-    moments = receiver.moments * receiver.colors * field[0].numel()
-    size = min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), moments // 8 // field.numel()))
-    lights = len(shears)
+    eighth = receiver.moments * receiver.colors // (8 * len(field))
+    lights, size = len(shears), min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), eighth))
     if any(isinstance(shear, SlabShear) for shear in shears):
         size = 1
     return [range(first, min(first + size, lights)) for first in range(0, lights, size)]
