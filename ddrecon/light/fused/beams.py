@@ -75,6 +75,6 @@ def attenuate(
     )
     count = len(found) - len(shears) * has_mass
     mean, *more = found[:count]
-    higher = more.pop() if len(more) > 3 else None
-    z, y, x = more or (None, None, None)
-    return Moments(mean, (z, y, x) if more else None, higher), list(found[count:])
+    flux = (more[0], more[1], more[2]) if more else None
+    higher = more[3] if len(more) > 3 else None
+    return Moments(mean, flux, higher), list(found[count:])

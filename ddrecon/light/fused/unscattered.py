@@ -136,9 +136,7 @@ def _stack(fields: list[Tensor]) -> Tensor:
     return fields[0][None] if len(fields) == 1 else torch.stack(fields)
 
 
-def _batches(
-    shears: Sequence[Shear | SlabShear], field: Tensor, receiver: Receiver
-) -> list[range]:
+def _batches(shears: Sequence[Shear | SlabShear], field: Tensor, receiver: Receiver) -> list[range]:
     """The numbers of beams, in parts small enough for their masses to be held at once.
 
     In slabs one by one: all ranks exchange in the same order.
