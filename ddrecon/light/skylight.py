@@ -19,9 +19,6 @@ from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
-MOST_MOMENTS = 4
-"""So many moments are summed at once by fused kernels."""
-
 
 def ambient_sky(radiance: Tensor) -> Sky:
     """Ambient light of `radiance` [C, 1, 1, 1], as light from the directions of a quadrature."""
@@ -39,7 +36,10 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     """
     skies = _lit_skies(lights)
     if skies and is_fused(*(sky.travel for sky in skies)):
-        return _sum_fused(medium, skies, degree)
+        from ddrecon.light.fused.beams import attenuate
+
+        weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
+        return attenuate(medium, torch.cat([sky.travel for sky in skies]), weights)[0]
     total = None
     for sky in skies:
         for travel, weights in zip(sky.travel, _moment_weights(sky, degree), strict=True):
@@ -48,14 +48,11 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     return None if total is None else _as_moments(total)
 
 
-def _as_moments(sums: Sequence[Tensor] | Tensor) -> Moments:
+def _as_moments(sums: Tensor) -> Moments:
     """Light of which `sums` has the mean, then the flux along z, y, x, then what is higher."""
     if len(sums) == 1:
         return Moments(sums[0])
-    higher = sums[4:]
-    if not isinstance(higher, Tensor):
-        higher = torch.stack(list(higher)) if higher else sums[0][:0]
-    return Moments(sums[0], (sums[1], sums[2], sums[3]), higher if len(higher) else None)
+    return Moments(sums[0], (sums[1], sums[2], sums[3]), sums[4:] if len(sums) > 4 else None)
 
 
 def _moment_weights(sky: Sky, degree: int) -> Tensor:
@@ -66,16 +63,6 @@ def _moment_weights(sky: Sky, degree: int) -> Tensor:
     if degree > 1:
         weights.append(harmonics(sky.travel, degree)[4:].T[..., None] * sky.irradiance[:, None])
     return torch.cat(weights, 1) / (4 * math.pi)
-
-
-def _sum_fused(medium: Medium, skies: Sequence[Sky], degree: int) -> Moments:
-    """What `sum_unscattered_sky` returns, by fused kernels: directions one after the other."""
-    from ddrecon.light.fused.beams import attenuate
-
-    weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
-    directions = torch.cat([sky.travel for sky in skies])
-    found = [attenuate(medium, directions, some)[0] for some in weights.split(MOST_MOMENTS, 1)]
-    return _as_moments([each for light in found for each in (light.mean, *(light.flux or ()))])
 
 
 def scatter_sky(medium: Medium, skies: Sequence[Sky], towards: Vector) -> Tensor:

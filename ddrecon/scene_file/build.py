@@ -19,6 +19,7 @@ from ddrecon.scene_file.build_starts import (
 )
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_volume
+from ddrecon.scene_file.colors import share_colors
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import Problems
 from ddrecon.scene_file.rounds import choose_rounds
@@ -46,7 +47,8 @@ def build_scene(
     scene_file: SceneFile, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Scene:
     """The scene of a file that was read, as tensors; `load_scene` says what is raised."""
-    place, tree, problems = torch.device(device), scene_file.tree, Problems()
+    place, tree, problems = torch.device(device), share_colors(scene_file.tree), Problems()
+    scene_file = replace(scene_file, tree=tree)
     volume, grid = None, None
     with problems.collecting():
         volume = build_volume(scene_file, dtype, place)

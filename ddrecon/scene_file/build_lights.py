@@ -12,6 +12,7 @@ from torch import Tensor
 from ddrecon.errors import DataWarning, FormatError
 from ddrecon.io.images.table import read_image
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
+from ddrecon.scene_file.colors import may_change
 from ddrecon.scene_file.files import read_referenced
 from ddrecon.scene_file.light_schema import (
     AmbientSection,
@@ -55,6 +56,9 @@ def _build_light(
     if isinstance(section, PointSection):
         return PointLight(tensor(section.position), color(section.intensity))
     pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
+    is_gray = bool((pixels == pixels[..., :1]).all())
+    if is_gray and not may_change(scene_file.tree, f"lights.{index}.radiance"):
+        pixels = pixels[..., :1]
     radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
     return EnvironmentLight(
         radiance, tensor(section.scale), tensor(section.rotation), section.directions

@@ -238,11 +238,11 @@ class SceneTree:
 
     def __post_init__(self) -> None:
         parameters = self.optimize.parameters if self.optimize else {}
-        named = {self._own_name(name): what for name, what in parameters.items()}
+        named = {self.own_name(name): what for name, what in parameters.items()}
         if self.optimize and len(named) == len(parameters):
             object.__setattr__(self, "optimize", replace(self.optimize, parameters=named))
 
-    def _own_name(self, name: str) -> str:
+    def own_name(self, name: str) -> str:
         """`name`, or `g` for `phase.g` where both are that of Henyey and Greenstein."""
         medium, last = split_name(name)
         section: VolumeSection | MediumSection | MixtureSection | None = self.volume
@@ -255,5 +255,5 @@ class SceneTree:
 
     def problems(self) -> Iterator[Problem]:
         parameters = self.optimize.parameters if self.optimize else {}
-        if len(set(map(self._own_name, parameters))) < len(parameters):
+        if len(set(map(self.own_name, parameters))) < len(parameters):
             yield "optimize", "g and phase.g are the same number: name it once"

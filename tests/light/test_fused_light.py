@@ -5,7 +5,9 @@ Values and derivatives, on grids and along directions where interpolation has ki
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -27,6 +29,9 @@ from ddrecon.scene import Scene
 from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
+from ddrecon.kernels import text
+from ddrecon.kernels.launch import launch
+from ddrecon.light.fused import receive
 from ddrecon.light.fused.point_light import way_adjoint_kernel, way_kernel
 from ddrecon.light.fused.receive import receive_adjoint_kernel, receive_kernel
 from ddrecon.light.fused.shear import shear_kernels
@@ -88,7 +93,7 @@ def test_rows_longer_than_a_block(shape: tuple[int, int, int]):
 
 def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
     """A scene with several lights of all kinds, with a medium of `kind`."""
-    density = half_empty(5, 7, 6, dtype=dtype)
+    density = half_empty(9, 11, 6, dtype=dtype)
     options: dict = {"sigma_a": (1.0,), "sigma_s": (6.0,), "directional": (3.0,)}
     if kind != "gray":
         options = {"directional": (3.0, 2.0, 1.0)}
@@ -102,32 +107,33 @@ def scene_of(kind: str, dtype: torch.dtype = torch.float64) -> Scene:
     number = density.new_tensor
     scene.lights += [
         DirectionalLight(number([0.2, 0.9, 0.3]), number([1.5])),
-        EnvironmentLight(radiance, number(1.3), number(20.0), directions=12),
+        EnvironmentLight(radiance, number(1.3), number(20.0), directions=20),
         AmbientLight(number([0.3])),
         PointLight(number([0.9, 0.7, 0.2]), number([1.0])),
     ]
     return scene
 
 
-def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, has_flux: bool) -> list[Tensor]:
+def fields_of(scene: Scene, values: dict[str, Tensor], engine: str, degree: int) -> list[Tensor]:
     """Masses of beams, and all moments of the light not yet scattered."""
     use_engine(engine)
     changed = with_values(scene, values)
-    medium, lights = scale_medium(changed.volume), decompose_lights(changed.lights)
-    reduced = reduced_light(medium, lights, has_flux)
-    sky = sum_unscattered_sky(medium, lights, has_flux)
+    medium, lights = scale_medium(changed.volume, degree or 1), decompose_lights(changed.lights)
+    reduced = reduced_light(medium, lights, degree)
+    sky = sum_unscattered_sky(medium, lights, degree)
     assert sky is not None
 
     def parts(moments: Moments) -> list[Tensor]:
-        return [moments.mean, *(moments.flux or ())]
+        higher = moments.spelled().higher
+        return [moments.mean, *(moments.flux or ()), *(() if higher is None else (higher,))]
 
     return [*(beam.mass for beam in reduced.beams), *parts(reduced.source), *parts(sky)]
 
 
-def gradients(scene: Scene, names: list[str], engine: str, has_flux: bool) -> list[Tensor]:
+def gradients(scene: Scene, names: list[str], engine: str, degree: int) -> list[Tensor]:
     """The light, and the derivatives of a random functional of it by `names`."""
     leaves = {name: value_of(scene, name).detach().clone().requires_grad_() for name in names}
-    found = fields_of(scene, leaves, engine, has_flux)
+    found = fields_of(scene, leaves, engine, degree)
     loss = sum((each * random_values(*each.shape, seed=3).to(each)).sum() for each in found)
     return [each.detach() for each in found] + list(torch.autograd.grad(loss, [*leaves.values()]))
 
@@ -138,11 +144,11 @@ each_kind = pytest.mark.parametrize("kind", ["gray", "colors", "fields"])
 
 
 @each_kind
-@pytest.mark.parametrize("has_flux", [True, False])
-def test_light_and_its_derivatives_are_those_of_torch(kind: str, has_flux: bool):
-    names = NUMBERS if has_flux else [name for name in NUMBERS if name != "lights.2.rotation"]
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_light_and_its_derivatives_are_those_of_torch(kind: str, degree: int):
+    names = NUMBERS if degree else [name for name in NUMBERS if name != "lights.2.rotation"]
     scene = scene_of(kind)
-    found, known = (gradients(scene, names, engine, has_flux) for engine in ("warp", "torch"))
+    found, known = (gradients(scene, names, engine, degree) for engine in ("warp", "torch"))
     for one, other in zip(found, known, strict=True):
         assert_near(one, other, 1e-11)
 
@@ -163,21 +169,21 @@ def test_point_lights_are_those_of_torch(kind: str, place: str):
     position = vector(*POSITIONS[place])
     scene.lights = [PointLight(position, vector(2.0)), *scene.lights]
     names = ["density", "sigma_a", "g", "lights.0.position", "lights.0.intensity"]
-    found, known = (gradients(scene, names, engine, True) for engine in ("warp", "torch"))
+    found, known = (gradients(scene, names, engine, 1) for engine in ("warp", "torch"))
     for one, other in zip(found, known, strict=True):
         assert_near(one, other, 1e-11)
 
 
 def test_the_density_alone():
     scene = scene_of("colors")
-    found, known = (gradients(scene, ["density"], engine, True) for engine in ("warp", "torch"))
+    found, known = (gradients(scene, ["density"], engine, 1) for engine in ("warp", "torch"))
     for one, other in zip(found, known, strict=True):
         assert_near(one, other, 1e-11)
 
 
 def test_single_precision():
     scene = scene_of("fields", torch.float32)
-    found, known = (gradients(scene, NUMBERS, engine, True) for engine in ("warp", "torch"))
+    found, known = (gradients(scene, NUMBERS, engine, 1) for engine in ("warp", "torch"))
     for one, other in zip(found, known, strict=True):
         assert_near(one, other, 2e-5)
 
@@ -188,22 +194,52 @@ def test_tangent_and_adjoint_are_transposes_of_each_other(name: str):
     value = value_of(scene, name).detach()
     shift = random_values(*value.shape, seed=5)
     with forward_ad.dual_level():
-        found = fields_of(scene, {name: forward_ad.make_dual(value, shift)}, "warp", True)
+        found = fields_of(scene, {name: forward_ad.make_dual(value, shift)}, "warp", 3)
         tangents = [forward_ad.unpack_dual(each).tangent for each in found]
     along = sum(
         float((each * random_values(*each.shape, seed=3)).sum())
         for each in tangents
         if each is not None
     )
-    back = float((gradients(scene, [name], "warp", True)[-1] * shift).sum())
+    back = float((gradients(scene, [name], "warp", 3)[-1] * shift).sum())
     assert along == pytest.approx(back, rel=1e-10)
+
+
+def test_sums_of_a_part_of_the_cells_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch):
+    scene = scene_of("colors")
+    known = gradients(scene, NUMBERS, "warp", 3)
+    monkeypatch.setattr(receive, "MOST_SUMS", 1)
+    for one, other in zip(gradients(scene, NUMBERS, "warp", 3), known, strict=True):
+        assert_near(one, other, 1e-12)
+
+
+def test_each_direction_is_marched_once_whatever_the_degree(monkeypatch: pytest.MonkeyPatch):
+    """In a value, an adjoint and a tangent alike."""
+    launched: list[str] = []
+
+    def note(kernel: Any, *given: Any, **named: Any) -> None:
+        launched.append(kernel.key)
+        launch(kernel, *given, **named)
+
+    monkeypatch.setattr(text, "launch", note)
+    scene = scene_of("gray")
+    change = torch.ones_like(scene.volume.density)
+    marches = []
+    for degree in (1, 3, 5):
+        launched.clear()
+        gradients(scene, ["density", "lights.2.radiance"], "warp", degree)
+        with forward_ad.dual_level():
+            density = forward_ad.make_dual(scene.volume.density, change)
+            fields_of(scene, {"density": density}, "warp", degree)
+        marches.append(Counter(name for name in launched if name.startswith("shear")))
+    assert marches[0] and marches[0] == marches[1] == marches[2]
 
 
 def test_opaque_and_empty_media_have_finite_derivatives():
     scene = scene_of("colors")
     for factor in (0.0, 1e4):
         scene.volume.density = factor * scene.volume.density
-        found, known = (gradients(scene, NUMBERS, engine, True) for engine in ("warp", "torch"))
+        found, known = (gradients(scene, NUMBERS, engine, 1) for engine in ("warp", "torch"))
         for one, other in zip(found, known, strict=True):
             assert bool(torch.isfinite(one).all())
             assert_near(one, other, 1e-11)
@@ -214,9 +250,9 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
     scene, threads = scene_of("colors"), torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        first, again = (gradients(scene, NUMBERS, "warp", True) for _ in range(2))
+        first, again = (gradients(scene, NUMBERS, "warp", 1) for _ in range(2))
         torch.set_num_threads(1)
-        alone = gradients(scene, NUMBERS, "warp", True)
+        alone = gradients(scene, NUMBERS, "warp", 1)
     finally:
         torch.set_num_threads(threads)
     for one, same, other in zip(first, again, alone, strict=True):

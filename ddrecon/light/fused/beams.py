@@ -58,8 +58,8 @@ def attenuate(
 ) -> tuple[Moments, list[Tensor]]:
     """The sum over L beams along `directions` [L, 3] of `weights` times tau, averaged over cells.
 
-    `weights` [L, 1 or 4, C]: for the mean, and along z, y, x for the flux. Also the mass up to
-    cells' centers [K, z, y, x] of each beam where it `has_mass`.
+    `weights` [L, moments, C]: for the mean, along z, y, x for the flux, and for all higher moments.
+    Also the mass up to cells' centers [K, z, y, x] of each beam where it `has_mass`.
     """
     extinction = medium.extinction
     shears, numbers = follow(medium.grid, directions, extinction.mass_bound)
@@ -73,9 +73,8 @@ def attenuate(
         numbers,
         weights.expand(-1, -1, colors),
     )
-    moments, masses = found[: weights.shape[1]], found[weights.shape[1] :]
-    mean, *flux = moments
-    if not flux:
-        return Moments(mean), list(masses)
-    z, y, x = flux
-    return Moments(mean, (z, y, x)), list(masses)
+    count = len(found) - len(shears) * has_mass
+    mean, *more = found[:count]
+    flux = (more[0], more[1], more[2]) if more else None
+    higher = more[3] if len(more) > 3 else None
+    return Moments(mean, flux, higher), list(found[count:])

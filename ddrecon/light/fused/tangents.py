@@ -51,12 +51,13 @@ def change_received(
     changes: Mapping[str, Tensor | None],
     d_moments: Sequence[Tensor],
 ) -> None:
-    """Writes the changes of what is received of beam number `light` to `d_moments`.
+    """Writes the changes of what is received of beams from number `light` on to `d_moments`.
 
-    Of beams but the first it adds them. `entered` [K, z, y, x], as of `Receiver.receive`; `changes`
-    by the names of `Receiver.given`, and of `entered`.
+    Of beams but the first it adds them. `entered` [n, K, z, y, x], as of `Receiver.receive`;
+    `changes` by the names of `Receiver.given`, and of `entered`.
     """
-    given = receiver.given | {"light": light, "lights": 1, "adds": light > 0, "entered": entered}
+    own = {"light": light, "lights": len(entered), "adds": light > 0, "entered": entered}
+    given = receiver.given | own
     kernel = tangent_of(receive_kernel(receiver.bits))
     made = {f"d_{name}": one for name, one in zip(MOMENTS, d_moments, strict=False)}
     kernel.launch(receiver.items, given | with_changes(given, changes), made)

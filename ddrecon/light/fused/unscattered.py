@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.dual import split
-from ddrecon.light.fused.receive import Receiver
+from ddrecon.light.fused.receive import MOST_BEAMS, Receiver
 from ddrecon.light.fused.shear import Shear
 from ddrecon.light.fused.shear_slabs import SlabShear
 from ddrecon.light.fused.tangents import BeamTangents, change_received
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
-MOST_BEAMS = 8
 MOST_NUMBERS = 1 << 22
-"""Of so many beams, and of so many numbers, masses are held at once: cells then receive the light
-of all of them in one pass.
+"""So many numbers of masses are held at once, or an eighth of the moments' where that is more:
+cells then receive the light of several beams in one pass.
 """
 
 
@@ -28,7 +27,8 @@ class Unscattered(torch.autograd.Function):
     `shears`: how each crosses the slices; `has_mass`: whether masses are wanted; `field`
     [K, z, y, x] and `scale` [C] of the extinction; `numbers` [L, 4]: of each beam its slope by rows
     and by columns, its path in a slice [u] and the bound of corrections; `weights` [L, moments, C]:
-    what transmittance is multiplied by. Moments are the mean, or the mean and three of a flux.
+    what transmittance is multiplied by. Moments are the mean, then three of a flux, and then all
+    others [moments - 4, C, z, y, x].
     Nothing but these is kept for derivatives. Tangents by `numbers` are those by the bound alone.
     """
 
@@ -44,7 +44,7 @@ class Unscattered(torch.autograd.Function):
         receiver = Receiver(field, scale, numbers, weights)
         moments, masses = receiver.new_moments(), []
         laid = _Laid(field)
-        for lights in _batches(shears, field):
+        for lights in _batches(shears, field, receiver):
             beams = [(i, shears[i]) for i in lights]
             entered = _stack([s.lift(s.sum(laid.of(s), numbers, i).entered) for i, s in beams])
             receiver.receive(lights[0], entered, moments, adds=lights[0] > 0)
@@ -67,7 +67,8 @@ class Unscattered(torch.autograd.Function):
         field, scale, numbers, weights = ctx.saved_tensors
         varies = any(ctx.needs_input_grad[3:])
         receiver = Receiver(field, scale, numbers, weights)
-        moments_bar, masses_bar = bars[: receiver.moments], bars[receiver.moments :]
+        count = len(bars) - len(ctx.shears) * ctx.has_mass
+        moments_bar, masses_bar = bars[:count], bars[count:]
         laid = _Laid(field)
         is_laid = any(shear.axis == 2 for shear in ctx.shears)
         laid_bar = _Laid(field.new_zeros(field.shape)) if is_laid else None
@@ -75,7 +76,7 @@ class Unscattered(torch.autograd.Function):
         scale_bar = torch.zeros_like(scale, dtype=torch.float64)
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
         weights_bar = torch.zeros_like(weights, dtype=torch.float64)
-        for lights in _batches(ctx.shears, field):
+        for lights in _batches(ctx.shears, field, receiver):
             shears = [ctx.shears[light] for light in lights]
             sums = [
                 s.sum(laid.of(s), numbers, i, True) for i, s in zip(lights, shears, strict=True)
@@ -98,8 +99,8 @@ class Unscattered(torch.autograd.Function):
                         numbers_bar[light, 2] += 0.5 * (field * mass_bar).sum(dtype=torch.float64)
             if found is not None:
                 scale_bar += found[:, 1 : 1 + len(scale)].sum(0)
-                by_weights = found[:, 1 + len(scale) :].view(len(lights), 4, -1)
-                weights_bar[lights[0] : lights[-1] + 1] = by_weights[:, : receiver.moments]
+                by_weights = found[:, 1 + len(scale) :].view(len(lights), receiver.moments, -1)
+                weights_bar[lights[0] : lights[-1] + 1] = by_weights
         field_bar = field_bar if laid_bar is None else laid_bar.add_to(field_bar)
         if not varies:
             return None, None, field_bar, None, None, None
@@ -115,15 +116,15 @@ class Unscattered(torch.autograd.Function):
             beams = BeamTangents(field, d_field, numbers, d_numbers)
             d_given = {"field": d_field, "scale": d_scale, "all_weights": d_weights}
             d_moments, d_masses = receiver.new_moments(), []
-            for light, shear in enumerate(ctx.shears):
-                entered, d_entered = beams.follow(shear, light)
-                change_received(
-                    receiver, light, entered, d_given | {"entered": d_entered}, d_moments
-                )
-                if ctx.has_mass and d_field is None:
-                    d_masses.append(d_entered)
-                elif ctx.has_mass:
-                    d_masses.append(torch.addcmul(d_entered, d_field, 0.5 * numbers[light, 2]))
+            for lights in _batches(ctx.shears, field, receiver):
+                followed = [beams.follow(ctx.shears[light], light) for light in lights]
+                entered, d_entered = (_stack(list(each)) for each in zip(*followed, strict=True))
+                d_given["entered"] = d_entered
+                change_received(receiver, lights[0], entered, d_given, d_moments)
+                for light, d_mass in zip(lights if ctx.has_mass else (), d_entered, strict=False):
+                    if d_field is not None:
+                        d_mass = torch.addcmul(d_mass, d_field, 0.5 * numbers[light, 2])
+                    d_masses.append(d_mass)
             return *d_moments, *d_masses
 
         d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
@@ -135,12 +136,13 @@ def _stack(fields: list[Tensor]) -> Tensor:
     return fields[0][None] if len(fields) == 1 else torch.stack(fields)
 
 
-def _batches(shears: Sequence[Shear | SlabShear], field: Tensor) -> list[range]:
+def _batches(shears: Sequence[Shear | SlabShear], field: Tensor, receiver: Receiver) -> list[range]:
     """The numbers of beams, in parts small enough for their masses to be held at once.
 
     In slabs one by one: all ranks exchange in the same order.
     """
-    lights, size = len(shears), max(1, min(MOST_BEAMS, MOST_NUMBERS // field.numel()))
+    eighth = receiver.moments * receiver.colors // (8 * len(field))
+    lights, size = len(shears), min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), eighth))
     if any(isinstance(shear, SlabShear) for shear in shears):
         size = 1
     return [range(first, min(first + size, lights)) for first in range(0, lights, size)]
