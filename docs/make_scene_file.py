@@ -16,6 +16,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from ddrecon import settings
 from ddrecon.scene_file import camera_schema, light_schema, phase_schema, schema
+from ddrecon.variables.default_rates import DENSITY_STEP
 from ddrecon.variables.kinds import KINDS, Kind
 
 PAGE = Path(__file__).parent / "scene_file.md"
@@ -433,7 +434,11 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "Settings of one parameter; all may be left out, `{}`.",
         {
             "init": "Where it starts; at the scene's own value unless given.",
-            "lr": "Learning rate, in the parameter's own unit; chosen by its size unless given.",
+            "lr": (
+                "Learning rate, in the parameter's own unit; chosen by its size unless given."
+                f" Of density it then has an optical depth of {DENSITY_STEP:g} across the box's"
+                " shortest side."
+            ),
             "min": "Its smallest value.",
             "max": "Its largest value.",
             "tv": (

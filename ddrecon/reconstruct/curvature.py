@@ -64,7 +64,9 @@ class Curvature:
             for view in scene.views
         }
         self.roughness = {
-            p.name: Roughness.about(self.values[p.name], p.grid, power * p.tv, p.knee)
+            p.name: Roughness.about(
+                self.values[p.name] / p.unit, p.grid, power * p.tv, p.knee
+            ).times(p.unit**-2)
             for p in parameters
             if p.tv
         }

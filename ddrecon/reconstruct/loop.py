@@ -84,7 +84,8 @@ class Reconstruction:
         self.support = setup.start_support(self.train, self.settings)
         self.factors = factors(scene, self.settings.refine_at)
         weights = {view.name: view.weight for view in self.train.views}
-        self.schedule = Schedule(self.settings, weights)
+        is_joint = moves_together(self.parameters, self.loss)
+        self.schedule = Schedule(self.settings, weights, is_joint)
         self.total = NO_ROWS
         self.misfit = 1.0
         self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
@@ -268,8 +269,7 @@ class Reconstruction:
 
         What cameras do, and how bright lights are, goes part of the way to what fits best.
         """
-        is_due = self.schedule.moves_together(self.iteration)
-        if is_due and moves_together(self.parameters, self.loss):
+        if self.schedule.moves_together(self.iteration):
             known = self.targets, self.power, self.gauges, self.memory.last
             step_together(self.train_level, self.parameters, *known)
             return

@@ -91,8 +91,10 @@ class NextView:
         """Takes in a sample, [n] away from the optimum."""
         all_parts = self.curvature.split(change)
         fields = {name: p for name, p in all_parts.items() if name in FIELDS and p.ndim >= 3}
-        parts = fields or all_parts
-        self.changes.append(torch.cat([part.reshape(-1) for part in parts.values()]).cpu())
+        # In steps of each: densities and cross sections have units of their own.
+        rates = {p.name: p.rate for p in self.curvature.parameters}
+        parts = [(part / rates[name]).reshape(-1) for name, part in (fields or all_parts).items()]
+        self.changes.append(torch.cat(parts).cpu())
         self.pictures.append(self._tangents(change) / self.deviation)
 
     def rank(self) -> list[Candidate]:

@@ -20,11 +20,6 @@ BETAS = (0.9, 0.99)
 
 The second forgets sooner than customary, since runs are short.
 """
-EPSILON = 1e-15
-"""Adam's bound on the size of a derivative.
-
-That of a mean over pixels with respect to one cell is far smaller than the customary 1e-8.
-"""
 FLOOR = 0.3
 """What is added to the size of a cell's derivative, as a part of the root mean square of all.
 
@@ -49,8 +44,7 @@ class Parameter:
     all its cells change alike; that ends after the part `even_until` of a run. `rate` is one number
     or one for each entry. `view` is the name of the view that it belongs to, None for what all
     views see. One that `is_fitted` is solved for instead; `curvature` is the second derivative of
-    the loss by it. Of a density, `unit` is what has an optical depth of 1 across the box's shortest
-    side.
+    the loss by it. Its regularizers see it in the `unit` of `unit_of`.
     """
 
     def __init__(
@@ -77,8 +71,7 @@ class Parameter:
         self.is_even = self.even_until > 0
         weight = settings.tv if isinstance(settings.tv, float) else kind.tv
         self.tv = weight if self.is_field else 0.0
-        self.knee = KNEE * unit if kind.is_compressed else None
-        self.thin = THIN * unit if kind.is_compressed else None
+        self.unit, self.knee = unit, KNEE if kind.is_compressed else None
         self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
@@ -90,7 +83,7 @@ class Parameter:
 
         See `ParameterSettings` for the weights.
         """
-        value, parts = self.value, list[Tensor]()
+        value, parts = self.value / self.unit, list[Tensor]()
         if self.tv:
             variation = total_variation
             if current_engine() == "warp":
@@ -98,7 +91,7 @@ class Parameter:
             seen = value if self.knee is None else compress(value, self.knee)
             parts.append((power * self.tv) * variation(seen, self.grid))
         if self.l1:
-            size = value.abs() if self.thin is None else compress(value, self.thin)
+            size = value.abs() if self.knee is None else compress(value, THIN)
             parts.append((power * self.l1) * size.mean())
         return sum(parts[1:], parts[0]) if parts else value.new_zeros(())
 
@@ -113,7 +106,7 @@ class Parameter:
         `rate` is the part of its learning rate that counts now, `power` the unit of the penalties
         in the gradient, as in `add_penalties`. With m and v the running means of the derivative and
         of its square, each divided by the part of 1 that their weights sum to, Adam moves the value
-        by -rate m / (sqrt(v) + epsilon), and a field as E46 and E49 say.
+        by -rate m / sqrt(v), and a field as E46 and E49 say.
         """
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
@@ -122,8 +115,8 @@ class Parameter:
             gradient = gradient.mean((-3, -2, -1), keepdim=True).expand_as(gradient).contiguous()
         rate_now, smallest = rate * self.rate, self._smallest_size(gradient)
         if self.tv and power and not self.is_even:
-            stiffness = stiffness_diagonal(before, self.grid, self.knee)
-            factor = DAMPING * rate * self.largest_rate * power * self.tv
+            stiffness = stiffness_diagonal(before / self.unit, self.grid, self.knee)
+            factor = DAMPING * rate * self.largest_rate * power * self.tv / self.unit**2
             smallest = torch.add(smallest, stiffness, alpha=factor)
         value, self.moments = self._step(before, gradient, rate_now, smallest)
         if self.is_direction:
@@ -160,11 +153,13 @@ class Parameter:
 
         It is a tensor, so that no device has to be waited for.
         """
+        # Squares of less are none.
+        least = torch.finfo(gradient.dtype).tiny ** 0.5
         if not self.is_field:
-            return gradient.new_tensor(EPSILON)
+            return gradient.new_tensor(least)
         # Of the mean of the new second moments, before there are any.
         mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - BETAS[1])
-        return (mean * (FLOOR**2 / (1 - BETAS[1] ** float(self.steps)))).sqrt() + EPSILON
+        return (mean * (FLOOR**2 / (1 - BETAS[1] ** float(self.steps)))).sqrt() + least
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""

@@ -17,7 +17,7 @@ from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.information import Information
 from ddrecon.reconstruct.limits import find_bounds, find_gauge, find_kept
 from ddrecon.reconstruct.numbers import number_curvature, single_numbers, solve_numbers_within
-from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like
+from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like, rounding_of
 
 TOLERANCE = 0.5
 """How small a sample's residual is to be, of a right side's usual size."""
@@ -76,8 +76,11 @@ class Posterior:
         self.prior = Prior(curvature, temperature)
         value = curvature.join(curvature.values)
         self.low, self.high = (bound - value for bound in find_bounds(curvature))
+        # What rounding leaves of a cell that no picture shows is at its bound.
+        near = {p.name: torch.full_like(p.value, rounding_of(p)) for p in curvature.parameters}
+        self.near = curvature.join(near)
         self.is_kept = find_kept(curvature)
-        at_bound = (self.low >= 0) & (gradient > 0) | (self.high <= 0) & (gradient < 0)
+        at_bound = self._is_held(torch.zeros_like(gradient), -gradient)
         # The optimum is one: what is left of a derivative elsewhere belongs to the optimizer.
         self.gradient = torch.where(at_bound, gradient, 0)
         self.gauge = find_gauge(curvature)
@@ -135,7 +138,8 @@ class Posterior:
 
     def _is_held(self, change: Tensor, residual: Tensor) -> Tensor:
         """Which entries are at a bound that `residual` presses them against."""
-        return (change <= self.low) & (residual < 0) | (change >= self.high) & (residual > 0)
+        is_low, is_high = change - self.low <= self.near, self.high - change <= self.near
+        return is_low & (residual < 0) | is_high & (residual > 0)
 
     def minimize(self, change: Tensor, residual: Tensor) -> tuple[Tensor, int, float]:
         """The least, within bounds, of a quadratic, from `change` where `residual` is lacking.

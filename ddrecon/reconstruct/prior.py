@@ -125,11 +125,16 @@ def _held(parameter: Parameter, scene: Scene, is_smoothed: bool) -> Tensor:
         camera = scene.view(parameter.view).camera
         return calibration_prior(camera, scene.volume.grid).to(value)
     if parameter.is_field:
-        inside = value[value != 0]
-        square = inside.square().mean() if len(inside) else value.new_ones(())
+        inside = value[value.abs() > rounding_of(parameter)]
+        square = inside.square().mean() if len(inside) else value.new_tensor(parameter.unit**2)
         return 1 / (square * (value.numel() if is_smoothed else 1))
     largest = WIDE * value.abs().max() + STEPS * parameter.largest_rate
     return 1 / largest**2
+
+
+def rounding_of(parameter: Parameter) -> float:
+    """What is as good as 0 among values of `parameter`: rounding of its steps."""
+    return torch.finfo(parameter.value.dtype).eps * parameter.largest_rate
 
 
 def _times(held: Tensor, part: Tensor) -> Tensor:

@@ -48,13 +48,18 @@ class Progress:
 
 
 class Schedule:
-    """When a run of `settings` refines, slows down and ends; `weights` are its views' by name."""
+    """When a run of `settings` refines, slows down and ends; `weights` are its views' by name.
 
-    def __init__(self, settings: OptimizeSettings, weights: Mapping[str, float]):
+    `is_joint`: it takes joint steps (E43).
+    """
+
+    def __init__(
+        self, settings: OptimizeSettings, weights: Mapping[str, float], is_joint: bool = False
+    ):
         self.is_auto = settings.iterations == AUTO
         self.planned = PLANNED if self.is_auto else int(settings.iterations)
         self.most = MOST if self.is_auto else self.planned
-        self.refine_at, self.weights = settings.refine_at, weights
+        self.refine_at, self.weights, self.is_joint = settings.refine_at, weights, is_joint
         # Twice over all views, so that a window does not tell one view from another.
         seen = settings.views_per_iteration or len(weights)
         self.window = max(WINDOW, 2 * math.ceil(len(weights) / seen))
@@ -85,9 +90,7 @@ class Schedule:
 
     def moves_together(self, iteration: int) -> bool:
         """Whether `iteration` is one of the last at its resolution, in which all moves together."""
-        place, ends = self.place(iteration), self._part_ends
-        parts = zip([0, *ends[:-1]], ends, strict=True)
-        return any(end - (end - begin) // TOGETHER <= place < end for begin, end in parts)
+        return self.place(iteration) in self._joint_places(self._part(iteration))
 
     @property
     def chi_square(self) -> float | None:
@@ -123,17 +126,18 @@ class Schedule:
 
     def _judge(self, iteration: int, part: int) -> None:
         """Ends the run, or `part` of it, where that is done after `iteration`."""
-        now, ends = self.progress, self._part_ends
+        now, ends, place = self.progress, self._part_ends, self.place(iteration + 1)
+        joint = self._joint_places(part)
         is_noise = self.chi_square is not None and self.chi_square <= 1
         is_at_rest = _is_at_rest(now.recent, self.window)
-        if is_noise and part >= len(self.refine_at):
+        if is_noise and part >= len(self.refine_at) and place >= joint.stop:
             now.ended = "noise"
         elif is_at_rest and part == len(ends):
             now.ended = "rest"
         elif iteration + 1 >= self.most:
             now.ended = "bound"
         elif part < len(ends) and (is_noise or is_at_rest):
-            now.skipped += ends[part] - self.place(iteration + 1)
+            now.skipped += max((joint.start if joint else ends[part]) - place, 0)
 
     def ending(self, made: int) -> dict[str, Any]:
         """Why a run that has `made` so many iterations ended: the kind, in words, and chi^2."""
@@ -164,6 +168,12 @@ class Schedule:
     def _part_ends(self) -> list[int]:
         """Where in the plan each part ends but the last."""
         return [round(part * self.planned) for part in self.refine_at] + [self.planned]
+
+    def _joint_places(self, part: int) -> range:
+        """Where in the plan `part` has its joint steps: its last places, if any."""
+        begin, *ends = [0, *self._part_ends][part : part + 2]
+        count = (ends[0] - begin) // TOGETHER if ends and self.is_joint else 0
+        return range(ends[0] - count, ends[0]) if count else range(0)
 
     def _part(self, iteration: int) -> int:
         """The number of the part that `iteration` belongs to."""

@@ -18,8 +18,8 @@ from ddrecon.reconstruct.rates import default_rate
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
 from ddrecon.settings import Iterations, OptimizeSettings
-from ddrecon.variables.kinds import kind_of, split_name
-from ddrecon.variables.values import value_of, variable_names
+from ddrecon.variables.default_rates import unit_of
+from ddrecon.variables.values import value_of, variable_names, with_values
 
 
 def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
@@ -135,27 +135,16 @@ def mean_power(targets: Mapping[str, Target]) -> float:
 
 def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter]:
     """The parameters that `settings` name, at the values from which `scene` starts them."""
-    parameters = []
-    for name, wanted in settings.parameters.items():
-        start = scene.starts.get(name)
-        start = value_of(scene, name) if start is None else start
-        rate = wanted.lr or default_rate(scene, name, start)
-        unit = _density_unit(scene, name)
+    starts = {
+        name: scene.starts[name] if name in scene.starts else value_of(scene, name)
+        for name in settings.parameters
+    }
+    parameters, begun = [], with_values(scene, starts)
+    for name, start in starts.items():
+        wanted = settings.parameters[name]
+        rate, unit = wanted.lr or default_rate(begun, name, start), unit_of(begun, name)
         parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid, unit))
     return parameters
-
-
-def _density_unit(scene: Scene, name: str) -> float:
-    """The density that has an optical depth of 1 across the shortest side of the box of `scene`.
-
-    By the mean extinction of the medium whose density is the variable `name`; 1 where that is 0,
-    and for another variable.
-    """
-    if not kind_of(name).is_compressed:
-        return 1.0
-    medium, _ = split_name(name)
-    depth = float(value_of(scene, f"{medium}sigma_t").mean()) * min(scene.volume.grid.extent)
-    return 1 / depth if depth > 0 else 1.0
 
 
 def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:

@@ -1,6 +1,7 @@
 """Default learning rates: the largest change of a variable in one step, in the variable's own unit.
 
-Those of densities, cross sections, brightness, positions and directions follow the scene's units.
+Those of densities, cross sections, brightness, positions and directions follow the scene's units:
+the same scene in other units of density or length moves alike.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ddrecon.medium.coefficients import Volume
 from ddrecon.scene import Scene, View
 
 Rate = Callable[[Scene, str, Tensor], float | Tensor]
@@ -20,12 +20,10 @@ Rate = Callable[[Scene, str, Tensor], float | Tensor]
 It is one number, or one for each entry of the value.
 """
 
-DENSITY_STEP = 0.1
-"""Largest change of a density in one step; densities are usually of order 1."""
-THICKEST_STEP = 8
-"""Optical depth that one step may lay across the box; more, and the light is gone before the next
-step can mend it.
-"""
+DENSITY_STEP = 1.7
+"""Optical depth that one step may lay across the box's shortest side."""
+SOUGHT_DEPTH = 20.0
+"""Optical depth that the densest medium may have across the box, where density is not known yet."""
 PIXELS = 0.25
 """Pixels by which one step of a camera's pose may move the image."""
 EXPOSURE_STEP = 0.05
@@ -37,25 +35,24 @@ RELATIVE_STEP = 0.1
 
 
 def density_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """`DENSITY_STEP`, or less in a box that would become thicker than `THICKEST_STEP`."""
-    volume = scene.volume
-    depth = float(volume.sigma_a.mean() + volume.sigma_s.mean()) * _side(volume)
-    return min(DENSITY_STEP, THICKEST_STEP / depth) if depth > 0 else DENSITY_STEP
+    """What has an optical depth of `DENSITY_STEP`."""
+    return DENSITY_STEP * unit_of(scene, name)
 
 
 def cross_section_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the mean [1/u], which counts as at least one over the box's shortest side."""
-    return RELATIVE_STEP * max(float(start.mean()), 1 / _side(scene.volume))
+    """A part of the mean [1/u], which counts as at least what has an optical depth of 1."""
+    return RELATIVE_STEP * max(float(start.mean()), unit_of(scene, name))
 
 
 def brightness_rate(scene: Scene, name: str, start: Tensor) -> float:
-    """A part of the mean, which counts as at least `RELATIVE_STEP`."""
-    return RELATIVE_STEP * max(float(start.mean()), RELATIVE_STEP)
+    """A part of the mean, which counts as at least `RELATIVE_STEP`, seen from the box's side."""
+    unit = _side(scene) ** 2 if name.endswith(".intensity") else 1.0
+    return RELATIVE_STEP * max(float(start.mean()), RELATIVE_STEP * unit)
 
 
 def position_rate(scene: Scene, name: str, start: Tensor) -> float:
     """A part of the box's shortest side [u]."""
-    return RELATIVE_STEP * _side(scene.volume)
+    return RELATIVE_STEP * _side(scene)
 
 
 def pose_rate(scene: Scene, name: str, start: Tensor) -> Tensor:
@@ -88,6 +85,24 @@ def direction_rate(scene: Scene, name: str, start: Tensor) -> float:
     return RELATIVE_STEP / 2 * float(start.norm())
 
 
+def unit_of(scene: Scene, name: str) -> float:
+    """The density, or cross section, of an optical depth of 1 across the box's shortest side.
+
+    `name` is the variable's: a density counts by the mean extinction of its own medium, a cross
+    section by the largest density of its own, or by `SOUGHT_DEPTH` where that is empty. 1 where
+    neither is known, and for other variables.
+    """
+    volume, side, kind = scene.volume, _side(scene), name.rpartition(".")[2]
+    if volume.media is not None and name.startswith("media."):
+        volume = volume.media[name.split(".")[1]]
+    if kind == "density" or kind.startswith("sigma_"):
+        depth = side * float(volume.sigma_a.mean() + volume.sigma_s.mean())
+        unit = 1 / depth if depth > 0 else 1.0
+        largest = float(volume.density.max()) or SOUGHT_DEPTH * unit
+        return unit if kind == "density" else 1 / (side * largest)
+    return 1.0
+
+
 def fixed_rate(rate: float) -> Rate:
     """`rate` in every scene, for a variable with a natural unit."""
     return lambda scene, name, start: rate
@@ -98,6 +113,6 @@ def _view_of(scene: Scene, name: str) -> View:
     return scene.view(name.partition(".")[2].rpartition(".")[0])
 
 
-def _side(volume: Volume) -> float:
+def _side(scene: Scene) -> float:
     """The box's shortest side [u]."""
-    return min(volume.grid.extent)
+    return min(scene.volume.grid.extent)

@@ -114,5 +114,6 @@ def test_only_runs_that_seek_cameras_and_a_field_take_them(scene: Scene) -> None
 
 @pytest.mark.parametrize(("planned", "expected"), [(128, {62, 63, 126, 127}), (60, set())])
 def test_it_is_the_last_iterations_of_each_resolution(planned: int, expected: set[int]) -> None:
-    schedule = Schedule(OptimizeSettings({}, iterations=planned, refine_at=(0.5,)), {})
+    settings = OptimizeSettings({}, iterations=planned, refine_at=(0.5,))
+    schedule = Schedule(settings, {}, is_joint=True)
     assert {i for i in range(planned) if schedule.moves_together(i)} == expected

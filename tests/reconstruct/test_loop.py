@@ -96,7 +96,7 @@ def test_a_field_is_even_for_part_of_a_run(ball_scene: Scene) -> None:
         assert (value.amax() == value.amin()) == (made <= 4)
         state, run = run.state(), Reconstruction(run.scene)
         run.restore(state)
-    assert losses[3] < losses[0]
+    assert min(losses[1:4]) < losses[0]
     # Where its optimizer began anew, its memory is of the steps since.
     assert run.parameters[0].steps == 2
 

@@ -5,10 +5,13 @@ sees.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
+from media import make_scene, random_values
 
+from ddrecon.medium.mixture import mix_media
 from ddrecon.reconstruct.rates import default_rate, rate_at
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene
@@ -34,6 +37,15 @@ def test_brighter_light_moves_faster_in_proportion(ball_scene: Scene) -> None:
         for value in (1.0, 10.0)
     )
     assert ten == pytest.approx(10 * one)
+
+
+def test_a_medium_moves_as_it_would_alone() -> None:
+    """Whatever is in the same place: a step has the same optical depth of each."""
+    thin, thick = (make_scene(random_values(4, 4, 4), sigma_s=(s,)).volume for s in (0.01, 1e3))
+    both = replace(make_scene(thin.density), volume=mix_media({"air": thin, "cloud": thick}))
+    for medium, volume in both.volume.media.items():
+        alone = default_rate(replace(both, volume=volume), "density", volume.density)
+        assert default_rate(both, f"media.{medium}.density", volume.density) == alone
 
 
 def test_all_views_where_no_number_is_asked_for() -> None:

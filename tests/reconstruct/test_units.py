@@ -1,0 +1,176 @@
+"""A run does not depend on units: of density, as per km or per mm, or of length."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from media import make_camera, make_scene, random_values
+from torch import Tensor
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.grid import Grid
+from ddrecon.light.lights import PointLight
+from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.mixture import mix_media
+from ddrecon.reconstruct import joint, schedule
+from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.next_view import NextView, shots_around
+from ddrecon.reconstruct.uncertainty import Uncertainty
+from ddrecon.renderer import render_each
+from ddrecon.scene import Scene, View
+from ddrecon.settings import AUTO, MASKS, NoiseSettings, OptimizeSettings, ParameterSettings
+
+EYES = {"one": (0.2, 0.3, 2.5), "two": (2.4, -0.3, 0.5)}
+GAINS = {"one": 1.2, "two": 1 / 1.2}
+CAMERAS = {
+    "density": ParameterSettings(tv=1e-3, l1=1e-2, support=MASKS, support_margin=0.0),
+    "lights.0.irradiance": ParameterSettings(),
+    **{
+        f"views.{view}.{key}": ParameterSettings()
+        for key in ("exposure", "camera")
+        for view in EYES
+    },
+}
+SMOOTH = ParameterSettings(tv=1e-3, l1=1e-3)
+SECTIONS = {
+    "density": ParameterSettings(),
+    "sigma_a": ParameterSettings(),
+    "sigma_s": SMOOTH,
+    "lights.1.intensity": ParameterSettings(),
+    "lights.1.position": ParameterSettings(),
+}
+MEDIA = {"media.cloud.density": SMOOTH, "media.air.sigma_s": ParameterSettings()}
+SOUGHT = {"cameras": CAMERAS, "sections": SECTIONS, "media": MEDIA}
+FACTORS = [(k, 1.0) for k in (1e-3, 1 / 8, 1e3)] + [(1.0, k) for k in (1e-3, 1 / 8, 1e3)]
+
+
+def scene_of(kind: str) -> Scene:
+    """Two views of a ball from an empty box, to be reconstructed for what is `SOUGHT`."""
+    z = torch.linspace(-1, 1, 6, dtype=torch.float64)
+    density = (0.9 - z[:, None, None] ** 2 - z[:, None] ** 2 - z**2).clamp(min=0)
+    world = make_scene(density, sigma_a=(0.2,), sigma_s=(6.0,), g=0.3)
+    world.lights.append(PointLight(density.new_tensor([0.9, 0.8, 0.9]), density.new_tensor([0.5])))
+    views = [
+        View(name, make_camera(eye, (8, 9)), exposure=density.new_tensor([GAINS[name]]))
+        for name, eye in EYES.items()
+    ]
+    images = render_each(world, views, SolveMemory())
+    shown = [
+        replace(
+            view,
+            image=image * (1 + 0.01 * random_values(*image.shape, seed=seed)),
+            exposure=torch.ones_like(image[0, 0, :1]),
+            mask=(image[0] > 0).double(),
+        )
+        for seed, (view, image) in enumerate(zip(views, images, strict=True))
+    ]
+    settings = OptimizeSettings(
+        SOUGHT[kind],
+        iterations=AUTO if kind == "cameras" else 4,
+        noise=NoiseSettings(read=0.05),
+        refine_at=(),
+        views_per_iteration=0,
+    )
+    world = replace(world, views=shown, optimize=settings)
+    volume, starts = world.volume, {"density": torch.zeros_like(density)}
+    if kind == "cameras":
+        starts["lights.0.irradiance"] = density.new_tensor([2.0])
+    if kind == "sections":
+        starts["sigma_s"] = torch.full((1, *density.shape), 4.0).double()
+        starts["lights.1.intensity"] = density.new_tensor([0.0])
+    if kind == "media":
+        air = replace(volume, density=torch.ones_like(density), sigma_s=volume.sigma_s / 20)
+        starts = {"media.cloud.density": starts["density"]}
+        world = replace(world, volume=mix_media({"cloud": volume, "air": air}))
+    return replace(world, starts=starts)
+
+
+def factor_of(name: str, density: float, length: float) -> float | Tensor:
+    """By how much the variable `name` grows in units of density and length so much smaller."""
+    if name.endswith(".camera"):
+        return torch.tensor([1, 1, 1, length, length, length])
+    factors = {
+        "density": density,
+        "sigma_a": 1 / density / length,
+        "sigma_s": 1 / density / length,
+        "position": length,
+        "intensity": length**2,
+    }
+    return factors.get(name.rpartition(".")[2], 1.0)
+
+
+def in_units(scene: Scene, density: float, length: float) -> Scene:
+    """`scene` whose densities and lengths are so many times as large, in units so much smaller."""
+
+    def scaled(name: str, value: Tensor) -> Tensor:
+        return value * factor_of(name, density, length)
+
+    def volume_of(volume: Volume) -> Volume:
+        if volume.media is not None:
+            return mix_media({name: volume_of(medium) for name, medium in volume.media.items()})
+        lower, upper = (
+            (length * z, length * y, length * x)
+            for z, y, x in (volume.grid.lower, volume.grid.upper)
+        )
+        names = ("density", "sigma_a", "sigma_s")
+        fields = {name: scaled(name, getattr(volume, name)) for name in names}
+        return replace(volume, grid=Grid(volume.grid.shape, lower, upper), **fields)
+
+    def view_of(view: View) -> View:
+        pose = view.camera.pose * view.camera.pose.new_tensor([1, 1, 1, length])
+        return replace(view, camera=replace(view.camera, pose=pose))
+
+    sun, lamp = scene.lights
+    assert isinstance(lamp, PointLight)
+    lamp = PointLight(scaled("position", lamp.position), scaled("intensity", lamp.intensity))
+    return replace(
+        scene,
+        volume=volume_of(scene.volume),
+        views=[view_of(view) for view in scene.views],
+        lights=[sun, lamp],
+        starts={name: scaled(name, start) for name, start in scene.starts.items()},
+    )
+
+
+def found(kind: str, density: float = 1.0, length: float = 1.0) -> dict[str, Tensor]:
+    """What a run finds, and how far a sample of its posterior is from it, in units of `scene_of`.
+
+    And how many iterations it took.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        # A joint step, in few iterations.
+        patch.setattr(schedule, "PLANNED", schedule.TOGETHER)
+        patch.setattr(joint, "MOST", 2)
+        torch.manual_seed(0)
+        run = Reconstruction(in_units(scene_of(kind), density, length))
+        while not run.is_done:
+            run.step()
+    uncertainty = Uncertainty(run, seed=0, tolerance=0.5)
+    change = uncertainty.step().change
+    ranking = NextView(uncertainty.curvature, shots_around(run.train_level, "ring")[:1], 1.0)
+    ranking.add(change)
+    samples = uncertainty.curvature.split(change)
+    both = {"run": {p.name: p.value.detach() for p in run.parameters}, "sample": samples}
+    alike = {"iterations": torch.tensor(float(run.iteration)), "ranked": ranking.changes[0]}
+    return alike | {
+        f"{name} of the {what}": value / factor_of(name, density, length)
+        for what, values in both.items()
+        for name, value in values.items()
+    }
+
+
+@pytest.fixture(scope="module", params=SOUGHT)
+def reference(request: pytest.FixtureRequest) -> tuple[str, dict[str, Tensor]]:
+    return request.param, found(request.param)
+
+
+@pytest.mark.parametrize(("density", "length"), FACTORS)
+def test_a_run_is_the_same_in_every_unit(
+    reference: tuple[str, dict[str, Tensor]], density: float, length: float
+) -> None:
+    kind, expected = reference
+    actual = found(kind, density, length)
+    off = {name: float((actual[name] - value).norm()) for name, value in expected.items()}
+    assert not {name for name, error in off.items() if error > 1e-6 * expected[name].norm()}
