@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from ddrecon.errors import UsageError
 from ddrecon.io.files.atomic import refusals, remove_temporaries
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear, write_preview
@@ -18,7 +19,12 @@ from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
+from ddrecon.run.checkpoint import (
+    LAST,
+    forget_checkpoints,
+    newest_checkpoint,
+    save_checkpoint,
+)
 from ddrecon.run.diagnoses import LateMeans, diagnose
 from ddrecon.run.findings import Findings, given_fields, solve
 from ddrecon.run.loss_log import LossLog
@@ -37,6 +43,14 @@ CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
+
+
+def require_run(folder: Path) -> Path:
+    """The folder of checkpoints of the run in `folder`; raises UsageError where there is no run."""
+    checkpoints = folder / CHECKPOINTS
+    if not (folder / "scene.yaml").is_file() or newest_checkpoint(checkpoints) is None:
+        raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
+    return checkpoints
 
 
 class RunFolder:

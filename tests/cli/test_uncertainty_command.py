@@ -11,8 +11,10 @@ import pytest
 from click.testing import Result
 from test_resume import press_ctrl_c_in
 
+from ddrecon.errors import DataWarning
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.reconstruct.posterior import Posterior
+from ddrecon.run.live import LiveRun
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -72,6 +74,23 @@ def test_one_that_stops_goes_on_to_the_same_bits(
     assert np.array_equal(volume("whole", "density_std"), volume("half", "density_std"))
     succeed("uncertainty", "run", "-o", "other", "--samples", "2", "--seed", "1", *KNOWN)
     assert not np.array_equal(volume("whole", "density_std"), volume("other", "density_std"))
+
+
+def test_the_checkpoint_before_the_last_serves_where_that_is_lost(
+    finished: Path, succeed: Run
+) -> None:
+    """To samples and to those who watch, whether the last is damaged or gone."""
+    (finished / "report.html").unlink()
+    last = finished / "checkpoints/last.pt"
+    last.with_name("previous.pt").write_bytes(last.read_bytes())
+    for lose in (lambda: last.write_bytes(last.read_bytes()[:1000]), last.unlink):
+        lose()
+        told = succeed(
+            "uncertainty", "run", "-o", "sure", "--overwrite", "--samples", "2", *KNOWN
+        ).stderr
+        assert "last.pt: " in told and "going on from run/checkpoints/previous.pt" in told
+        with pytest.warns(DataWarning, match="going on from"):
+            assert '<section id="volume">' in LiveRun(finished).page()
 
 
 def test_a_run_says_it_at_its_end(
