@@ -65,12 +65,6 @@ def load_checkpoint(
         return state, previous
 
 
-def forget_checkpoints(folder: Path) -> None:
-    """Removes the checkpoints in `folder`."""
-    for name in (LAST, PREVIOUS):
-        (folder / name).unlink(missing_ok=True)
-
-
 def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
     """The state in the file at `path`.
 

@@ -22,6 +22,7 @@ from ddrecon.reconstruct.posterior import Sample
 from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.drive import defer_interrupt
+from ddrecon.run.leftovers import remove_samples
 from ddrecon.run.run_folder import CHECKPOINTS, require_run
 from ddrecon.run.uncertainty_folder import UncertaintyFolder
 from ddrecon.scene import Scene
@@ -87,10 +88,10 @@ def drive_uncertainty(
     Each sample is saved when it is drawn: `resume` goes on after the last. `has_samples` keeps them
     as volumes. An interrupt takes effect after a sample.
     """
+    if not resume:
+        remove_samples(path)
     folder = UncertaintyFolder(path, _describe(run, request), has_samples)
     state = folder.resume() if resume else None
-    if state is None:
-        folder.start()
     found, ranking = _begin(run, from_first(state), request)
     try:
         _draw(found, ranking, samples, folder.keep, is_quiet)

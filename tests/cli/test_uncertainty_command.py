@@ -14,6 +14,7 @@ from test_resume import press_ctrl_c_in
 from ddrecon.errors import DataWarning
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.reconstruct.posterior import Posterior
+from ddrecon.run.leftovers import remove_samples
 from ddrecon.run.live import LiveRun
 
 Run = Callable[..., Result]
@@ -60,6 +61,8 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
     assert "lights.0.irradiance" in Path("sure/report.html").read_text()
     succeed("export", "sure", "-o", "sure.npz")
     assert set(field_names(Path("sure.npz"))) == {"density_std", "density_mean", "density_told"}
+    remove_samples(Path("sure"))
+    assert not any(Path("sure").iterdir())
 
 
 def test_one_that_stops_goes_on_to_the_same_bits(
@@ -105,3 +108,4 @@ def test_a_run_says_it_at_its_end(
 def test_what_is_no_run_is_refused(refuse: Refuse) -> None:
     (line,) = refuse(2, "uncertainty", "nowhere", "-o", "sure")
     assert "nowhere: holds no run" in line
+    assert "-o names the run itself" in refuse(2, "uncertainty", "run", "-o", "./run")[-1]
