@@ -179,6 +179,7 @@ def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
     succeed(*OPTIMIZE, "out", *earlier, "--iterations", "1", "--preview-every", "1")
     names = "notes.txt", "volumes/mine.npz", "previews/mine.png", "uncertainty/notes.txt"
     options = "uncertainty/uncertainty.json", "tensorboard/events.out.tfevents.1.host"
+    options += ("lights.1.radiance.npy",)
     for path in (Path("out", name) for name in names + options):
         path.parent.mkdir(exist_ok=True)
         path.write_text(path.name)
