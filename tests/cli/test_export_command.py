@@ -91,7 +91,7 @@ def test_volumes_through_every_format_keep_a_corner_in_its_place(
     assert np.array_equal(field.values, values) and np.array_equal(field.bounds, bounds)
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".vti"])
+@pytest.mark.parametrize("suffix", [".npz", ".vdb"])
 def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
     values = np.random.default_rng(1).random((4, 5, 6, 3)).astype(np.float32)
     write_field(Path("smoke.albedo.vol"), "albedo", values, np.array([[-0.5] * 3, [0.5] * 3]))
