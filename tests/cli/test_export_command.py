@@ -165,6 +165,10 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
         "volume.sigma_s={file: density.npz, name: density}",
     )
     assert field_names(Path("by_cell.npz")) == ["density", "sigma_t", "albedo"]
+    sought = "optimize.parameters.albedo={init: 0.8, field: true}"
+    succeed("optimize", "scene.yaml", "-o", "field", "-q", "--iterations", "2", "-D", sought)
+    assert "sigma_t 6.5 5.5 4.5" in succeed("export", "field", "-o", "field.npz").stdout
+    assert field_names(Path("field.npz")) == ["density", "albedo"]
     assert refuse(2, "export", "run", "density.npz", "-o", "both.vdb")[-1].startswith(
         "Error: one scene"
     )
