@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import Result
+from image_files import write_exr
 
 from ddrecon.io.volumes.table import write_field
 
@@ -151,10 +152,7 @@ def spoil_image(name: str) -> None:
     pixels = np.load("front.npy")
     pixels[3, 4, 1] = np.nan
     if name.endswith(".exr"):
-        exr = pytest.importorskip("OpenEXR")
-        exr.File(
-            {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"RGB": pixels}
-        ).write(name)
+        write_exr(Path(name), "RGB", pixels)
     else:
         np.save(name, pixels)
 

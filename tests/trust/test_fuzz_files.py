@@ -72,11 +72,11 @@ def write_image(path: Path) -> None:
     elif path.suffix == ".hdr":
         path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 6 +X 8\n" + bytes(range(192)))
     elif path.suffix == ".exr":
-        from ddrecon.io.images.exr import write_exr
+        from ddrecon.io.images.oiio import write_exr
 
         write_exr(path, PICTURE)
     elif path.suffix in (".tif", ".tiff"):
-        from ddrecon.io.images.tiff import write_tiff
+        from image_files import write_tiff
 
         write_tiff(path, PICTURE)
     else:
