@@ -117,7 +117,7 @@ def go_on(folder: Path, command: Sequence[str], ranks: Sequence[int], half: int)
     torn = [*command, "-o", str(folder / "torn")]
     processes = start(few, *torn, "--preview-every", str(half))
     # Pictures of that iteration say that it was made.
-    while not any((folder / "torn").glob(f"previews/*_{half:06d}.png")):
+    while not any((folder / "torn").glob(f"previews/*.{half:06d}.png")):
         time.sleep(0.05)
     processes[-1].send_signal(signal.SIGKILL)
     told = [process.communicate()[1] for process in processes]

@@ -11,7 +11,7 @@ from types import ModuleType
 from ddrecon.errors import FormatError, MissingExtraError
 
 EXTRAS = {
-    "OpenEXR": "exr",
+    "OpenImageIO": "exr",
     "tifffile": "tiff",
     "netCDF4": "netcdf",
     "matplotlib": "plot",
@@ -27,6 +27,15 @@ EXTRAS = {
 def advice(package: str) -> str:
     """How to get `package`, in words that follow what it is for."""
     return f'needs {package}: pip install "ddrecon[{EXTRAS[package]}]"'
+
+
+def is_there(package: str) -> bool:
+    """Whether `package` is installed."""
+    try:
+        import_module(package)
+    except ImportError:
+        return False
+    return True
 
 
 def load_extra(package: str, purpose: str) -> ModuleType:

@@ -43,6 +43,8 @@ PACKAGES = {
     ".nc": ("netCDF4",),
 }
 """What reading a format needs: one of these."""
+READ = [suffix for suffix in FORMATS if suffix != ".vti"]
+"""All formats but one that is only written."""
 
 
 def _is_readable(suffix: str) -> bool:
@@ -52,10 +54,10 @@ def _is_readable(suffix: str) -> bool:
 @pytest.fixture(scope="session")
 def readable_formats() -> list[str]:
     """The suffixes of all volume files that can be read here."""
-    return [suffix for suffix in FORMATS if _is_readable(suffix)]
+    return [suffix for suffix in READ if _is_readable(suffix)]
 
 
-@pytest.fixture(scope="session", params=FORMATS)
+@pytest.fixture(scope="session", params=READ)
 def suffix(request: pytest.FixtureRequest) -> str:
     """The suffix of each kind of volume file that can be read here."""
     if not _is_readable(request.param):

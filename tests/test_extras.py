@@ -4,8 +4,11 @@ told which.
 
 from __future__ import annotations
 
+import ast
+import re
 import sys
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -13,9 +16,9 @@ import pytest
 from ddrecon.errors import FormatError, MissingExtraError
 from ddrecon.extras import EXTRAS, load_extra, load_for_file
 
-PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"][
-    "optional-dependencies"
-]
+ROOT = Path(__file__).parents[1]
+ASKED = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PROJECT = ASKED["optional-dependencies"]
 PROJECTS = {"warp": "warp-lang"}
 """What pip calls a package, where that is another name than it is imported by."""
 
@@ -27,6 +30,23 @@ def test_every_extra_brings_its_package_and_all_brings_every_extra() -> None:
         project = PROJECTS.get(package, package.replace("_", "-"))
         assert any(need.startswith(f"{project}>=") for need in extras[name])
     assert PROJECT["all"] == [f"ddrecon[{','.join(extras)}]"]
+
+
+def test_what_is_imported_is_asked_for() -> None:
+    """Not merely brought along by what is, in whatever version that likes."""
+    imported = set[str]()
+    for path in (ROOT / "ddrecon").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {name.name.partition(".")[0] for name in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                imported.add((node.module or "").partition(".")[0])
+    needs = [*ASKED["dependencies"], *(need for extra in PROJECT.values() for need in extra)]
+    asked = {re.split(r"[^\w-]", need)[0].lower() for need in needs}
+    brings = packages_distributions()
+    # drjit is mitsuba's own
+    for package in imported - sys.stdlib_module_names - {"ddrecon", "drjit"}:
+        assert asked & {project.lower() for project in brings.get(package, [package])}, package
 
 
 @pytest.mark.parametrize("package", EXTRAS)

@@ -38,7 +38,7 @@ COMMON = (
         type=click.IntRange(min=1),
         help="Processor threads; OMP_NUM_THREADS or all cores unless given.",
     ),
-    click.option("--seed", type=int, default=0, show_default=True),
+    click.option("--seed", type=click.IntRange(-(2**31), 2**32 - 1), default=0, show_default=True),
     click.option("-q", "--quiet", is_flag=True, help="No progress line."),
     click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),
     click.option("--debug", is_flag=True, help="Show the traceback of an error."),

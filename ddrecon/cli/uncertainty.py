@@ -86,6 +86,8 @@ def uncertainty(
 
     if next_view and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
+    if output.resolve() == run.resolve():
+        raise click.UsageError("-o names the run itself; name another folder")
     state = state_of(run)
     session = replace(session, dtype=dtype_of(state))
     taken = take_up(session.build(session.read(run / "scene.yaml")), state, run)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ddrecon.io.images.table import READERS, read_image
-from ddrecon.io.images.tiff import is_stack
 from ddrecon.io.volumes.field import Fields
 from ddrecon.io.volumes.table import FORMATS, field_names, read_field
+from ddrecon.io.volumes.tiff_stack import is_stack
 
 
 def describe(path: Path) -> dict[str, Any]:

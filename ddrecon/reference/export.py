@@ -13,7 +13,7 @@ import numpy as np
 
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.folders import require_free_files
-from ddrecon.io.images.exr import write_exr
+from ddrecon.io.images.oiio import write_exr
 from ddrecon.io.volumes.table import write_field
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.scene import Scene

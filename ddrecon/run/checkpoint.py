@@ -35,21 +35,28 @@ def save_checkpoint(folder: Path, state: dict[str, Any], scene: Mapping[str, Any
             raise error.__context__ if isinstance(error.__context__, OSError) else error from None
 
 
-def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, Any], Path]:
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The last checkpoint in `folder`, good or not, else the one before it; None without any."""
+    return next((folder / name for name in (LAST, PREVIOUS) if (folder / name).is_file()), None)
+
+
+def load_checkpoint(
+    folder: Path, scene: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Any], Path]:
     """The state in the last checkpoint in `folder`, and its file.
 
-    Where that is damaged, it is the one before it, with a warning. Raises FormatError if neither
-    can be used, UsageError if there is none or it is not of this `scene`.
+    Where that is damaged or gone, it is the one before it, with a warning. Raises FormatError if
+    neither can be used, UsageError if there is none or it is not of `scene` (None: of any).
     """
     last, previous = folder / LAST, folder / PREVIOUS
-    if not last.exists() and not previous.exists():
+    if newest_checkpoint(folder) is None:
         raise UsageError(f"{last}: there is no checkpoint to resume from; run without --resume")
     try:
-        return _check(last, _load(last), scene), last
+        return _load(last, scene), last
     except FormatError as error:
         if not previous.exists():
             raise
-        state = _check(previous, _load(previous), scene)
+        state = _load(previous, scene)
         warnings.warn(
             f"{error.path}: {error.reason.partition(';')[0]}; going on from {previous}",
             DataWarning,
@@ -58,22 +65,11 @@ def load_checkpoint(folder: Path, scene: Mapping[str, Any]) -> tuple[dict[str, A
         return state, previous
 
 
-def read_state(path: Path) -> dict[str, Any]:
-    """The state in the checkpoint at `path`, of whatever scene; raises FormatError."""
-    content = _load(path)
-    if content.get("format") != FORMAT:
-        raise FormatError(path, UNUSABLE)
-    return dict(content["state"])
+def _load(path: Path, scene: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The state in the file at `path`.
 
-
-def forget_checkpoints(folder: Path) -> None:
-    """Removes the checkpoints in `folder`."""
-    for name in (LAST, PREVIOUS):
-        (folder / name).unlink(missing_ok=True)
-
-
-def _load(path: Path) -> dict[str, Any]:
-    """What is in the file at `path`; raises FormatError where it cannot be used."""
+    Raises FormatError where it cannot be used, UsageError where it is not of `scene`.
+    """
     if not path.is_file():
         raise FormatError(path, f"is missing; {ANEW}")
     try:
@@ -86,16 +82,12 @@ def _load(path: Path) -> dict[str, Any]:
         raise FormatError(path, UNUSABLE) from error
     if not is_whole or not isinstance(content, dict):
         raise FormatError(path, UNUSABLE)
-    return content
-
-
-def _check(path: Path, content: dict[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
     if content.get("format") != FORMAT:
         written = content.get("format")
         raise FormatError(
             path, f"a checkpoint of format {written}; this version reads {FORMAT}; {ANEW}"
         )
-    if changes := differences(content["scene"], scene):
+    if scene is not None and (changes := differences(content["scene"], scene)):
         raise UsageError(
             [
                 f"{path}: belongs to another scene: {change}; use another output folder"

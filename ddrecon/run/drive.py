@@ -25,6 +25,7 @@ from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
 from ddrecon.run.events import event_log
+from ddrecon.run.leftovers import remove_run
 from ddrecon.run.quality import describe_loss, loss_text, render_run
 from ddrecon.run.report_volume import turntable_images
 from ddrecon.run.run_folder import CHECKPOINTS, RunFolder
@@ -46,14 +47,17 @@ def open_run(
 ) -> Iterator[tuple[Reconstruction, RunFolder]]:
     """A run of `scene` and its folder `path`, this process's alone until the block ends.
 
-    The resolved scene and the `environment` are written there. Raises UsageError for a folder that
-    another process writes to or that is not empty, unless it may be or the run goes on from the
-    checkpoint in it; SceneError for a scene that cannot be reconstructed.
+    The resolved scene and the `environment` are written there; what an earlier run has left there
+    is removed, unless this one is to `resume` it. Raises UsageError for a folder that another
+    process writes to or that is not empty, unless it may be or the run goes on from the checkpoint
+    in it; SceneError for a scene that cannot be reconstructed.
     """
     run = _begin(scene, scene_file)
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
     with claim_folder(path, may_exist=may_exist or resume):
+            if loaded is None:
+                remove_run(path, scene_file)
         of_run = {"seed": run.seed, "engines": engine_of_scene(scene, has_slabs(scene))}
         folder = RunFolder(path, scene_file, result_of, environment | of_run)
         if loaded is None:

@@ -17,17 +17,17 @@ from time import monotonic
 
 import torch
 
-from ddrecon.errors import FormatError, UsageError
+from ddrecon.errors import DdreconError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import page_text, section, side_by_side
-from ddrecon.run.checkpoint import LAST, read_state
+from ddrecon.run.checkpoint import load_checkpoint, newest_checkpoint
 from ddrecon.run.findings import Findings, given_fields
 from ddrecon.run.loss_log import LossLog
 from ddrecon.run.quality import render_run
 from ddrecon.run.report import curves
 from ddrecon.run.report_views import view_section
 from ddrecon.run.report_volume import volume_section
-from ddrecon.run.run_folder import CHECKPOINTS
+from ddrecon.run.run_folder import require_run
 from ddrecon.run.serve import serve_page
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import AUTO, Iterations
@@ -44,9 +44,7 @@ class LiveRun:
     """
 
     def __init__(self, folder: Path):
-        self.folder, self.checkpoint = folder, folder / CHECKPOINTS / LAST
-        if not (folder / "scene.yaml").is_file() or not self.checkpoint.is_file():
-            raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
+        self.folder, self.checkpoints = folder, require_run(folder)
         self.seen, self.sections = 0, ["", ""]
         self.iterations: Iterations = AUTO
         self.maker, self.next_make = Thread(), 0.0
@@ -75,13 +73,13 @@ class LiveRun:
     def _is_finished(self) -> bool:
         """Whether the report was written after the run last began, or saved its state."""
         report = self.folder / REPORT
-        files = [self.folder / "environment.json", self.checkpoint]
-        last = max(file.stat().st_mtime_ns for file in files if file.is_file())
-        return report.is_file() and report.stat().st_mtime_ns >= last
+        began = _written(self.folder / "environment.json")
+        saved = _written(newest_checkpoint(self.checkpoints))
+        return 0 < max(began, saved) <= _written(report)
 
     def _follow(self) -> None:
         """Has volume and views made anew if there is a new checkpoint; waits only for the first."""
-        written = self.checkpoint.stat().st_mtime_ns
+        written = _written(newest_checkpoint(self.checkpoints))
         if written == self.seen or self.maker.is_alive() or monotonic() < self.next_make:
             return
         is_first, self.seen = self.seen == 0, written
@@ -92,14 +90,14 @@ class LiveRun:
 
     def _remake(self) -> None:
         start = monotonic()
-        # A checkpoint may be replaced while it is read: the next is as good.
-        with suppress(FormatError):
+        # What cannot be shown now may be with the next checkpoint.
+        with suppress(DdreconError):
             self.sections = self._make_sections()
         self.next_make = monotonic() + (monotonic() - start) * (1 / SHARE - 1)
 
     def _make_sections(self) -> list[str]:
         """Volume and views as the last checkpoint has them."""
-        state = read_state(self.checkpoint)
+        state, _ = load_checkpoint(self.checkpoints)
         dtype = next(iter(state["parameters"].values()))["value"].dtype
         run = Reconstruction(load_scene(self.folder / "scene.yaml", dtype=dtype))
         run.restore(state)
@@ -110,6 +108,11 @@ class LiveRun:
         findings = Findings(scene, given, light_field, images, quality, [], {}, {}, "")
         volume = section("Volume", volume_section(findings))
         return [volume, section("Views", *view_section(findings))]
+
+
+def _written(file: Path | None) -> int:
+    """When `file` was written [ns]; 0 where it is not there."""
+    return file.stat().st_mtime_ns if file is not None and file.is_file() else 0
 
 
 def serve_run(folder: Path, listening: socket) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,28 +14,12 @@ from ddrecon.io.files.atomic import flush, refusals, replace_file
 from ddrecon.reconstruct.log import Row
 
 COLUMNS = [field.name for field in fields(Row)]
-
-
-def _known(text: str) -> float | None:
-    return float(text) if text else None
-
-
-READERS: dict[str, Callable[[str], Any]] = {
-    "iteration": int,
-    "seconds": float,
-    "loss": float,
-    "data_loss": float,
-    "penalty": float,
-    "psnr": float,
-    "test_psnr": _known,
-    "forward_iterations": int,
-    "adjoint_iterations": int,
-    "cells": int,
-    "ssim": _known,
-    "test_ssim": _known,
-    "chi_square": _known,
+READERS: dict[Any, Callable[[str], Any]] = {
+    "int": int,
+    "float": float,
+    "float | None": lambda text: float(text) if text else None,
 }
-"""What reads the text of a cell, by column."""
+"""What reads the text of a cell, by the type of its column."""
 
 
 class LossLog:
@@ -52,16 +36,8 @@ class LossLog:
         self._write([])
 
     def cut(self, iteration: int) -> None:
-        """Removes the rows after `iteration`, where a resumed run goes on.
-
-        Warns where some before it are missing.
-        """
-        rows = self._read()[:iteration]
-        if len(rows) < iteration:
-            warnings.warn(
-                f"{self.path}: has {len(rows)} of the {iteration} iterations made", DataWarning, 2
-            )
-        self._write(rows)
+        """Removes the rows after `iteration`, where a resumed run goes on, and what is no row."""
+        self._write(row for row in self.rows() if row.iteration <= iteration)
 
     def add(self, row: Row) -> None:
         """Adds one row."""
@@ -72,29 +48,37 @@ class LossLog:
         """Returns when all rows are on the disk."""
         flush(self.path)
 
-    def rows(self) -> list[Row]:
-        """What was written."""
-        return [
-            Row(*(READERS[name](cell) for name, cell in zip(COLUMNS, row, strict=True)))
-            for row in self._read()
-        ]
+    def rows(self, made: int | None = None) -> list[Row]:
+        """What was written, but for what cannot be read; with `made` up to that iteration.
 
-    def _write(self, rows: list[list[str]]) -> None:
-        with replace_file(self.path) as temporary, temporary.open("w", newline="") as stream:
-            csv.writer(stream).writerows([COLUMNS, *rows])
-
-    def _read(self) -> list[list[str]]:
-        """The rows up to the first that is not whole, or not the next iteration's."""
+        Warns then where some are missing.
+        """
         try:
-            with self.path.open(newline="", errors="replace") as stream:
-                _, *rows = csv.reader(stream)
-        except (OSError, ValueError, csv.Error):
-            return []
-        count = next(
-            (i for i, row in enumerate(rows) if len(row) != len(COLUMNS) or row[0] != str(i + 1)),
-            len(rows),
-        )
-        return rows[:count]
+            _, *lines = self.path.read_text(errors="replace").splitlines() or [""]
+        except OSError:
+            lines = []
+        rows = [row for row in map(_row, lines) if row is not None]
+        if made is None:
+            return rows
+        rows = [row for row in rows if row.iteration <= made]
+        if len(rows) < made:
+            warnings.warn(
+                f"{self.path}: has {len(rows)} of the {made} iterations made", DataWarning, 2
+            )
+        return rows
+
+    def _write(self, rows: Iterable[Row]) -> None:
+        with replace_file(self.path) as temporary, temporary.open("w", newline="") as stream:
+            csv.writer(stream).writerows([COLUMNS, *map(_cells, rows)])
+
+
+def _row(line: str) -> Row | None:
+    """What `line` says; None where it is not whole, or no number stands where one should."""
+    cells = line.split(",")
+    try:
+        return Row(*(READERS[f.type](cell) for f, cell in zip(fields(Row), cells, strict=True)))
+    except ValueError:
+        return None
 
 
 def _cells(row: Row) -> list[Any]:

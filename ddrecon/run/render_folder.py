@@ -167,8 +167,8 @@ def render_lines(report: dict[str, Any], folder: Path) -> list[str]:
         notes = [f"{report['seconds']['views'][name]:.2f} s"]
         notes += [f"PSNR {report['psnr'][name]:.1f} dB"] if name in report["psnr"] else []
         lines.append(f"{name}: {', '.join(files)} ({', '.join(notes)})")
-    if any(file.endswith(".tif") for files in report["files"].values() for file in files):
-        lines.append(f"float .tif instead of .exr: EXR {advice('OpenEXR')}")
+    if not any(file.endswith(".exr") for files in report["files"].values() for file in files):
+        lines.append(f"no .exr: EXR {advice('OpenImageIO')}")
     if "ring" in report:
         files, white = ", ".join(report["ring"]["files"]), report["ring"]["white"]
         lines.append(f"around: {files} (radiance {white:.3g} is white)")

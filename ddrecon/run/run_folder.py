@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from ddrecon.errors import UsageError
 from ddrecon.io.files.atomic import refusals, remove_temporaries
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear, write_preview
@@ -18,7 +19,7 @@ from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.report.pictures import comparison, slices
-from ddrecon.run.checkpoint import LAST, forget_checkpoints, save_checkpoint
+from ddrecon.run.checkpoint import LAST, newest_checkpoint, save_checkpoint
 from ddrecon.run.diagnoses import LateMeans, diagnose
 from ddrecon.run.findings import Findings, given_fields, solve
 from ddrecon.run.loss_log import LossLog
@@ -37,6 +38,14 @@ CHECKPOINT_SECONDS = 60.0
 """A run writes a checkpoint about this often,"""
 CHECKPOINT_SHARE = 0.05
 """unless that would take more than this part of its time."""
+
+
+def require_run(folder: Path) -> Path:
+    """The folder of checkpoints of the run in `folder`; raises UsageError where there is no run."""
+    checkpoints = folder / CHECKPOINTS
+    if not (folder / "scene.yaml").is_file() or newest_checkpoint(checkpoints) is None:
+        raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
+    return checkpoints
 
 
 class RunFolder:
@@ -65,9 +74,7 @@ class RunFolder:
         self.save_every = CHECKPOINT_SECONDS
 
     def start(self, run: Reconstruction) -> None:
-        """Begins the log and the checkpoints of a new run; those of an earlier run are removed."""
-        with refusals(self.checkpoints):
-            forget_checkpoints(self.checkpoints)
+        """Begins the log and the checkpoints of a new run."""
         self.log.start()
         self.save(run)
 
@@ -108,7 +115,7 @@ class RunFolder:
     def preview(self, run: Reconstruction) -> None:
         """Writes pictures of every view and of the volume, marked with the iteration."""
         scene, _, images, _ = render_run(run)
-        self._pictures(scene, images, f"_{run.iteration:06d}")
+        self._pictures(scene, images, f".{run.iteration:06d}")
 
     def finish(self, run: Reconstruction) -> dict[str, Any]:
         """The summary of `run`; writes it and volumes, parameters, result, pictures and report."""
@@ -122,7 +129,7 @@ class RunFolder:
         light_field = solve(scene)
         images, quality = render_views(run, scene, light_field)
         self._pictures(scene, images, "")
-        log, environment = self.log.rows(), self.environment
+        log, environment = self.log.rows(run.iteration), self.environment
         diagnoses = diagnose(scene.views, images, quality, log, self.late.moved(run))
         told = [vars(diagnosis) for diagnosis in diagnoses]
         summary = _summary(run) | {"views": quality, "diagnoses": told}

@@ -20,19 +20,17 @@ from ddrecon.reconstruct.next_view import NextView, shots_around
 from ddrecon.reconstruct.picture_errors import PictureErrors
 from ddrecon.reconstruct.posterior import Sample
 from ddrecon.reconstruct.uncertainty import Uncertainty
-from ddrecon.run.checkpoint import LAST, UNUSABLE, read_state
+from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.drive import defer_interrupt
-from ddrecon.run.run_folder import CHECKPOINTS
+from ddrecon.run.leftovers import remove_samples
+from ddrecon.run.run_folder import CHECKPOINTS, require_run
 from ddrecon.run.uncertainty_folder import UncertaintyFolder
 from ddrecon.scene import Scene
 
 
 def state_of(folder: Path) -> dict[str, Any]:
     """The state that the run in `folder` was saved in last; raises UsageError without one."""
-    checkpoint = folder / CHECKPOINTS / LAST
-    if not (folder / "scene.yaml").is_file() or not checkpoint.is_file():
-        raise UsageError(f"{folder}: holds no run, as `ddrecon optimize -o` makes it")
-    state = read_state(checkpoint)
+    state, _ = load_checkpoint(require_run(folder))
     if "parameters" not in state:
         raise UsageError(f"{folder}: holds no run; name the folder that `ddrecon optimize` wrote")
     return state
@@ -90,10 +88,10 @@ def drive_uncertainty(
     Each sample is saved when it is drawn: `resume` goes on after the last. `has_samples` keeps them
     as volumes. An interrupt takes effect after a sample.
     """
+    if not resume:
+        remove_samples(path)
     folder = UncertaintyFolder(path, _describe(run, request), has_samples)
     state = folder.resume() if resume else None
-    if state is None:
-        folder.start()
     found, ranking = _begin(run, from_first(state), request)
     try:
         _draw(found, ranking, samples, folder.keep, is_quiet)

@@ -17,7 +17,7 @@ from ddrecon.io.volumes.table import write_field
 from ddrecon.reconstruct.next_view import Candidate, NextView
 from ddrecon.reconstruct.posterior import Sample
 from ddrecon.reconstruct.uncertainty import Uncertainty
-from ddrecon.run.checkpoint import LAST, forget_checkpoints, load_checkpoint, save_checkpoint
+from ddrecon.run.checkpoint import LAST, load_checkpoint, save_checkpoint
 from ddrecon.run.run_folder import CHECKPOINTS
 from ddrecon.run.uncertainty_report import write_uncertainty_report
 
@@ -38,10 +38,6 @@ class UncertaintyFolder:
         self.checkpoints, self.began = path / CHECKPOINTS, perf_counter()
         for name in ("volumes", CHECKPOINTS):
             (path / name).mkdir(exist_ok=True)
-
-    def start(self) -> None:
-        """Begins with no sample; those of earlier ones are forgotten."""
-        forget_checkpoints(self.checkpoints)
 
     def resume(self) -> dict[str, Any]:
         """The state after the last sample; raises UsageError where it depends on something else."""

@@ -78,10 +78,15 @@ def read_colmap(
     for index, image in enumerate(posed):
         if image.camera not in cameras:
             raise FormatError(path, f"image {image.name!r}: there is no camera {image.camera}")
+        picture = Path(image.name)
+        if picture.is_absolute() or ".." in picture.parts:
+            raise FormatError(
+                path, f"image {image.name!r} leaves the folder of pictures; rename it"
+            )
         camera = replace(cameras[image.camera], matrix=_matrix(path, image))
         is_test = test_every is not None and index % test_every == 0
         split = "test" if is_test else "train"
-        views.append(ViewSection("", camera, images / image.name, None, split))
+        views.append(ViewSection("", camera, images / picture, None, split))
     names = name_views([view.image for view in views])
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
 

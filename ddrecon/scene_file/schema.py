@@ -42,8 +42,8 @@ Paths = tuple[Path, ...]
 Backdrop = Color | Path
 
 MAX_CELLS = 2**30
-TAKEN = (".reduced", ".single", ".multiple", ".slices", ".gradient")
-"""Endings of the names of output files, which a view's name must not have."""
+TAKEN = re.compile(r".*\.(reduced|single|multiple|slices|gradient|[0-9]{6,})")
+"""Names that output files of other views have: their components, and previews by iteration."""
 
 
 BOTH = "g is the short form of a phase function: give only one of g or phase"
@@ -163,12 +163,8 @@ class ViewSection:
                 f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.',"
                 " the last not at its start",
             )
-        if self.name.endswith(TAKEN):
-            yield (
-                "name",
-                f"{self.name!r} ends as files of other views do;"
-                f" do not end it with {', '.join(TAKEN)}",
-            )
+        if taken := TAKEN.fullmatch(self.name):
+            yield "name", f"{self.name!r} ends in .{taken[1]}, as files of other views do"
         if self.image is None and self.camera.resolution is None:
             yield "camera", "missing key 'resolution'; only a view with an image can go without"
 

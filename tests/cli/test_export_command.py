@@ -91,7 +91,7 @@ def test_volumes_through_every_format_keep_a_corner_in_its_place(
     assert np.array_equal(field.values, values) and np.array_equal(field.bounds, bounds)
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".vti"])
+@pytest.mark.parametrize("suffix", [".npz", ".vdb"])
 def test_fields_of_several_files_go_into_one(succeed: Run, suffix: str) -> None:
     values = np.random.default_rng(1).random((4, 5, 6, 3)).astype(np.float32)
     write_field(Path("smoke.albedo.vol"), "albedo", values, np.array([[-0.5] * 3, [0.5] * 3]))
@@ -165,6 +165,10 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
         "volume.sigma_s={file: density.npz, name: density}",
     )
     assert field_names(Path("by_cell.npz")) == ["density", "sigma_t", "albedo"]
+    sought = "optimize.parameters.albedo={init: 0.8, field: true}"
+    succeed("optimize", "scene.yaml", "-o", "field", "-q", "--iterations", "2", "-D", sought)
+    assert "sigma_t 6.5 5.5 4.5" in succeed("export", "field", "-o", "field.npz").stdout
+    assert field_names(Path("field.npz")) == ["density", "albedo"]
     assert refuse(2, "export", "run", "density.npz", "-o", "both.vdb")[-1].startswith(
         "Error: one scene"
     )

@@ -169,17 +169,43 @@ def test_previews_along_the_way(succeed: Run) -> None:
     assert names == {
         f"{name}{mark}"
         for name in ("density.slices", "front", "side")
-        for mark in ("", "_000002", "_000004")
+        for mark in ("", ".000002", ".000004")
     }
 
 
 def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
-    succeed(*OPTIMIZE, "out", "--iterations", "2", "-D", "volume.g=0")
-    Path("out/notes.txt").write_text("mine")
+    """All that the earlier run wrote is gone, and what somebody else put beside it is not."""
+    earlier = ["-D", "views.1.name=other", "-D", "optimize.parameters.sigma_s={field: true}"]
+    succeed(*OPTIMIZE, "out", *earlier, "--iterations", "1", "--preview-every", "1")
+    names = "notes.txt", "volumes/mine.npz", "previews/mine.png", "uncertainty/notes.txt"
+    options = "uncertainty/uncertainty.json", "tensorboard/events.out.tfevents.1.host"
+    options += ("lights.1.radiance.npy",)
+    for path in (Path("out", name) for name in names + options):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(path.name)
     succeed(*OPTIMIZE, "out", "--overwrite")
     succeed(*OPTIMIZE, "fresh")
-    assert np.array_equal(density_of("out"), density_of("fresh"))
-    assert len(rows("out")) == 4 and Path("out/notes.txt").read_text() == "mine"
+    assert np.array_equal(density_of("out"), density_of("fresh")) and len(rows("out")) == 4
+    assert set(contents(Path("out"))) == {*contents(Path("fresh")), *names, "uncertainty"}
+    assert all(Path("out", name).read_text() == Path(name).name for name in names)
+
+
+def test_overwriting_keeps_what_the_new_run_reads(
+    run: Run, succeed: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So it can be resumed, however soon it was stopped."""
+    succeed(*OPTIMIZE, "out")
+
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    again = ["optimize", "out/scene.yaml", "-q", "-o", "out", "--iterations", "1"]
+    again += ["-D", "optimize.parameters.density.init={file: volumes/density.npz}"]
+    with monkeypatch.context() as patch:
+        patch.setattr("ddrecon.reconstruct.objective.render_each", stopped)
+        assert run(*again, "--overwrite").exit_code == 130
+    assert Path("out/scene.yaml").is_file() and not Path("out/result.yaml").exists()
+    succeed(*again, "--resume")
 
 
 def test_progress_is_on_stderr_and_silenced_by_q(run: Run) -> None:

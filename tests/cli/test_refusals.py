@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from click.testing import Result
+from image_files import write_exr
 
 from ddrecon.io.volumes.table import write_field
 
@@ -151,10 +152,7 @@ def spoil_image(name: str) -> None:
     pixels = np.load("front.npy")
     pixels[3, 4, 1] = np.nan
     if name.endswith(".exr"):
-        exr = pytest.importorskip("OpenEXR")
-        exr.File(
-            {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {"RGB": pixels}
-        ).write(name)
+        write_exr(Path(name), "RGB", pixels)
     else:
         np.save(name, pixels)
 
@@ -316,7 +314,12 @@ def test_debug_shows_where_an_error_comes_from(run: Callable[..., object]) -> No
         run(*COMMANDS["check"], "--debug", "-D", "volume.g=2")
 
 
-@pytest.mark.parametrize("ending", [".reduced", ".single", ".multiple", ".slices"])
+@pytest.mark.parametrize("ending", [".reduced", ".single", ".multiple", ".slices", ".000002"])
 def test_a_view_named_like_an_output_file(refuse: Refuse, ending: str) -> None:
     (line,) = refuse(2, *COMMANDS["render"], "-D", f"views.0.name=front{ending}")
-    assert "do not end it with" in line
+    assert f"'front{ending}' ends in {ending}, as files of other views do" in line
+
+
+@pytest.mark.parametrize("seed", ["-99999999999999999999", "99999999999999999999999"])
+def test_a_seed_that_no_generator_takes(refuse: Refuse, seed: str) -> None:
+    assert f"{seed} is not in the range" in refuse(2, *COMMANDS["check"], "--seed", seed)[-1]

@@ -11,8 +11,11 @@ import pytest
 from click.testing import Result
 from test_resume import press_ctrl_c_in
 
+from ddrecon.errors import DataWarning
 from ddrecon.io.volumes.table import field_names, read_field
 from ddrecon.reconstruct.posterior import Posterior
+from ddrecon.run.leftovers import remove_samples
+from ddrecon.run.live import LiveRun
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -58,6 +61,8 @@ def test_it_writes_deviations_numbers_and_a_page(finished: Path, succeed: Run) -
     assert "lights.0.irradiance" in Path("sure/report.html").read_text()
     succeed("export", "sure", "-o", "sure.npz")
     assert set(field_names(Path("sure.npz"))) == {"density_std", "density_mean", "density_told"}
+    remove_samples(Path("sure"))
+    assert not any(Path("sure").iterdir())
 
 
 def test_one_that_stops_goes_on_to_the_same_bits(
@@ -74,6 +79,23 @@ def test_one_that_stops_goes_on_to_the_same_bits(
     assert not np.array_equal(volume("whole", "density_std"), volume("other", "density_std"))
 
 
+def test_the_checkpoint_before_the_last_serves_where_that_is_lost(
+    finished: Path, succeed: Run
+) -> None:
+    """To samples and to those who watch, whether the last is damaged or gone."""
+    (finished / "report.html").unlink()
+    last = finished / "checkpoints/last.pt"
+    last.with_name("previous.pt").write_bytes(last.read_bytes())
+    for lose in (lambda: last.write_bytes(last.read_bytes()[:1000]), last.unlink):
+        lose()
+        told = succeed(
+            "uncertainty", "run", "-o", "sure", "--overwrite", "--samples", "2", *KNOWN
+        ).stderr
+        assert "last.pt: " in told and "going on from run/checkpoints/previous.pt" in told
+        with pytest.warns(DataWarning, match="going on from"):
+            assert '<section id="volume">' in LiveRun(finished).page()
+
+
 def test_a_run_says_it_at_its_end(
     folder: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -86,3 +108,4 @@ def test_a_run_says_it_at_its_end(
 def test_what_is_no_run_is_refused(refuse: Refuse) -> None:
     (line,) = refuse(2, "uncertainty", "nowhere", "-o", "sure")
     assert "nowhere: holds no run" in line
+    assert "-o names the run itself" in refuse(2, "uncertainty", "run", "-o", "./run")[-1]

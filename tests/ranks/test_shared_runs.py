@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shared_runs import RENDER, TESTS, VIEWS, Runs, job, run_jobs
 
-from ddrecon.run.checkpoint import read_state
+from ddrecon.run.checkpoint import load_checkpoint
 
 JOBS = {
     "one": job(1, "one"),
@@ -49,7 +49,7 @@ def test_a_killed_rank_loses_nothing(runs: Runs) -> None:
 
 def test_a_checkpoint_stands_where_the_first_rank_is_killed(runs: Runs) -> None:
     assert runs.codes["first killed"] == [-9, 5]
-    state = read_state(runs.folder / "headless" / "checkpoints" / "last.pt")
+    state = load_checkpoint(runs.folder / "headless" / "checkpoints")[0]
     assert state["total"]["iteration"] == 0
 
 

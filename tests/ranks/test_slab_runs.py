@@ -80,7 +80,7 @@ def test_what_slabs_cannot_do_is_refused(runs: Runs) -> None:
 
 def test_previews_and_pictures_are_of_all_slabs(runs: Runs) -> None:
     names = sorted(path.name for path in (runs.folder / "cells" / "previews").iterdir())
-    assert "c.png" in names and "c_000004.png" in names
+    assert "c.png" in names and "c.000004.png" in names
     assert (runs.folder / "cells" / "report.html").is_file()
 
 

@@ -96,7 +96,7 @@ def test_a_gray_scene_opened_is_the_scene_traced(tmp_path: Path, with_sky: bool)
     pytest.importorskip("mitsuba", reason=NEEDED)
     lights = NEAR
     if with_sky:
-        pytest.importorskip("OpenEXR")
+        pytest.importorskip("OpenImageIO")
         lights = [*NEAR, sky()]
     scene = with_an_orthographic_view(
         make_scene(random_values(3, 4, 5), sigma_a=(1.0,), sigma_s=(4.0,), g=-0.4)

@@ -141,6 +141,8 @@ def test_what_is_no_model_is_refused(
         ("cameras.txt", "20.0", "-20", "its focal lengths must be above 0"),
         ("cameras.txt", "20.0", "nan", "all finite"),
         ("images.txt", " 7 b", " 8 b", "image 'b c.png': there is no camera 8"),
+        ("images.txt", "b c.png", "/etc/c.png", "image '/etc/c.png' leaves the folder of pictures"),
+        ("images.txt", "b c.png", "d/../../c.png", "leaves the folder of pictures"),
         ("images.txt", "3 0.2", "3 x", "line 2: expected IMAGE_ID QW QX"),
         ("images.txt", "0.2 0.9 -0.3 0.1 0.1", "0 0 0 0 0.1", "not finite, or no rotation"),
     ],

@@ -96,14 +96,19 @@ def test_the_log_ends_where_the_checkpoint_does(run: Run) -> None:
     assert log.read_text() == whole
 
 
-def test_a_log_with_lost_rows_is_told(run: Run) -> None:
+@pytest.mark.parametrize(
+    "damaged", ["", "1", "1x", "1,0.5,nonsense,0.1,30,,3,4,120,0.1,0,,,", "1,\0", "70000"]
+)
+def test_a_log_with_lost_rows_is_told(run: Run, damaged: str) -> None:
+    """Whatever stands there instead of one, the rest is kept."""
     run(*OPTIMIZE, "--iterations", "3")
     log = Path("out/loss.csv")
-    log.write_text("".join(log.read_text().splitlines(keepends=True)[:2]))
-    assert (
-        run(*RESUME, "--iterations", "3").stderr
-        == "warning: out/loss.csv: has 1 of the 3 iterations made\n"
+    header, _, *rows = log.read_text().splitlines()
+    log.write_text("\n".join([header, damaged, *rows, ""]))
+    assert run(*RESUME, "--iterations", "4").stderr == (
+        "warning: out/loss.csv: has 3 of the 4 iterations made\n"
     )
+    assert iterations() == [2, 3, 4]
 
 
 def test_a_second_ctrl_c_saves_no_torn_state(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from ddrecon.errors import FormatError
@@ -34,14 +35,23 @@ def replace_file(path: Path) -> Iterator[Path]:
 def replace_file_durably(path: Path, kept_as: Path) -> Iterator[Path]:
     """As `replace_file`, but safe from a loss of power once it has ended.
 
-    What `path` was until then is kept as `kept_as`.
+    What `path` was until then is kept as `kept_as`; `path` is there at any time.
     """
     with replace_file(path) as temporary:
         yield temporary
         flush(temporary)
-        with suppress(FileNotFoundError):
-            os.replace(path, kept_as)
+        if path.exists():
+            with replace_file(kept_as) as kept:
+                _link_or_copy(path, kept)
     flush(path.parent)
+
+
+def _link_or_copy(path: Path, other: Path) -> None:
+    """Makes `other` the same file as `path`, or one like it where the system has no links."""
+    try:
+        os.link(path, other)
+    except OSError:
+        shutil.copyfile(path, other)
 
 
 def remove_temporaries(folder: Path) -> None:

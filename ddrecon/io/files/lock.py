@@ -30,6 +30,9 @@ def hold_lock(folder: Path) -> Iterator[None]:
     Raises UsageError while another process holds it, and where the file cannot be locked.
     """
     path = folder / LOCK
+    # Before it is opened: some releases of filelock empty the file they lock.
+    if _read_holder(path).get("host", socket.gethostname()) != socket.gethostname():
+        raise UsageError(_explain_refusal(path))
     try:
         # No soft locks: what they leave behind would have to be judged stale or not.
         lock = FileLock(path, fallback_to_soft=False).acquire(timeout=0)
@@ -38,8 +41,6 @@ def hold_lock(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"{path}: cannot be locked: {error.strerror or error}") from error
     with lock:
-        if _read_holder(path).get("host", socket.gethostname()) != socket.gethostname():
-            raise UsageError(_explain_refusal(path))
         path.write_text(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}))
         try:
             yield

@@ -18,10 +18,16 @@ from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images import srgb
-from ddrecon.io.images.exr import has_exr, read_exr, write_exr
 from ddrecon.io.images.hdr import read_hdr
-from ddrecon.io.images.png16 import has_deep_colors, is_deep_png, read_deep_png
-from ddrecon.io.images.tiff import read_tiff, write_tiff
+from ddrecon.io.images.oiio import (
+    has_deep_colors,
+    has_exr,
+    is_deep_png,
+    read_deep_png,
+    read_exr,
+    read_tiff,
+    write_exr,
+)
 
 PREVIEW = "sRGB of linear radiance at exposure 1: radiance 1 and more is white"
 """How the .png of an image is to be read."""
@@ -78,14 +84,14 @@ def read_mask(path: Path) -> np.ndarray:
 def write_linear(stem: Path, pixels: np.ndarray) -> list[Path]:
     """Writes `pixels` [h, w, 3] as float32 to `stem`.exr and `stem`.npy; returns these paths.
 
-    Where OpenEXR is not installed, a float .tif takes the place of the .exr.
+    Where OpenImageIO is not installed, there is no .exr.
     """
-    suffix, write = (".exr", write_exr) if has_exr() else (".tif", write_tiff)
-    picture, array = (stem.with_name(stem.name + ending) for ending in (suffix, ".npy"))
-    write(picture, pixels)
+    picture, array = (stem.with_name(stem.name + ending) for ending in (".exr", ".npy"))
+    if has_exr():
+        write_exr(picture, pixels)
     with replace_file(array) as temporary:
         np.save(temporary, as_float32(pixels), allow_pickle=False)
-    return [picture, array]
+    return [picture, array] if has_exr() else [array]
 
 
 def write_preview(path: Path, pixels: np.ndarray) -> None:

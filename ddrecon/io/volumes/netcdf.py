@@ -26,14 +26,8 @@ NAMES = {
 }
 """What the names of axes begin with."""
 METERS = {
-    "m": 1.0,
-    "meter": 1.0,
-    "meters": 1.0,
-    "metre": 1.0,
-    "metres": 1.0,
-    "km": 1000.0,
-    "kilometer": 1000.0,
-    "kilometers": 1000.0,
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
+    **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1000.0),
 }
 EVEN = 0.05
 """How far off even spacing a coordinate may be [cells]: files often round to a few digits."""
@@ -103,11 +97,9 @@ def read_netcdf(path: Path, name: str) -> Field:
         variable = file.variables[name]
         check_size(int(np.prod(variable.shape, dtype=object)) * variable.dtype.itemsize, path, name)
         values, axes = _arrange(path, file, variable)
-        edges = [_edges(path, file, dimension) for dimension in axes]
-    flips = tuple(
-        slice(None, None, -1 if edge is not None and edge[0] > edge[1] else 1) for edge in edges
-    )
-    known = [sorted(edge) for edge in edges if edge is not None]
+        sides = [_side(path, file, dimension) for dimension in axes]
+    flips = tuple(slice(None, None, step) for step, _ in sides)
+    known = [edges for _, edges in sides if edges is not None]
     bounds = np.array(known[::-1]).T if len(known) == 3 else None
     return check_field(path, name, values[flips], bounds)
 
@@ -160,10 +152,10 @@ def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str
     return values.transpose([kept.index(axis) for axis in order]), [places[axis] for axis in "zyx"]
 
 
-def _edges(path: Path, file: Any, dimension: str) -> tuple[float, float] | None:
-    """Where cells along `dimension` begin and end, in their order; None if it is not said."""
+def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None]:
+    """-1 where cells along `dimension` go down, else 1; where they begin and end, if it is said."""
     if dimension not in file.variables:
-        return None
+        return 1, None
     coordinate = file.variables[dimension]
     centers = np.asarray(coordinate[:], np.float64)
     steps = np.diff(centers)
@@ -175,24 +167,21 @@ def _edges(path: Path, file: Any, dimension: str) -> tuple[float, float] | None:
             f"{dimension} is not evenly spaced ({shortest:g} to {longest:g}); "
             "interpolate it first (xarray: .interp)",
         )
-    scale = _scale(file, coordinate)
+    step = -1 if centers[-1] < centers[0] else 1
+    # The two ends of a cell come in either order, whichever way the axis goes.
     corners = file.variables.get(getattr(coordinate, "bounds", ""))
     if corners is not None:
-        return float(corners[0, 0]) * scale, float(corners[-1, -1]) * scale
-    if not len(steps):
-        return None
-    return (centers[0] - steps.mean() / 2) * scale, (centers[-1] + steps.mean() / 2) * scale
+        edges = np.asarray(corners[:], np.float64)
+    elif len(steps):
+        edges = centers[[0, -1]] + steps.mean() / 2 * np.array([-1, 1])
+    else:
+        return step, None
+    return step, np.array([edges.min(), edges.max()]) * _scale(file, coordinate)
 
 
 def _scale(file: Any, coordinate: Any) -> float:
     """What takes `coordinate` to the unit of the first axis of x; 1 unless both are known."""
-    first = next(
-        (
-            file.variables[name]
-            for name in file.variables
-            if name in file.dimensions and _axis_of(file, name) == "x"
-        ),
-        coordinate,
-    )
+    along_x = [name for name in file.dimensions if _axis_of(file, name) == "x"]
+    first = next((file.variables[name] for name in along_x if name in file.variables), coordinate)
     units = [METERS.get(str(getattr(one, "units", "")).lower()) for one in (coordinate, first)]
     return units[0] / units[1] if units[0] and units[1] else 1.0

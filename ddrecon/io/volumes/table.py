@@ -17,7 +17,7 @@ from ddrecon.io.volumes.npz import npz_names, read_npz, write_npz
 from ddrecon.io.volumes.tiff_stack import read_stack, write_stack
 from ddrecon.io.volumes.vdb import write_vdb
 from ddrecon.io.volumes.vdb_reader import read_vdb, vdb_names
-from ddrecon.io.volumes.vti import read_vti, vti_names, write_vti
+from ddrecon.io.volumes.vti import refuse_vti, write_vti
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ FORMATS: dict[str, VolumeFormat] = {
     ".npz": VolumeFormat(npz_names, read_npz, write_npz),
     ".vol": VolumeFormat(name_from_file, read_vol, write_vol),
     ".vdb": VolumeFormat(vdb_names, read_vdb, write_vdb, has_metadata=True),
-    ".vti": VolumeFormat(vti_names, read_vti, write_vti),
+    ".vti": VolumeFormat(refuse_vti, refuse_vti, write_vti),
     ".nc": VolumeFormat(netcdf_names, read_netcdf, write_netcdf, has_metadata=True),
     **dict.fromkeys((".tif", ".tiff"), VolumeFormat(name_from_file, read_stack, write_stack)),
 }

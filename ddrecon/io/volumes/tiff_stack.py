@@ -8,6 +8,9 @@ calibration, and in full precision in an entry `bounds` of its description.
 from __future__ import annotations
 
 import json
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +20,11 @@ from ddrecon.errors import FormatError
 from ddrecon.extras import load_for_file
 from ddrecon.io.files.arrays import as_float32, check_size
 from ddrecon.io.files.atomic import replace_file
-from ddrecon.io.images.tiff import MARK, open_tiff
+from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.volumes.field import Field, Fields, check_field, require_only_field
+
+MARK = "bounds"
+"""What the description of a stack that we wrote says, besides what ImageJ says."""
 
 
 def write_stack(path: Path, fields: Fields, bounds: np.ndarray) -> None:
@@ -94,3 +100,43 @@ def _bounds(file: Any, cells: tuple[int, ...]) -> np.ndarray | None:
     size = np.array([*(below / above for above, below in per_unit), facts["spacing"]])
     low = -size * [facts.get(f"{axis}origin", 0) for axis in "xyz"]
     return np.stack([low, low + size * cells])
+
+
+def is_stack(path: Path) -> bool:
+    """Whether the TIFF file at `path` is a volume: of several pages, or written as one by us."""
+    with guard_reading(path), open_tiff(path) as file:
+        return _is_stack(file)
+
+
+@contextmanager
+def open_tiff(path: Path) -> Iterator[Any]:
+    """The `tifffile.TiffFile` at `path`, for a block that reads it.
+
+    Raises FormatError for damage that tifffile only logs: it takes the pages before a cut for all.
+    """
+    tifffile = load_for_file("tifffile", path)
+    errors: list[str] = []
+
+    def keep_errors(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            errors.append(record.getMessage())
+        return False
+
+    logger = logging.getLogger("tifffile")
+    logger.addFilter(keep_errors)
+    try:
+        with tifffile.TiffFile(path) as file:
+            yield file
+    except (KeyError, ValueError) as error:
+        if "imagecodecs" in str(error):
+            raise FormatError(path, f"cannot be read: {error}; save it uncompressed") from error
+        raise
+    finally:
+        logger.removeFilter(keep_errors)
+    if errors:
+        raise FormatError(path, f"is damaged: {errors[0]}")
+
+
+def _is_stack(file: Any) -> bool:
+    facts = file.imagej_metadata or {}
+    return len(file.pages) > 1 or facts.get("images", 1) > 1 or MARK in facts

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.atomic import replace_file
+from ddrecon.io.files.atomic import replace_file, replace_file_durably
 
 
 def test_the_temporary_file_lies_beside_the_final_one_and_becomes_it(tmp_path: Path):
@@ -29,6 +30,31 @@ def test_an_interrupted_write_leaves_the_old_file(
         temporary.write_text("half")
         raise interruption
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_the_file_is_there_all_the_while_it_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool
+) -> None:
+    """Whole at each step a crash may come after, what it was before is kept, and none is left."""
+    path, kept = tmp_path / "a.txt", tmp_path / "before.txt"
+    replace, seen = os.replace, []
+
+    def look(source: Path, target: Path) -> None:
+        replace(source, target)
+        seen.append(path.read_text())
+
+    def link(*_: Path) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "replace", look)
+    if not has_links:
+        monkeypatch.setattr(os, "link", link)
+    for text in ("1", "2", "3"):
+        with replace_file_durably(path, kept_as=kept) as temporary:
+            temporary.write_text(text)
+    assert seen == ["1", "1", "2", "2", "3"]
+    assert kept.read_text() == "2" and sorted(tmp_path.iterdir()) == [path, kept]
 
 
 def test_a_refusal_of_the_system_is_a_format_error(tmp_path: Path):

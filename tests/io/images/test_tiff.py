@@ -1,4 +1,4 @@
-"""TIFF: what we write others read, what they write we read, and what holds no floats is refused."""
+"""TIFF: what others write is read, and what holds no floats is refused."""
 
 from __future__ import annotations
 
@@ -8,18 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image as Pillow
+from refusals import image_refusal
 
 from ddrecon.errors import FormatError
+from ddrecon.io.images.oiio import read_tiff
 from ddrecon.io.images.table import read_image
-from ddrecon.io.images.tiff import read_tiff, write_tiff
 
-tifffile = pytest.importorskip("tifffile", reason="TIFF is read by tifffile (the extra `tiff`)")
-
-
-def test_pillow_reads_what_is_written(tmp_path: Path):
-    gray = np.random.default_rng(0).random((3, 5)).astype(np.float32)
-    write_tiff(tmp_path / "a.tif", gray)
-    assert np.array_equal(np.array(Pillow.open(tmp_path / "a.tif")), gray)
+tifffile = pytest.importorskip("tifffile")
+pytest.importorskip("OpenImageIO")
 
 
 def test_what_pillow_writes_is_read(tmp_path: Path):
@@ -66,8 +62,14 @@ def test_big_endian_strips_are_read(tmp_path: Path):
     ids=lambda options: ", ".join(options),
 )
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_every_layout_is_read(tmp_path: Path, dtype: type, options: dict[str, object]):
+def test_every_layout_is_read_right_or_refused(
+    tmp_path: Path, dtype: type, options: dict[str, object]
+):
     pixels = np.random.default_rng(2).random((20, 33, 3)).astype(dtype)
+    if dtype is np.float64 and "tile" in options:
+        tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", **options)
+        assert "64 bits in tiles; only" in image_refusal(tmp_path / "a.tif")
+        return
     stored = np.moveaxis(pixels, 2, 0) if "planarconfig" in options else pixels
     tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", **options)
     assert np.array_equal(read_image(tmp_path / "a.tif").pixels, pixels.astype(np.float32))
@@ -76,7 +78,7 @@ def test_every_layout_is_read(tmp_path: Path, dtype: type, options: dict[str, ob
 @pytest.mark.parametrize(
     ("pixels", "options", "why"),
     [
-        (np.ones((2, 2), np.uint8), {}, "holds 8-bit samples of format 1; only float"),
+        (np.ones((2, 2), np.uint8), {}, "holds samples of type uint8; only float"),
         (np.ones((2, 2), np.float32), {"extratags": [(274, 3, 1, 3, True)]}, "turned rows; only"),
         (np.ones((2, 2), np.float32), {"photometric": "miniswhite"}, "interpretation 0; only"),
         (np.ones((2, 2, 2), np.float32), {}, "is a volume"),
@@ -87,23 +89,4 @@ def test_other_kinds_are_refused_by_name(
 ):
     tifffile.imwrite(tmp_path / "a.tif", pixels, **({"photometric": "minisblack"} | options))
     with pytest.raises(FormatError, match=why):
-        read_image(tmp_path / "a.tif")
-
-
-def test_a_compression_that_takes_more_packages_says_so(tmp_path: Path):
-    Pillow.new("F", (8, 8)).save(tmp_path / "a.tif", compression="tiff_lzw")
-    try:
-        assert read_image(tmp_path / "a.tif").size == (8, 8)
-    except FormatError as error:
-        assert "imagecodecs" in error.reason and "save it uncompressed" in error.reason
-
-
-def test_pixels_that_are_not_there_are_refused(tmp_path: Path):
-    """A strip of no bytes, which other programs take for zeros."""
-    write_tiff(tmp_path / "a.tif", np.ones((2, 2), np.float32))
-    data = (tmp_path / "a.tif").read_bytes()
-    count = struct.pack("<HHII", 279, 4, 1, 16)
-    assert count in data
-    (tmp_path / "a.tif").write_bytes(data.replace(count, struct.pack("<HHII", 279, 4, 1, 0)))
-    with pytest.raises(FormatError, match="some of its pixels are not there"):
         read_image(tmp_path / "a.tif")

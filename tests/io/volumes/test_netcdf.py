@@ -114,10 +114,21 @@ def test_heights_are_in_the_unit_of_x(
     assert np.allclose(field.bounds, expected, rtol=1e-12)
 
 
-def test_downward_axes_are_turned(tmp_path: Path) -> None:
-    """As pressure levels are: the first slice is the uppermost."""
+@pytest.mark.parametrize("corners", [None, "low first", "in the order of the axis"])
+def test_downward_axes_are_turned(tmp_path: Path, corners: str | None) -> None:
+    """As pressure levels are: the first slice is the uppermost; the ends of a cell, where they are
+    said, come in either order.
+    """
     axes = plain() | {"z": (CENTERS["z"][::-1], {})}
-    field = read_field(written(tmp_path / "f.nc", VALUES[::-1], "z y x", **axes), "QN")
+    path = written(tmp_path / "f.nc", VALUES[::-1], "z y x", **axes)
+    if corners is not None:
+        ends = np.array(CENTERS["z"][::-1])[:, None] + [-0.5, 0.5]
+        with netcdf.Dataset(path, "a") as file:
+            file.createDimension("corner", 2)
+            file.variables["z"].bounds = "z_bounds"
+            turned = ends if corners == "low first" else ends[:, ::-1]
+            file.createVariable("z_bounds", "f8", ("z", "corner"))[:] = turned
+    field = read_field(path, "QN")
     assert np.array_equal(field.values, VALUES) and np.allclose(field.bounds, BOUNDS)
 
 

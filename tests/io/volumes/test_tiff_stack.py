@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from image_files import write_tiff
 from refusals import refusal
 
 from ddrecon.errors import FormatError
 from ddrecon.io.images.table import read_image
-from ddrecon.io.images.tiff import write_tiff
 from ddrecon.io.info import describe
 from ddrecon.io.volumes.table import read_field, write_field
 
