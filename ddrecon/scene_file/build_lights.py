@@ -56,9 +56,8 @@ def _build_light(
         return PointLight(tensor(section.position), color(section.intensity))
     pixels = read_referenced(scene_file, f"lights.{index}.file", section.file, _read_map)
     radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
-    return EnvironmentLight(
-        radiance, tensor(section.scale), tensor(section.rotation), section.directions
-    )
+    numbers = tensor(section.scale), tensor(section.rotation)
+    return EnvironmentLight(radiance, *numbers, section.directions, section.up)
 
 
 def _read_map(path: Path) -> np.ndarray:
