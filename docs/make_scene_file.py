@@ -342,10 +342,9 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "camera: {type: orthographic}",
         camera_schema.OrthographicSection,
         "Parallel rays, as a satellite far away sees.\n"
-        "Its other keys are those of a perspective camera.",
+        "Its other keys, `pixel_aspect` among them, are those of a perspective camera.",
         {
             "width": "Of the image [u].",
-            "pixel_aspect": "Height of a pixel over its width.",
         },
     ),
     (

@@ -158,8 +158,7 @@ def _write(stem: Path, ours: Tensor, theirs: Tensor) -> list[Path]:
 
 
 def reference_lines(report: dict[str, Any], folder: Path) -> list[str]:
-    """What `reference` prints of its `report`: how far ours is from theirs, and how long both took.
-    """
+    """How far ours is from theirs, and how long both took, as `reference` prints it."""
     lines = []
     for name, view in report["views"].items():
         noise, notes = view["noise"], [f"noise {view['noise']:.3f}"]
