@@ -32,6 +32,10 @@ class VolumeRenderer(torch.nn.Module):
         self.scene = scene
         self.memories: list[SolveMemory] = []
 
+    def extra_repr(self) -> str:
+        """The scene, in few words."""
+        return repr(self.scene)
+
     @leave_uncompiled
     def forward(
         self,

@@ -48,7 +48,7 @@ class View:
     noise: Noise | None = None
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Scene(Displayed):
     """A loaded scene.
 

@@ -221,15 +221,19 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     (
         "lights: {type: environment}",
         light_schema.EnvironmentSection,
-        "A latitude-longitude map (HDRI), +y up, oriented as Mitsuba's `envmap`.\n"
+        "A latitude-longitude map (HDRI), oriented as Mitsuba's `envmap`.\n"
         "Small bright regions become suns.",
         {
             "file": "An image of linear radiance: .exr, .hdr, .npy, .tif.",
             "scale": "Factor on its pixels.",
-            "rotation": "About +y, in degrees.",
+            "rotation": "About the pole, in degrees.",
             "directions": (
                 "Directions into which its light on the volume is gathered; more are slower and "
                 "more exact."
+            ),
+            "up": (
+                "Where the pole is, the map's first row. "
+                "With z, what the map holds at (x, y, z) is at (x, -z, y)."
             ),
         },
     ),
@@ -340,7 +344,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         "camera: {type: orthographic}",
         camera_schema.OrthographicSection,
         "Parallel rays, as a satellite far away sees.\n"
-        "Its other keys are those of a perspective camera.",
+        "Its other keys, `pixel_aspect` among them, are those of a perspective camera.",
         {
             "width": "Of the image [u].",
         },

@@ -45,17 +45,18 @@ def test_a_view_without_a_direction_is_refused(target: torch.Tensor, up: torch.T
         look_at(ORIGIN, target, up)
 
 
+@pytest.mark.parametrize("aspect", [1.0, 1.3])
 @pytest.mark.parametrize("is_perspective", [True, False])
-def test_every_ray_against_explicit_pixel_arithmetic(is_perspective: bool):
-    """Row 0 is the top, column 0 the left, and pixels are square, whatever the picture's shape."""
-    view = camera(is_perspective=is_perspective)
+def test_every_ray_against_explicit_pixel_arithmetic(is_perspective: bool, aspect: float):
+    """Row 0 is the top, column 0 the left, and pixels are as high as said, whatever the shape."""
+    view = replace(camera(is_perspective=is_perspective), pixel_aspect=aspect)
     bundle = cast_rays(view, (0.25, 0.75))
     right, up, backward, origin = view.pose.unbind(1)
     height, width = view.size
     for row in range(height):
         for column in range(width):
             x = (2 * (column + 0.75) / width - 1) * view.half_width
-            y = (height - 2 * (row + 0.25)) / width * view.half_width
+            y = (height - 2 * (row + 0.25)) / width * view.half_width * aspect
             shift = x * right + y * up
             start, toward = (
                 (origin, shift - backward) if is_perspective else (origin + shift, -backward)

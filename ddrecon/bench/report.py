@@ -12,6 +12,7 @@ import torch
 
 from ddrecon.bench.measure import Shot, Timing, correlation, relative_error
 from ddrecon.bench.path_tracing import Truth
+from ddrecon.reference.trace import error_text, least_error
 from ddrecon.report import page
 from ddrecon.report.page import paragraph, picture, section, write_page
 
@@ -22,9 +23,9 @@ class Row:
 
     Seconds are medians, `both_seconds` of image and gradient. `image_numerical` and
     `gradient_numerical` are against the same model solved exactly. `image_error` is against path
-    tracing, its noise subtracted in quadrature; `gradient_correlation` is with path replay's
-    gradient times density. `iterations` are the first solve's, or samples a pixel. `is_best`: no
-    other row is faster and closer to the truth.
+    tracing, whose `image_noise` is subtracted in quadrature; `gradient_correlation` is with path
+    replay's gradient times density. `iterations` are the first solve's, or samples a pixel.
+    `is_best`: no other row is faster and as close to the truth, as far as that can be told.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Row:
     image_numerical: float | None = None
     gradient_numerical: float | None = None
     image_error: float | None = None
+    image_noise: float = 0.0
     gradient_correlation: float | None = None
     is_best: bool = False
 
@@ -52,7 +54,7 @@ def with_best(rows: Sequence[Row]) -> list[Row]:
 
     def is_beaten(row: Row) -> bool:
         return any(
-            other.image_seconds < row.image_seconds and error_of(other) < error_of(row)
+            other.image_seconds < row.image_seconds and error_of(other) <= error_of(row)
             for other in rows
         )
 
@@ -60,10 +62,13 @@ def with_best(rows: Sequence[Row]) -> list[Row]:
 
 
 def error_of(row: Row) -> float:
-    """The error against path tracing, or else against the exact solution; or else infinity."""
-    return next(
-        (error for error in (row.image_error, row.image_numerical) if error is not None), math.inf
-    )
+    """The error against path tracing, or else against the exact solution; or else infinity.
+
+    What path tracing cannot tell from none counts as the least that it can.
+    """
+    if row.image_error is not None:
+        return max(row.image_error, least_error(row.image_noise))
+    return math.inf if row.image_numerical is None else row.image_numerical
 
 
 def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> Row:
@@ -76,7 +81,8 @@ def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> 
             gradient_numerical=relative_error(shot.gradient, exact.gradient),
         )
     if truth is not None:
-        row = replace(row, image_error=truth.image.error(shot.image.numpy()))
+        error = truth.image.error(shot.image.numpy())
+        row = replace(row, image_error=error, image_noise=truth.image.noise)
         if truth.by_amount is not None:
             expected = torch.from_numpy(truth.by_amount.image)
             row = replace(row, gradient_correlation=correlation(shot.by_amount, expected))
@@ -114,11 +120,9 @@ def _cells(row: Row, base: Row) -> list[str]:
         "" if value is None else f"{value:.1e}"
         for value in (row.image_numerical, row.gradient_numerical)
     ]
-    traced = [
-        "" if value is None else f"{value:.3f}"
-        for value in (row.image_error, row.gradient_correlation)
-    ]
-    return [row.name, *times, *numerical, *traced, "best" if row.is_best else ""]
+    error = "" if row.image_error is None else error_text(row.image_error, row.image_noise)
+    correlated = "" if row.gradient_correlation is None else f"{row.gradient_correlation:.3f}"
+    return [row.name, *times, *numerical, error, correlated, "best" if row.is_best else ""]
 
 
 def table(rows: Sequence[Row]) -> list[str]:

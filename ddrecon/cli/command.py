@@ -16,14 +16,16 @@ import click
 from ddrecon.engine import CHOICES
 from ddrecon.errors import DataWarning, DdreconError
 
+DEBUG = click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+OVERRIDES = click.option(
+    "-D",
+    "overrides",
+    multiple=True,
+    metavar="KEY.PATH=VALUE",
+    help="Override a value of the scene file; repeatable.",
+)
 COMMON = (
-    click.option(
-        "-D",
-        "overrides",
-        multiple=True,
-        metavar="KEY.PATH=VALUE",
-        help="Override a value of the scene file; repeatable.",
-    ),
+    OVERRIDES,
     click.option(
         "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
     ),
@@ -41,8 +43,10 @@ COMMON = (
     click.option("--seed", type=click.IntRange(-(2**31), 2**32 - 1), default=0, show_default=True),
     click.option("-q", "--quiet", is_flag=True, help="No progress line."),
     click.option("-v", "--verbose", is_flag=True, help="Keep finished progress lines."),
-    click.option("--debug", is_flag=True, help="Show the traceback of an error."),
+    DEBUG,
 )
+FEWER = {"watch": (DEBUG,), "info": (OVERRIDES, DEBUG), "export": (OVERRIDES, DEBUG)}
+"""The common options of commands that compute nothing."""
 THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
 """Waiting threads spin for a moment, then sleep.
 
@@ -60,17 +64,16 @@ SHARE = click.option(
     show_default=True,
     help="What the processes of torchrun share out; cells where a volume is too large for one.",
 )
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-SCENE = click.argument("scene", type=click.Path(path_type=Path))
-OUTPUT = click.option(
-    "-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the results."
-)
 REPORT = click.option(
     "--json",
     "report",
     type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Also write the result to FILE.",
+    metavar="[FILE]",
+    help="Print the result as JSON, or write it to FILE, which ends in .json.",
+)
+SCENE = click.argument("scene", type=click.Path(path_type=Path))
+OUTPUT = click.option(
+    "-o", "--output", type=click.Path(path_type=Path), required=True, help="Folder for the results."
 )
 OVERWRITE = click.option("--overwrite", is_flag=True, help="Write into a folder that is not empty.")
 
@@ -108,7 +111,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             _show(f"interrupted {error}".strip())
             sys.exit(130)
 
-    for option in reversed(COMMON):
+    for option in reversed(FEWER.get(command.__name__, COMMON)):
         wrapped = option(wrapped)
     return wrapped
 
@@ -124,25 +127,28 @@ def _set_environment() -> None:
 
 def _run(
     command: Callable[..., None],
-    overrides: tuple[str, ...],
-    device: str,
-    engine: str | None,
-    threads: int | None,
-    seed: int,
-    quiet: bool,
-    verbose: bool,
+    overrides: tuple[str, ...] = (),
+    device: str = "cpu",
+    engine: str | None = None,
+    threads: int | None = None,
+    seed: int = 0,
+    quiet: bool = False,
+    verbose: bool = False,
     dtype: str = "float64",
-    as_json: bool = False,
+    report: Path | None = None,
     share: str = "views",
     **others: Any,
 ) -> None:
     """Runs `command` in a session; on the first rank alone where ranks do not share its work."""
     from ddrecon.cli.session import open_session, show_compilations
+    from ddrecon.io.files.folders import require_folder_of
     from ddrecon.ranks import alone, is_first, leave_ranks
 
     common = overrides, device, engine, threads, seed, quiet, verbose
     with show_warnings(), show_compilations(quiet):
-        session = open_session(*common, dtype, as_json, share)
+        session = open_session(*common, dtype, report, share)
+        if report is not None:
+            require_folder_of(report)
         is_shared = command.__name__ in SHARED
         if is_shared or is_first():
             with nullcontext() if is_shared else alone():
@@ -155,14 +161,6 @@ def _shortage(error: BaseException) -> str:
     reason = str(error).partition("\n")[0] or "no more is given"
     advice = "make volume.resolution or the images smaller; --resume takes up an interrupted run"
     return f"out of memory: {reason}; {advice}"
-
-
-def require_folder_of(report: Path | None) -> None:
-    """Raises UsageError where `report` is to be written into a folder that does not exist."""
-    from ddrecon.io.files import folders
-
-    if report is not None:
-        folders.require_folder_of(report)
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import click
 
 from ddrecon.cli.file_commands import export, info
@@ -12,7 +14,21 @@ from ddrecon.cli.version import show_version
 from ddrecon.cli.watch import watch
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class Commands(click.Group):
+    """Commands whose `--json` stands alone but before a FILE, which ends in .json.
+
+    So it takes no scene file for one.
+    """
+
+    def parse_args(self, context: click.Context, args: list[str]) -> list[str]:
+        words = [
+            "--json=-" if word == "--json" and not after.endswith(".json") else word
+            for word, after in pairwise([*args, ""])
+        ]
+        return super().parse_args(context, words)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
     "--version",
     is_flag=True,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ddrecon.cli.command import AS_JSON, in_session
+from ddrecon.cli.command import REPORT, in_session
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -112,7 +112,7 @@ def _is_scene(source: Path) -> bool:
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@AS_JSON
+@REPORT
 @in_session
 def info(session: Session, file: Path) -> None:
     """Print what is in FILE: a volume's box, cells and fields, or an image's size and values.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ddrecon.cli.command import AS_JSON, DTYPE, OUTPUT, OVERWRITE, SCENE, SHARE, in_session
+from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
 from ddrecon.cli.watch import SAVE_EVERY, watched
 from ddrecon.errors import DataWarning
 
@@ -34,7 +34,7 @@ class CountOrAuto(click.IntRange):
 @click.command()
 @SCENE
 @DTYPE
-@AS_JSON
+@REPORT
 @SHARE
 @in_session
 def check(session: Session, scene: Path) -> None:
@@ -80,7 +80,7 @@ def check(session: Session, scene: Path) -> None:
 @click.option("--mp4", "has_mp4", is_flag=True, help="With --ring, also write ring.mp4.")
 @SHARE
 @DTYPE
-@AS_JSON
+@REPORT
 @in_session
 def render(
     session: Session,
@@ -165,7 +165,7 @@ def render(
 )
 @SHARE
 @DTYPE
-@AS_JSON
+@REPORT
 @in_session
 def optimize(
     session: Session,

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import UsageError
+from ddrecon.io.files.json_file import write_json
 from ddrecon.kernels.spare import keep_freed_memory
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
@@ -30,6 +31,8 @@ from ddrecon.scene_file.build import build_scene
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import suggestion
 
+STDOUT = Path("-")
+"""Where `--json` without a file sends a report."""
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -44,7 +47,7 @@ class Session:
     seed: int
     is_quiet: bool
     is_verbose: bool
-    as_json: bool
+    report: Path | None
     shares_cells: bool = False
 
     def with_overrides(self, *overrides: str) -> Session:
@@ -85,9 +88,13 @@ class Session:
         return tqdm(items, desc=what, leave=self.is_verbose, **bar_settings(self.is_quiet))
 
     def show(self, report: dict[str, Any], lines: Sequence[str]) -> None:
-        """Prints `report` as JSON where that was asked for, else `lines`; the first rank alone."""
-        if is_first():
-            click.echo(json.dumps(report, indent=1) if self.as_json else "\n".join(lines))
+        """Prints `lines`, or `report` as JSON, or writes it, as asked for; the first rank alone."""
+        if not is_first():
+            return
+        prints_json = self.report == STDOUT
+        click.echo(json.dumps(report, indent=1) if prints_json else "\n".join(lines))
+        if self.report is not None and not prints_json:
+            write_json(self.report, report)
 
     def environment(self) -> dict[str, Any]:
         """What a run's result may depend on besides its scene."""
@@ -133,7 +140,7 @@ def open_session(
     is_quiet: bool,
     is_verbose: bool,
     dtype: str,
-    as_json: bool,
+    report: Path | None,
     share: str = "views",
 ) -> Session:
     """Sets torch and the engine up as the options say.
@@ -160,7 +167,7 @@ def open_session(
     is_quiet = is_quiet or not is_first()
     shares_cells = share == "cells"
     return Session(
-        overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, as_json, shares_cells
+        overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, report, shares_cells
     )
 
 

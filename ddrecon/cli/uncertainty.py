@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ddrecon.cli.command import AS_JSON, OUTPUT, OVERWRITE, in_session
+from ddrecon.cli.command import OUTPUT, OVERWRITE, REPORT, in_session
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -53,7 +53,7 @@ SAMPLES = 16
     "(ring), or in directional lights that are (lights).",
 )
 @click.option("--resume", is_flag=True, help="Go on after the folder's last sample.")
-@AS_JSON
+@REPORT
 @in_session
 def uncertainty(
     session: Session,

@@ -13,17 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ddrecon.cli.command import (
-    AS_JSON,
-    DTYPE,
-    OUTPUT,
-    OVERWRITE,
-    REPORT,
-    SCENE,
-    SHARE,
-    in_session,
-    require_folder_of,
-)
+from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -47,18 +37,12 @@ if TYPE_CHECKING:
 )
 @REPORT
 @in_session
-def gradcheck(
-    session: Session, scene: Path, names: tuple[str, ...], samples: int, report: Path | None
-) -> None:
+def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: int) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
-    from ddrecon.io.files.json_file import write_json
     from ddrecon.validate.gradcheck import check_parameters, describe
 
-    require_folder_of(report)
     checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
-    click.echo("\n".join(line for check in checks for line in check.lines()))
-    if report is not None:
-        write_json(report, describe(checks))
+    session.show(describe(checks), [line for check in checks for line in check.lines()])
     if not all(check.has_passed for check in checks):
         sys.exit(1)
 
@@ -86,7 +70,7 @@ def gradcheck(
     help="Write the path-traced images alone, as NAME.*: targets for experiments.",
 )
 @DTYPE
-@AS_JSON
+@REPORT
 @in_session
 def reference(
     session: Session,
@@ -149,39 +133,32 @@ def bench(
     is_hard: bool,
     output: Path | None,
     overwrite: bool,
-    report: Path | None,
 ) -> None:
     """Measure speed against error on SCENE, or on a plume of ddrecon's own."""
     if session.overrides and scene is None:
         raise click.UsageError("-D changes a scene file; name one")
     if is_hard and (scene is not None or is_quick):
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
-    require_folder_of(report)
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.ranks import rank_count
 
     if rank_count() > 1:
         if scene is None or is_hard or output is not None:
             raise click.UsageError("torchrun shares the views of a SCENE: name one, and no -o")
-        _bench_shared(session, scene, report)
+        _bench_shared(session, scene)
         return
     with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
         if is_hard:
-            has_passed = _bench_hard(session, output, report)
+            _bench_hard(session, output)
         else:
-            has_passed = _bench_speed(session, scene, is_quick, output, report)
-    if not has_passed:
-        sys.exit(1)
+            _bench_speed(session, scene, is_quick, output)
 
 
-def _bench_speed(
-    session: Session, path: Path | None, is_quick: bool, output: Path | None, report: Path | None
-) -> bool:
-    """Measures the scene at `path`, or the plume, and writes what was asked for; True."""
+def _bench_speed(session: Session, path: Path | None, is_quick: bool, output: Path | None) -> None:
+    """Measures the scene at `path`, or the plume, and writes what was asked for."""
     from ddrecon.bench.path_tracing import PathTracer
     from ddrecon.bench.run import bench_lines, describe, load_pair, run_bench, write_bench
     from ddrecon.errors import MissingExtraError, SceneError
-    from ddrecon.io.files.json_file import write_json
 
     load = None if path is None else lambda dtype: replace(session, dtype=dtype).load(path)
     scene, double = load_pair(load, session.device, is_quick)
@@ -193,21 +170,16 @@ def _bench_speed(
     except (MissingExtraError, SceneError) as error:
         click.echo(f"without path tracing: {error}", err=True)
     rows, truth = run_bench(scene, double, tracer, is_quick, session.progress)
-    click.echo("\n".join(bench_lines(rows)))
     measured = describe(rows, truth, scene, session.environment())
-    if output is not None:
-        click.echo(write_bench(output, rows, measured))
-    if report is not None:
-        write_json(report, measured)
-    return True
+    written = [] if output is None else [write_bench(output, rows, measured)]
+    session.show(measured, [*bench_lines(rows), *written])
 
 
-def _bench_shared(session: Session, path: Path, report: Path | None) -> None:
+def _bench_shared(session: Session, path: Path) -> None:
     """Measures what it brings that ranks share the views of the scene at `path`."""
     import torch
 
     from ddrecon.bench.shared import describe_shared, measure_shared, shared_lines
-    from ddrecon.io.files.json_file import write_json
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
 
@@ -215,19 +187,18 @@ def _bench_shared(session: Session, path: Path, report: Path | None) -> None:
     require_sharing(scene)
     measured = measure_shared(scene, session.progress)
     if is_first():
-        click.echo("\n".join(shared_lines(scene, measured)))
-    if is_first() and report is not None:
-        write_json(report, describe_shared(measured, session.environment()))
+        report = describe_shared(measured, session.environment())
+        session.show(report, shared_lines(scene, measured))
 
 
-def _bench_hard(session: Session, output: Path | None, report: Path | None) -> bool:
-    """Runs the hard cases, writes their table where asked for, and says whether all have passed."""
+def _bench_hard(session: Session, output: Path | None) -> None:
+    """Runs the hard cases, writes their table where asked for, and exits with 1 if any fails."""
     from ddrecon.io.files.json_file import write_json
     from ddrecon.validate.hard import describe, run_cases, table
 
     results = run_cases(session.device, session.progress)
-    click.echo("\n".join(table(results)))
-    for file in (output / "hard.json" if output else None, report):
-        if file is not None:
-            write_json(file, describe(results))
-    return not any(result.failures() for result in results)
+    if output is not None:
+        write_json(output / "hard.json", describe(results))
+    session.show(describe(results), table(results))
+    if any(result.failures() for result in results):
+        sys.exit(1)

@@ -2,7 +2,8 @@
 
 The one convention, that of Mitsuba 3's `envmap`: rows are nodes from the pole +y (row 0) to the
 pole -y (the last row); columns are centers of equal sectors that wrap around, from -z over +x, +z
-and -x. Between them radiance is bilinear. A `rotation` turns the map about +y, right-handed.
+and -x. Between them radiance is bilinear. A `rotation` turns the map about +y, right-handed. With
+`up` z all this is turned about +x, so that (x, y, z) of it is (x, -z, y) of the world.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from ddrecon.numerics.interpolation import sample_slices
 def environment_radiance(light: EnvironmentLight, direction: Tensor) -> Tensor:
     """The radiance `[C, R]` seen when looking along `direction` [R, 3] (unit, array order)."""
     x, y, z = array_order(direction).unbind(-1)
+    if light.up == "z":
+        y, z = z, -y
     # Azimuth as a fraction of a full circle. At the poles it is anything, with a finite derivative.
     from_axis = (x * x + z * z).clamp(min=torch.finfo(x.dtype).tiny)
     is_pole = from_axis <= torch.finfo(x.dtype).tiny
@@ -39,14 +42,13 @@ def _wrap(radiance: Tensor) -> Tensor:
     return torch.cat([radiance[..., -1:], radiance, radiance[..., :1]], -1)
 
 
-def rotate_directions(vector: Tensor, rotation: Tensor) -> Tensor:
-    """The world's components of `vector` [..., 3] (x, y, z), given in a map's own frame.
-
-    `rotation` [degrees] is by how much the map is turned about +y.
-    """
-    cosine, sine = torch.cos(torch.deg2rad(rotation)), torch.sin(torch.deg2rad(rotation))
+def rotate_directions(vector: Tensor, light: EnvironmentLight) -> Tensor:
+    """The world's components of `vector` [..., 3] (x, y, z), given in the own frame of a map."""
+    angle = torch.deg2rad(light.rotation)
+    cosine, sine = torch.cos(angle), torch.sin(angle)
     x, y, z = vector.unbind(-1)
-    return torch.stack([cosine * x + sine * z, y, cosine * z - sine * x], -1)
+    x, z = cosine * x + sine * z, cosine * z - sine * x
+    return torch.stack([x, -z, y] if light.up == "z" else [x, y, z], -1)
 
 
 def refine_map(radiance: Tensor, rows: int, columns: int) -> Tensor:

@@ -34,14 +34,15 @@ class EnvironmentLight:
     """A latitude-longitude map of light from infinitely far away.
 
     `radiance` [C, h, w] >= 0 of every pixel, h >= 2 (`environment.py` says which lies where);
-    `scale`: scalar factor on it; `rotation`: scalar, about +y [degrees]; `directions`: how many
-    regions the light on the volume is gathered into.
+    `scale`: scalar factor on it; `rotation`: scalar, about the pole [degrees]; `directions`: how
+    many regions the light on the volume is gathered into; `up`: y or z, where the pole is.
     """
 
     radiance: Tensor
     scale: Tensor
     rotation: Tensor
     directions: int = 48
+    up: str = "y"
 
 
 @dataclass(eq=False)

@@ -78,7 +78,7 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
 
     # Suns take all light of their regions and leave them black.
     is_sun = _are_suns(moments[:, 0].sum(-1).detach(), regions)
-    suns = [_sun(region, light.rotation) for region in moments[is_sun]]
+    suns = [_sun(region, light) for region in moments[is_sun]]
     left = torch.where(is_sun[:, None, None], -darkest * geometry, above_darkest)
 
     # Ambient light has the mean radiance of what is left, `mean` above the darkest pixel.
@@ -89,8 +89,8 @@ def decompose_map(light: EnvironmentLight) -> list[DirectionalLight | AmbientLig
     # seen: hence the signs.
     deviation = left - mean * geometry
     middles = torch.nn.functional.normalize(geometry[:, 1:, 0], dim=-1)
-    travel = array_order(rotate_directions(-middles, light.rotation))
-    vector = rotate_directions(-deviation[:, 1:].transpose(1, 2), light.rotation)
+    travel = array_order(rotate_directions(-middles, light))
+    vector = rotate_directions(-deviation[:, 1:].transpose(1, 2), light)
     return [*suns, ambient, Sky(travel, deviation[:, 0], array_order(vector).transpose(1, 2))]
 
 
@@ -153,6 +153,6 @@ def _are_suns(irradiance: Tensor, regions: _Regions) -> Tensor:
     return (fraction > SUN_FRACTION) & (fraction > SUN_CONTRAST * of_sphere) & (rank < MAX_SUNS)
 
 
-def _sun(moments: Tensor, rotation: Tensor) -> DirectionalLight:
-    """The directional light of a region with `moments` [4, C], along its light's mean direction."""
-    return DirectionalLight(rotate_directions(-moments[1:].sum(-1), rotation), moments[0])
+def _sun(moments: Tensor, light: EnvironmentLight) -> DirectionalLight:
+    """The sun of a region of `light` with `moments` [4, C], along its light's mean direction."""
+    return DirectionalLight(rotate_directions(-moments[1:].sum(-1), light), moments[0])

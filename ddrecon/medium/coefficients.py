@@ -26,7 +26,7 @@ P1_DEGREE = 1
 """Diffusion knows light to this degree in angle: its mean and its flux."""
 
 
-@dataclass(eq=False, init=False)
+@dataclass(eq=False, init=False, repr=False)
 class Volume(Displayed):
     """What a user describes: density, and cross sections per unit density, on a `grid`.
 

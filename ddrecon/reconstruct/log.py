@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from ddrecon.display import Displayed
 from ddrecon.scene import Scene
 
 
@@ -56,8 +57,8 @@ def sum_rows(total: Row, row: Row) -> Row:
     )
 
 
-@dataclass(frozen=True)
-class Result:
+@dataclass(frozen=True, repr=False)
+class Result(Displayed):
     """A finished reconstruction: the `scene` with its reconstructed volume, and the log."""
 
     scene: Scene

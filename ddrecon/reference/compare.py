@@ -17,7 +17,7 @@ from ddrecon.io.images.table import write_picture, write_preview
 from ddrecon.losses import psnr
 from ddrecon.progress import Progress
 from ddrecon.reference.mitsuba_scene import LONGEST
-from ddrecon.reference.trace import Traced, Tracer
+from ddrecon.reference.trace import Traced, Tracer, error_text
 from ddrecon.renderer import solve_light, view_image
 from ddrecon.report.pictures import comparison, diverging, pixels
 from ddrecon.scene import Scene, View
@@ -158,17 +158,14 @@ def _write(stem: Path, ours: Tensor, theirs: Tensor) -> list[Path]:
 
 
 def reference_lines(report: dict[str, Any], folder: Path) -> list[str]:
-    """What `reference` prints of its `report`: how far ours is from theirs, and how long both took.
-
-    An error below a third of the reference's noise cannot be told from none.
-    """
+    """How far ours is from theirs, and how long both took, as `reference` prints it."""
     lines = []
     for name, view in report["views"].items():
         noise, notes = view["noise"], [f"noise {view['noise']:.3f}"]
         if "error" in view:
-            error = f"{view['error']:.3f}" if view["error"] >= noise / 3 else f"< {noise / 3:.3f}"
             distance = f"with the reference's noise, {noise:.3f}: {view['distance']:.3f}"
-            notes = [f"relative RMS error {error} ({distance})", f"PSNR {view['psnr']:.1f} dB"]
+            error = f"relative RMS error {error_text(view['error'], noise)} ({distance})"
+            notes = [error, f"PSNR {view['psnr']:.1f} dB"]
             if view["brightness"] is not None:
                 notes.append(f"brightness {view['brightness']:.3f} of the reference's")
         times = ", ".join(f"{who} {seconds:.2f} s" for who, seconds in view["seconds"].items())

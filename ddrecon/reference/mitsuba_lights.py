@@ -7,12 +7,15 @@ an environment map.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ddrecon.errors import SceneError
+from ddrecon.light.environment import rotate_directions
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
 
 Color = tuple[float, float, float]
@@ -62,12 +65,12 @@ def _light(light: DirectionalLight | PointLight) -> dict[str, Any]:
 
 
 def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]:
-    """The map turned about +y, as `ddrecon.environment` says, which holds `ambient` [3] as well."""
+    """The map turned as `ddrecon.light.environment` says, which holds `ambient` [3] as well."""
     radiance = (light.scale * light.radiance).detach().cpu().double().numpy()
     pixels = np.broadcast_to(radiance.transpose(1, 2, 0), (*radiance.shape[1:], 3)) + ambient
-    angle = np.radians(light.rotation.item())
     turn = np.eye(4)
-    turn[::2, ::2] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    turned = replace(light, rotation=light.rotation.detach().cpu().double())
+    turn[:3, :3] = rotate_directions(torch.eye(3, dtype=torch.float64), turned).T
     return {"type": "envmap", "bitmap": np.ascontiguousarray(pixels, np.float32), "to_world": turn}
 
 

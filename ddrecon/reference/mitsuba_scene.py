@@ -173,8 +173,8 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
     if camera.is_perspective:
         if not math.isclose(camera.pixel_aspect, 1, rel_tol=SQUARE):
             raise SceneError(
-                f"view {view.name!r}: Mitsuba's pixels are square, "
-                f"those of this camera {camera.pixel_aspect:.6g} times as high as wide"
+                f"view {view.name!r}: pixels of Mitsuba's perspective cameras are square, "
+                f"those of this one {camera.pixel_aspect:.6g} times as high as wide"
             )
         if camera.lens is not None:
             raise SceneError(
@@ -195,7 +195,7 @@ def _sensor(view: View, grid: Grid) -> dict[str, Any]:
             **sensor,
         }
     half_width = float(camera.half_width)
-    scale = np.diag([half_width, half_width, 1.0, 1.0])
+    scale = np.diag([half_width, half_width * camera.pixel_aspect, 1.0, 1.0])
     return {"type": "orthographic", "to_world": matrix @ scale, **sensor}
 
 

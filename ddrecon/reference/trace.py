@@ -128,5 +128,16 @@ class Traced:
         return float(((image - self.image) ** 2).mean() / _power(self.image))
 
 
+def least_error(noise: float) -> float:
+    """What an error must exceed to be told from none, by a reference of this `noise`."""
+    return noise / 3
+
+
+def error_text(error: float, noise: float) -> str:
+    """`error` against a reference of this `noise`, with "<" where it cannot be told from none."""
+    least = least_error(noise)
+    return f"{error:.3g}" if error >= least else f"< {least:.2g}"
+
+
 def _power(image: np.ndarray) -> float:
     return max(float((image**2).mean()), float(np.finfo(np.float64).tiny))

@@ -23,7 +23,7 @@ CONTROLS = (
     ("high", "to", 0.05, 1, 0.01),
 )
 """Sliders of the transfer function: names, labels, ends and steps."""
-HINT = "Drag to turn, wheel or two fingers to zoom."
+HINT = "Drag or arrow keys turn; wheel, two fingers, + and - zoom."
 PALETTES = ("lit smoke", "values")
 
 
@@ -85,9 +85,12 @@ def _controls() -> str:
 
 
 def _slice(axis: int, label: str) -> str:
-    canvases = "".join(f'<canvas data-of="{of}"></canvas>' for of in ("result", "truth"))
+    canvases = "".join(
+        f'<canvas data-of="{of}" role="img" aria-label="{of}, cut across {label}"></canvas>'
+        for of in ("result", "truth")
+    )
     slider = (
-        '<input type="range" min="0" max="0.9999" step="0.0001" value="0.5"'
+        '<input type="range" min="0" max="1" step="any" value="0.5"'
         f' aria-label="place along {label}">'
     )
     return (

@@ -56,8 +56,8 @@ def open_run(
     result_of = fingerprint(scene_file, scene.volume.density.dtype)
     loaded = _resume(run, path, result_of) if resume else None
     with claim_folder(path, may_exist=may_exist or resume):
-            if loaded is None:
-                remove_run(path, scene_file)
+        if loaded is None:
+            remove_run(path, scene_file)
         of_run = {"seed": run.seed, "engines": engine_of_scene(scene, has_slabs(scene))}
         folder = RunFolder(path, scene_file, result_of, environment | of_run)
         if loaded is None:

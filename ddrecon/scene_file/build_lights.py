@@ -60,9 +60,8 @@ def _build_light(
     if is_gray and not may_change(scene_file.tree, f"lights.{index}.radiance"):
         pixels = pixels[..., :1]
     radiance = torch.from_numpy(pixels).permute(2, 0, 1).contiguous().to(device, dtype)
-    return EnvironmentLight(
-        radiance, tensor(section.scale), tensor(section.rotation), section.directions
-    )
+    numbers = tensor(section.scale), tensor(section.rotation)
+    return EnvironmentLight(radiance, *numbers, section.directions, section.up)
 
 
 def _read_map(path: Path) -> np.ndarray:

@@ -172,7 +172,7 @@ def _build_camera(
             section.pixel_aspect,
             *_lens(section.distortion),
         )
-    return Camera(pose, size, section.width / 2, is_perspective=False)
+    return Camera(pose, size, section.width / 2, False, pixel_aspect=section.pixel_aspect)
 
 
 def _lens(section: LensSection | None) -> tuple[str | None, Tensor | None]:

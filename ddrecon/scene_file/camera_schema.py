@@ -25,6 +25,7 @@ class PoseSection:
     """Where a camera stands, and its `resolution` (width, height) in pixels.
 
     The pose is `origin`, `target` and `up` [u], or `matrix`, camera to world with OpenGL axes.
+    `pixel_aspect`: height of a pixel over its width.
     """
 
     ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
@@ -34,6 +35,7 @@ class PoseSection:
     up: Triple = (0.0, 1.0, 0.0)
     matrix: Matrix | None = None
     resolution: Size | None = optional(minimum=1, maximum=16384)
+    pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
 
     def problems(self) -> Iterator[Problem]:
         if self.matrix is not None:
@@ -88,15 +90,13 @@ class PerspectiveSection(PoseSection):
     """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
 
     The axis meets the image at `principal_point`, parts of its width and height from the top left.
-    `pixel_aspect`: height of a pixel over its width. With `distortion`, all this is said of the
-    pinhole camera that is left without it.
+    With `distortion`, all this is said of the pinhole camera that is left without it.
     """
 
     type: ClassVar[str] = "perspective"
 
     fov: float = limited(above=0, below=180)
     principal_point: Pair = (0.5, 0.5)
-    pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
     distortion: LensSection | None = None
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from ddrecon.grid import Triple
-from ddrecon.settings import Problem, bounded, limited
+from ddrecon.settings import Problem, bounded, limited, one_of
 
 Color = float | Triple
 
@@ -38,9 +38,9 @@ class AmbientSection:
 
 @dataclass(frozen=True)
 class EnvironmentSection:
-    """A latitude-longitude map, +y up.
+    """A latitude-longitude map whose pole is `up`.
 
-    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about +y.
+    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about the pole.
 
     `directions`: how many directions its light on the volume is gathered into.
     """
@@ -51,6 +51,7 @@ class EnvironmentSection:
     scale: float = bounded(1.0, minimum=0)
     rotation: float = 0.0
     directions: int = bounded(48, minimum=1, maximum=1024)
+    up: str = one_of("y", ("y", "z"))
 
 
 @dataclass(frozen=True)

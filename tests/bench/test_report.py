@@ -11,7 +11,8 @@ import torch
 
 from ddrecon.bench.measure import Shot, Timing, block_sums
 from ddrecon.bench.path_tracing import Truth
-from ddrecon.bench.report import Row, rows_of, with_best
+from ddrecon.bench.report import Row, cells, rows_of, with_best
+from ddrecon.bench.run import against_path_tracing
 from ddrecon.reference.trace import Traced
 
 
@@ -27,7 +28,21 @@ def test_the_best_are_those_that_no_other_beats_in_both_time_and_error() -> None
         row("d", 4, 0.1),
         row("e", 5, 0.05),
     ]
-    assert [item.name for item in with_best(rows) if item.is_best] == ["a", "c", "d", "e"]
+    assert [item.name for item in with_best(rows) if item.is_best] == ["a", "c", "e"]
+
+
+def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides() -> None:
+    image = torch.ones(3, 2, 2)
+    ours, slower, traced = (
+        Timing([Shot(factor * image, image, image, seconds, 0.0, 16)])
+        for factor, seconds in ((1.02, 1.0), (1.0, 2.0), (1.3, 72.0))
+    )
+    timings = {"base": ours, "slower": slower, "Mitsuba 16 paths a pixel": traced}
+    rows = rows_of(timings, {}, Truth(Traced(image.numpy(), 0.09)))
+    assert [line[7] for line in cells(rows)] == ["< 0.03", "< 0.03", "0.286"]
+    assert [row.name for row in rows if row.is_best] == ["base"]
+    (told,) = against_path_tracing(rows)
+    assert "64 paths" in told and "16 paths a pixel take 72 times as long" in told
 
 
 def test_rows_hold_medians_and_errors_of_what_can_be_compared() -> None:

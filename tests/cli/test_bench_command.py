@@ -107,4 +107,4 @@ def test_path_tracing_takes_part_where_mitsuba_is_installed(
     rows = {row["name"]: row for row in report["rows"]}
     few, many = (rows[f"Mitsuba {paths} paths a pixel"]["image_error"] for paths in (4, 64))
     assert many < few / 2 and report["truth_noise"]["image"] < many
-    assert "Mitsuba reaches base's image error" in result.stdout
+    assert "image error is against 256 paths a pixel" in result.stdout

@@ -39,7 +39,13 @@ def test_a_command_says_what_it_does(command: str) -> None:
     assert result.exit_code == 0 and main.commands[command].help.splitlines()[0] in " ".join(
         result.stdout.split()
     )
-    assert "-D KEY.PATH=VALUE" in result.stdout
+    assert "--debug" in result.stdout
+    computes = command not in ("watch", "info", "export")
+    assert all(
+        (f" {option} " in result.stdout) == computes
+        for option in ("--device", "--engine", "--threads", "--seed", "--quiet")
+    )
+    assert ("-D KEY.PATH=VALUE" in result.stdout) == (command != "watch")
 
 
 def test_version(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -143,3 +143,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_files_that_a_page_names_exist(page: Path) -> None:
     files = FILE.findall(page.read_text(encoding="utf-8"))
     assert [file for file in files if not (ROOT / file).exists()] == []
+
+
+def test_every_page_is_in_the_menu() -> None:
+    listed = re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(listed) == sorted(page.name for page in (ROOT / "docs").glob("*.md"))

@@ -23,8 +23,11 @@ from ddrecon.light.lights import EnvironmentLight
 SIZES = [(2, 3), (3, 4), (7, 5), (32, 64)]
 
 
-def light_of(radiance: Tensor, scale: float = 1.0, rotation: float = 0.0) -> EnvironmentLight:
-    return EnvironmentLight(radiance, radiance.new_tensor(scale), radiance.new_tensor(rotation))
+def light_of(
+    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, up: str = "y"
+) -> EnvironmentLight:
+    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
+    return EnvironmentLight(radiance, *numbers, up=up)
 
 
 def directions(count: int, seed: int = 0) -> Tensor:
@@ -62,13 +65,12 @@ def test_between_pixels_radiance_is_their_mean_also_across_the_seam():
     assert seen(light, *center(1.5, -0.5, 5, 8)) == pytest.approx([corners], rel=1e-12)
 
 
-def test_straight_up_and_down_are_the_first_and_last_row():
-    light = light_of(
-        torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64).view(1, 3, 1).expand(1, 3, 4)
-    )
-    assert seen(light, 0, 1, 0) == pytest.approx([2.0]) and seen(light, 0, -1, 0) == pytest.approx(
-        [3.0]
-    )
+@pytest.mark.parametrize(("up", "way"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
+def test_straight_up_and_down_are_the_first_and_last_row(up: str, way: tuple[int, int, int]):
+    rows = torch.tensor([2.0, 7.0, 3.0], dtype=torch.float64)
+    light = light_of(rows.view(1, 3, 1).expand(1, 3, 4), rotation=20.0, up=up)
+    assert seen(light, *way) == pytest.approx([2.0])
+    assert seen(light, *(-part for part in way)) == pytest.approx([3.0])
 
 
 def test_a_quarter_turn_rolls_the_map():
@@ -82,10 +84,11 @@ def test_a_quarter_turn_rolls_the_map():
     )
 
 
-def test_turning_the_map_is_turning_the_viewer():
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_turning_the_map_is_turning_the_viewer(up: str):
     radiance, ways = random_values(3, 6, 8), directions(50)
-    light = light_of(radiance, rotation=33.0)
-    found = environment_radiance(light, array_order(rotate_directions(ways, light.rotation)))
+    light = light_of(radiance, rotation=33.0, up=up)
+    found = environment_radiance(light, array_order(rotate_directions(ways, light)))
     torch.testing.assert_close(
         found, environment_radiance(light_of(radiance), array_order(ways)), rtol=1e-11, atol=1e-12
     )
@@ -105,15 +108,17 @@ def test_what_is_seen_is_linear_in_scale_and_radiance():
     )
 
 
+@pytest.mark.parametrize("up", ["y", "z"])
 @pytest.mark.parametrize("rotation", [0.0, 37.0, 90.0, -200.0])
-def test_maps_look_as_they_do_in_mitsuba(rotation: float):
+def test_maps_look_as_they_do_in_mitsuba(rotation: float, up: str):
     mitsuba = pytest.importorskip(
         "mitsuba", reason="the reference needs Mitsuba 3 (the extra `reference`)"
     )
     mitsuba.set_variant("scalar_rgb")
     radiance, ways = random_values(3, 6, 10), directions(300)
     bitmap = mitsuba.Bitmap(np.ascontiguousarray(radiance.permute(1, 2, 0).float().numpy()))
-    turn = mitsuba.ScalarTransform4f().rotate([0, 1, 0], rotation)
+    turn = mitsuba.ScalarTransform4f().rotate([1, 0, 0], 90.0 * (up == "z"))
+    turn = turn @ mitsuba.ScalarTransform4f().rotate([0, 1, 0], rotation)
     environment = mitsuba.load_dict(
         {
             "type": "scene",
@@ -125,7 +130,7 @@ def test_maps_look_as_they_do_in_mitsuba(rotation: float):
         interaction = mitsuba.SurfaceInteraction3f()
         interaction.wi = mitsuba.Vector3f(*(-component for component in way))
         expected.append(list(environment.eval(interaction)))
-    found = environment_radiance(light_of(radiance, 1.5, rotation), array_order(ways))
+    found = environment_radiance(light_of(radiance, 1.5, rotation, up), array_order(ways))
     torch.testing.assert_close(
         found, torch.tensor(expected, dtype=torch.float64).T, rtol=1e-5, atol=1e-5
     )

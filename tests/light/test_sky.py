@@ -28,11 +28,14 @@ SHAPE = (5, 4, 6)
 
 
 def light_of(
-    radiance: Tensor, scale: float = 1.0, rotation: float = 0.0, directions: int = 48
+    radiance: Tensor,
+    scale: float = 1.0,
+    rotation: float = 0.0,
+    directions: int = 48,
+    up: str = "y",
 ) -> EnvironmentLight:
-    return EnvironmentLight(
-        radiance, radiance.new_tensor(scale), radiance.new_tensor(rotation), directions
-    )
+    numbers = radiance.new_tensor(scale), radiance.new_tensor(rotation)
+    return EnvironmentLight(radiance, *numbers, directions, up)
 
 
 def uneven(height: int, width: int, seed: int = 0) -> Tensor:
@@ -175,22 +178,24 @@ def test_the_light_of_a_map_is_linear_in_scale_and_without_suns_in_radiance():
 
 
 def test_a_turned_world_looks_the_same():
-    """Map, volume and camera turned by 90 degrees about +y."""
-    grid = Grid((5, 4, 5), (-0.5, -0.6, -0.5), (0.5, 0.6, 0.5))
+    """Map, volume and camera turned by 90 degrees about +y, and so that z points up."""
     density = torch.rand(5, 4, 5, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    eye, up = (
-        torch.tensor([0.4, 0.5, 2.5], dtype=torch.float64),
-        torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64),
-    )
+    eye = torch.tensor([0.4, 0.5, 2.5], dtype=torch.float64)
     images = []
-    for rotation, field, origin in (
-        (0.0, density, eye),
-        (90.0, density.transpose(0, 2).flip(0), eye[[2, 1, 0]] * eye.new_tensor([1, 1, -1])),
+    for up, rotation, field, origin in (
+        ("y", 0.0, density, eye),
+        ("y", 90.0, density.transpose(0, 2).flip(0), eye[[2, 1, 0]] * eye.new_tensor([1, 1, -1])),
+        ("z", 0.0, density.transpose(0, 1).flip(1), eye[[0, 2, 1]] * eye.new_tensor([1, -1, 1])),
     ):
-        camera = Camera(look_at(origin, torch.zeros_like(eye), up), (4, 5), 0.3)
+        upwards = torch.eye(3, dtype=torch.float64)["xyz".index(up)]
+        camera = Camera(look_at(origin, torch.zeros_like(eye), upwards), (4, 5), 0.3)
+        corner = (0.5, 0.6, 0.5) if up == "y" else (0.6, 0.5, 0.5)  # z, y, x
+        grid = Grid(tuple(field.shape), tuple(-side for side in corner), corner)
         scene = make_scene(field.contiguous(), grid=grid, g=0.4, camera=camera)
-        images.append(render(replace(scene, lights=[light_of(uneven(6, 8), rotation=rotation)])))
-    torch.testing.assert_close(images[1], images[0], rtol=1e-9, atol=0)
+        light = light_of(uneven(6, 8), rotation=rotation, up=up)
+        images.append(render(replace(scene, lights=[light])))
+    for turned in images[1:]:
+        torch.testing.assert_close(turned, images[0], rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("quarter", [1, 3])

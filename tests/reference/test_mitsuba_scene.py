@@ -47,6 +47,17 @@ def test_the_box_and_its_volume_lie_where_the_grid_lies() -> None:
             np.testing.assert_allclose(moved(place, corner), expected, atol=1e-12)
 
 
+def test_the_upper_edge_of_a_film_of_parallel_rays_is_where_ours_is() -> None:
+    camera = replace(make_camera(is_perspective=False), pixel_aspect=1.4)
+    sensor = described(make_scene(random_values(*SHAPE), camera=camera))["sensor_0"]
+    height, width = camera.size
+    corner = cast_rays(camera, (0.0, 0.0)).origin[0].flip(-1)
+    # Mitsuba's film is 2 wide, and as high as its pixels are square.
+    np.testing.assert_allclose(
+        moved(sensor["to_world"], (1.0, height / width, 0.0)), corner, atol=1e-12
+    )
+
+
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_the_middle_of_a_films_edges_is_seen_along_our_rays(is_perspective: bool) -> None:
     camera = make_camera(size=(1, 2), half_width=0.4, is_perspective=is_perspective)
@@ -71,7 +82,7 @@ def test_the_middle_of_a_films_edges_is_seen_along_our_rays(is_perspective: bool
 
 def test_pixels_that_are_not_square_are_refused() -> None:
     with pytest.raises(
-        SceneError, match=r"pixels are square, those of this camera 1\.1 times as high as wide"
+        SceneError, match=r"perspective cameras are square, those of this one 1\.1 times as high"
     ):
         described(
             make_scene(random_values(*SHAPE), camera=replace(make_camera(), pixel_aspect=1.1))

@@ -125,7 +125,7 @@ LIGHTS: dict[str, Callable[[], list[Light]]] = {
     "ambient": lambda: [AmbientLight(COLORS)],
     "environment": lambda: [EnvironmentLight(sky(), ONES[0], 40 * ONES[0])],
     "environment and ambient": lambda: [
-        EnvironmentLight(sky(), 0.5 * ONES[0], -70 * ONES[0]),
+        EnvironmentLight(sky(), 0.5 * ONES[0], -70 * ONES[0], up="z"),
         AmbientLight(COLORS),
     ],
     "point": lambda: [PointLight(CENTER + torch.tensor([1.0, 1.5, 0.5]), COLORS)],
@@ -138,6 +138,7 @@ def test_light_scattered_once_is_ours_to_4_percent(light: str, is_perspective: b
     grid, density = soft_ball(12)
     half_width = 0.25 if is_perspective else 0.5
     camera = seen_from((0.5, 0.3, 0.8), half_width, 16, is_perspective)
+    camera = replace(camera, pixel_aspect=1.0 if is_perspective else 1.3)
     scene = make_scene(
         density,
         grid=grid,

@@ -62,3 +62,10 @@ def test_a_signed_field_is_white_at_zero_and_colored_on_both_sides() -> None:
         assert blue[2] > blue[0] and red[0] > red[2]
         np.testing.assert_allclose(light_blue, (blue + white) / 2, atol=1)
         np.testing.assert_allclose(light_red, (red + white) / 2, atol=1)
+
+
+def test_what_is_drawn_has_a_name_and_a_role() -> None:
+    page = volume_viewer([], "", 1, (0.0, 0.0, 1.0))
+    canvases = re.findall("<canvas[^>]*>", page)
+    assert len(canvases) == 6
+    assert all('role="img"' in one and 'aria-label="' in one for one in canvases)

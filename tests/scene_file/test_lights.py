@@ -55,13 +55,15 @@ def test_a_map_is_scaled_and_turned(write: Write, tmp_path: Path):
         "scale": 2.5,
         "rotation": -370,
         "directions": 12,
+        "up": "z",
     }
     (light,) = load_scene(write(lit_by(entry)), dtype=torch.float64).lights
     assert isinstance(light, EnvironmentLight) and (
         light.scale.item(),
         light.rotation.item(),
         light.directions,
-    ) == (2.5, -370, 12)
+        light.up,
+    ) == (2.5, -370, 12, "z")
     assert {value.dtype for value in (light.radiance, light.scale, light.rotation)} == {
         torch.float64
     }

@@ -20,8 +20,16 @@ function differenceOf(target, render) {
 
 function makeWiper(pair) {
   const [target, render] = pair.querySelectorAll("img");
-  const wipe = (part) => pair.style.setProperty("--wiped", `${100 * Math.min(1, Math.max(0, part))}%`);
+  let place;
+  const wipe = (part) => {
+    place = Math.min(1, Math.max(0, part));
+    pair.style.setProperty("--wiped", `${100 * place}%`);
+    pair.setAttribute("aria-valuenow", Math.round(100 * place));
+  };
   pair.classList.add("wiper");
+  pair.tabIndex = 0;
+  pair.setAttribute("role", "slider");
+  pair.setAttribute("aria-label", `${target.alt} on the left, ${render.alt} on the right`);
   wipe(0.5);
   const follow = (event) => {
     const { left, width } = pair.getBoundingClientRect();
@@ -29,6 +37,12 @@ function makeWiper(pair) {
   };
   pair.addEventListener("pointermove", follow);
   pair.addEventListener("pointerdown", follow);
+  pair.addEventListener("keydown", (event) => {
+    const step = { ArrowLeft: -0.05, ArrowRight: 0.05 }[event.key];
+    if (!step) return;
+    event.preventDefault();
+    wipe(place + step);
+  });
   const button = document.createElement("button");
   button.type = "button";
   button.textContent = "difference";

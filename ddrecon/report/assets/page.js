@@ -48,9 +48,11 @@ async function makeAlive() {
     const figure = document.createElement("figure");
     const canvas = document.createElement("canvas");
     canvas.tabIndex = 0;
-    canvas.setAttribute("aria-label", `${kind}: drag to turn, wheel to zoom`);
+    canvas.setAttribute("role", "application");
+    canvas.setAttribute("aria-roledescription", "volume");
     const caption = document.createElement("figcaption");
     caption.textContent = kind === "truth" ? "in the scene file" : "reconstructed";
+    canvas.setAttribute("aria-label", `${caption.textContent}: arrow keys turn, + and - zoom`);
     figure.append(canvas, ...(kinds.length > 1 ? [caption] : []));
     room.append(figure);
     try {

@@ -33,14 +33,16 @@ function drawSlices(name) {
   for (const figure of document.querySelectorAll("figure.slice")) {
     const axis = Number(figure.dataset.axis);
     const slider = figure.querySelector("input");
-    const part = slider ? Number(slider.value) : 0.5;
+    const count = fields.get(`result ${name}`).size[axis];
+    Object.assign(slider, { min: 0.5 / count, max: 1 - 0.5 / count, step: 1 / count }); // by cells
+    const part = Number(slider.value);
     for (const canvas of figure.querySelectorAll("canvas")) {
       const field = fields.get(`${canvas.dataset.of} ${name}`);
       canvas.hidden = !field;
       if (field) drawSlice(canvas, field, axis, part);
     }
-    const shown = fields.get(`result ${name}`);
-    const count = shown.size[axis];
-    figure.querySelector("output").textContent = `${"xyz"[axis]}: cell ${Math.min(count - 1, Math.floor(part * count))} of ${count}`;
+    const place = `${"xyz"[axis]}: cell ${Math.floor(part * count)} of ${count}`;
+    figure.querySelector("output").textContent = place;
+    slider.setAttribute("aria-valuetext", place);
   }
 }

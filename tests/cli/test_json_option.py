@@ -1,0 +1,37 @@
+"""`--json` prints a command's report, and `--json FILE.json` writes it, alike in all commands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+
+Run = Callable[..., Result]
+CHECKED = ["gradcheck", "-q", "--samples", "2", "-D", "volume.resolution=[4, 3, 3]"]
+CHECKED += ["-D", "diffusion.model=none", "-D", "lights.1.radiance=0"]
+COMMANDS = {"check": ["check"], "gradcheck": CHECKED, "info": ["info"]}
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+def test_it_prints_what_it_would_write(run: Run, folder: Path, command: list[str]) -> None:
+    """And takes no scene for a file to write."""
+    scene = Path("scene.yaml").read_text()
+    printed = run(*command, "--json", "scene.yaml")
+    plain = run(*command, "scene.yaml")
+    written = run(*command, "scene.yaml", "--json", "report.json")
+    assert [one.exit_code for one in (printed, plain, written)] == [0, 0, 0], printed.stderr
+    assert json.loads(printed.stdout) == json.loads(Path("report.json").read_text())
+    assert written.stdout == plain.stdout and not plain.stdout.startswith("{")
+    assert Path("scene.yaml").read_text() == scene
+    assert run(*command, "scene.yaml", "--json=other").exit_code == 0
+    assert Path("other").read_bytes() == Path("report.json").read_bytes()
+
+
+def test_a_folder_that_is_not_there_is_said_first(
+    refuse: Callable[..., list[str]], folder: Path
+) -> None:
+    (line,) = refuse(2, "check", "gone.yaml", "--json", "gone/report.json")
+    assert "there is no folder" in line
