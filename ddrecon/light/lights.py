@@ -56,3 +56,5 @@ class PointLight:
 
 
 Light = DirectionalLight | AmbientLight | EnvironmentLight | PointLight
+BRIGHTNESS = ("irradiance", "radiance", "intensity", "scale")
+"""Their numbers that multiply the light they send."""

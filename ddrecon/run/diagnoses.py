@@ -14,6 +14,7 @@ from statistics import mean, median
 import torch
 from torch import Tensor
 
+from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import View
@@ -34,7 +35,6 @@ LATE = 0.25
 """The last part of a run."""
 DRIFT = 0.005
 """Relative changes over the last part of a run that are not rest."""
-BRIGHTNESS = ("irradiance", "radiance", "intensity", "scale")
 REFLECTION = ("albedo", "sigma_s")
 
 
