@@ -74,8 +74,8 @@ class VolumeRenderer(torch.nn.Module):
             counts = {name: len(v) for name, v in given.items() if self._is_batch(name, v)}
             if not counts:
                 return self._render(given, view, 0)
-            if len(set(counts.values())) > 1:
-                raise UsageError(f"batches differ in size: {counts}")
+            if len(set(counts.values())) > 1 or 0 in counts.values():
+                raise UsageError(f"batches differ in size, or hold nothing: {counts}")
             entries = range(next(iter(counts.values())))
             each = [{n: v[i] if n in counts else v for n, v in given.items()} for i in entries]
             return torch.stack([self._render(one, view, i) for i, one in enumerate(each)])

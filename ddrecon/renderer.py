@@ -87,9 +87,9 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
     points. Raises UsageError when views differ in size: render those one by one.
     """
     views = scene.views if view is None else [scene.view(view)]
-    if len({item.camera.size for item in views}) > 1:
+    if len({item.camera.size for item in views}) != 1:
         raise UsageError(
-            "the views differ in size; render them one by one: render(scene, view=name)"
+            "there is no view, or views differ in size: render them one by one, render(scene, name)"
         )
     return torch.stack(render_each(scene, views, memory or SolveMemory()))
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,11 +13,13 @@ import torch
 from media import box_grid, make_scene, random_values
 from torch import Tensor
 
+import ddrecon
 from ddrecon.errors import UsageError
 from ddrecon.layer import VolumeRenderer, render
 from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
+BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
 
 
 def test_a_tiny_network_learns_the_density_behind_an_image() -> None:
@@ -203,6 +208,23 @@ def test_what_no_scene_file_may_say_is_refused(name: str, value: Any, problem: s
         setattr(layer.scene.volume, name, value)
         with pytest.raises(UsageError):
             render(layer.scene)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: ddrecon.load_scene("none.yaml"),
+        lambda: ddrecon.load_scene(BALL, dtype=torch.float16),
+        lambda: ddrecon.load_scene(BALL, device="nowhere"),
+        lambda: ddrecon.optimize(ddrecon.load_scene(BALL), "many"),
+        lambda: ddrecon.render(replace(small_layer().scene, views=[])),
+        lambda: small_layer()(density=torch.ones(0, *SHAPE)),
+        lambda: ddrecon.use_engine("steam"),
+    ],
+)
+def test_all_that_a_user_can_cause_is_an_error_of_ours(call: Callable[[], object]) -> None:
+    with pytest.raises(ddrecon.DdreconError):
+        call()
 
 
 def test_one_precision_and_a_known_view() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from ddrecon.errors import FormatError, SceneError
+from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise, estimate_noise
@@ -18,7 +18,7 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
-from ddrecon.settings import Iterations, OptimizeSettings
+from ddrecon.settings import AUTO, Iterations, OptimizeSettings
 from ddrecon.variables.kinds import kind_of, split_name
 from ddrecon.variables.values import value_of, variable_names
 
@@ -26,8 +26,10 @@ from ddrecon.variables.values import value_of, variable_names
 def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
     """What `scene` asks for, with `iterations` in place of its own where given.
 
-    Raises SceneError where it asks for nothing.
+    Raises SceneError where it asks for nothing, UsageError for `iterations` that are none.
     """
+    if isinstance(iterations, str) and iterations != AUTO:
+        raise UsageError(f"iterations: expected a number or {AUTO!r}, found {iterations!r}")
     if scene.optimize is None:
         raise SceneError(
             "optimize: missing section; say what to reconstruct, such as parameters: {density: {}}"
