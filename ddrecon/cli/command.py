@@ -169,7 +169,7 @@ def show_warnings() -> Iterator[None]:
     """Warnings about data become lines on stderr, each once; those of libraries stay unseen."""
     told = set[str]()
 
-    def show(message: Warning | str, *_: Any) -> None:
+    def show(message: Warning | str) -> None:
         if str(message) not in told:
             told.add(str(message))
             _show(f"warning: {message}")
@@ -177,7 +177,7 @@ def show_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = show
+        warnings.showwarning = lambda message, *_: show(message)
         yield
 
 

@@ -129,9 +129,7 @@ def usual_gain(views: Sequence[View], images: Mapping[str, Tensor]) -> float:
     return median(gains) if len(gains) > 2 else 1.0
 
 
-def find_exposure(
-    views: Sequence[View], images: Mapping[str, Tensor], least: float
-) -> str | None:
+def find_exposure(views: Sequence[View], images: Mapping[str, Tensor], least: float) -> str | None:
     """Whether some picture is brighter or darker, as a whole, than the others say.
 
     A factor is to explain more than the part `least` of what the picture leaves.
@@ -150,9 +148,7 @@ def find_exposure(
     )
 
 
-def find_shift(
-    views: Sequence[View], images: Mapping[str, Tensor], least: float
-) -> str | None:
+def find_shift(views: Sequence[View], images: Mapping[str, Tensor], least: float) -> str | None:
     """Whether renders fit their pictures better when moved: residuals go with the parallax.
 
     Moves are to explain more than the part `least` of them.
