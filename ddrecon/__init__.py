@@ -13,7 +13,7 @@ from ddrecon.display import draw_by
 __version__ = "0.1.0"
 _HOMES = {
     "load_scene": "ddrecon.scene_file.build",
-    "render": "ddrecon.renderer",
+    "render": "ddrecon.layer",
     "VolumeRenderer": "ddrecon.layer",
     "optimize": "ddrecon.reconstruct.loop",
     "Result": "ddrecon.reconstruct.loop",

@@ -1,4 +1,7 @@
-"""The renderer as a layer in somebody's network."""
+"""The front door from Python: a scene is rendered, by itself or as a layer in a network.
+
+Both look at what they are given; the rooms below take a scene as it is.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,25 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from ddrecon import renderer
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.numerics.autodiff import leave_uncompiled
-from ddrecon.renderer import render
+from ddrecon.errors import UsageError
+from ddrecon.numerics.autodiff import leave_uncompiled, require_plain_autograd
 from ddrecon.scene import Scene
-from ddrecon.variables.values import value_of, with_values
+from ddrecon.variables.values import require_legal, value_of, with_values
 
 DTYPES = (torch.float32, torch.float64)
 """What light is computed in."""
+
+
+def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = None) -> Tensor:
+    """Pictures `[views, 3, h, w]`, as `ddrecon.renderer.render` has them, of a legal `scene`.
+
+    Raises UsageError where `require_legal` does.
+    """
+    require_plain_autograd()
+    require_legal(scene)
+    return renderer.render(scene, view, memory)
 
 
 class VolumeRenderer(torch.nn.Module):
@@ -51,26 +65,21 @@ class VolumeRenderer(torch.nn.Module):
         `density`: [z, y, x] >= 0; `sigma_a`, `sigma_s` [1/u]: `[C]` or `[C, z, y, x]`; `g`: scalar
         in (-1, 1); `values`: anything else by name, such as `lights.0.irradiance`
         (`ddrecon.variables`). What is not given is the scene's. Each may have one more axis in
-        front, of n entries; the images then are `[n, views, 3, h, w]`. Raises KeyError for a name
-        the scene does not have, ValueError for shapes that do not go together or another device,
+        front, of n entries; the images then are `[n, views, 3, h, w]`. Raises UsageError for a name
+        the scene does not have, for other shapes, another device, and where `render` does;
         NotImplementedError within `torch.func.vmap` or `torch.func.grad`.
         """
         named = {"density": density, "sigma_a": sigma_a, "sigma_s": sigma_s, "g": g}
         given = {name: value for name, value in named.items() if value is not None}
         given |= values or {}
         own = self.scene.volume.density
-        for name, value in given.items():
-            if value.device != own.device:
-                raise ValueError(
-                    f"{name} is on {value.device}, the layer on {own.device}: layer.to(device)"
-                )
         with torch.autocast(own.device.type, enabled=False):
-            given = {name: value.to(own.dtype) for name, value in given.items()}
+            given = {n: v.to(own.dtype) if isinstance(v, Tensor) else v for n, v in given.items()}
             counts = {name: len(v) for name, v in given.items() if self._is_batch(name, v)}
             if not counts:
                 return self._render(given, view, 0)
-            if len(set(counts.values())) > 1:
-                raise ValueError(f"batches differ in size: {counts}")
+            if len(set(counts.values())) > 1 or 0 in counts.values():
+                raise UsageError(f"batches differ in size, or hold nothing: {counts}")
             entries = range(next(iter(counts.values())))
             each = [{n: v[i] if n in counts else v for n, v in given.items()} for i in entries]
             return torch.stack([self._render(one, view, i) for i, one in enumerate(each)])
@@ -87,14 +96,14 @@ class VolumeRenderer(torch.nn.Module):
         if name in ("sigma_a", "sigma_s", "sigma_t", "albedo"):
             return value.ndim in (2, 5)
         with torch.no_grad():
-            return value.ndim == value_of(self.scene, name).ndim + 1
+            return isinstance(value, Tensor) and value.ndim == value_of(self.scene, name).ndim + 1
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """What torch calls to move a module: the scene's tensors are moved as well."""
         module: Self = super()._apply(fn, recurse)
         scene = _map_tensors(fn, self.scene)
         if scene.volume.density.dtype not in DTYPES:
-            raise TypeError(
+            raise UsageError(
                 f"light is not computed in {scene.volume.density.dtype}; leave the layer in "
                 "float32 or float64, what it is given may be of any precision"
             )

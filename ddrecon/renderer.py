@@ -23,6 +23,7 @@ from ddrecon.diffusion.paper.iteration import iterate_jacobi
 from ddrecon.diffusion.paper.printed import solve_printed
 from ddrecon.diffusion.rounds.transport import run_rounds
 from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.errors import UsageError
 from ddrecon.light.beam import Beam
 from ddrecon.light.environment import environment_radiance
 from ddrecon.light.lights import AmbientLight, EnvironmentLight, Light
@@ -39,7 +40,7 @@ from ddrecon.march.sight import Sight, look_through
 from ddrecon.medium.coefficients import Medium, keep_medium, scale_medium
 from ddrecon.medium.cut import cut_volume
 from ddrecon.medium.remaining import has_backward_peak, remaining_moments
-from ddrecon.numerics.autodiff import is_varied, require_plain_autograd
+from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.remember import is_any_nonzero
 from ddrecon.scene import Scene, View
 from ddrecon.settings import DiffusionSettings
@@ -83,13 +84,12 @@ def render(scene: Scene, view: str | None = None, memory: SolveMemory | None = N
 
     Differentiable, in reverse and in forward mode, with respect to the tensors of `scene.volume`
     and of its lights. `memory` carries the last solutions from one call to the next, as starting
-    points. Raises ValueError when views differ in size: render those one by one.
+    points. Raises UsageError when views differ in size: render those one by one.
     """
-    require_plain_autograd()
     views = scene.views if view is None else [scene.view(view)]
-    if len({item.camera.size for item in views}) > 1:
-        raise ValueError(
-            "the views differ in size; render them one by one: render(scene, view=name)"
+    if len({item.camera.size for item in views}) != 1:
+        raise UsageError(
+            "there is no view, or views differ in size: render them one by one, render(scene, name)"
         )
     return torch.stack(render_each(scene, views, memory or SolveMemory()))
 

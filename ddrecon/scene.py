@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ddrecon.cameras import Camera
 from ddrecon.display import Displayed
+from ddrecon.errors import UsageError
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.pictures.noise import Noise
@@ -69,9 +70,9 @@ class Scene(Displayed):
     path: Path | None = None
 
     def view(self, name: str) -> View:
-        """The view called `name`; raises KeyError with the known names."""
+        """The view called `name`; raises UsageError with the known names."""
         for view in self.views:
             if view.name == name:
                 return view
         names = ", ".join(view.name for view in self.views)
-        raise KeyError(f"no view {name!r}; the views are {names}")
+        raise UsageError(f"no view {name!r}; the views are {names}")

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import pytest
 import torch
 from media import box_grid, make_scene, random_values
 from torch import Tensor
 
-from ddrecon.layer import VolumeRenderer
-from ddrecon.renderer import render
+import ddrecon
+from ddrecon.errors import UsageError
+from ddrecon.layer import VolumeRenderer, render
 from ddrecon.variables.values import value_of, with_values
 
 SHAPE = (5, 4, 6)
+BALL = Path(__file__).parents[1] / "configs" / "ball.yaml"
 
 
 def test_a_tiny_network_learns_the_density_behind_an_image() -> None:
@@ -110,12 +118,10 @@ def test_the_scene_moves_with_the_layer() -> None:
     assert single.scene.starts["density"].dtype == torch.float32
     assert value_of(small_layer().to("meta").scene, "lights.0.irradiance").device.type == "meta"
     with pytest.raises(
-        TypeError, match=r"not computed in torch\.float16; leave the layer in float3"
+        UsageError, match=r"not computed in torch\.float16; leave the layer in float3"
     ):
         single.half()
     assert single().dtype == torch.float32
-    with pytest.raises(ValueError, match=r"density is on meta, the layer on cpu: layer.to\(device"):
-        single(density=torch.ones(SHAPE, device="meta"))
 
 
 @pytest.mark.parametrize("given", [torch.bfloat16, torch.float32, torch.float64])
@@ -158,8 +164,76 @@ def test_a_batch_is_its_entries_one_by_one() -> None:
         torch.testing.assert_close(images[i], one, rtol=1e-5, atol=1e-7)
         (alone,) = torch.autograd.grad((one * weight[i]).sum(), density)
         torch.testing.assert_close(gradient[i], alone, rtol=1e-3, atol=1e-6)
-    with pytest.raises(ValueError, match="batches differ in size"):
+    with pytest.raises(UsageError, match="batches differ in size"):
         layer(density=densities, g=torch.tensor([0.1, 0.2]))
+
+
+DOUBLE = {"dtype": torch.float64}
+WRONG = {
+    "density": [
+        (-torch.ones(SHAPE, **DOUBLE), "density: must be at least 0, found -1"),
+        (torch.full(SHAPE, math.nan, **DOUBLE), "density: must be finite, found nan"),
+        (torch.ones(5, 4, **DOUBLE), r"density: has shape \[5, 4\]; expected \[5, 4, 6\]"),
+        (torch.ones(SHAPE, device="meta", **DOUBLE), "density: is torch.float64 on meta, but"),
+        (0.5, "density: expected a tensor, found float"),
+    ],
+    "sigma_s": [
+        (torch.tensor([3.0, -1.0, 2.0], **DOUBLE), "sigma_s: must be at least 0, found -1 to 3"),
+        (torch.tensor([math.inf], **DOUBLE), "sigma_s: must be finite, found inf"),
+        (torch.ones(2, **DOUBLE), r"sigma_s: has shape \[2\]; expected \[1\] or \[3\]"),
+    ],
+    "g": [(torch.tensor(1.0, **DOUBLE), "g: must be above -1 and below 1, found 1")],
+    "lights.0.direction": [
+        (torch.zeros(3, **DOUBLE), "lights.0.direction: must not be zero"),
+        (torch.ones(2, **DOUBLE), r"lights.0.direction: has shape \[2\]; expected \[3\]"),
+    ],
+    "lights.0.irradiance": [(-torch.ones(1, **DOUBLE), "irradiance: must be at least 0, found")],
+    "views.view.camera": [(torch.ones(3, **DOUBLE), r"camera: has shape \[3\]; expected \[6\]")],
+    "depth": [(torch.ones(1, **DOUBLE), "no variable 'depth'; besides views, the scene has d")],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [(name, *case) for name, cases in WRONG.items() for case in cases],
+)
+def test_what_no_scene_file_may_say_is_refused(name: str, value: Any, problem: str) -> None:
+    """By the layer, by name, and where a scene's own tensor was replaced."""
+    layer = small_layer()
+    with pytest.raises(UsageError, match=problem):
+        layer(values={name: value})
+    with pytest.raises(UsageError, match=problem):
+        render(with_values(layer.scene, {name: value}))
+    if name in ("density", "sigma_s", "g"):
+        setattr(layer.scene.volume, name, value)
+        with pytest.raises(UsageError):
+            render(layer.scene)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: ddrecon.load_scene("none.yaml"),
+        lambda: ddrecon.load_scene(BALL, dtype=torch.float16),
+        lambda: ddrecon.load_scene(BALL, device="nowhere"),
+        lambda: ddrecon.optimize(ddrecon.load_scene(BALL), "many"),
+        lambda: ddrecon.render(replace(small_layer().scene, views=[])),
+        lambda: small_layer()(density=torch.ones(0, *SHAPE)),
+        lambda: ddrecon.use_engine("steam"),
+    ],
+)
+def test_all_that_a_user_can_cause_is_an_error_of_ours(call: Callable[[], object]) -> None:
+    with pytest.raises(ddrecon.DdreconError):
+        call()
+
+
+def test_one_precision_and_a_known_view() -> None:
+    scene = small_layer().scene
+    with pytest.raises(UsageError, match="no view 'side'; the views are view"):
+        render(scene, "side")
+    scene.volume.sigma_a = scene.volume.sigma_a.float()
+    with pytest.raises(UsageError, match=r"sigma_a: is torch\.float32 on cpu, but"):
+        render(scene)
 
 
 def test_what_torch_cannot_do_is_said() -> None:

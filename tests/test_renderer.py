@@ -16,6 +16,7 @@ from torch.autograd import forward_ad
 
 from ddrecon.cameras import Camera, cast_rays
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.errors import UsageError
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight
 from ddrecon.renderer import Components, render, solve_light, view_components
@@ -92,7 +93,7 @@ def test_views_are_rendered_by_name_and_must_agree_in_size():
     for index, name in enumerate(["view", "other"]):
         torch.testing.assert_close(render(scene, name)[0], both[index], rtol=1e-12, atol=0)
     scene.views += [View("large", make_camera(size=(5, 5)))]
-    with pytest.raises(ValueError, match="differ in size"):
+    with pytest.raises(UsageError, match="differ in size"):
         render(scene)
 
 

@@ -88,7 +88,6 @@ def lines(report: dict[str, Any]) -> list[str]:
         *([support_text(report["support"])] if report["support"] else []),
         f"engine: {name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
-        *(f"doubtful: {doubt}" for doubt in report["doubts"]),
     ]
 
 

@@ -165,11 +165,18 @@ def _shortage(error: BaseException) -> str:
 
 @contextmanager
 def show_warnings() -> Iterator[None]:
-    """Warnings about data become lines on stderr; those of libraries stay unseen."""
+    """Warnings about data become lines on stderr, each once; those of libraries stay unseen."""
+    told = set[str]()
+
+    def show(message: Warning | str) -> None:
+        if str(message) not in told:
+            told.add(str(message))
+            _show(f"warning: {message}")
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = lambda message, *_: _show(f"warning: {message}")
+        warnings.showwarning = lambda message, *_: show(message)
         yield
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ddrecon.cli.command import REPORT, in_session
+from ddrecon.errors import UsageError
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -46,10 +47,13 @@ def export(
     SCENE is a scene file or the folder of a finished run; a folder of `ddrecon uncertainty` counts
     as its volumes.
     """
+    from ddrecon.io.volumes.table import FORMATS
     from ddrecon.run.uncertainty_folder import volumes_in
 
     sources = tuple(path for source in sources for path in volumes_in(source) or [source])
-    kind = output.suffix.lower()
+    kind, known = output.suffix.lower(), (".xml", ".json", *FORMATS)
+    if kind not in known:
+        raise UsageError(f"-o {output}: unknown format {kind!r}; known: {', '.join(known)}")
     has_scene = any(map(_is_scene, sources))
     if (has_scene or kind in (".xml", ".json")) and len(sources) > 1:
         raise click.UsageError(f"one scene at a time is written as {kind}")
@@ -81,11 +85,12 @@ def _export_fields(
     up: str,
 ) -> None:
     """Writes the fields of a scene, or of all volumes `sources`, to `output`."""
-    from ddrecon.io.volumes.convert import raise_z, read_together, require_target
+    from ddrecon.io.files.folders import require_free_files
+    from ddrecon.io.volumes.convert import raise_z, read_together
     from ddrecon.io.volumes.table import keeps_constants, write_fields
     from ddrecon.scene_file.export_fields import fields_of
 
-    require_target(output, may_exist=overwrite)
+    require_free_files([output], may_exist=overwrite)
     if is_scene:
         fields, constants, bounds = fields_of(session.load(sources[0]))
     else:

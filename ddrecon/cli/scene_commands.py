@@ -5,7 +5,6 @@ torch is imported inside the commands, so that `--help` answers at once.
 
 from __future__ import annotations
 
-import warnings
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,6 @@ import click
 
 from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
 from ddrecon.cli.watch import SAVE_EVERY, watched
-from ddrecon.errors import DataWarning
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -185,7 +183,6 @@ def optimize(
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
     from ddrecon.run.events import require_tensorboard
-    from ddrecon.scene_file.doubts import find_doubts
 
     if has_events:
         require_tensorboard()
@@ -194,8 +191,6 @@ def optimize(
     scene_file = session.read(scene)
     built, environment = session.build(scene_file), session.environment()
     require_sharing(built)
-    for doubt in find_doubts(built):
-        warnings.warn(doubt, DataWarning, 2)
     if not is_first():
         run = follow_run(built, scene_file, resume=resume, preview_every=preview_every)
         if has_uncertainty:

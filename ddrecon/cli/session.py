@@ -7,6 +7,7 @@ import logging
 import os
 import platform
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from tqdm import tqdm
 
 from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
-from ddrecon.errors import UsageError
+from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.json_file import write_json
 from ddrecon.kernels.spare import keep_freed_memory
 from ddrecon.progress import bar_settings
@@ -28,6 +29,7 @@ from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.build import build_scene
+from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import suggestion
 
@@ -66,8 +68,11 @@ class Session:
         return read_scene(result_in(path) if os.path.isdir(path) else path, self.overrides)
 
     def build(self, scene_file: SceneFile) -> Scene:
-        """The scene as tensors on this session's device."""
-        return build_scene(scene_file, dtype=self.dtype, device=self.device)
+        """The scene as tensors on this session's device; warns of what can hardly be meant."""
+        scene = build_scene(scene_file, dtype=self.dtype, device=self.device)
+        for doubt in find_doubts(scene):
+            warnings.warn(doubt, DataWarning, 2)
+        return scene
 
     def load(self, path: Path) -> Scene:
         """The scene at `path` as tensors."""

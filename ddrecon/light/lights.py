@@ -57,3 +57,5 @@ class PointLight:
 
 
 Light = DirectionalLight | AmbientLight | EnvironmentLight | PointLight
+BRIGHTNESS = ("irradiance", "radiance", "intensity", "scale")
+"""Their numbers that multiply the light they send."""

@@ -35,7 +35,7 @@ class Volume(Displayed):
     in (-1, 1), the mean cosine of Henyey and Greenstein's. Tensors may be replaced or require
     gradients. `media`: what the volume was mixed from, by name (`mixture`). `support` [z, y, x]:
     where it is 0 the volume counts as empty, and derivatives by density are 0; None: it is 1
-    everywhere. Raises ValueError where shapes disagree.
+    everywhere.
     """
 
     grid: Grid
@@ -63,11 +63,6 @@ class Volume(Displayed):
         self.grid, self.density, self.sigma_a, self.sigma_s = grid, density, sigma_a, sigma_s
         self.media, self.support = media, support
         self.phase = HenyeyGreenstein(phase) if isinstance(phase, Tensor) else phase
-        if tuple(self.density.shape) != self.grid.shape:
-            raise ValueError(
-                f"density is {tuple(self.density.shape)} but the grid has {self.grid.shape} "
-                "cells [z, y, x]"
-            )
 
     @property
     def g(self) -> Tensor:

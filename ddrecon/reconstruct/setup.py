@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import torch
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import FormatError, SceneError, UsageError
+from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise, estimate_noise
 from ddrecon.reconstruct.brightness import RELEASE, can_solve_light
@@ -17,16 +18,19 @@ from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.reconstruct.rates import default_rate
 from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
-from ddrecon.settings import Iterations, OptimizeSettings
+from ddrecon.settings import AUTO, Iterations, OptimizeSettings
 from ddrecon.variables.default_rates import unit_of
+from ddrecon.variables.kinds import kind_of, split_name
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 
 def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
     """What `scene` asks for, with `iterations` in place of its own where given.
 
-    Raises SceneError where it asks for nothing.
+    Raises SceneError where it asks for nothing, UsageError for `iterations` that are none.
     """
+    if isinstance(iterations, str) and iterations != AUTO:
+        raise UsageError(f"iterations: expected a number or {AUTO!r}, found {iterations!r}")
     if scene.optimize is None:
         raise SceneError(
             "optimize: missing section; say what to reconstruct, such as parameters: {density: {}}"
@@ -43,12 +47,21 @@ def select_views(scene: Scene, is_test: bool) -> Scene:
 def require_usable(train: Scene, settings: OptimizeSettings) -> None:
     """Raises SceneError where `settings` cannot be reconstructed from the views of `train`.
 
-    That is where there are none, a parameter does not touch them, or a target is not finite.
+    That is where there are none, nothing shines, a parameter does not touch them, or a target is
+    not finite. Raises FormatError where pictures are black, or masks leave no pixel.
     """
     if not train.views:
         raise SceneError(
             "views: none has split: train and an image; there is nothing to reconstruct from"
         )
+    counted = (target_of(v) * (1 if v.mask is None else v.mask) for v in train.views)
+    if not any(bool(picture.any()) for picture in counted):
+        raise FormatError(
+            "views",
+            "no training picture shows anything where its pixels count; masks are white there",
+        )
+    if _is_dark(train, settings):
+        raise SceneError("lights: none shines, and none is sought: give one a brightness above 0")
     known = variable_names(train)
     problems = [
         f"optimize.parameters.{name}: there is no training view of this name with an image"
@@ -61,6 +74,17 @@ def require_usable(train: Scene, settings: OptimizeSettings) -> None:
             problems.append(f"views.{view.name}: {place} is not finite")
     if problems:
         raise SceneError(problems)
+
+
+def _is_dark(train: Scene, settings: OptimizeSettings) -> bool:
+    """Whether there is nothing to be seen: no light that shines or is sought, no background."""
+    has_light = any(
+        all(bool(value.any()) for name, value in vars(light).items() if name in BRIGHTNESS)
+        for light in train.lights
+    )
+    seeks_light = any(name.startswith("lights.") for name in settings.parameters)
+    behind = [view.background for view in train.views if view.background is not None]
+    return not (has_light or seeks_light or any(bool(radiance.any()) for radiance in behind))
 
 
 def choose_loss(settings: OptimizeSettings, train: Scene) -> str:

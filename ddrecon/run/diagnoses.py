@@ -14,6 +14,7 @@ from statistics import mean, median
 import torch
 from torch import Tensor
 
+from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import View
@@ -25,7 +26,7 @@ GAIN = 1.15
 SHIFT = 0.5
 """A render that fits better when moved by more pixels was seen by another camera."""
 EXPLAINED = 0.3
-"""The part of a residual that such a move has to explain."""
+"""The part of a residual that a factor or such a move has to explain."""
 WORTHWHILE = 0.1
 """A run is unfinished where as many iterations again would take this part off its loss."""
 SURE = 3.0
@@ -34,7 +35,6 @@ LATE = 0.25
 """The last part of a run."""
 DRIFT = 0.005
 """Relative changes over the last part of a run that are not rest."""
-BRIGHTNESS = ("irradiance", "radiance", "intensity", "scale")
 REFLECTION = ("albedo", "sigma_s")
 
 
@@ -87,13 +87,15 @@ def diagnose(
     seen = [view for view in views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
     overfit = find_overfit(seen, quality)
+    # What is not yet explained is no picture's fault as long as going on may explain it.
+    least = max(EXPLAINED, find_share_to_go(rows, usual_gain(trained, images)))
     told = {
         "overfit": overfit,
-        "exposure": find_exposure(trained, images),
-        "cameras": find_shift(trained, images),
+        "exposure": find_exposure(trained, images, least),
+        "cameras": find_shift(trained, images, least),
         # What is overfit would only become more so.
         "unfinished": None if overfit else find_falling(rows),
-        "drift": find_drift(moved),
+        "drift": find_drift(moved) if least < 1 else None,
     }
     return [Diagnosis(kind, text) for kind, text in told.items() if text is not None]
 
@@ -111,11 +113,32 @@ def find_overfit(views: Sequence[View], quality: Mapping[str, Mapping[str, float
     )
 
 
-def find_exposure(views: Sequence[View], images: Mapping[str, Tensor]) -> str | None:
-    """Whether some picture is brighter or darker, as a whole, than the others say."""
-    gains = {view.name: _gain(view, images[view.name]) for view in views}
-    usual = median(gains.values()) if len(gains) > 2 else 1.0
-    odd = {n: g / usual for n, g in gains.items() if abs(math.log(g / usual)) > math.log(GAIN)}
+def find_share_to_go(rows: Sequence[Row], usual: float) -> float:
+    """The part of the misfit that going on may explain, 0 to 1.
+
+    That is what the loss loses in as many iterations again, be it by chance. It is all where a run
+    is too short to tell, and where renders as a whole lack the `usual` gain.
+    """
+    share = _promised_share(rows, sure=0)
+    return 1.0 if share is None or abs(math.log(usual)) > math.log(GAIN) else min(share, 1.0)
+
+
+def usual_gain(views: Sequence[View], images: Mapping[str, Tensor]) -> float:
+    """By what factor most pictures are brighter than their renders; 1 of fewer than three."""
+    gains = [_gain(view, images[view.name], 1.0)[0] for view in views]
+    return median(gains) if len(gains) > 2 else 1.0
+
+
+def find_exposure(views: Sequence[View], images: Mapping[str, Tensor], least: float) -> str | None:
+    """Whether some picture is brighter or darker, as a whole, than the others say.
+
+    A factor is to explain more than the part `least` of what the picture leaves.
+    """
+    odd, usual = {}, usual_gain(views, images)
+    for view in views:
+        gain, explained = _gain(view, images[view.name], usual)
+        if abs(math.log(gain / usual)) > math.log(GAIN) and explained > least:
+            odd[view.name] = gain / usual
     if not odd:
         return None
     named = ", ".join(f"{name} ({gain:.2f} times)" for name, gain in _worst(odd))
@@ -125,12 +148,15 @@ def find_exposure(views: Sequence[View], images: Mapping[str, Tensor]) -> str | 
     )
 
 
-def find_shift(views: Sequence[View], images: Mapping[str, Tensor]) -> str | None:
-    """Whether renders fit their pictures better when moved: residuals go with the parallax."""
+def find_shift(views: Sequence[View], images: Mapping[str, Tensor], least: float) -> str | None:
+    """Whether renders fit their pictures better when moved: residuals go with the parallax.
+
+    Moves are to explain more than the part `least` of them.
+    """
     moves = {}
     for view in views:
         (right, down), explained = best_shift(view, images[view.name])
-        if math.hypot(right, down) > SHIFT and explained > EXPLAINED:
+        if math.hypot(right, down) > SHIFT and explained > least:
             moves[view.name] = math.hypot(right, down)
     if not moves:
         return None
@@ -146,12 +172,8 @@ def find_falling(rows: Sequence[Row]) -> str | None:
 
     Only what is of the last resolution tells: what falls after a refinement soon comes to rest.
     """
-    last = [row.loss for row in rows if row.cells == rows[-1].cells]
-    count = min(len(rows) // 6, len(last) // 3)
-    if count < 3 or not min(last) > 0:
-        return None
-    gain = promised(last[-3 * count :], len(rows)) / mean(last[-count:])
-    if gain < WORTHWHILE:
+    gain = _promised_share(rows, SURE)
+    if gain is None or gain < WORTHWHILE:
         return None
     much = f"some {100 * gain:.0f} %" if gain < 0.5 else "more than half"
     return (
@@ -160,19 +182,31 @@ def find_falling(rows: Sequence[Row]) -> str | None:
     )
 
 
-def promised(losses: Sequence[float], more: int) -> float:
+def _promised_share(rows: Sequence[Row], sure: float) -> float | None:
+    """What `promised` says of as many iterations again, as part of the loss.
+
+    None where a run is too short to tell.
+    """
+    last = [row.loss for row in rows if row.cells == rows[-1].cells]
+    count = min(len(rows) // 6, len(last) // 3)
+    if count < 3 or not min(last) > 0:
+        return None
+    return promised(last[-3 * count :], len(rows), sure) / mean(last[-count:])
+
+
+def promised(losses: Sequence[float], more: int, sure: float = SURE) -> float:
     """By how much `more` iterations would lower a loss that comes to rest as `losses` do.
 
     They are taken for c + a q^t: of the means m1, m2, m3 of their thirds, of w iterations each,
     the falls m1 - m2 and m2 - m3 have the ratio q^w = Q (Aitken 1926), and so a q^t is at the end
-    (m2 - m3) w (1 - q) Q^2 / (q (1 - Q)^2). It is 0 where the second fall may be chance, by how
-    much neighbors differ.
+    (m2 - m3) w (1 - q) Q^2 / (q (1 - Q)^2). It is 0 where the second fall may be chance: no more
+    than `sure` standard errors, by how much neighbors differ.
     """
     count = len(losses) // 3
     first, second, third = (losses[i * count : (i + 1) * count] for i in range(3))
     fall = mean(second) - mean(third)
     variance = mean((b - a) ** 2 for a, b in pairwise([*second, *third])) / 2
-    if fall <= SURE * math.sqrt(2 * variance / count):
+    if fall <= sure * math.sqrt(2 * variance / count):
         return 0.0
     # A fall that does not slow down is a straight line.
     ratio = min(fall / max(mean(first) - mean(second), fall), 1 - 1e-6)
@@ -221,11 +255,16 @@ def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:
     return (float(move[0]), float(move[1])), 1 - float(left @ left) / total
 
 
-def _gain(view: View, image: Tensor) -> float:
-    """How much brighter the picture of `view` is than its render, as a whole."""
+def _gain(view: View, image: Tensor, usual: float) -> tuple[float, float]:
+    """The factor on the render of `view` that fits its picture best, by least squares.
+
+    And the part that it explains of what the `usual` factor leaves.
+    """
     weight = _weight(view)
-    picture, render = (float((x * weight).sum().clamp(min=1e-12)) for x in (_picture(view), image))
-    return picture / render
+    picture, render = ((x * weight).double().flatten() for x in (_picture(view), image))
+    left, power = picture - usual * render, float(render @ render) or 1e-30
+    change = float(left @ render) / power
+    return max(usual + change, 1e-12), change**2 * power / max(float(left @ left), 1e-30)
 
 
 def _picture(view: View) -> Tensor:

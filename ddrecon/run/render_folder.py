@@ -149,7 +149,7 @@ def require_variation(scene: Scene, parameter: str) -> None:
     """Raises UsageError unless `parameter` names a number of `scene` or a component of one."""
     try:
         variation(scene, parameter)
-    except KeyError as error:
+    except UsageError as error:
         names = variable_names(scene)
         parts = [
             f"{name}.{part}"
@@ -157,7 +157,7 @@ def require_variation(scene: Scene, parameter: str) -> None:
             for part in component_names(name, value_of(scene, name))
         ]
         guess = "" if parameter in names else suggestion(parameter, [*names, *parts])
-        raise UsageError(f"--gradient {parameter}: {error.args[0]}{guess}") from None
+        raise UsageError(f"--gradient {parameter}: {error}{guess}") from None
 
 
 def render_lines(report: dict[str, Any], folder: Path) -> list[str]:

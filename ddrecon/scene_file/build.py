@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import torch
 
+from ddrecon.errors import UsageError
+from ddrecon.layer import DTYPES
 from ddrecon.light.lights import Light
 from ddrecon.march.steps import choose_steps
 from ddrecon.scene import Scene
@@ -37,9 +39,15 @@ def load_scene(
 
     `overrides` (`key.path=value`) are put in first.
 
-    Raises SceneError with one line per problem of the scene, or FormatError for a file it names
-    that cannot be used.
+    Raises SceneError with one line per problem of the scene, FormatError for a file it names that
+    cannot be used, or UsageError for another `dtype` than `DTYPES` and a `device` that is not here.
     """
+    if dtype not in DTYPES:
+        raise UsageError(f"dtype {dtype}: light is computed in float32 or float64")
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(f"device {device}: {error}") from None
     return build_scene(read_scene(path, overrides), dtype=dtype, device=device)
 
 

@@ -10,6 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from ddrecon.errors import UsageError
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 from ddrecon.scene import Scene
@@ -64,7 +65,7 @@ def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSe
     key = f"optimize.parameters.{name}"
     try:
         value = value_of(scene, name).clone()
-    except KeyError:
+    except UsageError:
         raise scene_file.refused(
             key, f"the scene has no such number{suggestion(name, variable_names(scene))}"
         ) from None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera, image_places, look_at
+from ddrecon.errors import FormatError
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import Image, read_image, read_mask
 from ddrecon.lenses import MODELS, is_folded
@@ -91,8 +92,14 @@ def _build_view(
             ).to(device, dtype)
     size = _size(section.camera, image)
     if size is not None:
-        pictures = {"image": image, "mask": mask, "background": background}
-        _note_sizes(scene_file, key, pictures, size, problems)
+        for path, picture in (
+            (section.image, image),
+            (section.mask, mask),
+            (section.background, background),
+        ):
+            if picture is not None and tuple(picture.shape[-2:]) != size:
+                wrong = f"is {_by(picture.shape[-2:])} pixels, but {key}.camera has {_by(size)}"
+                problems.note(FormatError(path, wrong))
         with problems.collecting():
             camera = _build_camera(scene_file, f"{key}.camera", section.camera, size)
             _require_unfolded(scene_file, f"{key}.camera", camera)
@@ -127,21 +134,6 @@ def _build_view(
     )
 
 
-def _note_sizes(
-    scene_file: SceneFile,
-    key: str,
-    pictures: Mapping[str, Tensor | None],
-    size: tuple[int, int],
-    problems: Problems,
-) -> None:
-    """Notes those of `pictures`, by their keys in the view `key`, that are not of `size` (h, w)."""
-    for name, picture in pictures.items():
-        if picture is not None and tuple(picture.shape[-2:]) != size:
-            height, width = picture.shape[-2:]
-            wrong = f"is {width} x {height} pixels, but the camera has {size[1]} x {size[0]}"
-            problems.note(scene_file.refused(f"{key}.{name}", wrong))
-
-
 def _pixels(image: Image, dtype: torch.dtype, device: torch.device) -> Tensor:
     """The pixels of `image`, [3, h, w]."""
     return torch.from_numpy(image.pixels).permute(2, 0, 1).contiguous().to(device, dtype)
@@ -152,6 +144,10 @@ def _size(camera: CameraSection, image: Tensor | None) -> tuple[int, int] | None
     if camera.resolution is not None:
         return camera.resolution[1], camera.resolution[0]
     return None if image is None else (image.shape[1], image.shape[2])
+
+
+def _by(size: Sequence[int]) -> str:
+    return f"{size[1]} x {size[0]}"
 
 
 def _build_camera(

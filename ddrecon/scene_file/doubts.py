@@ -9,13 +9,17 @@ import torch
 
 from ddrecon.cameras import Camera
 from ddrecon.grid import Grid
+from ddrecon.medium.coefficients import scale_medium
 from ddrecon.scene import Scene
 from ddrecon.variables.values import extinction_of, with_values
 
 THICKEST, THINNEST = 3e3, 1e-3
 """Optical depths beyond these look like a wall, or like nothing."""
-THICK_FACES = 2.0
-"""Optical depths of a cell at a face beyond which images are off (docs/hard_cases.md)."""
+THICK_FACES, ABSORBING = 2.0, 2.5
+"""A cell at a face of extinction k, the forward peak left out, and absorption a is too thick where
+k + 2.5 sqrt(a k), times its size, is beyond 2: images are off by a fifth (docs/hard_cases.md)."""
+FORWARD = 0.5
+"""From this mean cosine on g may be traded for fewer scatterings."""
 SMALLEST = 2.0
 """A box of fewer pixels than this, along its diagonal, shows nothing."""
 UNITS = "are volume.bounds, cross sections and cameras in the same unit?"
@@ -44,21 +48,33 @@ def _doubt_depth(scene: Scene) -> list[str]:
 
 
 def _doubt_faces(scene: Scene) -> list[str]:
-    """Whether a medium that scatters is thick in cells at the faces of the box."""
+    """Whether a medium that scatters is thick in cells at the faces of the box.
+
+    What counts is the depth without the forward peak, and more of it where light is absorbed.
+    """
     volume = with_values(scene, scene.starts).volume
     if not bool((volume.sigma_s > 0).any()):
         return []
-    depth = extinction_of(volume).amax(0) * volume.density
-    thickest = max(
-        float(depth.select(axis, end).max()) * size
-        for axis, size in enumerate(volume.grid.spacing)
-        for end in (0, -1)
+    medium = scale_medium(volume, scene.diffusion.angles)
+    lost = medium.extinction.value
+    lost = lost + ABSORBING * (medium.absorption.value * lost).sqrt()
+    thickest, whole = (
+        max(
+            float(field.select(axis - 3, end).max()) * size
+            for axis, size in enumerate(volume.grid.spacing)
+            for end in (0, -1)
+        )
+        for field in (lost, extinction_of(volume).amax(0) * volume.density)
     )
     if thickest <= THICK_FACES:
         return []
+    finer, g = thickest / THICK_FACES, float(medium.g.max())
+    advice = f"take cells {finer:.1f} times smaller, and leave a layer of empty ones"
+    if g >= FORWARD:
+        advice = f"say g: 0 and sigma_s times {1 - g:.2g} (similarity), or {advice}"
     return [
-        f"volume: cells at the faces of the box are up to {thickest:.3g} optical depths thick; "
-        "images may be off by a fifth and more: take smaller cells, and leave a layer of empty ones"
+        f"volume: cells at the faces of the box are up to {whole:.3g} optical depths thick; images "
+        f"may be off by a fifth and more: {advice}"
     ]
 
 

@@ -51,15 +51,15 @@ class Problems:
 
         It is a FormatError where only files are to blame, else a SceneError.
         """
-        files = list(dict.fromkeys(line for error in self.unusable for line in error.lines))
+        files = dict.fromkeys(line for error in self.unusable for line in error.lines)
+        lines = [*_group(dict.fromkeys(self.lines)), *files]
+        if len(lines) > MOST:
+            lines[MOST:] = ["and more: mend these first"]
         if self.lines:
-            lines = [*_group(dict.fromkeys(self.lines)), *files]
-            raise SceneError(
-                [*lines[:MOST], "and more: mend these first"] if len(lines) > MOST else lines
-            )
+            raise SceneError(lines)
         if self.unusable:
             first = self.unusable[0]
-            raise FormatError(first.path, first.reason, files[1:])
+            raise FormatError(first.path, first.reason, lines[1:])
 
 
 def _group(lines: Iterable[str]) -> list[str]:

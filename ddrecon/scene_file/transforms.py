@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ddrecon.errors import FormatError
+from ddrecon.errors import FormatError, SceneError
 from ddrecon.io.images.table import READERS
 from ddrecon.scene_file.leaves import Rule, read_each, read_list, read_path, read_text
 from ddrecon.scene_file.nodes import Node, describe_found
@@ -26,6 +26,7 @@ from ddrecon.scene_file.view_names import name_views
 MAX_BYTES = 64 * 2**20
 TEST_NAME = re.compile(r"(?<![a-z])(test|val)(?![a-z])", re.IGNORECASE)
 TRAIN_NAME = re.compile(r"(?<![a-z])train(?![a-z])", re.IGNORECASE)
+LISTS = ("train_filenames", "test_filenames", "val_filenames")
 
 
 def read_transforms(
@@ -39,7 +40,12 @@ def read_transforms(
     problems, views = Problems(), list[ViewSection]()
     for path in paths:
         with problems.collecting():
-            views += _file_views(_document(node, path), path, test_every)
+            document = _document(node, path)
+            try:
+                views += _file_views(document, path, test_every)
+            except SceneError as error:
+                first, *others = error.problems
+                raise FormatError(path, first.removeprefix(f"{path}: "), others) from error
     problems.raise_any()
     names = name_views([view.image for view in views])
     return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
@@ -88,9 +94,13 @@ def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSect
         )
     frames = read_list(root.value["frames"])
     rule = Rule(str, {}, path.absolute().parent)
-    tests = _tests(root.value, path, frames, rule, test_every)
+    splits = _splits(root.value, path, frames, rule, test_every)
+    if not any(splits):
+        raise root.refused("its lists of files name no frame")
     problems, views = Problems(), []
-    for frame, is_test in zip(frames, tests, strict=True):
+    for frame, split in zip(frames, splits, strict=True):
+        if split is None:
+            continue
         with problems.collecting():
             if not isinstance(frame.value, dict):
                 raise frame.refused(f"expected a mapping, found {describe_found(frame)}")
@@ -103,36 +113,47 @@ def _file_views(root: Node, path: Path, test_every: int | None) -> list[ViewSect
                 raise frame.refused(
                     "has neither file_path nor w and h, so that its number of pixels is unknown"
                 )
-            views.append(ViewSection("", camera, image, mask, "test" if is_test else "train"))
+            views.append(ViewSection("", camera, image, mask, split))
     problems.raise_any()
     return views
 
 
-def _tests(
+def _splits(
     entries: Entries, path: Path, frames: list[Node], rule: Rule, test_every: int | None
-) -> list[bool]:
-    """Which frames are test views.
+) -> list[str | None]:
+    """The split of each frame; None for one that the file's lists leave out, as nerfstudio does.
 
     Lists of the file say so, or its name (`transforms_test.json`), or it is one in `test_every`.
     """
-    listed = [
-        name for name in ("train_filenames", "test_filenames", "val_filenames") if name in entries
-    ]
-    if listed:
-        tests = {
-            text
-            for name in listed[listed[0] == "train_filenames" :]
-            for text in read_each(entries[name].children(), rule, read_text)
-        }
+    if any(name in entries for name in LISTS):
+        names = [_name(frame) for frame in frames]
+        train, test, val = (_listed(entries.get(name), names, rule) for name in LISTS)
+        is_open = "train_filenames" not in entries
         return [
-            isinstance(frame.value, dict)
-            and "file_path" in frame.value
-            and frame.value["file_path"].value in tests
-            for frame in frames
+            "test" if name in test | val else "train" if is_open or name in {*train, None} else None
+            for name in names
         ]
     if TEST_NAME.search(path.stem) or TRAIN_NAME.search(path.stem) or test_every is None:
-        return [bool(TEST_NAME.search(path.stem))] * len(frames)
-    return [index % test_every == 0 for index in range(len(frames))]
+        return ["test" if TEST_NAME.search(path.stem) else "train"] * len(frames)
+    return ["train" if index % test_every else "test" for index in range(len(frames))]
+
+
+def _name(frame: Node) -> Path | None:
+    """What lists call the `frame`, if anything."""
+    name = frame.value.get("file_path") if isinstance(frame.value, dict) else None
+    return Path(name.value) if name is not None and isinstance(name.value, str) else None
+
+
+def _listed(node: Node | None, names: Sequence[Path | None], rule: Rule) -> set[Path]:
+    """The frames that a list of the file names; raises SceneError for one that there is not."""
+
+    def read_name(entry: Node, rule: Rule) -> Path:
+        name = Path(read_text(entry, rule))
+        if name not in names:
+            raise entry.refused(f"no frame has the file_path {entry.value!r}")
+        return name
+
+    return set() if node is None else set(read_each(node.children(), rule, read_name))
 
 
 def _image(entries: Entries, rule: Rule) -> Path | None:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ddrecon.errors import UsageError
 from ddrecon.scene import Scene
 from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
@@ -27,13 +28,13 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
 
     `name` is a variable (`density`, `g`, `lights.0.irradiance`), all of whose entries change alike,
     or a component of one (`sigma_s.r`, `lights.0.direction.x`, `views.front.camera.rotation_y`).
-    Directions, positions and cameras change by component only. Raises KeyError.
+    Directions, positions and cameras change by component only. Raises UsageError.
     """
     if name in variable_names(scene):
         value = value_of(scene, name)
         if components := kind_of(name).components:
             parts = ", ".join(f"{name}.{component}" for component in components)
-            raise KeyError(f"{name} changes by component: {parts}")
+            raise UsageError(f"{name} changes by component: {parts}")
         return name, torch.ones_like(value)
     owner, _, component = name.rpartition(".")
     if owner in variable_names(scene):
@@ -43,7 +44,7 @@ def variation(scene: Scene, name: str) -> tuple[str, Tensor]:
             change = torch.zeros_like(value)
             change[components.index(component)] = 1
             return owner, change
-    raise KeyError(f"the scene has no number {name}")
+    raise UsageError(f"the scene has no number {name}")
 
 
 Key = TypeVar("Key")
@@ -54,7 +55,7 @@ def render_tangent(
 ) -> dict[Key, tuple[Tensor, Tensor]]:
     """The images that `images_of` renders of `scene`, each with its derivative by `name`.
 
-    `name` is as for `variation`. Raises KeyError.
+    `name` is as for `variation`. Raises UsageError.
     """
     variable, change = variation(scene, name)
     with forward_ad.dual_level():

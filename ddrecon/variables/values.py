@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import twist
+from ddrecon.errors import UsageError
 from ddrecon.light.lights import Light
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
@@ -29,6 +30,7 @@ from ddrecon.variables.kinds import (
     kind_of,
     split_name,
 )
+from ddrecon.variables.legal import require_form, require_range
 
 RESPONSE = {"exposure": 1.0, "offset": 0.0}
 """What a camera does to radiance, and what it is where a view has none (E28)."""
@@ -61,7 +63,7 @@ def fields_of(scene: Scene) -> dict[str, Tensor]:
 
 
 def value_of(scene: Scene, name: str) -> Tensor:
-    """The value of the variable `name`; raises KeyError for a name that is none.
+    """The value of the variable `name`; raises UsageError for a name that is none.
 
     `density` [z, y, x]; cross sections and albedo [C] or [C, z, y, x]; numbers of phase functions
     and of lights as these hold them; a camera's twist is the change of its pose, [6] and zero: see
@@ -69,8 +71,7 @@ def value_of(scene: Scene, name: str) -> Tensor:
     [1] or [3].
     """
     if (known := _own_name(scene.volume, name)) not in variable_names(scene):
-        names = [known for known in variable_names(scene) if not known.startswith("views.")]
-        raise KeyError(f"no variable {name!r}; besides views, the scene has {', '.join(names)}")
+        raise _unknown(scene, name)
     if is_of_volume(known):
         return _volume_value(scene.volume, known)
     section, _, path = name.partition(".")
@@ -87,22 +88,49 @@ def with_values(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
 
     A density of one number fills the grid.
 
-    Raises KeyError for a name that is none, ValueError for a density of another shape than the
-    grid's.
+    Raises UsageError for a name that is none, and for another shape, precision or device than the
+    scene's.
     """
     values = {_own_name(scene.volume, name): value for name, value in values.items()}
     known = variable_names(scene)
     unknown = [name for name in values if name not in known]
     if unknown:
-        raise KeyError(f"no variable {unknown[0]!r}; the scene has {', '.join(known)}")
+        raise _unknown(scene, unknown[0])
     lights = [
-        _replace_light(light, f"lights.{index}", values) for index, light in enumerate(scene.lights)
+        _replace_light(light, f"lights.{index}", values, scene)
+        for index, light in enumerate(scene.lights)
     ]
     views = [_replace_view(view, values, scene) for view in scene.views]
     volume = _replace_volume(
         scene.volume, {name: value for name, value in values.items() if is_of_volume(name)}
     )
     return replace(scene, volume=volume, lights=lights, views=views)
+
+
+def require_legal(scene: Scene, *, waits: bool = False) -> None:
+    """Raises UsageError where a number of `scene` is none that a scene file may have.
+
+    That is one of its volume or lights of a wrong shape, precision or device, one that is not
+    finite, or out of range, such as a density below 0. Of those on a GPU it looks at the range only
+    if it `waits` for it.
+    """
+    cells, density = scene.volume.grid.shape, scene.volume.density
+    numbers = {
+        name: _volume_value(scene.volume, name)
+        for name in _volume_names(scene.volume)
+        if split_name(name)[1] not in EXTINCTION_AND_ALBEDO
+    }
+    for index, light in enumerate(scene.lights):
+        numbers |= {f"lights.{index}.{name}": getattr(light, name) for name in _tensors(light)}
+    for name, value in numbers.items():
+        require_form(name, value, value, density, cells)
+        if waits or value.device.type == "cpu":
+            require_range(name, value)
+
+
+def _unknown(scene: Scene, name: str) -> UsageError:
+    names = [known for known in variable_names(scene) if not known.startswith("views.")]
+    return UsageError(f"no variable {name!r}; besides views, the scene has {', '.join(names)}")
 
 
 def component_names(name: str, value: Tensor) -> tuple[str, ...]:
@@ -191,6 +219,12 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
                 for medium, part in volume.media.items()
             }
         )
+    density, cells = values.get("density"), volume.grid.shape
+    if isinstance(density, Tensor) and density.ndim == 0:
+        values = {**values, "density": density.expand(cells)}
+    for name, value in values.items():
+        now = volume.sigma_a if name in EXTINCTION_AND_ALBEDO else _volume_value(volume, name)
+        require_form(name, value, now, volume.density, cells)
     stored = {name: value for name, value in values.items() if name not in EXTINCTION_AND_ALBEDO}
     if len(stored) < len(values):
         sigma_t, albedo = (
@@ -198,8 +232,6 @@ def _replace_volume(volume: Volume, values: Mapping[str, Tensor]) -> Volume:
             for name in EXTINCTION_AND_ALBEDO
         )
         stored["sigma_a"], stored["sigma_s"] = cross_sections(sigma_t, albedo)
-    if "density" in stored and stored["density"].ndim == 0:
-        stored["density"] = stored["density"].expand(volume.grid.shape)
     phase = volume.phase
     if "g" in stored:
         phase = HenyeyGreenstein(stored.pop("g"))
@@ -221,8 +253,11 @@ def _values_of(medium: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _replace_light(light: Light, name: str, values: Mapping[str, Tensor]) -> Light:
+def _replace_light(light: Light, name: str, values: Mapping[str, Tensor], scene: Scene) -> Light:
     tensors = {key: values[f"{name}.{key}"] for key in _tensors(light) if f"{name}.{key}" in values}
+    for key, value in tensors.items():
+        volume = scene.volume
+        require_form(f"{name}.{key}", value, getattr(light, key), volume.density, volume.grid.shape)
     changed: Light = replace(light, **tensors)  # type: ignore[arg-type]
     return changed
 
@@ -252,6 +287,8 @@ def _replace_view(view: View, values: Mapping[str, Tensor], scene: Scene) -> Vie
     given: dict[str, Any] = {p: values[name] for p, name in names.items() if name in values}
     if not given:
         return view
+    for part, value in given.items():
+        require_form(names[part], value, _view_value(view, part), view.camera.pose, (0, 0, 0))
     response = {part: given.pop(part) for part in RESPONSE if part in given}
     camera = view.camera
     if "camera" in given:

@@ -112,3 +112,17 @@ def test_a_scene_without_images_or_optimize(succeed: Run) -> None:
     )
     lines = succeed("check", "scene.yaml").stdout.splitlines()
     assert "optimizes: nothing" in lines and "  front: perspective, 8 x 6 pixels, train" in lines
+
+
+def test_every_command_tells_the_same_doubts(succeed: Run) -> None:
+    """Each once, on stderr, whatever is printed."""
+    thick = "-D", "volume.sigma_s=300", "-D", "optimize.parameters.density.init=1"
+    succeed("optimize", "scene.yaml", "-o", "run", "-D", "optimize.refine_at=[]", *thick)
+    (told,) = succeed("check", "scene.yaml", *thick).stderr.splitlines()
+    assert "cells at the faces of the box" in told
+    for command in (
+        ["render", "scene.yaml", "-o", "out", *thick],
+        ["export", "scene.yaml", "-o", "scene.vdb", *thick],
+        ["uncertainty", "run", "-o", "sure", "--samples", "2", "--tolerance", "1"],
+    ):
+        assert succeed(*command).stderr.splitlines().count(told) == 1

@@ -277,14 +277,3 @@ def test_a_constant_cross_section_equals_the_same_one_in_every_cell(medium_of):
         torch.testing.assert_close(
             getattr(constant, name).value, getattr(varying, name).value, rtol=1e-15, atol=0
         )
-
-
-def test_a_density_of_another_shape_is_refused():
-    with pytest.raises(ValueError, match=r"\(2, 3, 5\).*\(2, 3, 4\)"):
-        Volume(
-            box_grid((2, 3, 4)),
-            random_values(2, 3, 5),
-            random_values(1),
-            random_values(1),
-            scalar(0.0),
-        )

@@ -1,5 +1,6 @@
 """The loss that pictures deserve, by their kind; and the units of penalties."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -7,13 +8,41 @@ import torch
 from media import half_empty, make_scene
 from torch import Tensor
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import FormatError, SceneError
 from ddrecon.grid import Grid
+from ddrecon.light.lights import AmbientLight, EnvironmentLight
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
+from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.setup import choose_loss, start_parameters
 from ddrecon.scene import Scene
 from ddrecon.settings import OptimizeSettings, ParameterSettings
+
+
+def test_what_shows_nothing_is_refused_and_what_shows_little_is_not(ball_scene: Scene) -> None:
+    """Masks that leave no pixel, black pictures, and no light at all; one of each is enough."""
+    scene, (first, *others) = ball_scene, ball_scene.views
+    black = [replace(view, mask=torch.zeros(view.camera.size)) for view in others]
+    empty = [replace(view, image=0 * view.image) for view in others]
+    dark = [AmbientLight(torch.zeros(1)), EnvironmentLight(torch.ones(1, 2, 3), *torch.zeros(2))]
+    backlit = replace(first, background=torch.ones(1, 1, 1))
+    sought = replace(scene.optimize, parameters={"lights.1.scale": ParameterSettings()})
+    for change, error in (
+        ({"views": [black[0], *black]}, FormatError),
+        ({"views": empty}, FormatError),
+        ({"views": [first, *black, *empty]}, None),
+        ({"lights": dark}, SceneError),
+        ({"lights": []}, SceneError),
+        ({"lights": [*scene.lights, *dark]}, None),
+        ({"lights": dark, "views": [backlit, *others]}, None),
+        ({"lights": dark, "optimize": sought}, None),
+    ):
+        with (
+            nullcontext()
+            if error is None
+            else pytest.raises(error, match=r"shows anything|none shines")
+        ):
+            Reconstruction(replace(scene, **change))
 
 
 def with_steps(scene: Scene, *steps: float) -> Scene:

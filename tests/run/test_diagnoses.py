@@ -51,17 +51,27 @@ def make_scene(*overrides: str) -> Scene:
 
 def kinds(scene: Scene, iterations: int = 60) -> list[str]:
     """The kinds of diagnoses of a reconstruction of `scene`."""
-    run, rows, late = Reconstruction(scene, iterations), [], LateMeans()
+    return kinds_at(scene, iterations)[-1]
+
+
+def kinds_at(scene: Scene, *stops: int) -> list[list[str]]:
+    """The same of one that is looked at after so many iterations, and ends after the last."""
+    run, rows, late, told = Reconstruction(scene, stops[-1]), [], LateMeans(), []
     while not run.is_done:
         rows.append(run.step())
         late.note(run)
-    found = run.current_scene()
-    with torch.no_grad():
-        images = {view.name: render(found, view.name)[0] for view in scene.views}
-    quality = {
-        view.name: {"psnr": psnr(images[view.name], view.image, view.mask)} for view in scene.views
-    }
-    return [told.kind for told in diagnose(scene.views, images, quality, rows, late.moved(run))]
+        if run.iteration not in stops:
+            continue
+        found = run.current_scene()
+        with torch.no_grad():
+            images = {view.name: render(found, view.name)[0] for view in scene.views}
+        quality = {
+            view.name: {"psnr": psnr(images[view.name], view.image, view.mask)}
+            for view in scene.views
+        }
+        diagnoses = diagnose(scene.views, images, quality, rows, late.moved(run))
+        told.append([each.kind for each in diagnoses])
+    return told
 
 
 def expose(scene: Scene) -> None:
@@ -100,6 +110,28 @@ def test_a_fault_is_told_and_no_other(
     scene = make_scene()
     fault(scene)
     assert kinds(scene, iterations) == expected
+
+
+SIDE = (
+    "lights=[{type: directional, direction: [-1, 0, 0.2], irradiance: 3}]",
+    "volume.sigma_s=[20, 30, 40]",
+)
+
+
+@pytest.mark.parametrize(
+    ("begin", "scene"), [(lambda scene: None, ()), (start_empty, SIDE)], ids=["near", "far"]
+)
+def test_nobody_is_accused_of_what_going_on_would_mend(
+    begin: Callable[[Scene], None], scene: tuple[str, ...]
+) -> None:
+    """On correct scenes, at any time; a picture exposed otherwise is told at the end."""
+    right, wrong = make_scene(*scene), make_scene(*scene)
+    wrong.views[2].image = 1.5 * wrong.views[2].image
+    begin(right)
+    begin(wrong)
+    for told in kinds_at(right, 3, 20, 60, 120):
+        assert {*told} <= {"unfinished"}
+    assert kinds_at(wrong, 3, 120)[-1] == ["exposure"]
 
 
 DRIFTING = (

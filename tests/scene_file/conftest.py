@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ddrecon.errors import SceneError
+from ddrecon.errors import DdreconError, SceneError
 from ddrecon.scene_file.load import SceneFile, read_scene
 
 
@@ -31,12 +31,14 @@ def read(write: Callable[[str], Path]) -> Callable[..., SceneFile]:
 
 @pytest.fixture
 def refusal(write: Callable[[str], Path], tmp_path: Path) -> Callable[..., list[str]]:
-    """The problem lines of text read as a scene, without the folder they begin with."""
+    """The problem lines of text refused as a scene, without the folder they begin with.
 
-    def problems(text: str, *overrides: str) -> list[str]:
-        with pytest.raises(SceneError) as caught:
+    `kind` is whose fault it is: the scene's, or that of a data file.
+    """
+
+    def problems(text: str, *overrides: str, kind: type[DdreconError] = SceneError) -> list[str]:
+        with pytest.raises(kind) as caught:
             read_scene(write(text), overrides)
-        assert all("\n" not in line for line in caught.value.problems)
-        return [line.replace(f"{tmp_path}/", "") for line in caught.value.problems]
+        return [line.replace(f"{tmp_path}/", "") for line in str(caught.value).splitlines()]
 
     return problems

@@ -247,10 +247,11 @@ def test_images_become_channels_first_and_give_the_resolution(write: Write, tmp_
 def test_image_and_mask_sizes_must_be_the_cameras(write: Write, tmp_path: Path):
     np.save(tmp_path / "a.npy", np.ones((8, 6, 3)))
     np.save(tmp_path / "m.npy", np.ones((5, 6)))
-    lines = problems(write(SCENE), "views.0.image=a.npy", "views.0.mask=m.npy")
-    assert lines == [
-        "-D views.0.image=a.npy: views.0.image: is 6 x 8 pixels, but the camera has 8 x 6",
-        "-D views.0.mask=m.npy: views.0.mask: is 6 x 5 pixels, but the camera has 8 x 6",
+    with pytest.raises(FormatError) as caught:
+        load_scene(write(SCENE), overrides=["views.0.image=a.npy", "views.0.mask=m.npy"])
+    assert [line.replace(f"{tmp_path}/", "") for line in caught.value.lines] == [
+        "a.npy: is 6 x 8 pixels, but views.0.camera has 8 x 6",
+        "m.npy: is 6 x 5 pixels, but views.0.camera has 8 x 6",
     ]
 
 

@@ -51,4 +51,23 @@ def test_thick_cells_at_the_faces() -> None:
     (line,) = doubts(*filled, grid.format(10))
     assert f"are up to {9 * size:.3g} optical depths thick" in line
     assert doubts(*filled, grid.format(10), "volume.sigma_s=0") == []
-    assert doubts(*filled, grid.format(math.ceil(45 * size))) == []
+    assert doubts(*filled, grid.format(math.ceil(60 * size))) == []
+
+
+def test_a_thick_face_is_told_by_what_it_costs() -> None:
+    """Absorption makes a depth worse, a forward peak better; tissue is told of similarity."""
+    cells = "volume.density=1", "optimize=null", "volume.resolution=[10, 10, 10]"
+    size = load_scene(BALL).volume.grid.extent[0] / 10
+    for albedo, g, words in (
+        (1, 0, None),
+        (0.5, 0, "take cells 2.1 times smaller"),
+        (0.5, 0.9, "say g: 0 and sigma_s times 0.1"),
+        (0.99, 0.9, None),
+    ):
+        found = doubts(
+            *cells,
+            f"volume.sigma_a={(1 - albedo) * 1.5 / size}",
+            f"volume.sigma_s={albedo * 1.5 / size}",
+            f"volume.g={g}",
+        )
+        assert words in found[0] if words else found == []

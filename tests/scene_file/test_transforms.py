@@ -143,32 +143,51 @@ def test_angles_and_focal_lengths_say_the_same(read: Read, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("name", "more", "test_every", "expected"),
     [
-        ("transforms.json", {}, None, []),
-        ("transforms.json", {}, 2, [0, 2, 4]),
-        ("transforms_test.json", {}, 2, [0, 1, 2, 3, 4]),
-        ("transforms_train.json", {}, 2, []),
-        ("contest.json", {}, None, []),
+        ("transforms.json", {}, None, "....."),
+        ("transforms.json", {}, 2, "t.t.t"),
+        ("transforms_test.json", {}, 2, "ttttt"),
+        ("transforms_train.json", {}, 2, "....."),
+        ("contest.json", {}, None, "....."),
         (
             "transforms.json",
             {"train_filenames": ["0.png"], "val_filenames": ["3.png"], "test_filenames": ["4.png"]},
             2,
-            [3, 4],
+            ".  tt",
         ),
-        ("transforms.json", {"test_filenames": ["1.png"]}, None, [1]),
+        (
+            "transforms.json",
+            {"train_filenames": ["./1.png", "2.png"], "test_filenames": ["2.png"]},
+            None,
+            " .t  ",
+        ),
+        ("transforms.json", {"test_filenames": ["1.png"]}, None, ".t..."),
+        ("transforms.json", {"val_filenames": []}, None, "....."),
     ],
 )
 def test_which_views_are_held_out(
-    read: Read, tmp_path: Path, name: str, more: Any, test_every: int | None, expected: list[int]
+    read: Read, tmp_path: Path, name: str, more: Any, test_every: int | None, expected: str
 ) -> None:
+    """Which of five are training views (.), which test views (t), and which are left out."""
     transforms(
         tmp_path / name, *(frame(f"{index}.png") for index in range(5)), **(NERFSTUDIO | more)
     )
     source = {"transforms": name} | ({"test_every": test_every} if test_every else {})
-    assert [
-        index
-        for index, view in enumerate(views(read(changed(views=source))))
-        if view.split == "test"
-    ] == expected
+    splits = dict.fromkeys("01234", " ")
+    for view in views(read(changed(views=source))):
+        splits[view.name] = "t" if view.split == "test" else "."
+    assert "".join(splits.values()) == expected
+
+
+def test_lists_that_name_no_frame_are_refused(refusal: Refusal, tmp_path: Path) -> None:
+    for lists, problem in (
+        ({"train_filenames": ["a.png", "b.png"]}, "train_filenames.1: no frame has the file_path"),
+        ({"val_filenames": ["b.png"]}, "val_filenames.0: no frame has the file_path 'b.png'"),
+        ({"train_filenames": []}, "its lists of files name no frame"),
+        ({"train_filenames": [3]}, "train_filenames.0: expected text, found 3"),
+    ):
+        text = transforms(tmp_path / "t.json", frame("a.png"), **(NERFSTUDIO | lists))
+        (line,) = refusal(text, kind=FormatError)
+        assert line.startswith(f"t.json: {problem}")
 
 
 @pytest.mark.parametrize(
@@ -221,7 +240,8 @@ def test_a_dumped_scene_is_the_same(read: Read, tmp_path: Path) -> None:
 def test_what_is_no_camera_of_ours_is_refused_by_key(
     refusal: Refusal, tmp_path: Path, change: dict[str, Any], problem: str
 ) -> None:
-    (line,) = refusal(transforms(tmp_path / "transforms.json", frame(), **(NERFSTUDIO | change)))
+    text = transforms(tmp_path / "transforms.json", frame(), **(NERFSTUDIO | change))
+    (line,) = refusal(text, kind=FormatError)
     assert line.startswith("transforms.json: ") and problem in line
 
 
@@ -245,7 +265,8 @@ def test_what_is_no_camera_of_ours_is_refused_by_key(
 def test_what_is_wrong_with_a_frame_is_told_by_key(
     refusal: Refusal, tmp_path: Path, frames: list[Any], problem: str
 ) -> None:
-    (line,) = refusal(transforms(tmp_path / "transforms.json", *frames, **NERFSTUDIO))
+    text = transforms(tmp_path / "transforms.json", *frames, **NERFSTUDIO)
+    (line,) = refusal(text, kind=FormatError)
     assert line.startswith(f"transforms.json: {problem}")
 
 
@@ -255,9 +276,10 @@ def test_intrinsics_that_say_too_little(refusal: Refusal, tmp_path: Path) -> Non
         ({"fl_x": 20}, "fl_x: is in pixels, but w and h do not say how many there are"),
         ({"camera_angle_x": 0.5, "cx": 3}, "cx: is in pixels"),
     ):
-        (line,) = refusal(transforms(tmp_path / "t.json", frame(), **shared))
+        (line,) = refusal(transforms(tmp_path / "t.json", frame(), **shared), kind=FormatError)
         assert problem in line
-    (line,) = refusal(transforms(tmp_path / "t.json", frame(None), camera_angle_x=0.5))
+    text = transforms(tmp_path / "t.json", frame(None), camera_angle_x=0.5)
+    (line,) = refusal(text, kind=FormatError)
     assert "frames.0: has neither file_path nor w and h" in line
 
 
@@ -268,12 +290,10 @@ def test_files_that_are_none(read: Read, refusal: Refusal, tmp_path: Path) -> No
         and "views.transforms: " in line
         and "none.json does not exist" in line
     )
-    for text, problem in (("{", "not JSON"), ("[" * 10**5, "not JSON")):
+    for text, problem in (("{", "not JSON"), ("[" * 10**5, "not JSON"), ("[1]", "no 'frames'")):
         (tmp_path / "bad.json").write_text(text)
-        with pytest.raises(FormatError, match=problem):
-            read(changed(views={"transforms": "bad.json"}))
-    (tmp_path / "bad.json").write_text("[1]")
-    assert "has no 'frames'" in refusal(changed(views={"transforms": "bad.json"}))[0]
+        (line,) = refusal(changed(views={"transforms": "bad.json"}), kind=FormatError)
+        assert line.startswith("bad.json: ") and problem in line
 
 
 @pytest.mark.parametrize(
@@ -367,11 +387,11 @@ def test_what_is_wrong_with_every_frame_is_told_once(refusal: Refusal, tmp_path:
     wrong = (2 * np.array(POSE)).tolist()
     frames = [frame(None, transform_matrix=wrong) for _ in range(10)]
     transforms(tmp_path / "t.json", *frames, frame(None, transform_matrix=3), **NERFSTUDIO)
-    lines = refusal(changed(views={"transforms": "t.json"}))
+    lines = refusal(changed(views={"transforms": "t.json"}), kind=FormatError)
     assert len(lines) == 2 and "frames.0.transform_matrix: its last row" in lines[0]
     assert lines[0].endswith("(9 more like this)") and "frames.10.transform_matrix: exp" in lines[1]
     transforms(tmp_path / "t.json", *frames[:2], **NERFSTUDIO)
-    assert len(refusal(changed(views={"transforms": "t.json"}))) == 2
+    assert len(refusal(changed(views={"transforms": "t.json"}), kind=FormatError)) == 2
 
 
 LENSES = {

@@ -8,10 +8,12 @@ from importlib import import_module
 
 import pytest
 import torch
+from media import make_camera, make_scene, random_values
+from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.light.moments import Moments
-from ddrecon.renderer import render
+from ddrecon.renderer import render, solve_light
 from ddrecon.validate import hard
 from ddrecon.validate.balance import Balance, balance_of
 from ddrecon.validate.hard import HardResult, Unsolved, describe, run_case, table
@@ -101,3 +103,61 @@ def test_what_rounding_makes_of_a_residual_is_attained():
     render(case.scene(torch.float64, CPU), memory=memory)
     balance = balance_of(case.scene(torch.float32, CPU), memory.last["forward", 0].float())
     assert balance.attainable / 8 < balance.residual < hard.ROUNDINGS * balance.attainable
+
+
+SHAPE = (6, 5, 7)
+
+
+def half_full(shape: tuple[int, int, int]) -> Tensor:
+    return (2 * random_values(*shape) - 1).clamp(min=0)
+
+
+def hot_voxel(shape: tuple[int, int, int]) -> Tensor:
+    """One cell of optical depth 1e4 under an extinction cross section of 1."""
+    density = torch.zeros(shape, dtype=torch.float64)
+    density[tuple(n // 2 for n in shape)] = 1e4 * max(shape)
+    return density
+
+
+def checkerboard(shape: tuple[int, int, int]) -> Tensor:
+    return 1e3 * (sum(torch.meshgrid(*map(torch.arange, shape), indexing="ij")) % 2).double()
+
+
+@pytest.mark.parametrize("density", [half_full, hot_voxel, checkerboard])
+@pytest.mark.parametrize(("sigma_a", "sigma_s"), [(10.0, 2.0), (0.5, 8.0), (0.0, 8.0)])
+def test_isotropic_light_is_never_negative_in_the_dark(
+    density: Callable[..., Tensor], sigma_a: float, sigma_s: float
+):
+    """An M-matrix with a source >= 0. With g not 0 its source holds -div(D kappa_s Q1), of either
+    sign, and L0 may dip below zero.
+    """
+    scene = make_scene(density(SHAPE), sigma_a=(sigma_a,), sigma_s=(sigma_s,), directional=(3.0,))
+    mean = solve_light(scene, SolveMemory()).outgoing.mean
+    assert float(mean.min()) >= -1e-12 * float(mean.max()) and float(render(scene).min()) >= 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(
+    ("density", "view"),
+    [
+        (checkerboard(SHAPE), {}),
+        (hot_voxel(SHAPE), {}),
+        (half_full((1, 1, 1)), {}),
+        # There the direction from the cell towards the camera is nothing but rounding.
+        (half_full(SHAPE), {"eye": (0.05, 0.0, -1 / 12), "half_width": 1.0}),
+        (half_full(SHAPE), {"eye": (0.0, 0.0, 0.5)}),
+    ],
+    ids=["checkerboard", "hot voxel", "one cell", "eye at the center of a cell", "eye on a face"],
+)
+def test_image_and_gradient_are_finite(density: Tensor, view: dict, dtype: torch.dtype):
+    density = density.to(dtype).requires_grad_()
+    camera = make_camera(dtype=dtype, **view)
+    image = render(make_scene(density, camera=camera, g=0.4, ambient=(0.5,)))
+    (gradient,) = torch.autograd.grad(image.sum(), density)
+    assert bool(image.isfinite().all()) and bool(gradient.isfinite().all())
+
+
+def test_an_empty_volume_shows_the_background():
+    nothing = torch.zeros(SHAPE, dtype=torch.float64)
+    image = render(make_scene(nothing, directional=(3.0,), ambient=(0.3, 0.4, 0.5), g=0.4))[0]
+    assert torch.equal(image, image.new_tensor([0.3, 0.4, 0.5]).view(3, 1, 1).expand_as(image))

@@ -10,6 +10,7 @@ from media import make_scene, random_values
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.errors import UsageError
 from ddrecon.renderer import render, solve_light, view_components
 from ddrecon.scene import Scene
 from ddrecon.variables.tangents import render_tangent, variation
@@ -86,5 +87,5 @@ def test_a_color_of_light_shows_in_its_own_channel_alone(scene: Scene) -> None:
     ],
 )
 def test_what_cannot_vary_is_refused_with_what_can(scene: Scene, name: str, hint: str) -> None:
-    with pytest.raises(KeyError, match=hint):
+    with pytest.raises(UsageError, match=hint):
         variation(scene, name)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from media import make_scene, random_values
 
+from ddrecon.errors import UsageError
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.variables.values import component_names, value_of, variable_names, with_values
@@ -104,9 +105,9 @@ def test_one_density_fills_the_grid(scene: Scene) -> None:
     ],
 )
 def test_what_a_scene_does_not_have_is_refused(scene: Scene, name: str) -> None:
-    with pytest.raises(KeyError):
+    with pytest.raises(UsageError):
         value_of(scene, name)
-    with pytest.raises(KeyError):
+    with pytest.raises(UsageError):
         with_values(scene, {name: torch.zeros(3)})
 
 

@@ -8,18 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ddrecon.errors import FormatError
-from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.volumes.field import BOX, Field, Fields
-from ddrecon.io.volumes.table import field_names, read_field, require_format
-
-
-def require_target(output: Path, *, may_exist: bool) -> None:
-    """Raises UsageError where `output` is there and may not be or its folder is missing.
-
-    Raises FormatError where its suffix is no volume format's.
-    """
-    require_format(output)
-    require_free_files([output], may_exist=may_exist)
+from ddrecon.io.volumes.table import field_names, read_field
 
 
 def read_together(sources: Sequence[Path]) -> tuple[Fields, np.ndarray]:

@@ -92,11 +92,6 @@ def keeps_constants(path: Path) -> bool:
     return _format_of(path).has_metadata
 
 
-def require_format(path: Path) -> None:
-    """Raises FormatError where the suffix of `path` is none of those in `FORMATS`."""
-    _format_of(path)
-
-
 def _format_of(path: Path) -> VolumeFormat:
     try:
         return FORMATS[path.suffix.lower()]
