@@ -144,13 +144,11 @@ def show_summary(store: dict[str, Any]) -> str:
 
 
 def show(name: str, store: dict[str, Any]) -> str:
-    """What stands on a page for a figure: its table, then what made it; nothing before it is
-    measured.
-    """
+    """What stands on a page for a figure: its table, then what made it."""
     if name == "summary":
         return show_summary(store)
     if name not in store:
-        return ""
+        return "*Not measured yet with today's code.*\n"
     figure = store[name]
     made = f"`{figure['command']}`, commit `{figure['commit']}`, {figure['day']}"
     return "\n".join([*figure["table"], "", f"*{made}, {figure['machine']}.*", ""])

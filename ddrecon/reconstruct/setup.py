@@ -20,7 +20,6 @@ from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene
 from ddrecon.settings import AUTO, Iterations, OptimizeSettings
 from ddrecon.variables.default_rates import unit_of
-from ddrecon.variables.kinds import kind_of, split_name
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 
