@@ -150,12 +150,12 @@ def _run(
     common = overrides, device, engine, threads, seed, quiet, verbose
     reader = functools.cache(read_input)
     with show_warnings(), show_compilations(quiet):
+        if report is not None:
+            require_folder_of(report)
         if "RANK" not in os.environ:  # ranks meet before one of them fails, so that it is told once
             for path in _named_scenes(**others):
                 reader(path, overrides)
         session = open_session(*common, dtype, report, share, reader)
-        if report is not None:
-            require_folder_of(report)
         is_shared = command.__name__ in SHARED
         if is_shared or is_first():
             with nullcontext() if is_shared else alone():
