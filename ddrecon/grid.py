@@ -8,9 +8,10 @@ file that turns one into the other; inside the physics, vectors are in array ord
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Triple = tuple[float, float, float]
 
@@ -64,6 +65,8 @@ class Grid:
 
     def centers(self, like: Tensor) -> list[Tensor]:
         """World coordinates [u] of the cell centers along z, y, x, each for `[z, y, x]`."""
+        import torch
+
         coordinates = []
         for axis, (cells, low, step) in enumerate(
             zip(self.shape, self.lower, self.spacing, strict=True)

@@ -20,8 +20,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-MODELS = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
-"""The coefficients of each model, in order; all are 0 where there is no distortion."""
 MOST_STEPS = 50
 """Newton steps at most; three or four are enough for any lens that is sold."""
 WAY = 16

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from datetime import timedelta
 from io import BytesIO
 from time import monotonic, perf_counter, sleep
-from typing import Any, TypeVar
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ddrecon.errors import RanksError, UsageError, one_line
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MEET_SECONDS = 120.0
 """So long ranks wait for each other at the start; the environment variable says otherwise."""
@@ -111,6 +111,8 @@ def leave_ranks() -> None:
     """Parts from the other ranks, which need not do so at the same time."""
     global _group
     if _group is not None:
+        import torch.distributed
+
         _group = None
         torch.distributed.destroy_process_group()
 
@@ -158,6 +160,8 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
     """
     if _group is None or not tensors:
         return list(tensors)
+    import torch
+
     flat = torch.cat([tensor.detach().flatten() for tensor in tensors])
     with _exchange(flat.nbytes):
         torch.distributed.all_reduce(flat)
@@ -169,6 +173,8 @@ def sum_over_ranks(tensors: Sequence[Tensor]) -> list[Tensor]:
 
 def gather_from_ranks(part: Tensor) -> list[Tensor]:
     """The `part` that each rank has, by rank; all are of one shape."""
+    import torch
+
     assert _group is not None
     part = part.contiguous()
     parts = [torch.empty_like(part) for _ in range(_group.count)]
@@ -179,6 +185,8 @@ def gather_from_ranks(part: Tensor) -> list[Tensor]:
 
 def trade_with_ranks(parts: Tensor) -> Tensor:
     """What each rank has for this one, by rank; for each of them this one has one of `parts`."""
+    import torch
+
     parts = parts.contiguous()
     got = torch.empty_like(parts)
     with _exchange(parts.nbytes):
@@ -193,8 +201,11 @@ def swap_with_neighbors(
 
     That is of the shape of what they get; the first rank has none before it, the last none after.
     """
+    import torch.distributed as dist
+
     assert _group is not None
-    dist, got, jobs = torch.distributed, list[Tensor | None](), list[Any]()
+    got: list[Tensor | None] = []
+    jobs: list[Any] = []
     for other, tensor in ((_group.rank - 1, before), (_group.rank + 1, after)):
         got.append(None)
         if tensor is not None:
@@ -209,6 +220,10 @@ def swap_with_neighbors(
 
 def sum_numbers(numbers: Sequence[float]) -> list[float]:
     """The sums over ranks of each of `numbers`."""
+    if _group is None:
+        return list(numbers)
+    import torch
+
     sums: list[float] = sum_over_ranks([torch.tensor(numbers, dtype=torch.float64)])[0].tolist()
     return sums
 
@@ -222,6 +237,8 @@ def from_first(value: T) -> T:
     """The `value` that the first rank has: plain values and tensors, these on the processor."""
     if _group is None:
         return value
+    import torch
+
     # As a file of tensors and plain values: what is read can run no code.
     stream = BytesIO()
     if _group.rank == 0:

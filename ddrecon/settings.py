@@ -1,8 +1,9 @@
 """The sections `render`, `diffusion` and `optimize` of a scene: defaults and legal values.
 
 What the scene loader checks stands with each field: the limits `minimum`, `above`, `maximum` and
-`below` of its numbers, or its `choices`, which are the names of a table of implementations.
-`problems` yields what is wrong with several values together.
+`below` of its numbers, or its `choices`, which are the names of a table of implementations. No
+table is loaded here: a scene file is read without torch. `problems` yields what is wrong with
+several values together.
 """
 
 from __future__ import annotations
@@ -13,17 +14,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypedDict, Unpack
 
-from ddrecon.diffusion.closures import CLOSURES, FLOOR
-from ddrecon.diffusion.limiters import LIMITERS
-from ddrecon.diffusion.rounds.sweep import DIRECTIONS
-from ddrecon.diffusion.solvers import SOLVERS
-from ddrecon.losses import LOSSES
-
 DERIVATIVES = ("all", "single", "diffusion")
 """Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the
 diffusion (the paper's Fig. 9).
 """
+FLOOR = 3.3
+"""Optical thickness across the box's shortest side that the closure `smooth` gives empty space.
 
+See docs/theory.md, section 5.
+"""
+LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
+"""The coefficients of each model of a lens, in order; all are 0 where there is no distortion."""
 
 Problem = tuple[str, str]
 """The key of a record that breaks a rule, and what is wrong with its value."""
@@ -102,14 +103,14 @@ class DiffusionSettings:
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
     scheme: str = one_of("conservative", ("conservative", "printed"))
-    closure: str = one_of("geometric", CLOSURES)
+    closure: str = one_of("geometric", ("geometric", "smooth"))
     floor: float = bounded(FLOOR, above=0, maximum=1e3)
-    limiter: str = one_of("marshak", LIMITERS)
-    solver: str = one_of("multigrid", SOLVERS)
+    limiter: str = one_of("marshak", ("marshak", "levermore_pomraning"))
+    solver: str = one_of("multigrid", ("multigrid", "conjugate_gradient", "jacobi"))
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
     warm_start: bool = True
     transport_rounds: int | None = optional(minimum=0, maximum=16)
-    degree: int | None = one_of(None, DIRECTIONS)
+    degree: int | None = one_of(None, (1, 3, 5, 7))
 
     @property
     def angles(self) -> int:
@@ -232,7 +233,7 @@ class OptimizeSettings:
 
     parameters: Mapping[str, ParameterSettings]
     iterations: Iterations = bounded(300, minimum=1)
-    loss: str | None = one_of(None, LOSSES)
+    loss: str | None = one_of(None, ("l2", "l1", "huber", "relative_l2", "display", "photon"))
     noise: NoiseSettings | None = None
     views_per_iteration: int = bounded(3, minimum=0)
     derivatives: str = one_of("all", DERIVATIVES)

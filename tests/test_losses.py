@@ -1,7 +1,5 @@
 """Losses: closed forms, masks, and invariances of total variation."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 import torch
@@ -19,7 +17,6 @@ from ddrecon.losses import (
     total_variation,
 )
 from ddrecon.pictures.noise import Noise
-from ddrecon.settings import OptimizeSettings
 
 
 def box(cells: int, side: float = 1.0) -> Grid:
@@ -31,11 +28,6 @@ def test_l2_is_the_mean_square() -> None:
     assert image_loss("l2", image, target, None) == pytest.approx(
         float(((image - target) ** 2).sum()) / 60
     )
-
-
-def test_a_scene_may_ask_for_every_loss_there_is() -> None:
-    (choice,) = (field for field in fields(OptimizeSettings) if field.name == "loss")
-    assert set(choice.metadata["choices"]) == set(LOSSES)
 
 
 @pytest.mark.parametrize("loss", LOSSES)

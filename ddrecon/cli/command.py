@@ -6,7 +6,7 @@ import functools
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import click
 
 from ddrecon.engine import CHOICES
 from ddrecon.errors import DataWarning, DdreconError
+from ddrecon.interrupts import INTERRUPTED, interruptible
 
 DEBUG = click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 OVERRIDES = click.option(
@@ -64,6 +65,7 @@ SHARE = click.option(
     show_default=True,
     help="What the processes of torchrun share out; cells where a volume is too large for one.",
 )
+SCENE_SUFFIXES = (".yaml", ".yml")
 REPORT = click.option(
     "--json",
     "report",
@@ -88,7 +90,8 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
     def wrapped(debug: bool, **options: Any) -> None:
         _set_environment()
         try:
-            _run(command, **options)
+            with interruptible():
+                _run(command, **options)
         except DdreconError as error:
             from ddrecon.ranks import tell_failure
 
@@ -109,7 +112,7 @@ def in_session(command: Callable[..., None]) -> Callable[..., None]:
             sys.exit(2)
         except KeyboardInterrupt as error:
             _show(f"interrupted {error}".strip())
-            sys.exit(130)
+            sys.exit(INTERRUPTED)
 
     for option in reversed(FEWER.get(command.__name__, COMMON)):
         wrapped = option(wrapped)
@@ -140,20 +143,38 @@ def _run(
     **others: Any,
 ) -> None:
     """Runs `command` in a session; on the first rank alone where ranks do not share its work."""
-    from ddrecon.cli.session import open_session, show_compilations
+    from ddrecon.cli.session import open_session, read_input, show_compilations
     from ddrecon.io.files.folders import require_folder_of
     from ddrecon.ranks import alone, is_first, leave_ranks
 
     common = overrides, device, engine, threads, seed, quiet, verbose
+    reader = functools.cache(read_input)
     with show_warnings(), show_compilations(quiet):
-        session = open_session(*common, dtype, report, share)
         if report is not None:
             require_folder_of(report)
+        if "RANK" not in os.environ:  # ranks meet before one of them fails, so that it is told once
+            for path in _named_scenes(**others):
+                reader(path, overrides)
+        session = open_session(*common, dtype, report, share, reader)
         is_shared = command.__name__ in SHARED
         if is_shared or is_first():
             with nullcontext() if is_shared else alone():
                 command(session=session, **others)
     leave_ranks()
+
+
+def _named_scenes(
+    scene: Path | None = None, file: Path | None = None, sources: Sequence[Path] = (), **_: Any
+) -> list[Path]:
+    """The scene files among a command's arguments; raises FormatError for another missing file."""
+    from ddrecon.io.files.reading import guard_reading
+
+    data = [*sources, *([file] if file else [])]
+    for path in data:
+        if path.suffix not in SCENE_SUFFIXES:
+            with guard_reading(path):
+                pass
+    return [*([scene] if scene else []), *(path for path in data if path.suffix in SCENE_SUFFIXES)]
 
 
 def _shortage(error: BaseException) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ddrecon.cli.command import REPORT, in_session
+from ddrecon.cli.command import REPORT, SCENE_SUFFIXES, in_session
 from ddrecon.errors import UsageError
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _words(value: Any) -> str:
 
 def _is_scene(source: Path) -> bool:
     """Whether `source` is a scene file or, perhaps, the folder of a run."""
-    return source.is_dir() or source.suffix in (".yaml", ".yml")
+    return source.is_dir() or source.suffix in SCENE_SUFFIXES
 
 
 @click.command()

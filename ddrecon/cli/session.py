@@ -1,4 +1,7 @@
-"""What surrounds a command: device, precision, threads; how it loads scenes and shows results."""
+"""What surrounds a command: device, precision, threads; how it loads scenes and shows results.
+
+torch is imported in functions, so that what is wrong with a scene file is told at once.
+"""
 
 from __future__ import annotations
 
@@ -8,39 +11,37 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
-import torch
 from tqdm import tqdm
 
 from ddrecon import __version__
 from ddrecon.engine import LOG, current_engine, engine_versions, use_engine
 from ddrecon.errors import DataWarning, UsageError
 from ddrecon.io.files.json_file import write_json
-from ddrecon.kernels.spare import keep_freed_memory
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT
-from ddrecon.scene import Scene, View
-from ddrecon.scene_file.build import build_scene
-from ddrecon.scene_file.doubts import find_doubts
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import suggestion
 
+if TYPE_CHECKING:
+    import torch
+
+    from ddrecon.scene import Scene, View
+
 STDOUT = Path("-")
 """Where `--json` without a file sends a report."""
-DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 @dataclass(frozen=True)
 class Session:
-    """What the common options of a command say."""
+    """What the common options of a command say; `reader` is `read_input`, or knows what it read."""
 
     overrides: tuple[str, ...]
     device: torch.device
@@ -50,7 +51,8 @@ class Session:
     is_quiet: bool
     is_verbose: bool
     report: Path | None
-    shares_cells: bool = False
+    shares_cells: bool
+    reader: Callable[[Path, tuple[str, ...]], SceneFile]
 
     def with_overrides(self, *overrides: str) -> Session:
         """The same session with more overrides of the scene file."""
@@ -65,10 +67,13 @@ class Session:
 
     def read(self, path: Path) -> SceneFile:
         """The scene file at `path`, or the result in the folder of a finished run, checked."""
-        return read_scene(result_in(path) if os.path.isdir(path) else path, self.overrides)
+        return self.reader(path, self.overrides)
 
     def build(self, scene_file: SceneFile) -> Scene:
         """The scene as tensors on this session's device; warns of what can hardly be meant."""
+        from ddrecon.scene_file.build import build_scene
+        from ddrecon.scene_file.doubts import find_doubts
+
         scene = build_scene(scene_file, dtype=self.dtype, device=self.device)
         for doubt in find_doubts(scene):
             warnings.warn(doubt, DataWarning, 2)
@@ -103,6 +108,9 @@ class Session:
 
     def environment(self) -> dict[str, Any]:
         """What a run's result may depend on besides its scene."""
+        import numpy as np
+        import torch
+
         return {
             "ddrecon": __version__,
             "python": platform.python_version(),
@@ -120,6 +128,11 @@ class Session:
             "overrides": list(self.overrides),
             "command": sys.argv,
         }
+
+
+def read_input(path: Path, overrides: tuple[str, ...]) -> SceneFile:
+    """The scene file at `path`, or the result in the folder of a finished run, checked."""
+    return read_scene(result_in(path) if os.path.isdir(path) else path, overrides)
 
 
 def result_in(folder: Path) -> Path:
@@ -147,6 +160,7 @@ def open_session(
     dtype: str,
     report: Path | None,
     share: str = "views",
+    reader: Callable[[Path, tuple[str, ...]], SceneFile] | None = None,
 ) -> Session:
     """Sets torch and the engine up as the options say.
 
@@ -154,6 +168,10 @@ def open_session(
     device that is not there, MissingExtraError for an engine that is not there, RanksError for
     other ranks.
     """
+    import torch
+
+    from ddrecon.kernels.spare import keep_freed_memory
+
     if device == "cuda" and not torch.cuda.is_available():
         raise UsageError(
             "--device cuda: torch sees no CUDA device here; "
@@ -169,15 +187,17 @@ def open_session(
     torch.set_num_threads(threads)
     keep_freed_memory()
     torch.manual_seed(seed)
-    is_quiet = is_quiet or not is_first()
-    shares_cells = share == "cells"
+    shown = is_quiet or not is_first(), is_verbose, report
+    asked = getattr(torch, dtype)
     return Session(
-        overrides, place, DTYPES[dtype], threads, seed, is_quiet, is_verbose, report, shares_cells
+        overrides, place, asked, threads, seed, *shown, share == "cells", reader or read_input
     )
 
 
 def _own_gpu() -> torch.device:
     """The GPU of this rank, by its place on its machine; raises UsageError without one."""
+    import torch
+
     place, count = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
     if place >= count:
         raise UsageError(

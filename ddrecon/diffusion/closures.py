@@ -17,15 +17,11 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
+from ddrecon.settings import FLOOR
 from ddrecon.slabs.exchange import gather_own
 from ddrecon.slabs.slab import Slab, whole_of
 
 Shape = tuple[int, int, int]
-FLOOR = 3.3
-"""Optical thickness across the box's shortest side that `smooth` gives empty space.
-
-See docs/theory.md, section 5.
-"""
 BACKGROUND = 0.01
 """Optical thickness, across a side of the box, of a haze that gives an empty box distances too.
 

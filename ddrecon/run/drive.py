@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from tqdm import tqdm
 
 from ddrecon.errors import DivergenceError, FormatError, RanksError, SceneError, UsageError
+from ddrecon.interrupts import defer_interrupt
 from ddrecon.io.files.folders import claim_folder
 from ddrecon.io.files.json_file import write_json
 from ddrecon.progress import bar_settings
@@ -173,27 +172,6 @@ def drive_run(
         leave_ranks()
     with alone():
         return folder.finish(run)
-
-
-@contextmanager
-def defer_interrupt() -> Iterator[list[int]]:
-    """A list that fills when the process is asked to stop, so that no iteration is torn.
-
-    Asked twice, it stops at once.
-    """
-    asked: list[int] = []
-
-    def note(number: int, _: FrameType | None) -> None:
-        if asked:
-            raise KeyboardInterrupt("at once; go on from the last checkpoint with --resume")
-        asked.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def progress_text(total: Row, row: Row) -> str:

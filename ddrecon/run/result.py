@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ddrecon.lenses import MODELS
-from ddrecon.scene import Scene
 from ddrecon.scene_file.dump import describe
 from ddrecon.scene_file.load import SceneFile
+from ddrecon.settings import LENSES
 from ddrecon.variables.kinds import PAIRS, PHASE, is_of_volume, split_name
+
+if TYPE_CHECKING:
+    from ddrecon.scene import Scene
 
 LENS = ("focal", "principal_point", "distortion")
 RESULT = "result.yaml"
@@ -121,7 +123,7 @@ def _lens(values: Mapping[str, Any], camera: dict[str, Any]) -> dict[str, Any]:
         found["principal_point"] = values["principal_point"]
     if values["distortion"] is not None:
         model = camera["distortion"]["type"]
-        coefficients = zip(MODELS[model], values["distortion"], strict=True)
+        coefficients = zip(LENSES[model], values["distortion"], strict=True)
         found["distortion"] = {"type": model} | dict(coefficients)
     return found
 

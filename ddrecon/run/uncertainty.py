@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ddrecon.errors import FormatError, RanksError, UsageError
+from ddrecon.interrupts import defer_interrupt
 from ddrecon.pictures.noise import Noise
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
@@ -21,7 +22,6 @@ from ddrecon.reconstruct.picture_errors import PictureErrors
 from ddrecon.reconstruct.posterior import Sample
 from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
-from ddrecon.run.drive import defer_interrupt
 from ddrecon.run.leftovers import remove_samples
 from ddrecon.run.run_folder import CHECKPOINTS, require_run
 from ddrecon.run.uncertainty_folder import UncertaintyFolder

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import torch
@@ -14,7 +14,7 @@ from ddrecon.cameras import Camera, image_places, look_at
 from ddrecon.errors import FormatError
 from ddrecon.grid import Grid
 from ddrecon.io.images.table import Image, read_image, read_mask
-from ddrecon.lenses import MODELS, is_folded
+from ddrecon.lenses import is_folded
 from ddrecon.pictures.noise import Noise
 from ddrecon.scene import View
 from ddrecon.scene_file.camera_schema import CameraSection, LensSection, PerspectiveSection
@@ -175,8 +175,7 @@ def _lens(section: LensSection | None) -> tuple[str | None, Tensor | None]:
     """The model of a lens and its coefficients, float64."""
     if section is None:
         return None, None
-    coefficients = [getattr(section, name) for name in MODELS[section.type]]
-    return section.type, torch.tensor(coefficients, dtype=torch.float64)
+    return section.type, torch.tensor(astuple(section), dtype=torch.float64)
 
 
 def _require_unfolded(scene_file: SceneFile, key: str, camera: Camera) -> None:

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import mul
 from typing import ClassVar
-
-import numpy as np
 
 from ddrecon.grid import Triple
 from ddrecon.settings import Problem, bounded, limited, optional
@@ -39,20 +38,23 @@ class PoseSection:
 
     def problems(self) -> Iterator[Problem]:
         if self.matrix is not None:
-            yield from _rigidity(np.array(self.matrix))
+            yield from _rigidity(self.matrix)
 
 
-def _rigidity(matrix: np.ndarray) -> Iterator[Problem]:
-    """Why `matrix` [4, 4] is no rotation and shift, where it is not."""
-    rotation = matrix[:3, :3]
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-4:
+def _rigidity(matrix: Matrix) -> Iterator[Problem]:
+    """Why `matrix` is no rotation and shift, where it is not."""
+    *rows, last = matrix
+    *axes, _ = zip(*rows, strict=True)
+    products = [sum(map(mul, axes[i], axes[j])) - (i == j) for i in range(3) for j in range(i, 3)]
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = axes
+    if max(abs(a - b) for a, b in zip(last, (0, 0, 0, 1), strict=True)) > 1e-4:
         yield "matrix", "its last row must be [0, 0, 0, 1]"
-    elif np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4:
+    elif not all(abs(product) <= 1e-4 for product in products):
         yield (
             "matrix",
             "must be rigid, but its first three columns are not of unit length and perpendicular",
         )
-    elif np.linalg.det(rotation) < 0:
+    elif ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) < 0:
         yield "matrix", "must be rigid, but it mirrors (determinant -1)"
 
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.scene_file.camera_schema import (
@@ -93,6 +91,8 @@ def read_colmap(
 
 def _matrix(path: Path, image: Posed) -> Matrix:
     """Camera to world with OpenGL axes."""
+    import numpy as np
+
     quaternion, shift = np.array(image.rotation), np.array(image.shift)
     norm = math.sqrt(float(quaternion @ quaternion))
     if not (math.isfinite(norm) and norm > 0 and np.isfinite(shift).all()):

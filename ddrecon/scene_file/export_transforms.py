@@ -9,9 +9,9 @@ from typing import Any
 from ddrecon.errors import SceneError
 from ddrecon.io.files.folders import require_free_files
 from ddrecon.io.files.json_file import write_json
-from ddrecon.lenses import MODELS
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.load import SceneFile
+from ddrecon.settings import LENSES
 
 NAMES = {"opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 """What lenses are called there."""
@@ -61,7 +61,7 @@ def _camera(view: View) -> dict[str, Any]:
         "cy": float(y) * height,
     }
     if camera.lens is not None and camera.distortion is not None:
-        coefficients = zip(MODELS[camera.lens], camera.distortion.tolist(), strict=True)
+        coefficients = zip(LENSES[camera.lens], camera.distortion.tolist(), strict=True)
         intrinsics |= {"camera_model": NAMES[camera.lens]} | dict(coefficients)
     return intrinsics | {"transform_matrix": [*camera.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
 

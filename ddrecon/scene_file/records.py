@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import Field, fields, is_dataclass
-from functools import reduce
+from functools import cache, reduce
 from operator import or_
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
@@ -57,6 +57,7 @@ from ddrecon.variables.kinds import (
 )
 
 R = TypeVar("R")
+type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
 
 
 def read_record(node: Node, kind: type[R], folder: Path) -> R:
@@ -68,7 +69,7 @@ def read_record(node: Node, kind: type[R], folder: Path) -> R:
     all_fields = fields(kind)  # type: ignore[arg-type]
     declared: dict[str, Field[Any]] = {field.name: field for field in all_fields}
     known = [*(["type"] if hasattr(kind, "type") else []), *declared]
-    hints, problems, values = get_type_hints(kind), Problems(), {}
+    hints, problems, values = type_hints(kind), Problems(), {}
     for what in find_absences(kind, declared, entries):
         problems.note(node.refused(what))
     for name, child in entries.items():

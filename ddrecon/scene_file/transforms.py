@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from ddrecon.errors import FormatError, SceneError
-from ddrecon.io.images.table import READERS
 from ddrecon.scene_file.leaves import Rule, read_each, read_list, read_path, read_text
 from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.scene_file.problems import Problems
@@ -158,6 +157,8 @@ def _listed(node: Node | None, names: Sequence[Path | None], rule: Rule) -> set[
 
 def _image(entries: Entries, rule: Rule) -> Path | None:
     """The frame's image, a .png where its name has no suffix of an image."""
+    from ddrecon.io.images.table import READERS
+
     if "file_path" not in entries:
         return None
     path = read_path(entries["file_path"], rule)

@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ddrecon.lenses import MODELS
 from ddrecon.scene_file.camera_schema import (
     FisheyeSection,
     LensSection,
@@ -20,6 +19,7 @@ from ddrecon.scene_file.camera_schema import (
 )
 from ddrecon.scene_file.leaves import Rule, read_matrix, read_number, read_text
 from ddrecon.scene_file.nodes import Node
+from ddrecon.settings import LENSES
 
 OPENCV = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 """Camera models whose distortion is OpenCV's, as far as they have some."""
@@ -105,7 +105,7 @@ def _distortion(entries: Entries, rule: Rule) -> LensSection | None:
         # nerfstudio: k1, k2, k3, k4, p1, p2
         nodes = entries["distortion_params"].children()
         given |= dict(zip(COEFFICIENTS, (read_number(node, rule) for node in nodes), strict=False))
-    known = MODELS[section.type]
+    known = LENSES[section.type]
     for name, value in given.items():
         if name not in known and value != 0:
             source = entries[name if name in entries else "distortion_params"]

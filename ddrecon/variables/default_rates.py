@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
-from ddrecon.scene import Scene, View
+    from ddrecon.scene import Scene, View
 
-Rate = Callable[[Scene, str, Tensor], float | Tensor]
+Rate = Callable[["Scene", str, "Tensor"], "float | Tensor"]
 """The rate of a variable by the scene, the variable's name and the value that it starts from.
 
 It is one number, or one for each entry of the value.
@@ -62,7 +63,7 @@ def pose_rate(scene: Scene, name: str, start: Tensor) -> Tensor:
     """
     camera, grid = _view_of(scene, name).camera, scene.volume.grid
     radius = math.hypot(*grid.extent) / 2
-    distance = float(torch.dist(camera.pose[:, 3], camera.pose.new_tensor(grid.center_xyz)))
+    distance = float(camera.pose[:, 3].dist(camera.pose.new_tensor(grid.center_xyz)))
     pixel = 2 * float(camera.half_width) / camera.size[1]
     pixel, depth = (pixel * distance, distance / radius) if camera.is_perspective else (pixel, 1.0)
     turn = pixel / radius

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from ddrecon.lenses import MODELS
+from ddrecon.settings import LENSES
 from ddrecon.variables.default_rates import (
     Rate,
     brightness_rate,
@@ -117,7 +117,7 @@ KINDS: Mapping[str, Kind] = {
         fixed_rate(1e-3), components=("x", "y"), difference_steps=SHORT_STEPS
     ),
     "views.NAME.distortion": Kind(
-        fixed_rate(1e-3), components=MODELS["opencv"], difference_steps=SHORT_STEPS
+        fixed_rate(1e-3), components=LENSES["opencv"], difference_steps=SHORT_STEPS
     ),
 }
 """Every kind of variable, by its pattern."""

@@ -1,5 +1,6 @@
 """A rehearsal comes to every kernel that is launched in earnest, and leaves nothing behind."""
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -59,13 +60,17 @@ def test_an_iteration_needs_no_other_kernels(loads: Loads, monkeypatch: pytest.M
     assert set(side_by_side) == set(loads)
 
 
+def fill_kernels() -> list[TextKernel]:
+    return [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out", "out") for k in range(3)]
+
+
 def test_kernels_do_nothing_in_a_rehearsal(loads: Loads, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise AssertionError("launched")
 
     monkeypatch.setattr(launching, "_call", fail)
     monkeypatch.setattr(compiling.wp, "load_module", lambda module, **_: loads.append(module))
-    kernels = [TextKernel(f"fill_{k}", 64, "out[item] = 1;", "F *out", "out") for k in range(3)]
+    kernels = fill_kernels()
     found = []
 
     def computation() -> None:
@@ -76,9 +81,44 @@ def test_kernels_do_nothing_in_a_rehearsal(loads: Loads, monkeypatch: pytest.Mon
 
     compiling.compile_rehearsed(computation)
     assert not torch.stack(found).any()
-    assert {kernel.module for kernel in kernels} == set(loads)
+    for kernel in kernels:
+        with pytest.raises(AssertionError, match="launched"):
+            kernel.launch(4, {}, {"out": found[0]})
+    assert sorted(map(id, loads)) == sorted(id(kernel.module) for kernel in kernels)
     # Where a process has kernels, nothing is rehearsed.
     compiling.compile_rehearsed(lambda: found.append("again"))
     assert "again" not in found
-    with pytest.raises(AssertionError, match="launched"):
-        kernels[0].launch(4, {}, {"out": found[0]})
+
+
+def test_a_launch_waits_for_no_other_kernel(loads: Loads, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A computation begins while its last kernel is still compiled."""
+    first, *_, last = fill_kernels()
+    has_begun, may_end = threading.Event(), threading.Event()
+    real = compiling.wp.load_module
+
+    def load_slowly(module: object, **of: object) -> None:
+        if module is last.module:
+            has_begun.set()
+            assert may_end.wait(60)
+        real(module, **of)
+
+    monkeypatch.setattr(compiling.wp, "load_module", load_slowly)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    out = torch.zeros(4, dtype=torch.float64)
+    # In a thread of its own: code that waits for all would never come back.
+    work = [kernel.launch for kernel in (first, last)]
+    rehearsing = threading.Thread(
+        target=compiling.compile_rehearsed,
+        args=(lambda: [launch(4, {}, {"out": out.clone()}) for launch in work],),
+        daemon=True,
+    )
+    rehearsing.start()
+    rehearsing.join(30)
+    is_free = not rehearsing.is_alive() and has_begun.wait(30)
+    if is_free:
+        first.launch(4, {}, {"out": out}, 1)
+    may_end.set()
+    assert is_free and out.all()
+    rehearsing.join()
+    last.launch(4, {}, {"out": out.zero_()}, 1)
+    assert out.all()

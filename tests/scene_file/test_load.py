@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -508,3 +509,15 @@ def test_problems_are_in_the_order_of_the_file(refusal: Refusal):
         SCENE.replace("g: 0.3", "g: 2").replace("0.6", "-1").replace("fov: 28", "fov: 0")
     )
     assert [line.split(":")[1] for line in lines] == ["5", "7", "12"]
+
+
+def test_what_a_record_is_is_found_out_once(read: Read):
+    """So that thousands of views are read quickly: no annotation is evaluated again."""
+    read(SCENE)
+    called = set[str]()
+    sys.setprofile(lambda frame, event, _: called.add(frame.f_code.co_qualname))
+    try:
+        read(SCENE)
+    finally:
+        sys.setprofile(None)
+    assert "read_record" in called and "get_type_hints" not in called

@@ -1,0 +1,41 @@
+"""What is wrong with a scene file is told at once: torch and numpy are not loaded to say so."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+SCENE = "{volume: {bounds: 3, resolution: [1, 1], densty: 1}, views: [{camera: {}}]}"
+COMMANDS = (
+    ["check", "missing.yaml"],
+    ["check", "missing"],
+    ["check", "wrong.yaml"],
+    ["optimize", "wrong.yaml", "-o", "out", "--iterations", "3"],
+    ["render", "wrong.yaml", "-o", "out", "--ring", "3"],
+    ["render", "scene.yaml", "-o", "out", "-D", "volume.g=2"],
+    ["gradcheck", "scene.yaml", "-D", "volume.desity=1"],
+    ["reference", "scene.yaml", "-o", "out", "-D", "views=3"],
+    ["bench", "scene.yaml", "-D", "volume"],
+    ["info", "wrong.yaml"],
+    ["info", "missing.npz"],
+    ["export", "wrong.yaml", "-o", "out.vdb"],
+    ["export", "missing.npz", "-o", "out.vdb"],
+    ["check", "scene.yaml", "--dtype", "float16"],
+)
+PROGRAM = f"""
+import sys
+from click.testing import CliRunner
+from ddrecon.cli.commands import main
+for command in {COMMANDS!r}:
+    done = CliRunner().invoke(main, command)
+    print(done.exit_code, bool(done.stderr), *({{"torch", "numpy", "warp"}} & set(sys.modules)))
+"""
+
+
+def test_errors_of_a_scene_file_need_no_torch(folder: Path) -> None:
+    Path("wrong.yaml").write_text(SCENE)
+    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True)
+    assert done.stderr == ""
+    assert [line[1:] for line in done.stdout.splitlines()] == [" True"] * len(COMMANDS)
+    assert {line[0] for line in done.stdout.splitlines()} == {"2", "3"}

@@ -1,0 +1,38 @@
+"""What a scene can ask for is what there is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import fields
+
+import pytest
+
+from ddrecon.diffusion.closures import CLOSURES
+from ddrecon.diffusion.limiters import LIMITERS
+from ddrecon.diffusion.rounds.sweep import DIRECTIONS
+from ddrecon.diffusion.solvers import SOLVERS
+from ddrecon.losses import LOSSES
+from ddrecon.scene_file.camera_schema import FisheyeSection, OpencvSection
+from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
+
+
+@pytest.mark.parametrize(
+    ("record", "key", "table"),
+    [
+        (DiffusionSettings, "closure", CLOSURES),
+        (DiffusionSettings, "limiter", LIMITERS),
+        (DiffusionSettings, "solver", SOLVERS),
+        (DiffusionSettings, "degree", DIRECTIONS),
+        (OptimizeSettings, "loss", LOSSES),
+    ],
+)
+def test_a_scene_may_ask_for_whatever_is_in_a_table(
+    record: type, key: str, table: Iterable[object]
+) -> None:
+    choices = {field.name: field.metadata.get("choices") for field in fields(record)}
+    assert list(choices[key]) == list(table)
+
+
+@pytest.mark.parametrize("section", [OpencvSection, FisheyeSection])
+def test_a_lens_has_its_coefficients_in_order(section: type) -> None:
+    assert LENSES[section.type] == tuple(field.name for field in fields(section))
