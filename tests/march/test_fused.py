@@ -218,7 +218,7 @@ def test_single_precision():
     (image, one), (known, other) = (gradients(scene, LIGHT, e) for e in ("warp", "torch"))
     assert_near(image, known, 1e-5)
     for found, expected in zip(one, other, strict=True):
-        assert_near(found, expected, 2e-5)
+        assert_near(found, expected, 5e-5)  # sums round by the width of a processor's vectors
 
 
 @pytest.mark.parametrize("eye", [(0.3, 0.4, 3.0), (3.0, 0.5, 0.2), (0.2, -3.0, -0.4)], ids=str)

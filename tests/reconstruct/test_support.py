@@ -183,7 +183,8 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
         views.append(replace(view, mask=mask))
     line = refusal(replace(scene, views=views))
     assert "no cell is left" in line and "support_margin" in line
-    views = [replace(view, mask=torch.zeros(32, 32)) for view in scene.views]
+    masks = (torch.full((32, 32), float(index != 1)) for index in range(len(scene.views)))
+    views = [replace(view, mask=mask) for view, mask in zip(scene.views, masks, strict=True)]
     assert "shows nothing at all, by its mask" in refusal(replace(scene, views=views))
     bright = ball("optimize.parameters.density={support: 0.999}")
     assert "shows nothing at all, by a displayed value of 0.999" in refusal(bright)
