@@ -77,7 +77,7 @@ def solve_numbers_within(
 
     `gauge` [k, j] has what no picture shows in its columns.
     """
-    free = ~is_fixed
+    free = ~is_fixed.to(matrix.device)
     bent, unit = matrix[free][:, free], matrix.diagonal()[free].clamp(min=1e-300).rsqrt()
     bent = bent * unit * unit[:, None]
     if gauge is not None:

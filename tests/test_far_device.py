@@ -1,0 +1,181 @@
+"""What ddrecon does on a device of its own: all that CUDA would refuse, but no GPU is needed."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from far_device import FAR, Far, near_kernels
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorDeviceMismatchError, FakeTensorMode
+
+from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import use_engine
+from ddrecon.reconstruct import joint, posterior, schedule
+from ddrecon.reconstruct.gradients import differentiate
+from ddrecon.reconstruct.levels import scene_at_level
+from ddrecon.reconstruct.log import Result
+from ddrecon.reconstruct.loop import optimize
+from ddrecon.scene_file.build import load_scene
+from ddrecon.variables.values import value_of
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+# Of one camera and one lamp all is sought that capture.yaml seeks of each.
+CAPTURE = (
+    "optimize.parameters={density: {init: 0, min: 0, support: auto, support_margin: 4},"
+    " lights.0.irradiance: {}, views.cam_0.exposure: {init: [1, 1, 1]}, views.cam_0.offset: {},"
+    " views.cam_0.camera: {}}"
+)
+RUNS = {"plume": (8, ()), "paper/fig10": (8, ()), "capture": (16, (CAPTURE,))}
+Operation = Callable[[Tensor, Tensor], Any]
+OPERATIONS: dict[str, Operation] = {
+    "sum": lambda far, near: far + near,
+    "sum with a number": lambda far, near: far * near[0] + 2 * near[1],
+    "sum with a number there": lambda far, near: near + far.sum(),
+    "in place": lambda far, near: near.add_(far),
+    "in place by a number": lambda far, near: far.add_(near[0]),
+    "in place by a number there": lambda far, near: near.add_(far.sum()),
+    "out": lambda far, near: torch.add(far, far, out=near),
+    "out there": lambda far, near: torch.add(near, near, out=far),
+    "product": lambda far, near: far @ near,
+    "join": lambda far, near: torch.cat([far, near]),
+    "choice": lambda far, near: torch.where(near > 0, far, far),
+    "choice of a number": lambda far, near: torch.where(far > 0, far, near[0]),
+    "mask": lambda far, near: far.masked_fill(near > 0, 0.0),
+    "mask by a number": lambda far, near: far.masked_fill(far > 0, near[0]),
+    "clamp": lambda far, near: far.clamp(near[0], near[1]),
+    "places": lambda far, near: far.index_select(0, near.long()),
+    "gather": lambda far, near: far.gather(0, near.long()),
+    "scatter": lambda far, near: far.index_add(0, far.long(), near),
+    "copies": lambda far, near: near.copy_(far) + far.cpu(),
+}
+
+
+def is_refused(operation: Operation, far: Tensor, near: Tensor) -> bool:
+    try:
+        operation(far, near)
+    except (FakeTensorDeviceMismatchError, RuntimeError) as error:
+        assert "same device" in str(error) or "two devices" in str(error)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("operation", OPERATIONS.values(), ids=OPERATIONS)
+def test_operations_are_refused_as_torch_refuses_them_on_cuda(operation: Operation) -> None:
+    with FakeTensorMode():
+        expected = is_refused(operation, torch.zeros(3, device="cuda"), torch.zeros(3))
+    assert is_refused(operation, torch.zeros(3, device=FAR), torch.zeros(3)) == expected
+
+
+def test_indices_and_masks_go_to_the_device_and_not_back() -> None:
+    """FakeTensor lets them pass; the rule is that of ATen's `IndexingUtils.h` and its message."""
+    near = torch.arange(3.0)
+    far = near.to(FAR)
+    at, seen = torch.tensor([0, 2]), near > 0
+    assert far[at].tolist() == far[at.to(FAR)].tolist() == [0.0, 2.0]
+    assert far[seen].tolist() == far[[1, 2]].tolist() == [1.0, 2.0]
+    far[seen] = 5.0
+    far[at] = near[1]
+    assert far.tolist() == [1.0, 5.0, 1.0]
+    for refused in (at, seen):
+        with pytest.raises(RuntimeError, match="same device"):
+            near[refused.to(FAR)]
+        with pytest.raises(RuntimeError, match="same device"):
+            near[refused.to(FAR)] = 1.0
+        with pytest.raises(RuntimeError, match="two devices"):
+            far[refused] = near[:2]
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        lambda far: far.numpy(),
+        lambda far: torch.stack([far[0], torch.ones(())]),
+        lambda far: torch.rand(3, device=FAR, generator=torch.Generator()),
+    ],
+    ids=["as an array of numpy", "numbers in one tensor", "the processor's generator"],
+)
+def test_what_fake_tensors_let_pass_is_refused(refused: Callable[[Tensor], Any]) -> None:
+    with pytest.raises((TypeError, RuntimeError)):
+        refused(torch.ones(3, device=FAR))
+
+
+def test_derivatives_there_are_those_of_the_processor() -> None:
+    """Both modes, with tensors that torch makes on its own, and shapes changed in place."""
+    near = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+    far = near.detach().to(FAR).requires_grad_()
+
+    def function(x: Tensor) -> Tensor:
+        return (x @ torch.outer(x, x) @ x).sqrt() + x[[0, 1]].prod() * x.new_tensor(2.0)
+
+    for one in (near, far):
+        function(one).backward()
+    assert isinstance(far.grad, Far)
+    assert far.grad.tolist() == near.grad.tolist()
+    tangents = [torch.func.jvp(function, (one.detach(),), (one.detach(),)) for one in (near, far)]
+    assert [one.tolist() for one in tangents[0]] == [one.tolist() for one in tangents[1]]
+
+
+def run(name: str, device: torch.device) -> Result:
+    """Two iterations: one in which each moves alone, and a joint one where there are cameras."""
+    level, overrides = RUNS[name]
+    path, overrides = (
+        CONFIGS / f"{name}.yaml",
+        ["optimize.refine_at=[]", "diffusion.tolerance=0.01", *overrides],
+    )
+    scene = load_scene(path, overrides=overrides, device=device)
+    views = {view.is_test: view for view in reversed(scene.views)}
+    few = [view for view in scene.views if view in views.values() or view is scene.views[1]]
+    torch.manual_seed(0)
+    return optimize(scene_at_level(replace(scene, views=few), level), 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["torch", "warp"])
+@pytest.mark.parametrize("name", RUNS)
+def test_iterations_there_find_what_they_find_on_the_processor(
+    name: str, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if engine == "warp":
+        pytest.importorskip("warp")
+    monkeypatch.setattr(schedule, "TOGETHER", 2)
+    monkeypatch.setattr(joint, "MOST", 1)
+    monkeypatch.setattr(posterior, "INNER", 1)
+    use_engine(engine)
+    with near_kernels() if engine == "warp" else contextlib.nullcontext():
+        there = run(name, FAR)
+    here = run(name, torch.device("cpu"))
+    assert isinstance(there.scene.volume.density, Far)
+    for one, other in zip(there.rows, here.rows, strict=True):
+        assert one.loss == pytest.approx(other.loss, rel=1e-4)
+        assert one.test_psnr == pytest.approx(other.test_psnr, abs=1e-2)
+
+
+@pytest.mark.parametrize("engine", ["torch", "warp"])
+def test_every_kind_of_derivative_is_found_there(engine: str) -> None:
+    if engine == "warp":
+        pytest.importorskip("warp")
+    use_engine(engine)
+    found = []
+    for device in (FAR, torch.device("cpu")):
+        is_near = engine == "torch" or device != FAR
+        with contextlib.nullcontext() if is_near else near_kernels():
+            scene = load_scene(
+                CONFIGS / "gradcheck_all.yaml",
+                overrides=["volume.resolution=[5, 4, 3]", "volume.density=0.5"],
+                dtype=torch.float64,
+                device=device,
+            )
+            values = {n: value_of(scene, n).requires_grad_() for n in scene.optimize.parameters}
+            names = [view.name for view in scene.views]
+            gradients = differentiate(
+                scene, names, values, lambda _, image: image.square().mean(), SolveMemory()
+            ).gradients
+            found.append({name: one.cpu() for name, one in gradients.items()})
+    for name, there in found[0].items():
+        torch.testing.assert_close(there, found[1][name], rtol=1e-6, atol=1e-12)
