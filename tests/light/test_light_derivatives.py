@@ -43,7 +43,7 @@ NUMBERS = [
     (light, field.name)
     for light, value in LIGHTS.items()
     for field in fields(value)
-    if field.name != "directions"
+    if field.name not in ("directions", "up")
 ]
 WAYS: dict[str, dict[str, Any]] = {
     "isotropic": {},
