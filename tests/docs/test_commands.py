@@ -60,7 +60,7 @@ def quick(command: str) -> list[str]:
         "reference": lambda: ["--spp", "4"],
         "gradcheck": lambda: ["--samples", "2"],
     }
-    return [name, *rest, *(added[name]() if name in added else []), "-q"]
+    return [name, *rest, *(added[name]() if name in added else [])]
 
 
 def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene]]:

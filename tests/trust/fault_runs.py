@@ -64,7 +64,8 @@ def start(folder: Path, out: Path, prepare: Callable[[], None]) -> int:
 
 def optimize(folder: Path, out: Path) -> None:
     """The command that a user gives, at first and again."""
-    going_on = ["--resume"] if any(out.glob("checkpoints/*.pt")) else ["--overwrite"]
+    is_begun = any(out.glob("checkpoints/[lp]*.pt"))  # not one half written
+    going_on = ["--resume"] if is_begun else ["--overwrite"]
     main(
         [
             "optimize",
