@@ -16,7 +16,6 @@ from ddrecon.diffusion.rounds.fused.share import (
 )
 from ddrecon.grid import Grid
 from ddrecon.kernels.dual import launch_row_tangents, split
-from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
@@ -69,7 +68,7 @@ for (int i = begin; i < end; ++i) {"""
 """
 )
 _ADJOINT = (
-    ROW_SUM
+    "\n{\nREORDERED\n"
     + _ROWS
     + """
 const F *source_bars = behind(source_bar, at), *gain_bars = behind(gain_bar, at);
