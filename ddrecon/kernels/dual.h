@@ -49,9 +49,7 @@ template <class F, int COUNT = 1> struct Dual {
     INLINE Dual operator-() const { return chain(-value, F(-1)); }
     INLINE Dual operator+(const Dual& o) const { return chain(value + o.value, F(1), o, F(1)); }
     INLINE Dual operator-(const Dual& o) const { return chain(value - o.value, F(1), o, F(-1)); }
-    INLINE Dual operator*(const Dual& o) const {
-        return chain(value * o.value, o.value, o, value);
-    }
+    INLINE Dual operator*(const Dual& o) const { return chain(value * o.value, o.value, o, value); }
     INLINE Dual operator/(const Dual& o) const {
         const F inverse = F(1) / o.value, quotient = value * inverse;
         return chain(quotient, inverse, o, -quotient * inverse);

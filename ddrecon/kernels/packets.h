@@ -1,10 +1,10 @@
 #pragma once
 #include "ddrecon/kernels/numbers.h"
 // Many alike items at a time: a packet of LANES runs in a processor's vector lanes. Where
-// neighboring items need values from places of their own (rays that walk through cells), a loop over
-// numbers beside each other does not do. Then every value is a vector of LANES numbers, one of each
-// item, and the code reads as that for a single item does: `a * b`, `pick(a < b, a, b)`. On a GPU a
-// packet is one item, its values are plain numbers, and a thread does it.
+// neighboring items need values from places of their own (rays that walk through cells), a loop
+// over numbers beside each other does not do. Then every value is a vector of LANES numbers, one of
+// each item, and the code reads as that for a single item does: `a * b`, `pick(a < b, a, b)`. On a
+// GPU a packet is one item, its values are plain numbers, and a thread does it.
 
 namespace ddrecon {
 
@@ -85,9 +85,7 @@ template <class F> struct Packets {
     static INLINE unsigned bits_of(IM is) {
         return __builtin_bit_cast(unsigned short, __builtin_convertvector(is, Bits));
     }
-    static INLINE IM lanes_of(unsigned bits) {
-        return ((I{} + (int)bits) >> numbers() & 1) != 0;
-    }
+    static INLINE IM lanes_of(unsigned bits) { return ((I{} + (int)bits) >> numbers() & 1) != 0; }
     static INLINE I numbers() {
         I x;
         for (int l = 0; l < LANES; ++l) x[l] = l;
