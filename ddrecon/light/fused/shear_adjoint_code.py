@@ -5,13 +5,11 @@ Everything is gathered. Where numbers of the beam vary, their cotangents are sum
 
 from __future__ import annotations
 
-from ddrecon.kernels.native import TOTAL
 from ddrecon.light.fused.shear_code import BLENDS, CELL_ITEM, CORRECTION, GEOMETRY, RAY_ITEM
 
 # The correction's cotangent at each cell; of the numbers, what comes by carrying masses back.
 CELLS_ADJOINT = (
     GEOMETRY
-    + TOTAL
     + CELL_ITEM
     + BLENDS
     + """
@@ -61,7 +59,6 @@ sums[3] = total(of_bound, count);
 # Cotangents of the field on rays, on slices and midway, in place of masses and refinements.
 RAYS_ADJOINT = (
     GEOMETRY
-    + TOTAL
     + RAY_ITEM
     + """
 F passed[BLOCK], bends[BLOCK], linear[BLOCK + 6], bent[BLOCK + 6], bar[BLOCK + 3];
@@ -155,7 +152,6 @@ if (varies) {
 
 FIELD_ADJOINT = (
     GEOMETRY
-    + TOTAL
     + CELL_ITEM
     + """
 F linear[BLOCK + 3], slopes[BLOCK + 3], of_row[BLOCK], of_column[BLOCK];
