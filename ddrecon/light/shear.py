@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
@@ -94,9 +93,9 @@ def mass_passed(
     """
     # Trapezoids over half steps are more than those over whole ones by
     # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
-    bent = running_sum(torch.cat([torch.zeros_like(on_slices[:1]), bends]))
+    bent = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
     # The mass of all slices passed: step sum over j < k of rho_j.
-    passed = running_sum(on_slices) - on_slices
+    passed = on_slices.cumsum(0) - on_slices
     if before is not None:
         passed, bent = passed + before[0], bent + before[1]
     return passed * step + third_order.bounded(bent * (0.5 * step))
