@@ -31,7 +31,7 @@ from ddrecon.numerics.nodes import Nodes
 from ddrecon.settings import RenderSettings
 from ddrecon.slabs.slab import Slab, whole_of
 
-CHUNK_NODES = 1 << 18
+CHUNK_NODES = 1 << 17
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and
 memory does not grow with pixels.
 """
