@@ -26,78 +26,73 @@ from ddrecon.kernels.text import TextKernel, declarations
 T = TypeVar("T")
 # Members are all that a local struct can have: no templates, no friends.
 _DUAL = """
-#if defined(__CUDA_ARCH__)
-#define HERE __device__ __forceinline__
-#else
-#define HERE inline __attribute__((always_inline))
-#endif
 typedef F R;
 typedef int Whole;
-const auto decay_of = decay;
-const auto psi_of = psi_series;
-const auto psi_slope_of = psi_slope_series;
+const auto decay_of = [](R x) { return decay(x); };
+const auto psi_of = [](R x) { return psi_series(x); };
+const auto psi_slope_of = [](R x) { return psi_slope_series(x); };
 // Copied by hand: so compilers keep two numbers, where they would make a short vector of them, and
 // loops of short vectors do not become loops of long ones.
 struct Dual {
     R v, d;
-    HERE Dual() {}
-    HERE Dual(const Dual& o) : v(o.v), d(o.d) {}
-    HERE Dual& operator=(const Dual& o) {
+    INLINE Dual() {}
+    INLINE Dual(const Dual& o) : v(o.v), d(o.d) {}
+    INLINE Dual& operator=(const Dual& o) {
         v = o.v, d = o.d;
         return *this;
     }
-    HERE Dual(R v) : v(v), d(R(0)) {}
-    HERE Dual(R v, R d) : v(v), d(d) {}
-    HERE Dual operator-() const { return {-v, -d}; }
-    HERE Dual operator+(const Dual& o) const { return {v + o.v, d + o.d}; }
-    HERE Dual operator-(const Dual& o) const { return {v - o.v, d - o.d}; }
-    HERE Dual operator*(const Dual& o) const { return {v * o.v, d * o.v + v * o.d}; }
-    HERE Dual operator/(const Dual& o) const {
+    INLINE Dual(R v) : v(v), d(R(0)) {}
+    INLINE Dual(R v, R d) : v(v), d(d) {}
+    INLINE Dual operator-() const { return {-v, -d}; }
+    INLINE Dual operator+(const Dual& o) const { return {v + o.v, d + o.d}; }
+    INLINE Dual operator-(const Dual& o) const { return {v - o.v, d - o.d}; }
+    INLINE Dual operator*(const Dual& o) const { return {v * o.v, d * o.v + v * o.d}; }
+    INLINE Dual operator/(const Dual& o) const {
         const R one = R(1) / o.v, q = v * one;
         return {q, (d - q * o.d) * one};
     }
-    HERE Dual& operator+=(const Dual& o) { return *this = *this + o; }
-    HERE Dual& operator-=(const Dual& o) { return *this = *this - o; }
-    HERE explicit operator Whole() const { return (Whole)v; }
-    HERE explicit operator double() const { return (double)v; }
-    HERE bool operator<(const Dual& o) const { return v < o.v; }
-    HERE bool operator>(const Dual& o) const { return v > o.v; }
-    HERE bool operator<=(const Dual& o) const { return v <= o.v; }
-    HERE bool operator>=(const Dual& o) const { return v >= o.v; }
-    HERE bool operator==(const Dual& o) const { return v == o.v; }
+    INLINE Dual& operator+=(const Dual& o) { return *this = *this + o; }
+    INLINE Dual& operator-=(const Dual& o) { return *this = *this - o; }
+    INLINE explicit operator Whole() const { return (Whole)v; }
+    INLINE explicit operator double() const { return (double)v; }
+    INLINE bool operator<(const Dual& o) const { return v < o.v; }
+    INLINE bool operator>(const Dual& o) const { return v > o.v; }
+    INLINE bool operator<=(const Dual& o) const { return v <= o.v; }
+    INLINE bool operator>=(const Dual& o) const { return v >= o.v; }
+    INLINE bool operator==(const Dual& o) const { return v == o.v; }
 };
 // Where numbers are read: values and changes.
 struct In {
     const R *v, *d;
-    HERE Dual operator[](long long i) const { return {v[i], d[i]}; }
-    HERE In operator+(long long i) const { return {v + i, d + i}; }
-    HERE explicit operator bool() const { return v; }
-    HERE In operator-(long long i) const { return {v - i, d - i}; }
+    INLINE Dual operator[](long long i) const { return {v[i], d[i]}; }
+    INLINE In operator+(long long i) const { return {v + i, d + i}; }
+    INLINE explicit operator bool() const { return v; }
+    INLINE In operator-(long long i) const { return {v - i, d - i}; }
 };
 // Where changes are written.
 struct Change {
     R& d;
-    HERE void operator=(const Dual& o) { d = o.d; }
-    HERE void operator+=(const Dual& o) { d += o.d; }
+    INLINE void operator=(const Dual& o) { d = o.d; }
+    INLINE void operator+=(const Dual& o) { d += o.d; }
 };
 struct Out {
     R* d;
-    HERE explicit operator bool() const { return d; }
-    HERE Change operator[](long long i) const { return {d[i]}; }
-    HERE Out operator+(long long i) const { return {d + i}; }
+    INLINE explicit operator bool() const { return d; }
+    INLINE Change operator[](long long i) const { return {d[i]}; }
+    INLINE Out operator+(long long i) const { return {d + i}; }
 };
 // Where both are written, and read again.
 struct Both {
     R *v, *d;
     struct Place {
         R &v, &d;
-        HERE void operator=(const Dual& o) { v = o.v, d = o.d; }
-        HERE operator Dual() const { return {v, d}; }
-        HERE Dual operator*(const Dual& o) const { return Dual(v, d) * o; }
+        INLINE void operator=(const Dual& o) { v = o.v, d = o.d; }
+        INLINE operator Dual() const { return {v, d}; }
+        INLINE Dual operator*(const Dual& o) const { return Dual(v, d) * o; }
     };
-    HERE Place operator[](long long i) const { return {v[i], d[i]}; }
-    HERE explicit operator bool() const { return v; }
-    HERE Both operator+(long long i) const { return {v + i, d + i}; }
+    INLINE Place operator[](long long i) const { return {v[i], d[i]}; }
+    INLINE explicit operator bool() const { return v; }
+    INLINE Both operator+(long long i) const { return {v + i, d + i}; }
 };
 """
 _FUNCTIONS = """

@@ -17,11 +17,6 @@ from ddrecon.kernels.text import TextKernel
 
 _GRID = "int nz, ny, nx, width, parts; F hz, hy, hx, lz, ly, lx;"
 _ROW = """
-#if defined(__CUDA_ARCH__)
-#define INLINE
-#else
-#define INLINE __attribute__((always_inline))
-#endif
 // nz, ny, nx: the grid's cells; hz, hy, hx: a cell's sides; lz, ly, lx: the grid's lower corner
 const int rows = nz * ny, c = item / (rows * parts);
 const int row = item / parts - c * rows;

@@ -4,15 +4,22 @@
     scale = TextKernel("scale", bits, text, "F *x, *out; F factor", "out")
     scale.launch(count, {"x": x, "factor": 2.0}, {"out": out})
 
+Warp's own language makes scalar code of a thread. C++ it compiles for processors, where loops over
+numbers beside each other become vector instructions, and for GPUs, where a thread does one turn.
+What is more than a call stands in a `header` of the package, in the namespace `ddrecon`: at least
+`numbers.h` and `packets.h` can be called.
+
 What the text is given is declared as in C: pointers and numbers of type `F` (the kernel's own),
 `double`, `int`, `long` or `bool`; `F *fields[3]` are three pointers. Those that are named as made
 it writes; others point to constants. It all goes into one record: a launch takes the same few
 microseconds, however much that is.
 """
 
+import functools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,7 +28,6 @@ from torch import Tensor
 
 from ddrecon.kernels.compiling import clear_in_rehearsal
 from ddrecon.kernels.launch import MOST, launch, too_many
-from ddrecon.kernels.native import number_type, program
 
 _TYPES = {
     "double": ("double", wp.float64, torch.float64),
@@ -39,7 +45,7 @@ class TextKernel:
     """The kernel `name` that does `text` for each `item`, in numbers of so many `bits`.
 
     `given` declares what the text has besides, and `made` names the arrays of that which it writes,
-    whether it reads them or not; `write` puts before it what both need.
+    whether it reads them or not.
     """
 
     def __init__(
@@ -49,9 +55,9 @@ class TextKernel:
         text: str,
         given: str,
         made: str,
-        write: Callable[[int, str], str] = program,
+        header: str = "kernels/packets.h",
     ):
-        F = number_type(bits)
+        F = wp.float64 if bits == 64 else wp.float32
         types = _TYPES | {"F": ("F", F, torch.float64 if bits == 64 else torch.float32)}
         members, locals_, self.arrays = {}, [], {}
         self.lists: dict[str, list[str]] = {}
@@ -72,10 +78,13 @@ class TextKernel:
         # Pointers go as numbers: their addresses.
         Record = wp.struct(type("Record", (), {"__annotations__": members, "__module__": __name__}))
 
-        @wp.func_native(write(bits, "".join(locals_) + text))
+        number = f"using namespace ddrecon;\ntypedef {'double' if bits == 64 else 'float'} F;\n"
+        options = {"extra_build_options": include(header)}
+
+        @wp.func_native(number + "".join(locals_) + text)
         def do_item(item: int, given: Record): ...
 
-        @wp.kernel(enable_backward=False, module="unique", name=name)
+        @wp.kernel(enable_backward=False, module="unique", name=name, module_options=options)
         def do_items(first: int, given: Record):
             do_item(first + wp.tid(), given)
 
@@ -123,15 +132,20 @@ class TextKernel:
             ready = value
             if name in self.lists:
                 entries = zip(self.lists[name], value, strict=True)
-                ready = [self._ready(entry, each) for entry, each in entries]
+                ready = [
+                    self._ready(entry, each) if isinstance(each, Tensor) else each
+                    for entry, each in entries
+                ]
             elif isinstance(value, Tensor):
                 ready = self._ready(name, value)
             self.write(record, name, ready)
             held.append(ready)
         for name, value in made.items():
             self.write(record, name, value)
-        clear_in_rehearsal(made.values())
-        like = next(value for value in made.values() if isinstance(value, Tensor))
+        lists = (value if isinstance(value, list) else [value] for value in made.values())
+        arrays = [array for each in lists for array in each if isinstance(array, Tensor)]
+        clear_in_rehearsal(arrays)
+        like = arrays[0]
         return Bound(self, record, [held, made], like)
 
     def _ready(self, name: str, array: Tensor | None) -> Tensor | None:
@@ -154,6 +168,28 @@ class TextKernel:
                 raise too_many(f"{self.name}, {name}", value)
         else:
             raise ValueError(f"the kernel declares no {name}")
+
+
+def include(header: str) -> Any:
+    """Warp's options for modules that include a `header` of the package, by its path in there.
+
+    They are experimental in Warp 1.19, and named here alone.
+    """
+    line, root = f'#include "ddrecon/{header}"\n', Path(__file__).parents[2]
+    return wp.ModuleBuildOptions(
+        extra_cpu_include_dirs=[str(root)],
+        extra_cuda_include_dirs=[str(root)],
+        extra_cpu_preamble=line,
+        extra_cuda_preamble=line,
+        extra_build_dependencies=sorted(map(str, _included(root / "ddrecon" / header, root))),
+    )
+
+
+@functools.cache
+def _included(header: Path, root: Path) -> frozenset[Path]:
+    """`header` and those it includes: modules are compiled anew where one of them has changed."""
+    names = re.findall(r'#include "(.*)"', header.read_text(encoding="utf-8"))
+    return frozenset({header}).union(*(_included(root / name, root) for name in names))
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
-    if is_fused(direction):
+    if is_fused_whole(grid, direction):
         from ddrecon.light.fused.sum_mass import sum_mass
 
         return sum_mass(field, grid, direction, bound)
@@ -51,6 +51,11 @@ def sum_mass_to_cells(
         return sum_one(field, grid, direction, bound)
     each = [recompute(sum_one, one, grid, direction, bound) for one in field.split(1)]
     return torch.cat([entered for entered, _ in each]), each[0][1]
+
+
+def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:
+    """Whether fused kernels follow beams along `directions`; in slabs they do not."""
+    return not isinstance(grid, Slab) and is_fused(*directions)
 
 
 def _sum_mass(

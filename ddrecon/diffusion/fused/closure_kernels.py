@@ -15,12 +15,12 @@ const F* one = field + color(fields, size) + start;
 const F* two = other_field + color(other_fields, size) + start;
 const F S = scale[c], T = HAS_TWO ? other_scale[c] : F(0);
 const long long to = c * size + start;
-auto extinction = [&](int i) INLINE -> F { return S * one[i] + (HAS_TWO ? T * two[i] : F(0)); };
+auto extinction = [&](int i) HERE -> F { return S * one[i] + (HAS_TWO ? T * two[i] : F(0)); };
 """
 # 4 / distance, along x interpolated between two of `coarse` numbers.
 _SPREADING = """
 const F* row_inverse = inverse_distance + ((long long)c * rows + row) * coarse;
-auto spreading = [&](int i) INLINE -> F {
+auto spreading = [&](int i) HERE -> F {
     const int k = (int)lower[i];
     const int next = k + 1 < coarse ? k + 1 : k;
     return F(4) * (row_inverse[k] + part[i] * (row_inverse[next] - row_inverse[k]));

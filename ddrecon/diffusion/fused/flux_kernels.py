@@ -27,15 +27,15 @@ const long long w = has_more ? to : q;
 const F *wz = more_z + w, *wy = more_y + w, *wx = more_x + w;
 const F S = scattering_scale[c], beyond = outside[c], whole = F(has_more);
 // kappa_s Q1 along an axis, so many cells further.
-auto scattered = [&](int i, const F* flux, const F* more, long long further) INLINE -> F {
+auto scattered = [&](int i, const F* flux, const F* more, long long further) HERE -> F {
     return DIRECTED
         ? S * field[i + further] * (flux[i + further] + whole * more[i + further]) : F(0);
 };
 // What drives F upwards through the faces below and above a cell along an axis.
-auto drive_low = [&](int i, F p, F p_low, long long low, F h, bool inside) INLINE -> F {
+auto drive_low = [&](int i, F p, F p_low, long long low, F h, bool inside) HERE -> F {
     return (inside ? (u[i + low] - u[i]) / h : beyond - u[i]) + driven(p, p_low, h, inside);
 };
-auto drive_high = [&](int i, F p, F p_high, long long high, F h, bool inside) INLINE -> F {
+auto drive_high = [&](int i, F p, F p_high, long long high, F h, bool inside) HERE -> F {
     return (inside ? (u[i] - u[i + high]) / h : u[i] - beyond) + driven(p, p_high, h, inside);
 };
 """
@@ -45,10 +45,10 @@ ROWS
 F *out_z = light_z + to, *out_y = light_y + to, *out_x = light_x + to;
 const F *old_z = begun_z + to, *old_y = begun_y + to, *old_x = begun_x + to;
 const F kept = F(is_begun);
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
+each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
     const F a = d[i];
     auto along = [&](const F* flux, const F* more, long long low, long long high, F h,
-                     bool has_low, bool has_high) INLINE -> F {
+                     bool has_low, bool has_high) HERE -> F {
         const F p = scattered(i, flux, more, 0);
         const F p_low = scattered(i, flux, more, low), p_high = scattered(i, flux, more, high);
         return F(times) * a
@@ -67,12 +67,12 @@ const F *bar_z = light_z_bar + to, *bar_y = light_y_bar + to, *bar_x = light_x_b
 const F factor = scattering_factor[c];
 F *u_bars = mean_bar + to, *d_bars = diffusion_bar + to, *field_bars = field_bar + to;
 F *qz_bars = flux_z_bar + to, *qy_bars = flux_y_bar + to, *qx_bars = flux_x_bar + to;
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
+each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
     const F a = d[i], s = DIRECTED ? S * field[i] : F(0);
     F u_bar = F(0), d_bar = F(0), s_bar = F(0);
     // Both faces along an axis; returns the cotangent of kappa_s Q1.
     auto along = [&](const F* flux, const F* more, const F* bar, long long low, long long high,
-                     F h, bool has_low, bool has_high) INLINE -> F {
+                     F h, bool has_low, bool has_high) HERE -> F {
         const F p = scattered(i, flux, more, 0);
         const F p_low = scattered(i, flux, more, low), p_high = scattered(i, flux, more, high);
         const F t_low = share(a, d[i + low], h, has_low);

@@ -28,7 +28,7 @@ const F* cx = nx == 1
 // Where there is no face, the difference across it is zero.
 const F *cz_low = zl ? cz - plane : u, *cz_high = zh ? cz : u;
 const F *cy_low = yl ? cy - nx : u, *cy_high = yh ? cy : u;
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
+each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
     const F here = u[i];
     const F change = own_loss[i] * here
         + cz_low[i] * (here - u[i + to_zl]) + cz_high[i] * (here - u[i + to_zh])

@@ -36,11 +36,11 @@ const F *qz = flux_z + to, *qy = flux_y + to, *qx = flux_x + to, S = scattering_
 _SPREAD = """
 F* out = spread + to;
 const F *one = begun + to, *other = begun_more + to;
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
+each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
     const F a = d[i], s = S * field[i];
     // What enters through the lower face along an axis, less what leaves through the upper one.
     auto along = [&](const F* flux, long long low, long long high, F h, bool has_low,
-                     bool has_high) INLINE -> F {
+                     bool has_high) HERE -> F {
         const F p = s * flux[i], p_low = S * field[i + low] * flux[i + low];
         const F p_high = S * field[i + high] * flux[i + high];
         return F(2) * a / h
@@ -56,12 +56,12 @@ _ADJOINT = """
 const F *r = spread_bar + to, factor = scattering_factor[c];
 F *d_bars = diffusion_bar + to, *field_bars = field_bar + to;
 F *qz_bars = flux_z_bar + to, *qy_bars = flux_y_bar + to, *qx_bars = flux_x_bar + to;
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
+each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
     const F a = d[i], s = S * field[i], here = r[i];
     F d_bar = F(0);
     // Both faces along an axis; returns the cotangent of kappa_s Q1.
     auto along = [&](const F* flux, long long low, long long high, F h, bool has_low,
-                     bool has_high) INLINE -> F {
+                     bool has_high) HERE -> F {
         const F t_low = share(a, d[i + low], h, has_low);
         const F t_high = share(a, d[i + high], h, has_high);
         const F p = s * flux[i], p_low = S * field[i + low] * flux[i + low];

@@ -30,13 +30,13 @@ F* cy = conductance_y
 F* cx = conductance_x
     + color(own, (size / nx) * (nx - 1)) + (long long)row * (nx - 1);
 const bool has_cz = is_own && zh, has_cy = is_own && yh;
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
+each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
     const F a = d[i];
     const F s = S * s_field[i];
     F escape = F(0), gain = F(0);
     // Both faces along an axis: what escapes there, and -div(D kappa_s Q1).
     auto along = [&](F below, F above, const F* flux, long long low, long long high, F h,
-                     bool has_low, bool has_high) INLINE -> F {
+                     bool has_low, bool has_high) HERE -> F {
         const F lower = F(2) * a * share(a, below, h, has_low);
         const F upper = F(2) * a * share(a, above, h, has_high);
         escape += (has_low ? F(0) : lower / h) + (has_high ? F(0) : upper / h);
@@ -84,7 +84,7 @@ const F* cy_high = is_own && yh ? cy : r;
 const long long to = c * size + start;
 F *d_bars = diffusion_bar + to, *field_bars = field_bar + to, *q0_bars = mean_bar + to;
 F *qz_bars = flux_z_bar + to, *qy_bars = flux_y_bar + to, *qx_bars = flux_x_bar + to;
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
+each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
     const F a = d[i], here = r[i];
     const F s = S * s_field[i];
     const F own_loss = is_own ? losses[i] : F(0);
@@ -92,7 +92,7 @@ each([&](int i, bool xl, bool xh, int to_xl, int to_xh) INLINE {
     F d_bar = F(0), s_bar = q0[i] * here;
     // Both faces along an axis; returns the cotangent of kappa_s Q1.
     auto along = [&](F below, F above, const F* flux, long long low, long long high,
-                     F low_bar, F high_bar, F h, bool has_low, bool has_high) INLINE -> F {
+                     F low_bar, F high_bar, F h, bool has_low, bool has_high) HERE -> F {
         const F t_low = share(a, below, h, has_low), t_high = share(a, above, h, has_high);
         F lower_bar = has_low ? (is_own ? low_bar / (h * h) : F(0)) : escape_bar / h;
         F upper_bar = has_high ? (is_own ? high_bar / (h * h) : F(0)) : escape_bar / h;

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import row_kernel
 from ddrecon.light.moments import MARGIN
 from ddrecon.numerics.harmonics import norm
@@ -25,17 +24,17 @@ const F isotropic = factors[c], directed = DIRECTED ? factors[colors + c] : F(0)
 const F* added = behind(more, c * size + start);
 const F dz = is_eye ? point[0] - (lz + hz * (F(z) + F(0.5))) : point[0];
 const F dy = is_eye ? point[1] - (ly + hy * (F(y) + F(0.5))) : point[1];
-auto to_x = [&](int i) INLINE -> F {
+auto to_x = [&](int i) HERE -> F {
     return is_eye ? point[2] - (lx + hx * (F(i) + F(0.5))) : point[2];
 };
 // 1 / distance to the eye.
-auto shorten = [&](F dx) INLINE -> F {
+auto shorten = [&](F dx) HERE -> F {
     const F distance = wp::sqrt(dz * dz + dy * dy + dx * dx);
     return is_eye ? (distance > F(0) ? F(1) / distance : F(0)) : F(1);
 };
-auto size_of = [](F a) INLINE -> F { return a < F(0) ? -a : a; };
-auto sign_of = [](F a) INLINE -> F { return a < F(0) ? F(-1) : (a > F(0) ? F(1) : F(0)); };
-auto bend = [](F r, F divisor) INLINE -> F {
+auto size_of = [](F a) HERE -> F { return a < F(0) ? -a : a; };
+auto sign_of = [](F a) HERE -> F { return a < F(0) ? F(-1) : (a > F(0) ? F(1) : F(0)); };
+auto bend = [](F r, F divisor) HERE -> F {
     const F part = r / divisor;
     return part < F(-1) ? F(-1) : (part > F(1) ? F(1) : part);
 };
@@ -70,8 +69,9 @@ for (int i = begin; i < end; ++i) {
 """
 )
 _ADJOINT = (
-    ROW_SUM
-    + """
+    """
+{
+REORDERED
 const long long to = c * size + start;
 const F* bar = radiance_bar + to;
 F *u_bars = mean_bar + to, *along_bars = behind(along_bar, to);

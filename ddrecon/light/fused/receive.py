@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.kernels.native import TOTAL
 from ddrecon.kernels.text import TextKernel, cut
 
 CHUNK = 512
@@ -80,8 +79,7 @@ for (int c = 0; c < colors; ++c) {
 """
 )
 _ADJOINT = (
-    TOTAL
-    + _ITEM
+    _ITEM
     + """
 const F* const bars[4] = {mean, flux_z, flux_y, flux_x};
 auto bar_of = [&](int a) { return a < 4 ? bars[a] : higher + (a - 4) * colors * cells; };

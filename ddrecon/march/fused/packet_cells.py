@@ -12,7 +12,7 @@ struct Lines { int rows, columns, row, column; };
 struct Place {
     I m, i, j, p;
     V a, excess;
-    INLINE Place at(V y, int size) {
+    static INLINE Place at(V y, int size) {
         const V none = P::all(F(0)), end = P::all(F(size - 1));
         // Also where y is not a number.
         const V held = P::least(P::pick(y > none, y, none), end);
@@ -28,7 +28,7 @@ struct Place {
         return q;
     }
     // The same place of lines that begin `by` cells on.
-    INLINE Place behind(Place q, I by) {
+    static INLINE Place behind(Place q, I by) {
         q.m += by; q.i += by; q.j += by; q.p += by;
         return q;
     }
@@ -37,7 +37,7 @@ struct Place {
 struct Corners {
     I at00, at01, at10, at11;
     V w00, w01, w10, w11;
-    INLINE Corners of(const Place& y, const Place& x, const Lines& lines) {
+    static INLINE Corners of(const Place& y, const Place& x, const Lines& lines) {
         Corners q;
         const I yi = y.i * lines.row, yj = y.j * lines.row;
         const I xi = x.i * lines.column, xj = x.j * lines.column;
@@ -54,22 +54,22 @@ struct Corners {
 struct Layers {
     I at[4];
     V linear[4], across[4];
-    INLINE Layers of(const Place& z) {
+    static INLINE Layers of(const Place& z) {
         const V none = P::all(F(0)), w1 = z.a, w0 = F(1) - w1, e = z.excess;
         return {{z.m, z.i, z.j, z.p}, {none, w0, w1, none},
                 {e * w0, e * (w1 - F(2) * w0), e * (w0 - F(2) * w1), e * w1}};
     }
-    INLINE bool is_outer(int i) { return i == 0 || i == 3; }
+    static INLINE bool is_outer(int i) { return i == 0 || i == 3; }
 };
 """
 VALUES = """
 struct Values {
-    INLINE V linear(const F* f, const Corners& q) {
+    static INLINE V linear(const F* f, const Corners& q) {
         return q.w00 * P::gather(f, q.at00) + q.w01 * P::gather(f, q.at01)
              + q.w10 * P::gather(f, q.at10) + q.w11 * P::gather(f, q.at11);
     }
     // The linear value, and in `bend` what it is off by: a (1 - a) / 2 second differences an axis.
-    INLINE V curved(
+    static INLINE V curved(
         const F* f, const Corners& q, const Place& y, const Place& x, const Lines& lines, V& bend
     ) {
         const I ym = y.m * lines.row, yi = y.i * lines.row, yj = y.j * lines.row;

@@ -20,19 +20,19 @@ static_assert(!HAS_RUNGS || (TERMS <= LANES && LANES <= 2 * TERMS), "terms of a 
 constexpr int LAST_RUNG = IS_STEEP ? {STEEP_STEPS} : {EVEN_STEPS};
 struct Rungs {{
     // At which rung a number is, and how that changes with it.
-    INLINE V place(V number) {{
+    static INLINE V place(V number) {{
         if (!IS_STEEP) return number * F(LAST_RUNG);
         const V g = P::most(number, P::all(F(0)));
         return F({0.5 / STEEP_STEP!r}) * P::log((F(1) + g) / (F(1) - g));
     }}
-    INLINE V slope(V number) {{
+    static INLINE V slope(V number) {{
         if (!IS_STEEP) return P::all(F(LAST_RUNG));
         const V g = P::most(number, P::all(F(0)));
         return F({1 / STEEP_STEP!r}) / (F(1) - g * g);
     }}
     // The coefficients there, and how they change with both places, as far as that is asked for.
     // A lane's terms stand beside each other: it reads them as a vector of its own.
-    INLINE void read(
+    static INLINE void read(
         const F* table, const Cubic& rung, const Cubic& angle, V* out, V* by_rung, V* by_angle
     ) {{
         V rungs[4], angles[4], rung_slopes[4], angle_slopes[4];
@@ -86,7 +86,7 @@ struct Rungs {{
 #endif
     }}
     // What bars of the coefficients are for the table.
-    INLINE void spread(F* table_bar, const Cubic& rung, const Cubic& angle, const V* bar) {{
+    static INLINE void spread(F* table_bar, const Cubic& rung, const Cubic& angle, const V* bar) {{
         V rungs[4], angles[4];
         Cubic::weights(rung, F(1), rungs);
         Cubic::weights(angle, ANGLE_STEP, angles);
@@ -100,12 +100,12 @@ struct Rungs {{
                 }}
             }}
     }}
-    INLINE int row(const Cubic& rung, const Cubic& angle, int l) {{
+    static INLINE int row(const Cubic& rung, const Cubic& angle, int l) {{
         return 4 * P::lane_of(rung.first, l) * (STEPS + 1) + 2 * P::lane_of(angle.first, l);
     }}
 #if !defined(__CUDA_ARCH__)
     // Each lane's terms to each term's lanes.
-    INLINE void turn(const V* lines, V* terms) {{
+    static INLINE void turn(const V* lines, V* terms) {{
         const F* from = (const F*)lines;
         for (int k = 0; k < TERMS; ++k)
             for (int l = 0; l < LANES; ++l) terms[k][l] = from[l * LANES + k];
@@ -115,7 +115,7 @@ struct Rungs {{
 // (1 - g^2) / (1 + g^2 - 2 g w)^(3/2), and its derivatives.
 struct Plain {{
     V value, by_g, by_cosine;
-    INLINE Plain at(V g, V cosine) {{
+    static INLINE Plain at(V g, V cosine) {{
         Plain p;
         const V square = F(1) + g * g - F(2) * g * cosine, top = F(1) - g * g;
         const V inverse = F(1) / square, power = inverse / P::root(square);

@@ -12,12 +12,12 @@ DECAYS = """
 struct Decay {
     // The mean of exp(-depth) while depth goes from u0 to u1, where that is x0 and x1; and its
     // derivatives by both.
-    INLINE V mean(V u0, V u1, V x0, V x1) {
+    static INLINE V mean(V u0, V u1, V x0, V x1) {
         const V half = P::all(F(0.5)), apart = P::size(u1 - u0);
         const V near = P::most(x0, x1) * (F(1) - apart * P::psi_series(P::least(apart, half)));
         return P::pick(apart < half, near, P::size(x0 - x1) / P::most(apart, half));
     }
-    INLINE V slopes(V u0, V u1, V x0, V x1, V& by0, V& by1) {
+    static INLINE V slopes(V u0, V u1, V x0, V x1, V& by0, V& by1) {
         const V half = P::all(F(0.5)), apart = P::size(u1 - u0), most = P::most(x0, x1);
         const V inverse = F(1) / P::most(apart, half);
         const V far = P::size(x0 - x1) * inverse;
@@ -36,14 +36,14 @@ POLYNOMIALS = f"""
 constexpr int COEFFICIENTS = {COEFFICIENTS};
 // E13 along a ray, by its polynomial in 1 - 2 s / (depth + s).
 struct Polynomial {{
-    INLINE V place(V depth) {{ return F(1) - F({2.0 * SCALE}) / (depth + F({SCALE})); }}
-    INLINE V at(const V* c, V place) {{
+    static INLINE V place(V depth) {{ return F(1) - F({2.0 * SCALE}) / (depth + F({SCALE})); }}
+    static INLINE V at(const V* c, V place) {{
         V value = c[TERMS - 1];
         for (int k = TERMS - 2; k >= 0; --k) value = c[k] + value * place;
         return value;
     }}
     // Its derivative by depth: d place / d depth = (1 - place)^2 / (2 s).
-    INLINE V slope(const V* c, V place) {{
+    static INLINE V slope(const V* c, V place) {{
         V value = F(TERMS - 1) * c[TERMS - 1];
         for (int k = TERMS - 2; k >= 1; --k) value = F(k) * c[k] + value * place;
         const V away = F(1) - place;
@@ -56,21 +56,21 @@ CUBICS = """
 struct Cubic {
     I first;
     V part;
-    INLINE Cubic at(V place, int steps) {
+    static INLINE Cubic at(V place, int steps) {
         Cubic q;
         q.first = P::whole(P::least(P::most(place, P::all(F(0))), P::all(F(steps - 1))));
         q.part = place - P::real(q.first);
         return q;
     }
     // What value and slope at both places count, which are a `step` apart; and how that changes.
-    INLINE void weights(const Cubic& q, F step, V* w) {
+    static INLINE void weights(const Cubic& q, F step, V* w) {
         const V u = q.part, rest = F(1) - u;
         w[0] = (F(1) + u + u) * rest * rest;
         w[1] = step * u * rest * rest;
         w[2] = (F(1) + rest + rest) * u * u;
         w[3] = -step * rest * u * u;
     }
-    INLINE void slopes(const Cubic& q, F step, V* w) {
+    static INLINE void slopes(const Cubic& q, F step, V* w) {
         const V u = q.part, rest = F(1) - u;
         w[0] = F(-6) * u * rest;
         w[1] = step * rest * (rest - u - u);
@@ -84,7 +84,7 @@ constexpr int STEPS = {STEPS};
 struct Point {{
     // Light from a point whose foot is at -`foot` on a ray, `across` the square of its distance:
     // between which angles of the table of p it is.
-    INLINE Cubic at(V foot, V across, V t) {{
+    static INLINE Cubic at(V foot, V across, V t) {{
         const V apart = P::root(across), away = -(foot + t);
         V place = P::all(F(0));
         for (int l = 0; l < LANES; ++l)
@@ -93,7 +93,7 @@ struct Point {{
     }}
     // The coefficients of p over the depth of the peak; `table` is that of the color. Or how they
     // change with the place in it.
-    INLINE void curve(const Cubic& angle, const F* table, V* out, bool slopes = false) {{
+    static INLINE void curve(const Cubic& angle, const F* table, V* out, bool slopes = false) {{
         V weights[4];
         if (slopes) Cubic::slopes(angle, F({math.pi / STEPS!r}), weights);
         else Cubic::weights(angle, F({math.pi / STEPS!r}), weights);
@@ -105,7 +105,7 @@ struct Point {{
         }}
     }}
     // What bars of these are for the table.
-    INLINE void spread(const Cubic& angle, F* table_bar, const V* bar) {{
+    static INLINE void spread(const Cubic& angle, F* table_bar, const V* bar) {{
         V weights[4];
         Cubic::weights(angle, F({math.pi / STEPS!r}), weights);
         for (int l = 0; l < LANES; ++l)
@@ -115,7 +115,7 @@ struct Point {{
                                P::lane(weights[j], l) * P::lane(bar[k], l));
     }}
     // The integral of 1 / r^2: the angle that the way subtends over the distance.
-    INLINE V subtended(V foot, V across, V t0, V t1) {{
+    static INLINE V subtended(V foot, V across, V t0, V t1) {{
         const V apart = P::root(across);
         const V opposite = apart * (t1 - t0), adjacent = across + (foot + t0) * (foot + t1);
         V angle = P::all(F(0));
@@ -125,7 +125,7 @@ struct Point {{
     }}
     // And its derivatives.
     struct Slopes {{ V foot, across, t0, t1; }};
-    INLINE Slopes subtended_slopes(V foot, V across, V t0, V t1) {{
+    static INLINE Slopes subtended_slopes(V foot, V across, V t0, V t1) {{
         const V s0 = foot + t0, s1 = foot + t1;
         const V r0 = F(1) / (across + s0 * s0), r1 = F(1) / (across + s1 * s1);
         const V angle = subtended(foot, across, t0, t1);
@@ -134,7 +134,7 @@ struct Point {{
     // How the place in tables changes with the way along the ray, and with `across`; and by that
     // place the cosine.
     struct Turning {{ V along, across, cosine; }};
-    INLINE Turning turning(V foot, V across, V t) {{
+    static INLINE Turning turning(V foot, V across, V t) {{
         const V apart = P::root(across), away = foot + t, square = across + away * away;
         const V per = P::all(F({STEPS / math.pi!r}));
         return {{per * apart / square, F(-0.5) * per * away / (apart * square),

@@ -6,7 +6,7 @@ walk.
 
 from __future__ import annotations
 
-from ddrecon.kernels.packets import packet_program
+from ddrecon.kernels.packets import PACKETS
 from ddrecon.kernels.text import TextKernel
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.packet_cells import PLACES, VALUES
@@ -310,4 +310,4 @@ def packet_kernel(
     text = constants + structs + chosen + WALKS + ROW_OF + _BEGIN + SEE + _EMIT + walk
     fields = f"all_fields[{2 * layout.channels}]" if changes else f"fields[{layout.channels}]"
     declared = f"{GIVEN} F *{fields}; {given}"
-    return TextKernel(name, layout.bits, text, declared, made, packet_program)
+    return TextKernel(name, layout.bits, PACKETS + text, declared, made)

@@ -39,13 +39,13 @@ ROWS = """
 constexpr bool HAS_PERMUTATION = sizeof(F) == 4 && LANES == 16;
 typedef float V32 __attribute__((vector_size(64)));
 struct Rows {
-    INLINE V read(const F* row, int first, int stride) {
+    static INLINE V read(const F* row, int first, int stride) {
         if (stride == 1) return P::read(row + first);
         V x;
         for (int j = 0; j < LANES; ++j) x[j] = row[(long long)(first + j) * stride];
         return x;
     }
-    INLINE V pick(V row, I at) {
+    static INLINE V pick(V row, I at) {
         V32 x;
         __builtin_memcpy(&x, &row, sizeof(V32));
         x = __builtin_ia32_permvarsf512(x, at);
@@ -53,29 +53,29 @@ struct Rows {
         return row;
     }
     // The same, and 0 at places from LANES on.
-    INLINE V pick_any(V row, I at) {
+    static INLINE V pick_any(V row, I at) {
         V32 x;
         __builtin_memcpy(&x, &row, sizeof(V32));
         x = __builtin_ia32_vpermi2varps512(x, at, V32{});
         __builtin_memcpy(&row, &x, sizeof(V32));
         return row;
     }
-    INLINE I pick_any(I from, I at, I other) {
+    static INLINE I pick_any(I from, I at, I other) {
         return __builtin_ia32_vpermi2vard512(from, at, other);
     }
     // Those `lanes` of x that are named by bits, in front of `others`.
-    INLINE I gather_lanes(I x, unsigned lanes, I others) {
+    static INLINE I gather_lanes(I x, unsigned lanes, I others) {
         return __builtin_ia32_compresssi512_mask(x, others, (unsigned short)lanes);
     }
 };
 #else
 constexpr bool HAS_PERMUTATION = false;
 struct Rows {
-    INLINE V read(const F* row, int, int) { return P::all(row[0]); }
-    INLINE V pick(V row, I) { return row; }
-    INLINE V pick_any(V row, I) { return row; }
-    INLINE I pick_any(I from, I, I) { return from; }
-    INLINE I gather_lanes(I x, unsigned, I) { return x; }
+    static INLINE V read(const F* row, int, int) { return P::all(row[0]); }
+    static INLINE V pick(V row, I) { return row; }
+    static INLINE V pick_any(V row, I) { return row; }
+    static INLINE I pick_any(I from, I, I) { return from; }
+    static INLINE I gather_lanes(I x, unsigned, I) { return x; }
 };
 #endif
 """
@@ -88,7 +88,7 @@ struct Window {
     V a, b;
     long long at_m, at_i, at_j, at_p;
     int first, stride;
-    INLINE Window of(const Run& run, const Place& y, const Place& x, const Lines& lines) {
+    static INLINE Window of(const Run& run, const Place& y, const Place& x, const Lines& lines) {
         Window w;
         w.is_in = __builtin_convertvector(P::lanes_of(run.lanes), M);
         w.first = run.first;

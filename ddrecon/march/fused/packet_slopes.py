@@ -33,7 +33,7 @@ auto at_side = [&](V y, int size, F side) -> Side {
 };
 struct Slope {
     V z, y, x, bend_z, bend_y, bend_x;
-    INLINE Slope mean(const Slope& a, const Slope& b) {
+    static INLINE Slope mean(const Slope& a, const Slope& b) {
         const V half = P::all(F(0.5));
         return {half * (a.z + b.z), half * (a.y + b.y), half * (a.x + b.x),
                 half * (a.bend_z + b.bend_z), half * (a.bend_y + b.bend_y),

@@ -19,7 +19,7 @@ _ON_A_GPU = """
 struct Shares {
     Place y, x;
     Lines lines;
-    INLINE Shares of(const Place& y, const Place& x, const Lines& lines) {
+    static INLINE Shares of(const Place& y, const Place& x, const Lines& lines) {
         return Shares{y, x, lines};
     }
     void add(F* field, V bar, V bend_bar) const {
@@ -99,7 +99,7 @@ struct Shares {
         at_high = __builtin_convertvector(-(x.p == x.j), V);
         alike = most;
     }
-    INLINE Shares of(const Run& run, const Place& y, const Place& x, const Lines& lines,
+    static INLINE Shares of(const Run& run, const Place& y, const Place& x, const Lines& lines,
                      const Ones& ones, bool is_bent) {
         Shares s;
         s.run = run;

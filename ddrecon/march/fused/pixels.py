@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 
-from ddrecon.kernels.packets import packet_program
+from ddrecon.kernels.packets import PACKETS
 from ddrecon.kernels.text import BLOCK, TextKernel
 from ddrecon.march.fused.packet_cells import PLACES, VALUES
 from ddrecon.march.fused.packet_runs import ROWS, RUNS, WINDOWS
@@ -176,11 +176,11 @@ def interpolation_kernel(bits: int) -> TextKernel:
     """
     text = f"constexpr int TILE = {TILE};" + _PACKET + _INTERPOLATE
     more = "F *uneven, *bound, *out; int *rough"
-    return TextKernel("interpolate", bits, text, _PIXELS + more, "out rough", packet_program)
+    return TextKernel("interpolate", bits, PACKETS + text, _PIXELS + more, "out rough")
 
 
 @functools.cache
 def spread_kernel(bits: int) -> TextKernel:
     """The kernel that adds to `values_bar` [2 C, r, c] what `out_bar` [2 C, pixels] is for them."""
     text, more = _PACKET + SHARES + _SPREAD, "F *out_bar, *values_bar"
-    return TextKernel("spread", bits, text, _PIXELS + more, "values_bar", packet_program)
+    return TextKernel("spread", bits, PACKETS + text, _PIXELS + more, "values_bar")

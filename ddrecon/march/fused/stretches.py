@@ -12,7 +12,7 @@ import functools
 import torch
 from torch import Tensor
 
-from ddrecon.kernels.packets import LANES, packet_program
+from ddrecon.kernels.packets import LANES, PACKETS
 from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.march.fused.packet_cells import PLACES
 from ddrecon.numerics.remember import remember
@@ -64,7 +64,7 @@ def mark_kernel(bits: int) -> TextKernel:
     F *planes, *rays; bool *touched; int *walked;
     int ray_count, node_count, rows, columns, words;
     """
-    return TextKernel("mark", bits, PLACES + _MARK, given, "walked", packet_program)
+    return TextKernel("mark", bits, PACKETS + PLACES + _MARK, given, "walked")
 
 
 @remember

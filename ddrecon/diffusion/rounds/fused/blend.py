@@ -11,7 +11,6 @@ from torch import Tensor
 from ddrecon.diffusion.rounds.fused.share import SHARE, SHARE_SLOPE, numbers_by_color
 from ddrecon.grid import Grid
 from ddrecon.kernels.dual import launch_row_tangents, split
-from ddrecon.kernels.native import ROW_SUM
 from ddrecon.kernels.rows import launch_rows, row_kernel, with_long_rows
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
@@ -51,7 +50,7 @@ for (int k = 0; k < higher; ++k) {
 """
 )
 _ADJOINT = (
-    ROW_SUM
+    "\n{\nREORDERED\n"
     + _ROWS
     + """
 const F *const bars[4] = {new_mean_bar + at, new_z_bar + at, new_y_bar + at, new_x_bar + at};

@@ -5,7 +5,6 @@ import functools
 from ddrecon.diffusion.rounds.fused.returning_rows import RETURN
 from ddrecon.diffusion.rounds.fused.rows import FOLLOW, GIVEN, SCRATCH
 from ddrecon.diffusion.rounds.fused.share import constants
-from ddrecon.kernels.native import TOTAL
 from ddrecon.kernels.text import TextKernel
 
 
@@ -22,6 +21,6 @@ def follow_kernel(bits: int, shares_field: bool) -> TextKernel:
 @functools.cache
 def return_kernel(bits: int, shares_field: bool, varies_numbers: bool) -> TextKernel:
     """The kernel that follows it back; `varies_numbers`: derivatives by scales are asked for."""
-    text = constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers) + TOTAL + RETURN
+    text = constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers) + RETURN
     made = "found sums e_bar sc_bar returning entering_bar "
     return TextKernel("return_rows", bits, text, GIVEN, made + SCRATCH)

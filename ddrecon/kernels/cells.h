@@ -1,0 +1,128 @@
+#pragma once
+#include "ddrecon/kernels/dual.h"
+// A function of the numbers in one cell, gone through over cells side by side: its values, tangents
+// and cotangents. A `Cell` has counts INS, OUTS and NUMBERS, and
+//
+//     template <class N> INLINE static void find(const N* in, const N* number, N* out);
+//
+// for any kind of number N: of fields `in`, and of numbers that all cells of a color share.
+
+namespace ddrecon {
+
+// What an item does: one of the `rows` of a color, of `width` cells.
+struct Row {
+    int width, color, colors;
+    long long item, items, start, at;
+    INLINE Row(int item, int width, int rows, int colors)
+        : width(width),
+          color(item / rows),
+          colors(colors),
+          item(item),
+          items((long long)rows * colors),
+          start((long long)(item % rows) * width),
+          at((long long)item * width) {}
+    // The row in each of COUNT arrays; in those of one color that all share, unless it `is_each`.
+    template <int COUNT, class P> INLINE void in_all(P* const* arrays, P** found) const {
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) found[k] = arrays[k] + at;
+    }
+    template <int COUNT, class P>
+    INLINE void in_all(P* const* arrays, const int* is_each, P** found) const {
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) found[k] = arrays[k] + (is_each[k] ? at : start);
+    }
+    template <int COUNT, class F> INLINE void of_color(const F* numbers, F* found) const {
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) found[k] = numbers[k * colors + color];
+    }
+};
+
+template <class Cell, class F> INLINE void find_values(
+    const Row& row, const int* is_each, const F* const* fields, const F* numbers, F* const* made) {
+    const F* in[Cell::INS];
+    F number[Cell::NUMBERS], *out[Cell::OUTS];
+    row.in_all<Cell::INS>(fields, is_each, in);
+    row.of_color<Cell::NUMBERS>(numbers, number);
+    row.in_all<Cell::OUTS>(made, out);
+    INDEPENDENT
+    for (int i = 0; i < row.width; ++i) {
+        F x[Cell::INS], y[Cell::OUTS];
+        UNROLLED
+        for (int k = 0; k < Cell::INS; ++k) x[k] = in[k][i];
+        Cell::find(x, number, y);
+        UNROLLED
+        for (int k = 0; k < Cell::OUTS; ++k) out[k][i] = y[k];
+    }
+}
+
+template <class Cell, class F> INLINE void find_tangents(
+    const Row& row, const int* is_each, const F* const* fields, const F* const* d_fields,
+    const F* numbers, const F* d_numbers, F* const* made) {
+    typedef Dual<F> N;
+    const F *in[Cell::INS], *d_in[Cell::INS];
+    F number[Cell::NUMBERS], d_number[Cell::NUMBERS], *out[Cell::OUTS];
+    row.in_all<Cell::INS>(fields, is_each, in);
+    row.in_all<Cell::INS>(d_fields, is_each, d_in);
+    row.of_color<Cell::NUMBERS>(numbers, number);
+    row.of_color<Cell::NUMBERS>(d_numbers, d_number);
+    row.in_all<Cell::OUTS>(made, out);
+    INDEPENDENT
+    for (int i = 0; i < row.width; ++i) {
+        N x[Cell::INS], own[Cell::NUMBERS], y[Cell::OUTS];
+        UNROLLED
+        for (int k = 0; k < Cell::INS; ++k) x[k] = N(in[k][i], d_in[k][i]);
+        UNROLLED
+        for (int k = 0; k < Cell::NUMBERS; ++k) own[k] = N(number[k], d_number[k]);
+        Cell::find(x, own, y);
+        UNROLLED
+        for (int k = 0; k < Cell::OUTS; ++k) out[k][i] = y[k].by[0];
+    }
+}
+
+// Dual numbers with a direction for all that is given have the slopes by which cotangents `bars` of
+// what was found become those of what was given: of fields `made`, of numbers `sums` over a row.
+template <class Cell, class F> INLINE void find_cotangents(
+    const Row& row, const int* is_each, const F* const* fields, const F* numbers,
+    const F* const* bars, F* const* made, F* sums) {
+    REORDERED
+    constexpr int GIVEN = Cell::INS + Cell::NUMBERS;
+    typedef Dual<F, GIVEN> N;
+    const F *in[Cell::INS], *bar[Cell::OUTS];
+    F number[Cell::NUMBERS], sum[Cell::NUMBERS], *out[Cell::INS];
+    row.in_all<Cell::INS>(fields, is_each, in);
+    row.of_color<Cell::NUMBERS>(numbers, number);
+    row.in_all<Cell::OUTS>(bars, bar);
+    row.in_all<Cell::INS>(made, out);
+    UNROLLED
+    for (int k = 0; k < Cell::NUMBERS; ++k) sum[k] = F(0);
+    INDEPENDENT
+    for (int i = 0; i < row.width; ++i) {
+        N x[Cell::INS], own[Cell::NUMBERS], y[Cell::OUTS];
+        F found[GIVEN];
+        UNROLLED
+        for (int k = 0; k < Cell::INS; ++k) {
+            x[k] = N(in[k][i]);
+            x[k].by[k] = F(1);
+        }
+        UNROLLED
+        for (int k = 0; k < Cell::NUMBERS; ++k) {
+            own[k] = N(number[k]);
+            own[k].by[Cell::INS + k] = F(1);
+        }
+        Cell::find(x, own, y);
+        UNROLLED
+        for (int k = 0; k < GIVEN; ++k) {
+            found[k] = F(0);
+            UNROLLED
+            for (int o = 0; o < Cell::OUTS; ++o) found[k] += bar[o][i] * y[o].by[k];
+        }
+        UNROLLED
+        for (int k = 0; k < Cell::INS; ++k) out[k][i] = found[k];
+        UNROLLED
+        for (int k = 0; k < Cell::NUMBERS; ++k) sum[k] += found[Cell::INS + k];
+    }
+    UNROLLED
+    for (int k = 0; k < Cell::NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];
+}
+
+} // namespace ddrecon

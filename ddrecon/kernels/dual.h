@@ -1,0 +1,101 @@
+#pragma once
+#include "ddrecon/kernels/numbers.h"
+// Forward mode: a number and its derivatives along COUNT directions. A function written for any
+// number N, called with Dual<F>, has its tangent beside its value; with as many directions as it is
+// given numbers, it has all its slopes.
+
+namespace ddrecon {
+
+// A function of one number: its value and its slope there.
+template <class F> struct Sloped {
+    F value, slope;
+};
+
+template <class F, int COUNT = 1> struct Dual {
+    F value, by[COUNT];
+    INLINE Dual() {}
+    INLINE Dual(F value) : value(value) {
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) by[k] = F(0);
+    }
+    INLINE Dual(F value, F change) : value(value) {
+        static_assert(COUNT == 1, "one change is for one direction");
+        by[0] = change;
+    }
+    // Copied by hand: compilers then keep numbers, where they would make short vectors of them, and
+    // loops of short vectors do not become loops of long ones.
+    INLINE Dual(const Dual& o) { *this = o; }
+    INLINE Dual& operator=(const Dual& o) {
+        value = o.value;
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) by[k] = o.by[k];
+        return *this;
+    }
+    // What is `found`, with the slopes of that along this and another number.
+    INLINE Dual chain(F found, F by_this) const {
+        Dual r;
+        r.value = found;
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) r.by[k] = by_this * by[k];
+        return r;
+    }
+    INLINE Dual chain(F found, F by_this, const Dual& o, F by_other) const {
+        Dual r;
+        r.value = found;
+        UNROLLED
+        for (int k = 0; k < COUNT; ++k) r.by[k] = by_this * by[k] + by_other * o.by[k];
+        return r;
+    }
+    INLINE Dual operator-() const { return chain(-value, F(-1)); }
+    INLINE Dual operator+(const Dual& o) const { return chain(value + o.value, F(1), o, F(1)); }
+    INLINE Dual operator-(const Dual& o) const { return chain(value - o.value, F(1), o, F(-1)); }
+    INLINE Dual operator*(const Dual& o) const { return chain(value * o.value, o.value, o, value); }
+    INLINE Dual operator/(const Dual& o) const {
+        const F inverse = F(1) / o.value, quotient = value * inverse;
+        return chain(quotient, inverse, o, -quotient * inverse);
+    }
+    INLINE Dual& operator+=(const Dual& o) { return *this = *this + o; }
+    INLINE Dual& operator-=(const Dual& o) { return *this = *this - o; }
+};
+// With plain numbers, which are as well written before it.
+template <class F, int COUNT> INLINE Dual<F, COUNT> operator+(F a, const Dual<F, COUNT>& b) {
+    return b.chain(a + b.value, F(1));
+}
+template <class F, int COUNT> INLINE Dual<F, COUNT> operator-(F a, const Dual<F, COUNT>& b) {
+    return b.chain(a - b.value, F(-1));
+}
+template <class F, int COUNT> INLINE Dual<F, COUNT> operator*(F a, const Dual<F, COUNT>& b) {
+    return b.chain(a * b.value, a);
+}
+template <class F, int COUNT> INLINE Dual<F, COUNT> operator*(const Dual<F, COUNT>& a, F b) {
+    return b * a;
+}
+template <class F, int COUNT> INLINE Dual<F, COUNT> operator/(F a, const Dual<F, COUNT>& b) {
+    return Dual<F, COUNT>(a) / b;
+}
+
+// The value of a number of either kind, for comparisons; and a choice by one.
+template <class F> INLINE F value_of(F x) { return x; }
+template <class F, int COUNT> INLINE F value_of(const Dual<F, COUNT>& x) { return x.value; }
+template <class N> INLINE N pick(bool is, const N& one, const N& other) { return is ? one : other; }
+template <class F, int COUNT>
+INLINE Dual<F, COUNT> pick(bool is, const Dual<F, COUNT>& one, const Dual<F, COUNT>& other) {
+    Dual<F, COUNT> r;
+    r.value = is ? one.value : other.value;
+    UNROLLED
+    for (int k = 0; k < COUNT; ++k) r.by[k] = is ? one.by[k] : other.by[k];
+    return r;
+}
+
+// Whether numbers N have derivatives.
+template <class N> constexpr bool IS_DUAL = false;
+template <class F, int COUNT> constexpr bool IS_DUAL<Dual<F, COUNT>> = true;
+
+// What a function of one number, `found` with its slope at the value of `x`, is of x itself.
+template <class F> INLINE F along(F, const Sloped<F>& found) { return found.value; }
+template <class F, int COUNT>
+INLINE Dual<F, COUNT> along(const Dual<F, COUNT>& x, const Sloped<F>& found) {
+    return x.chain(found.value, found.slope);
+}
+
+} // namespace ddrecon

@@ -1,0 +1,142 @@
+#pragma once
+// What kernels compute with: numbers F, float or double, and functions of a depth that become
+// vector code. Included at namespace scope by Warp, for processors and for GPUs.
+
+#if defined(__CUDA_ARCH__)
+#define INLINE __device__ __forceinline__
+#define HERE
+#else
+#define INLINE inline __attribute__((always_inline))
+// The same of a lambda.
+#define HERE __attribute__((always_inline))
+#endif
+#if defined(__clang__)
+// Products are added in one instruction where the processor has one (on a GPU that is the rule).
+#pragma clang fp contract(fast)
+// First in a block: its sums have a free order, or else they would not become vector code.
+#define REORDERED _Pragma("clang fp reassociate(on)")
+// Before a loop over constants, whose arrays become registers before anything else is optimized.
+#define UNROLLED _Pragma("clang loop unroll(full)")
+#else
+#define REORDERED
+#define UNROLLED _Pragma("unroll")
+#endif
+#if defined(__clang__) && !defined(__CUDA_ARCH__)
+// Before a loop: no turn reads what another writes, which clang cannot see of many arrays.
+#define INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
+#else
+#define INDEPENDENT
+#endif
+
+namespace ddrecon {
+
+#if defined(__CUDA_ARCH__)
+constexpr bool IS_GPU = true;
+#else
+constexpr bool IS_GPU = false;
+#endif
+
+// How numbers are written, and log(2) in two parts, for `decay`; how many terms of series count.
+template <class F> struct Format;
+template <> struct Format<float> {
+    typedef int Bits;
+    static constexpr int digits = 23, terms = 8, log_terms = 6, root_bits = 0x3f3504f3;
+    static constexpr float most = 87.0f, shift = 12582912.0f;
+    static constexpr float log2_high = 0.693145751953125f, log2_low = 1.42860682030941723212e-6f;
+};
+template <> struct Format<double> {
+    typedef long long Bits;
+    static constexpr int digits = 52, terms = 14, log_terms = 11;
+    static constexpr long long root_bits = 0x3fe6a09e667f3bcd;
+    static constexpr double most = 700.0, shift = 6755399441055744.0;
+    static constexpr double log2_high = 0.693147180369123816490;
+    static constexpr double log2_low = 1.90821492927058770002e-10;
+};
+
+template <int N> constexpr double FACTORIAL = N * FACTORIAL<N - 1>;
+template <> inline constexpr double FACTORIAL<0> = 1.0;
+// Coefficients of exp(x), of psi(-x), of its slope psi'(-x), and of log((1 + s) / (1 - s)) / (2 s)
+// in s^2.
+template <int K> struct OfExp {
+    static constexpr double value = 1.0 / FACTORIAL<K>;
+};
+template <int K> struct OfPsi {
+    static constexpr double value = 1.0 / FACTORIAL<K + 2>;
+};
+template <int K> struct OfPsiSlope {
+    static constexpr double value = -(K + 1) / FACTORIAL<K + 3>;
+};
+template <int K> struct OfLog {
+    static constexpr double value = 1.0 / (2 * K + 1);
+};
+
+// TERMS of a series at x, a number or a vector of them, by Horner's rule.
+template <template <int> class Coefficient, class F, int TERMS, int K = 0, class N>
+INLINE N series(N x) {
+    constexpr F own = F(Coefficient<K>::value);
+    if constexpr (K + 1 == TERMS) {
+        return N{} + own;
+    } else {
+        return series<Coefficient, F, TERMS, K + 1>(x) * x + own;
+    }
+}
+
+// exp(-depth) = 2^n e^r with n whole and |r| < log(2) / 2. Adding and taking away `shift` rounds to
+// a whole number, whose digits are then those at the end of the sum. libm's exp is no vector code.
+// For depths from about -87 to any size, exact to the last digit but one; where it is below about
+// 1e-38 (1e-304 of doubles) it is that. What is not a number stays so.
+template <class F> INLINE F decay(F depth) {
+#if defined(__CUDA_ARCH__)
+    return exp(-depth);
+#else
+    typedef Format<F> Own;
+    typedef typename Own::Bits Bits;
+    const F x = depth > Own::most ? -Own::most : (depth < -Own::most ? Own::most : -depth);
+    const F shifted = x * F(1.4426950408889634074) + Own::shift, n = shifted - Own::shift;
+    const F r = (x - n * Own::log2_high) - n * Own::log2_low;
+    const F p = series<OfExp, F, Own::terms>(r);
+    const Bits exponent = __builtin_bit_cast(Bits, shifted) << Own::digits;
+    return __builtin_bit_cast(F, (Bits)(__builtin_bit_cast(Bits, p) + exponent));
+#endif
+}
+
+// The square root of a number that is at least 0: libm's, which tells of others, is no vector code.
+template <class F> INLINE F root(F x) {
+#if defined(__CUDA_ARCH__)
+    return sqrt(x);
+#else
+    return __builtin_elementwise_sqrt(x);
+#endif
+}
+
+// psi(d) = (1 - phi) / d with phi = (1 - exp(-d)) / d, for d from 0 to 1/2; and its derivative.
+template <class F> INLINE F psi_series(F depth) {
+    return series<OfPsi, F, Format<F>::terms>(-depth);
+}
+template <class F> INLINE F psi_slope_series(F depth) {
+    return series<OfPsiSlope, F, Format<F>::terms>(-depth);
+}
+
+// phi and psi (`numerics/decay.py`) of a depth of at least 0.
+template <class F> struct Decayed {
+    F phi, psi;
+};
+template <class F> INLINE Decayed<F> decayed(F depth) {
+    const bool is_thin = depth < F(0.5);
+    const F near_psi = psi_series(is_thin ? depth : F(0)), thick = is_thin ? F(0.5) : depth;
+    const F phi = is_thin ? F(1) - depth * near_psi : (F(1) - decay(depth)) / thick;
+    return {phi, is_thin ? near_psi : (F(1) - phi) / thick};
+}
+
+// A sum in double precision, eight at a time.
+template <class F> INLINE double total(const F* values, int count) {
+    double lanes[8] = {0, 0, 0, 0, 0, 0, 0, 0}, sum = 0;
+    int t = 0;
+    for (; t + 8 <= count; t += 8)
+        for (int i = 0; i < 8; ++i) lanes[i] += (double)values[t + i];
+    for (; t < count; ++t) sum += (double)values[t];
+    for (int i = 0; i < 8; ++i) sum += lanes[i];
+    return sum;
+}
+
+} // namespace ddrecon

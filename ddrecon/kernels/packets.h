@@ -1,0 +1,155 @@
+#pragma once
+#include "ddrecon/kernels/numbers.h"
+// Many alike items at a time: a packet of LANES runs in a processor's vector lanes. Where
+// neighboring items need values from places of their own (rays that walk through cells), a loop
+// over numbers beside each other does not do. Then every value is a vector of LANES numbers, one of
+// each item, and the code reads as that for a single item does: `a * b`, `pick(a < b, a, b)`. On a
+// GPU a packet is one item, its values are plain numbers, and a thread does it.
+
+namespace ddrecon {
+
+#if defined(__CUDA_ARCH__)
+constexpr int LANES = 1;
+#else
+constexpr int LANES = 16;
+constexpr unsigned ALL_LANES = (1u << LANES) - 1;
+#endif
+
+// V are numbers of type F, I whole numbers, W numbers in double precision; M and IM are what
+// comparisons of V and of I give.
+template <class F> struct Packets {
+    typedef Format<F> Own;
+#if defined(__CUDA_ARCH__)
+    typedef F V;
+    typedef int I;
+    typedef double W;
+    typedef bool M;
+    typedef bool IM;
+#else
+    typedef F V __attribute__((vector_size(LANES * sizeof(F))));
+    typedef int I __attribute__((vector_size(LANES * sizeof(int))));
+    typedef double W __attribute__((vector_size(LANES * sizeof(double))));
+    typedef decltype(V{} < V{}) M;
+    typedef I IM;
+    typedef bool Bits __attribute__((ext_vector_type(LANES)));
+#endif
+    static INLINE V pick(M is, V one, V other) { return is ? one : other; }
+    static INLINE I pick(IM is, I one, I other) { return is ? one : other; }
+    static INLINE V least(V a, V b) { return a < b ? a : b; }
+    static INLINE V most(V a, V b) { return a > b ? a : b; }
+#if defined(__CUDA_ARCH__)
+    static INLINE V all(F x) { return x; }
+    static INLINE I whole(V x) { return (int)x; }
+    static INLINE V real(I x) { return F(x); }
+    static INLINE W wide(V x) { return (double)x; }
+    static INLINE V narrow(W x) { return F(x); }
+    static INLINE V root(V x) { return sqrt(x); }
+    static INLINE V inverse_root(V x) { return F(1) / sqrt(x); }
+    static INLINE V size(V x) { return x < F(0) ? -x : x; }
+    static INLINE bool every(M is) { return is; }
+    static INLINE F lane(V x, int) { return x; }
+    static INLINE double lane_of(W x, int) { return x; }
+    static INLINE int lane_of(I x, int) { return x; }
+    static INLINE W load_wide(const double* p, int first, int) { return p[first]; }
+    static INLINE void put(V& x, int, F value) { x = value; }
+    static INLINE V read(const F* p) { return *p; }
+    static INLINE void write(F* p, V x) { *p = x; }
+    static INLINE V gather(const F* p, I at) { return p[at]; }
+    static INLINE void add(F* p, I at, V x) { atomicAdd(p + at, x); }
+    static INLINE V decay(V depth) { return exp(-depth); }
+    static INLINE V log(V x) { return ::log(x); }
+    static INLINE void add_one(F* p, F x) { atomicAdd(p, x); }
+#else
+    static INLINE V all(F x) { return x - V{}; }
+    static INLINE I whole(V x) { return __builtin_convertvector(x, I); }
+    static INLINE V real(I x) { return __builtin_convertvector(x, V); }
+    static INLINE W wide(V x) { return __builtin_convertvector(x, W); }
+    static INLINE V narrow(W x) { return __builtin_convertvector(x, V); }
+    static INLINE V root(V x) { return __builtin_elementwise_sqrt(x); }
+    // 1 / root of x; by a step of Newton's from 14 bits where the processor has these.
+    static INLINE V inverse_root(V x) {
+#if defined(__AVX512F__)
+        if constexpr (sizeof(V) == 64 && sizeof(F) == 4) {
+            typedef float V32 __attribute__((vector_size(64)));
+            V32 known = __builtin_bit_cast(V32, x);
+            known = __builtin_ia32_rsqrt14ps512_mask(known, known, (unsigned short)-1);
+            const V r = __builtin_bit_cast(V, known);
+            return r * (F(1.5) - F(0.5) * x * r * r);
+        }
+#endif
+        return F(1) / root(x);
+    }
+    static INLINE V size(V x) { return __builtin_elementwise_abs(x); }
+    static INLINE bool every(M is) { return __builtin_reduce_and(is) != 0; }
+    // Lanes in a mask as bits of a number, of which the first is the lowest; and back.
+    static INLINE unsigned bits_of(IM is) {
+        return __builtin_bit_cast(unsigned short, __builtin_convertvector(is, Bits));
+    }
+    static INLINE IM lanes_of(unsigned bits) { return ((I{} + (int)bits) >> numbers() & 1) != 0; }
+    static INLINE I numbers() {
+        I x;
+        for (int l = 0; l < LANES; ++l) x[l] = l;
+        return x;
+    }
+    static INLINE F lane(V x, int l) { return x[l]; }
+    static INLINE double lane_of(W x, int l) { return x[l]; }
+    static INLINE int lane_of(I x, int l) { return x[l]; }
+    static INLINE W load_wide(const double* p, int first, int last) {
+        W x;
+        for (int l = 0; l < LANES; ++l) x[l] = p[first + l < last ? first + l : last];
+        return x;
+    }
+    static INLINE void put(V& x, int l, F value) { x[l] = value; }
+    // LANES numbers beside each other.
+    static INLINE V read(const F* p) {
+        V x;
+        __builtin_memcpy(&x, p, sizeof(V));
+        return x;
+    }
+    static INLINE void write(F* p, V x) { __builtin_memcpy(p, &x, sizeof(V)); }
+    static INLINE V gather(const F* p, I at) {
+        V x;
+        for (int l = 0; l < LANES; ++l) x[l] = p[at[l]];
+        return x;
+    }
+    static INLINE void add(F* p, I at, V x) {
+        for (int l = 0; l < LANES; ++l) p[at[l]] += x[l];
+    }
+    static INLINE void add_one(F* p, F x) { *p += x; }
+    // log x = n log 2 + log m with x = 2^n m > 0 and m between the root of 1/2 and that of 2:
+    // log m = 2 (s + s^3 / 3 + s^5 / 5 + ...), where s = (m - 1) / (m + 1).
+    static INLINE V log(V x) {
+        const M bits = __builtin_bit_cast(M, x), n = (bits - Own::root_bits) >> Own::digits;
+        const V m = __builtin_bit_cast(V, bits - (n << Own::digits));
+        const V s = (m - F(1)) / (m + F(1));
+        const V p = series<OfLog, F, Own::log_terms>(s * s);
+        return F(2) * s * p + __builtin_convertvector(n, V) * F(0.69314718055994530942);
+    }
+    // exp(-depth), as that of numbers.
+    static INLINE V decay(V depth) {
+        const V end = all(Own::most);
+        const V x = pick(depth > end, -end, pick(depth < -end, end, -depth));
+        const V shifted = x * F(1.4426950408889634074) + Own::shift, n = shifted - Own::shift;
+        const V r = (x - n * Own::log2_high) - n * Own::log2_low;
+        const M p = __builtin_bit_cast(M, series<OfExp, F, Own::terms>(r));
+        return __builtin_bit_cast(V, p + (__builtin_bit_cast(M, shifted) << Own::digits));
+    }
+#endif
+    // The lanes' sum, in double precision.
+    static INLINE double sum(V x) {
+        double total = 0.0;
+        for (int l = 0; l < LANES; ++l) total += (double)lane(x, l);
+        return total;
+    }
+    // Entries first, first + step, ... of p; `last` stands for those beyond it.
+    static INLINE V load(const F* p, int first, int step, int last) {
+        V x = all(F(0));
+        for (int l = 0; l < LANES; ++l)
+            put(x, l, p[(long long)(first + l < last ? first + l : last) * step]);
+        return x;
+    }
+    // psi of depths from 0 to 1/2.
+    static INLINE V psi_series(V depth) { return series<OfPsi, F, Own::terms>(-depth); }
+};
+
+} // namespace ddrecon
