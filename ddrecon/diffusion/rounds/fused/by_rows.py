@@ -16,7 +16,6 @@ from ddrecon.diffusion.rounds.fused.rows import MARGIN, POINTERS
 from ddrecon.diffusion.rounds.fused.schedule import make_tables
 from ddrecon.diffusion.rounds.fused.surroundings import surround
 from ddrecon.diffusion.rounds.fused.swept import Parts, Swept
-from ddrecon.diffusion.rounds.fused.turned import Faces, Turned, pass_chunks
 from ddrecon.kernels.spare import borrow, give_back
 from ddrecon.kernels.text import TextKernel
 
@@ -25,15 +24,8 @@ LARGE = 2**20
 """Cells of a large volume."""
 
 
-Saved = tuple[Tensor | None, Tensor | None]
-"""What the adjoint needs: I before slabs of slices, and what has entered where cells are shared."""
-
-
 class Rows:
     """The arrays of a sweep on a processor, and the launches of kernels on them."""
-
-    KINDS: tuple[str, ...] = ("",)
-    """Before the names of what enters and leaves a slab."""
 
     def __init__(self, swept: Swept, threads: int):
         self.swept, self.like = swept, swept.like
@@ -44,14 +36,9 @@ class Rows:
         self.slab = SLABS[swept.grid.cells > LARGE]
         most = MOST_OF_FEW if self.count <= FEW else MOST
         size = self.like.element_size()
-        lanes = Lanes.that_fit(threads, self.colors, swept.grid.shape, self.count, size)
-        whole, axis, self.lanes = swept.grid, 0, lanes
-        if isinstance(swept.grid, Turned):
-            whole, axis = swept.grid.whole, swept.grid.axis
-            self.lanes = Lanes.of_colors(threads, self.colors)
-            most = min(most, swept.grid.most_together(swept.directions))
+        self.lanes = Lanes.that_fit(threads, self.colors, swept.grid.shape, self.count, size)
         self.tables = make_tables(
-            whole, swept.directions, self.count, most, self.lanes.pieces, self.like.dtype, axis
+            swept.grid, swept.directions, self.count, most, self.lanes.pieces, self.like.dtype
         )
         # slabs begin anew in the middle, where the ways meet
         low, high = self.depth // 2, self.depth - self.depth // 2
@@ -59,22 +46,21 @@ class Rows:
         self.fields, self.ranges, self.densest = surround(self._matter(), self.pitch)
         self.channels = [len(field) for field in swept.fields]
 
-    def follow(self, is_saved: bool) -> tuple[Tensor, Saved]:
+    def follow(self, is_saved: bool) -> tuple[Tensor, Tensor | None]:
         """Moments of radiance less those of light; and what `transpose` needs, if it `is_saved`.
 
         Moments are [K, C, z, y, x], and of light only the first two are taken. `transpose` needs
-        I before slabs of slices, [C, directions, slabs, y, x], and what has entered.
+        I before slabs of slices, [C, directions, slabs, y, x].
         """
         shape = self.colors, self.swept.directions, self.slabs, self.height, self.width
         saved = self.like.new_empty(shape) if is_saved else None
         sums, lines = self._sums(), self._line_count(self.height + 2)
         given, made = self._given(), {"found": sums, "saved": saved, **self._zeros(lines=lines)}
-        entered = self._launch(follow_kernel(self.bits, self._shares_field), False, given, made)
-        kept = entered[0] if is_saved and entered is not None else None
-        return (sums.sum(0) if len(sums) > 1 else sums[0]), (saved, kept)
+        self._launch(follow_kernel(self.bits, self._shares_field), False, given, made)
+        return (sums.sum(0) if len(sums) > 1 else sums[0]), saved
 
     def transpose(
-        self, saved: Saved, bars: Parts, varies_numbers: bool
+        self, saved: Tensor, bars: Parts, varies_numbers: bool
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light.
 
@@ -93,12 +79,9 @@ class Rows:
             "lines": lines, **self._zeros(returning=lanes.number * returning),
         }  # fmt: skip
         kernel = return_kernel(self.bits, self._shares_field, varies_numbers)
-        given = self._given() | {"bars": bars, "saved": saved[0], "entering": saved[1]}
-        left_bar = self._launch(kernel, True, given, made)
+        given = self._given() | {"bars": bars, "saved": saved}
+        self._launch(kernel, True, given, made)
         give_back(lines)
-        if left_bar is not None:
-            # That is of I less the inflow, with which kernels have counted it.
-            scales[0, :, 2] -= left_bar.sum((0, 2, 3, 4))
         found = sums.sum(0) if len(sums) > 1 else sums[0]
         of_fields = [
             (bar[0] if len(bar) == 1 else bar.sum(0)).sum_to_size(each, *shape)
@@ -118,10 +101,9 @@ class Rows:
         return self.lanes.number * (2 * self.tables.most * self.pitch * places + MARGIN)
 
     def _sums(self) -> Tensor:
-        """Moments for each piece; zero where no direction goes, of a piece or a slab."""
+        """Moments for each piece; zero where no direction of a piece goes."""
         shape = self.lanes.pieces, self.count, *self.like.shape
-        is_whole = self.lanes.pieces == 1 and not isinstance(self.swept.grid, Turned)
-        return self.like.new_empty(shape) if is_whole else self.like.new_zeros(shape)
+        return self.like.new_empty(shape) if shape[0] == 1 else self.like.new_zeros(shape)
 
     def _zeros(self, **sizes: int) -> dict[str, Tensor]:
         """Zeros by their names, with what kernels work in and an empty row."""
@@ -155,22 +137,10 @@ class Rows:
 
     def _launch(
         self, kernel: TextKernel, is_backward: bool, given: dict[str, Any], made: dict[str, Any]
-    ) -> Tensor | None:
-        """Does all jobs; in slabs, returns what has entered this one, [N, C, directions, y, x]."""
+    ) -> None:
+        """Does all jobs."""
         count, work = self.lanes.number, self.like.numel() * self.tables.most * self.count
-        grid = self.swept.grid
-        if isinstance(grid, Turned):
-            kinds = ("",) if is_backward else self.KINDS
-            faces = Faces.of(self.like, self.swept.directions, len(kinds))
-            end, other = ("leaving_bar", "entering_bar") if is_backward else ("entering", "leaving")
-            for kind, entered, left in zip(kinds, faces.entered, faces.left, strict=True):
-                given, made = given | {kind + end: entered}, made | {kind + other: left}
-            below, above = grid.layers
-            bound = kernel.bind(given | {"layers_below": below, "layers_above": above}, made)
-            pass_chunks(bound, grid, self.lanes, self.tables, faces, work, is_backward)
-            return faces.entered
         bound = kernel.bind(given, made)
         phase: Phase
         for phase in plan(self.lanes, self.tables.chunks, self.depth, is_backward):
             bound.launch(count, count, work, jobs=phase.jobs, starts=phase.starts)
-        return None

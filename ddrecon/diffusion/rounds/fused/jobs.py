@@ -66,12 +66,6 @@ class Lanes(NamedTuple):
     number: int
 
     @staticmethod
-    def of_colors(threads: int, colors: int) -> Lanes:
-        """A thread does a color, one way after the other."""
-        together = min(threads, colors)
-        return Lanes(colors, together, 1, together)
-
-    @staticmethod
     def of(threads: int, colors: int) -> Lanes:
         """Two threads do a color; more than all colors need share its directions."""
         together = max(1, min(threads // 2, colors))
@@ -132,34 +126,6 @@ def plan(lanes: Lanes, chunks: Chunks, depth: int, is_backward: bool) -> tuple[P
     if lanes.number == 1:
         return (Phase.of([list(chain(*chain(*parts)))]),)
     return tuple(map(Phase.of, parts))
-
-
-@functools.cache
-def plan_chunk(
-    lanes: Lanes, chunks: Chunks, way: int, number: int, slices: tuple[int, int], adds: bool
-) -> tuple[Phase, ...]:
-    """The phases in which all colors go through `slices` along a chunk of one `way`.
-
-    `lanes` are those `of_colors`. What is found is added to what there is where it `adds`.
-    """
-    (piece,) = chunks[way]
-    phases = []
-    for first in range(0, lanes.colors, lanes.together):
-        found: list[list[Job]] = [[] for _ in range(lanes.number)]
-        for lane, color in enumerate(range(first, min(first + lanes.together, lanes.colors))):
-            job = Job(
-                color, -1 if way else 1, *piece[number], *slices,
-                middle=0,
-                adds=int(adds),
-                lane=lane,
-                sums_at=way * lanes.colors + color,
-                own_bar=color,
-                shared_bar=lane,
-                piece=0,
-            )  # fmt: skip
-            found[lane].append(job)
-        phases.append(Phase.of(found))
-    return tuple(phases)
 
 
 def _part(

@@ -78,22 +78,11 @@ class Step:
         return self.signs > (0, 0, 0)
 
 
-def turn(direction: Direction, axis: int) -> Direction:
-    """`direction` where z and the array `axis` have changed places."""
-    turned = list(direction)
-    turned[0], turned[axis] = turned[axis], turned[0]
-    z, y, x = turned
-    return z, y, x
-
-
 @functools.cache
-def steps_of(grid: Grid, count: int, axis: int = 0) -> tuple[tuple[Step, float], ...]:
-    """The step along each of `count` directions, and the quadrature's weight.
-
-    Of `grid`, z is the array `axis` of the grid that directions are of, and that axis is z.
-    """
+def steps_of(grid: Grid, count: int) -> tuple[tuple[Step, float], ...]:
+    """The step along each of `count` directions through `grid`, and the quadrature's weight."""
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
-    steps = (Step.of(grid, turn(tuple(point), axis)) for point in points.tolist())
+    steps = (Step.of(grid, (z, y, x)) for z, y, x in points.tolist())
     return tuple(zip(steps, weights.tolist(), strict=True))
 
 
@@ -128,16 +117,14 @@ def make_tables(
     most: int,
     pieces: int,
     dtype: torch.dtype,
-    axis: int = 0,
 ) -> Tables:
     """The tables of `count` directions through `grid`, of light with so many `moments`.
 
-    On each way the directions are cut into chunks of about `most` at most, in `pieces`. `axis` as
-    of `steps_of`.
+    On each way the directions are cut into chunks of about `most` at most, in `pieces`.
     """
-    made = _Maker(moments, axis)
+    made = _Maker(moments)
     chunks = []
-    steps = steps_of(grid, count, axis)
+    steps = steps_of(grid, count)
     for is_up in (True, False):
         units = _pairs([each for each in steps if each[0].is_up == is_up], made.odd > 0)
         chunks.append(made.add_way(units, most, pieces))
@@ -175,8 +162,8 @@ def _pairs(steps: list[tuple[Step, float]], is_paired: bool) -> list[Unit]:
 class _Maker:
     """Tables while they are made, as lists."""
 
-    def __init__(self, moments: int, axis: int):
-        self.degree, self.axis = round(moments**0.5) - 1, axis
+    def __init__(self, moments: int):
+        self.degree = round(moments**0.5) - 1
         # A direction and its mirror image tell which harmonics are odd in x.
         odd = self._harmonics([(0.48, 0.6, 0.64)]) * self._harmonics([(0.48, 0.6, -0.64)])
         is_odd = (odd[:, 0] < 0).tolist()
@@ -240,9 +227,8 @@ class _Maker:
             self.matrices += [part.T.reshape(-1) for part in parts]
 
     def _harmonics(self, directions: list[Direction]) -> Tensor:
-        """Y_k [K, N] of `directions` as steps have them."""
-        points = [turn(direction, self.axis) for direction in directions]
-        return harmonics(torch.tensor(points, dtype=torch.float64), self.degree)
+        """Y_k [K, N] of `directions`."""
+        return harmonics(torch.tensor(directions, dtype=torch.float64), self.degree)
 
     def _add_step(self, step: Step) -> None:
         fill = POINTS - len(step.points)

@@ -45,8 +45,6 @@ def changes_of(swept: Swept, *changes: Tensor | None) -> Swept:
 class RowTangents(Rows):
     """The change of a sweep on a processor: light and its change go through the rows together."""
 
-    KINDS = ("", "d_")
-
     def __init__(self, swept: Swept, changes: Swept, threads: int):
         self.changes = changes
         super().__init__(swept, threads)
