@@ -16,7 +16,7 @@ from ddrecon.diffusion.rounds.fused.swept import (
     split,
     units_of_parts,
 )
-from ddrecon.diffusion.rounds.fused.tangents import CellTangents, RowTangents, changes_of
+from ddrecon.diffusion.rounds.fused.tangents import CellTangents, changes_of
 from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
@@ -152,11 +152,10 @@ class _Sweep(torch.autograd.Function):
             swept = Swept.of(*ctx.of, *values)
             d_swept = changes_of(swept, *d_values)
             swept = swept.spelled()
-            tangents = (
-                CellTangents(swept, d_swept)
-                if ctx.by_cells
-                else RowTangents(swept, d_swept, ctx.threads)
-            )
-            return split(d_swept.less_light(tangents.change()))
+            if ctx.by_cells:
+                changed = CellTangents(swept, d_swept).change()
+            else:
+                changed, _ = Rows(swept, ctx.threads, d_swept).follow()
+            return split(d_swept.less_light(changed))
 
         return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None
