@@ -64,9 +64,9 @@ def engine_of_parts(in_torch: Collection[str] = ()) -> dict[str, str]:
 def has_kernels(part: str, is_on_gpu: bool, has_slabs: bool = False) -> bool:
     """Whether warp has kernels for `part` on such a device, of whole grids or in slabs.
 
-    On a GPU multigrid is torch's, and kernels sweep whole grids alone.
+    On a GPU multigrid is torch's; sweeps go through whole grids alone.
     """
-    return not is_on_gpu or (part != "diffusion" and not (part == "transport rounds" and has_slabs))
+    return not (is_on_gpu if part == "diffusion" else part == "transport rounds" and has_slabs)
 
 
 def name_engines(engines: Mapping[str, str]) -> str:

@@ -67,6 +67,9 @@ template <class F, int COUNT> INLINE Dual<F, COUNT> operator-(F a, const Dual<F,
 template <class F, int COUNT> INLINE Dual<F, COUNT> operator*(F a, const Dual<F, COUNT>& b) {
     return b.chain(a * b.value, a);
 }
+template <class F, int COUNT> INLINE Dual<F, COUNT> operator*(const Dual<F, COUNT>& a, F b) {
+    return b * a;
+}
 template <class F, int COUNT> INLINE Dual<F, COUNT> operator/(F a, const Dual<F, COUNT>& b) {
     return Dual<F, COUNT>(a) / b;
 }
@@ -83,6 +86,10 @@ INLINE Dual<F, COUNT> pick(bool is, const Dual<F, COUNT>& one, const Dual<F, COU
     for (int k = 0; k < COUNT; ++k) r.by[k] = is ? one.by[k] : other.by[k];
     return r;
 }
+
+// Whether numbers N have derivatives.
+template <class N> constexpr bool IS_DUAL = false;
+template <class F, int COUNT> constexpr bool IS_DUAL<Dual<F, COUNT>> = true;
 
 // What a function of one number, `found` with its slope at the value of `x`, is of x itself.
 template <class F> INLINE F along(F, const Sloped<F>& found) { return found.value; }

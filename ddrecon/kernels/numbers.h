@@ -30,6 +30,12 @@
 
 namespace ddrecon {
 
+#if defined(__CUDA_ARCH__)
+constexpr bool IS_GPU = true;
+#else
+constexpr bool IS_GPU = false;
+#endif
+
 // How numbers are written, and log(2) in two parts, for `decay`; how many terms of series count.
 template <class F> struct Format;
 template <> struct Format<float> {
@@ -91,6 +97,15 @@ template <class F> INLINE F decay(F depth) {
     const F p = series<OfExp, F, Own::terms>(r);
     const Bits exponent = __builtin_bit_cast(Bits, shifted) << Own::digits;
     return __builtin_bit_cast(F, (Bits)(__builtin_bit_cast(Bits, p) + exponent));
+#endif
+}
+
+// The square root of a number that is at least 0: libm's, which tells of others, is no vector code.
+template <class F> INLINE F root(F x) {
+#if defined(__CUDA_ARCH__)
+    return sqrt(x);
+#else
+    return __builtin_elementwise_sqrt(x);
 #endif
 }
 

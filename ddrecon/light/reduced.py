@@ -17,10 +17,10 @@ from ddrecon.light.lights import AmbientLight, DirectionalLight, PointLight
 from ddrecon.light.moments import Moments, beam_moments
 from ddrecon.light.pairs import TurnedBeam, follow_pair
 from ddrecon.light.point_light import PointBeam, follow_point_light
+from ddrecon.light.shear import is_fused_whole
 from ddrecon.light.sky import Source
 from ddrecon.medium.coefficients import Medium
 from ddrecon.medium.remaining import remaining_moments
-from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.remember import remember
 
 
@@ -74,7 +74,9 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
         i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
     }
     is_even = directional and not medium.is_cellwise
-    if is_even and is_fused(*(light.direction for light in directional.values())):
+    if is_even and is_fused_whole(
+        medium.grid, *(light.direction for light in directional.values())
+    ):
         from ddrecon.light.fused.beams import follow_beams
 
         found, moments = follow_beams(medium, list(directional.values()), degree > 0)
@@ -94,7 +96,7 @@ def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> Re
 def _follow(
     medium: Medium, light: DirectionalLight | PointLight, degree: int
 ) -> tuple[Beam | PointBeam, Moments]:
-    if isinstance(light, DirectionalLight) and is_fused(light.direction):
+    if isinstance(light, DirectionalLight) and is_fused_whole(medium.grid, light.direction):
         from ddrecon.light.fused.beams import follow_beams
 
         (beam,), received = follow_beams(medium, [light], has_flux=False)

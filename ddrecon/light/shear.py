@@ -16,7 +16,6 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.numerics.autodiff import is_fused, recompute
-from ddrecon.numerics.running_sum import running_sum
 from ddrecon.numerics.separable import Weights, sample_lattice
 from ddrecon.numerics.slicing import Slicing, across
 from ddrecon.numerics.third_order import ThirdOrder
@@ -39,7 +38,7 @@ def sum_mass_to_cells(
     between slices, and its mass is carried back to cells to third order: the two corrections.
     Returns `[K, z, y, x]` and a scalar.
     """
-    if is_fused(direction):
+    if is_fused_whole(grid, direction):
         from ddrecon.light.fused.sum_mass import sum_mass
 
         return sum_mass(field, grid, direction, bound)
@@ -52,6 +51,11 @@ def sum_mass_to_cells(
         return sum_one(field, grid, direction, bound)
     each = [recompute(sum_one, one, grid, direction, bound) for one in field.split(1)]
     return torch.cat([entered for entered, _ in each]), each[0][1]
+
+
+def is_fused_whole(grid: Grid, *directions: Tensor) -> bool:
+    """Whether fused kernels follow beams along `directions`; in slabs they do not."""
+    return not isinstance(grid, Slab) and is_fused(*directions)
 
 
 def _sum_mass(
@@ -94,9 +98,9 @@ def mass_passed(
     """
     # Trapezoids over half steps are more than those over whole ones by
     # (step / 2) sum over j < k of (rho_(j + 1/2) - (rho_j + rho_(j + 1)) / 2).
-    bent = running_sum(torch.cat([torch.zeros_like(on_slices[:1]), bends]))
+    bent = torch.cat([torch.zeros_like(on_slices[:1]), bends]).cumsum(0)
     # The mass of all slices passed: step sum over j < k of rho_j.
-    passed = running_sum(on_slices) - on_slices
+    passed = on_slices.cumsum(0) - on_slices
     if before is not None:
         passed, bent = passed + before[0], bent + before[1]
     return passed * step + third_order.bounded(bent * (0.5 * step))

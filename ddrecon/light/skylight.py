@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.light.moments import Moments, Vector
-from ddrecon.light.shear import sum_mass_to_cells
+from ddrecon.light.shear import is_fused_whole, sum_mass_to_cells
 from ddrecon.light.sky import Sky
 from ddrecon.medium.coefficients import Medium
-from ddrecon.numerics.autodiff import is_fused, is_varied, recompute
+from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.harmonics import harmonics
 from ddrecon.numerics.quadrature import sphere_quadrature
 
@@ -35,7 +35,7 @@ def sum_unscattered_sky(medium: Medium, lights: Sequence[object], degree: int) -
     as going along its middle (E17).
     """
     skies = _lit_skies(lights)
-    if skies and is_fused(*(sky.travel for sky in skies)):
+    if skies and is_fused_whole(medium.grid, *(sky.travel for sky in skies)):
         from ddrecon.light.fused.beams import attenuate
 
         weights = torch.cat([_moment_weights(sky, degree) for sky in skies])
@@ -102,7 +102,7 @@ def _attenuate_direction(medium: Medium, direction: Tensor, weights: Tensor) -> 
 
     tau is averaged over each cell.
     """
-    if len(weights) == 1 and is_fused(direction):
+    if len(weights) == 1 and is_fused_whole(medium.grid, direction):
         from ddrecon.light.fused.beams import attenuate
 
         return attenuate(medium, direction[None], weights[None])[0].mean[None]

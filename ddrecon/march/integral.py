@@ -28,11 +28,10 @@ from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
 from ddrecon.numerics.decay import decayed_sum
 from ddrecon.numerics.nodes import Nodes
-from ddrecon.numerics.running_sum import running_sum
 from ddrecon.settings import RenderSettings
 from ddrecon.slabs.slab import Slab, whole_of
 
-CHUNK_NODES = 1 << 18
+CHUNK_NODES = 1 << 17
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and
 memory does not grow with pixels.
 """
@@ -201,7 +200,7 @@ def integrate_segments(
     scale = emission.extinction.scale.view(-1, 1).expand(emission.colors, 1)
     # scale times mass is depth: of each segment, and from the camera to where it begins and ends.
     mass = nodes.integral(at_nodes.extinction)
-    own = end = running_sum(mass)
+    own = end = mass.cumsum(0)
     if front is not None:
         end = end + front
     begin = end - mass

@@ -17,12 +17,6 @@ from torch.autograd.graph import saved_tensors_hooks
 from ddrecon.engine import current_engine
 
 T = TypeVar("T")
-_GRID_SAMPLE_BACKWARD = {
-    4: torch.ops.aten.grid_sampler_2d_backward,
-    5: torch.ops.aten.grid_sampler_3d_backward,
-}
-_BILINEAR, _BORDER = 0, 1
-"""How these call interpolation and the padding that repeats the outermost cells."""
 
 
 def is_varied(tensor: Tensor) -> bool:
@@ -146,19 +140,6 @@ def _refuse_graph() -> None:
         raise NotImplementedError(
             "create_graph=True: only first derivatives of light are implemented"
         )
-
-
-def grid_sample_adjoint(
-    output_bar: Tensor, values: Tensor, points: Tensor, needs: tuple[bool, bool]
-) -> tuple[Tensor, Tensor]:
-    """The backward pass of torch's `grid_sample`: cotangents of `values` and `points`.
-
-    For linear interpolation with the outermost cells repeated. `needs`: which of both are wanted.
-    """
-    cotangents: tuple[Tensor, Tensor] = _GRID_SAMPLE_BACKWARD[values.ndim](
-        output_bar.contiguous(), values, points, _BILINEAR, _BORDER, False, list(needs)
-    )
-    return cotangents
 
 
 def recompute(function: Callable[..., T], *arguments: object) -> T:

@@ -1,7 +1,7 @@
 """Linear interpolation in slices and volumes, differentiable in reverse and in forward mode.
 
-torch's `grid_sample` has no forward mode; it is added here. And where points lie on cells' centers
-its slope is that of the side that rounding picks; here it is the mean of both, as central
+torch's `grid_sample` has no forward mode: there cells are gathered. And where points lie on cells'
+centers its slope is that of the side that rounding picks; here it is the mean of both, as central
 differences have it.
 
 Coordinates are in torch's convention: -1 and 1 are the outer faces of the first and last cell
@@ -10,16 +10,15 @@ Coordinates are in torch's convention: -1 and 1 are the outer faces of the first
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from ddrecon.numerics.autodiff import grid_sample_adjoint, keep
+from ddrecon.numerics.autodiff import is_forward
 from ddrecon.numerics.third_order import (
     ThirdOrder,
     kink_width,
+    ramp,
     second_difference,
     subtract_correction,
     third_order_weight,
@@ -68,71 +67,51 @@ def _interpolate(values: Tensor, points: Tensor, third_order: ThirdOrder | None)
 
 
 def _sample(values: Tensor, points: Tensor) -> Tensor:
-    sampled: Tensor = _Sample.apply(values, points)
-    return sampled
-
-
-class _Sample(torch.autograd.Function):
-    """torch's `grid_sample`, with forward mode and slopes that are the mean of both sides'."""
-
-    @staticmethod
-    def forward(values: Tensor, points: Tensor) -> Tensor:
-        return _grid_sample(values, points)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        values, points = inputs
-        keep(ctx, values, points)
-
-    @staticmethod
-    def backward(ctx: Any, output_bar: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        values, points = ctx.saved_tensors
-        values_bar = points_bar = None
-        if ctx.needs_input_grad[0]:
-            values_bar = grid_sample_adjoint(output_bar, values, points, (True, False))[0]
-        if ctx.needs_input_grad[1]:
-            points_bar = _points_bar(output_bar, values, points)
-        return values_bar, points_bar
-
-    @staticmethod
-    def jvp(ctx: Any, d_values: Tensor | None, d_points: Tensor | None) -> Tensor:
-        values, points = ctx.saved_tensors
-        d_output = values.new_zeros(values.shape[:2] + points.shape[1:-1])
-        # The values enter linearly.
-        if d_values is not None:
-            d_output = d_output + _grid_sample(d_values, points)
-        # The slope of one channel is what the backward pass gives for a cotangent of 1 there.
-        if d_points is not None:
-            for channel in range(values.shape[1]):
-                one = torch.zeros_like(d_output)
-                one[:, channel] = 1
-                d_output[:, channel] += (_points_bar(one, values, points) * d_points).sum(-1)
-        return d_output
+    """Multilinear values `[N, K, ...]` of `values` [N, K, sizes] at `points` [N, ..., axes]."""
+    if is_forward():
+        return _gather(values, points)
+    sampled = _grid_sample(values, points)
+    if not points.requires_grad:
+        return sampled
+    # Where points lie on kinks, those a little to both sides, along the axes on which they do.
+    sizes = points.new_tensor(values.shape[:1:-1])
+    place = ((points.detach() + 1) * sizes - 1) / 2
+    near = kink_width(points, 1) * sizes
+    is_on_kink = (place - place.round()).abs() < near
+    if not bool(is_on_kink.any()):
+        return sampled
+    shift = is_on_kink * (4 * near / sizes)
+    sides = [_grid_sample(values, points + way * shift) for way in (-1, 1)]
+    beside = 0.5 * (sides[0] + sides[1])
+    return beside + (sampled - beside).detach()
 
 
 def _grid_sample(values: Tensor, points: Tensor) -> Tensor:
     return grid_sample(values, points, mode="bilinear", padding_mode="border", align_corners=False)
 
 
-def _points_bar(output_bar: Tensor, values: Tensor, points: Tensor) -> Tensor:
-    """The cotangent of `points`: where one lies on a kink, the mean of those on both sides."""
-    cotangents = [
-        grid_sample_adjoint(output_bar, values, side, (False, True))[1]
-        for side in _sides(values, points)
+def _gather(values: Tensor, points: Tensor) -> Tensor:
+    """The same corner by corner: the nearest cell along each axis, and both beside it."""
+    sizes, shape = values.shape[2:], points.shape[1:-1]
+    corners = [
+        (torch.zeros_like(points[..., 0], dtype=torch.long), torch.ones_like(points[..., 0]))
     ]
-    return torch.stack(cotangents).mean(0)
-
-
-def _sides(values: Tensor, points: Tensor) -> tuple[Tensor, ...]:
-    """`points`; where some lie on kinks, cells' centers along some axis, a little to both sides.
-
-    They are shifted along the axes on which they do.
-    """
-    sizes = points.new_tensor(values.shape[:1:-1])
-    place = ((points + 1) * sizes - 1) / 2
-    near = kink_width(points, 1) * sizes
-    is_on_kink = (place - place.round()).abs() < near
-    if not bool(is_on_kink.any()):
-        return (points,)
-    shift = is_on_kink * (4 * near / sizes)
-    return points - shift, points + shift
+    for size, coordinate in zip(sizes, points.unbind(-1)[::-1], strict=True):
+        place, width = ((coordinate + 1) * size - 1) / 2, kink_width(points, size)
+        nearest = place.detach().round().clamp(0, size - 1)
+        # How far on the way to it, and from it.
+        come = ramp(place - nearest + 1, width)
+        gone = ramp(place - nearest, width)
+        weights = 1 - come, come - gone, gone
+        cells = [(nearest.long() + side).clamp(0, size - 1) for side in (-1, 0, 1)]
+        corners = [
+            (size * number + cell, factor * weight)
+            for number, factor in corners
+            for cell, weight in zip(cells, weights, strict=True)
+        ]
+    flat = values.flatten(2)
+    return sum(
+        flat.gather(2, number.flatten(1)[:, None].expand(-1, flat.shape[1], -1)).unflatten(2, shape)
+        * weight[:, None]
+        for number, weight in corners
+    )

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.numerics.autodiff import is_varied
 from ddrecon.numerics.third_order import (
     ThirdOrder,
     kink_width,
+    ramp,
     second_difference,
     subtract_correction,
     third_order_weight,
@@ -101,15 +101,3 @@ def _linear(coordinate: Tensor, size: int, fades: bool) -> Tensor:
         ends = torch.ones_like(place)[..., None]
         passed = torch.cat([ends, passed, 0 * ends], -1)
     return passed[..., :-1] - passed[..., 1:]
-
-
-def ramp(place: Tensor, tolerance: float) -> Tensor:
-    """`place` held within 0 and 1, with the mean slope 1/2 within `tolerance` of a kink."""
-    if not is_varied(place):
-        return place.clamp(0, 1)
-    held = place.detach()
-    is_near = (held > -tolerance) & (held < 1 + tolerance)
-    is_inside = (held > tolerance) & (held < 1 - tolerance)
-    slope = 0.5 * (is_near.to(place.dtype) + is_inside.to(place.dtype))
-    # The second term is 0 and has the slope.
-    return held.clamp(0, 1) + slope * (place - held)

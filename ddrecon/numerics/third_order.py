@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ddrecon.numerics.autodiff import is_varied
+
 KINK = 16
 """Within so many units in the last place, of a coordinate counted in cells, a point counts as lying
 on a cell's center.
@@ -74,6 +76,18 @@ def second_difference(values: Tensor, axis: int) -> Tensor:
 def kink_width(place: Tensor, size: int) -> float:
     """How near to a kink, in cells, a coordinate counted in `size` cells counts as lying on it."""
     return float(KINK * torch.finfo(place.dtype).eps * size)
+
+
+def ramp(place: Tensor, tolerance: float) -> Tensor:
+    """`place` held within 0 and 1, with the mean slope 1/2 within `tolerance` of a kink."""
+    if not is_varied(place):
+        return place.clamp(0, 1)
+    held = place.detach()
+    is_near = (held > -tolerance) & (held < 1 + tolerance)
+    is_inside = (held > tolerance) & (held < 1 - tolerance)
+    slope = 0.5 * (is_near.to(place.dtype) + is_inside.to(place.dtype))
+    # The second term is 0 and has the slope.
+    return held.clamp(0, 1) + slope * (place - held)
 
 
 def third_order_weight(coordinate: Tensor, size: int) -> Tensor:

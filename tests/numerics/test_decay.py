@@ -1,7 +1,4 @@
-"""Exponential decay over a segment: closed forms, quadrature, and rounding at every depth.
-
-Its derivatives are those of the plain formulas: `test_by_hand.py`.
-"""
+"""Exponential decay over a segment: closed forms, quadrature, and rounding at every depth."""
 
 from __future__ import annotations
 

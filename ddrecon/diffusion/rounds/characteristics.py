@@ -7,23 +7,23 @@ centers; depth and scattering depth of the step are those of the mean of its end
 into the ray is linear in depth between them. Radiance is never negative where that is not, and a
 white furnace is exact.
 
-All steps are computed at once, but for the recurrence I_k = passed_k I_{k-1} + source_k, which is
-differentiated by hand in both modes.
+All steps are computed at once, but for the recurrence I_k = passed_k I_{k-1} + source_k. In a slab
+of the grid, light comes from one neighbor and leaves for the other (E48).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Coefficient, Medium
-from ddrecon.numerics.autodiff import keep
 from ddrecon.numerics.decay import decayed_line
 from ddrecon.numerics.slicing import Slicing, across
+from ddrecon.slabs.slab import Slab, whole_of
 
 SLICES, ROWS, COLUMNS = 0, 2, 3
 """Dimensions of arrays laid out for a course: [slices, C, rows, columns]."""
@@ -67,6 +67,12 @@ class Course:
         """The inverse of `lay`."""
         return values.permute([self.order.index(dim) for dim in range(4)])
 
+    def way_along(self, axis: int) -> int:
+        """1 where light goes up along the grid's `axis`, -1 where down, 0 where neither."""
+        speed = {SLICES: self.forward, ROWS: self.drift[0], COLUMNS: self.drift[1]}
+        along = speed[self.order.index(1 + axis)]
+        return (along > 0) - (along < 0)
+
     def before(self, values: Tensor, is_repeated: bool) -> Tensor:
         """`values` where rays were one slice earlier.
 
@@ -78,17 +84,37 @@ class Course:
 
 
 def radiance_along(
-    medium: Medium, scatters: Tensor, inflow: Tensor | None, direction: Direction
+    medium: Medium,
+    scatters: Tensor,
+    inflow: Tensor | None,
+    direction: Direction,
+    entering: Tensor | None = None,
 ) -> Tensor:
     """I [C, z, y, x] at cell centers along `direction`, of what `scatters` into it (E11).
 
     `direction`: the unit vector of travel (array order); `scatters` [C, z, y, x]: q, of which
     `medium` adds (1 - f) kappa_s a unit length; `inflow` [C, 1, 1, 1]: the radiance that enters the
-    box, None for none.
+    box, None for none. In a slab it is I in its own cells; `entering` is the layer of I before
+    these, less the `inflow`, as the neighbor has it.
     """
-    course = Course.of(medium.grid, direction)
-    gained = course.lift(follow(*step_along(medium, scatters, inflow, course), course))
-    return gained if inflow is None else gained + inflow
+    grid = medium.grid
+    course = Course.of(whole_of(grid), direction)
+    passed, source = step_along(medium, scatters, inflow, course)
+    if not isinstance(grid, Slab):
+        gained = course.lift(follow(passed, source, course))
+        return gained if inflow is None else gained + inflow
+    dim, way = course.order.index(1 + grid.axis), course.way_along(grid.axis)
+    passed, source = (part.narrow(dim, grid.halo[0], grid.size) for part in (passed, source))
+    if way and entering is not None:
+        # One layer more, of which nothing passes and to which is added what is there.
+        layer = course.lay(entering)
+        more = torch.zeros_like(layer[:, : passed.shape[1]]), layer
+        passed, source = (
+            torch.cat([first, own][::way], dim)
+            for first, own in zip(more, (passed, source), strict=True)
+        )
+    found = follow(passed, source, course).narrow(dim, int(way > 0), grid.size)
+    return course.lift(found) if inflow is None else course.lift(found) + inflow
 
 
 def step_along(
@@ -123,8 +149,19 @@ def follow(passed: Tensor, source: Tensor, course: Course) -> Tensor:
     `[slices, C, rows, columns]`; I is zero before the first slice and beyond the faces of the box.
     `passed` may have one channel where `source` has C.
     """
-    radiance: Tensor = _Follow.apply(passed, source, course)
-    return radiance
+    rows, columns = course.drift
+    # A row and a column of zeros where light comes from.
+    zeros = int(columns > 0), int(columns < 0), int(rows > 0), int(rows < 0)
+    radiance, arriving = [], torch.zeros_like(source[0])
+    for share, more in list(zip(passed.unbind(), source.unbind(), strict=True))[:: course.forward]:
+        radiance.append(torch.addcmul(more, share, arriving))
+        arriving = pad(radiance[-1], zeros)
+        for dim, drift in ((1, rows), (2, columns)):
+            if drift:
+                low, high = (arriving.narrow(dim, i, more.shape[dim]) for i in (0, 1))
+                here, behind = (high, low) if drift > 0 else (low, high)
+                arriving = torch.lerp(here, behind, abs(drift))
+    return torch.stack(radiance[:: course.forward])
 
 
 def _step_integral(coefficient: Coefficient, course: Course) -> Tensor:
@@ -153,98 +190,3 @@ def _interpolate_upstream(values: Tensor, dim: int, drift: float, is_repeated: b
     lower, upper = (longer.narrow(dim, start, values.shape[dim]) for start in (0, 1))
     behind, here = (lower, upper) if drift > 0 else (upper, lower)
     return behind if abs(drift) == 1 else torch.lerp(here, behind, abs(drift))
-
-
-class _Follow(torch.autograd.Function):
-    """With P for the move from one slice to the next, I_k = passed_k P I_{k-1} + source_k.
-
-    The adjoint is the same recurrence backward along the rays,
-    source_bar_k = I_bar_k + P^T (passed_{k+1} source_bar_{k+1}), and
-    passed_bar_k = source_bar_k P I_{k-1}.
-    """
-
-    @staticmethod
-    def forward(passed: Tensor, source: Tensor, course: Course) -> Tensor:
-        return _recur(passed, source, course)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        passed, _, ctx.course = inputs
-        keep(ctx, passed, output)
-
-    @staticmethod
-    def backward(ctx: Any, out_bar: Tensor) -> tuple[Tensor, Tensor, None]:
-        passed, out = ctx.saved_tensors
-        source_bar = _recur_transposed(passed, out_bar, ctx.course)
-        passed_bar = source_bar * ctx.course.before(out, is_repeated=False)
-        if passed.shape != out.shape:
-            passed_bar = passed_bar.sum(1, keepdim=True)
-        return passed_bar, source_bar, None
-
-    @staticmethod
-    def jvp(ctx: Any, d_passed: Tensor | None, d_source: Tensor | None, _: None) -> Tensor:
-        passed, out = ctx.saved_tensors
-        # dI_k = passed_k P dI_{k-1} + (dsource_k + dpassed_k P I_{k-1})
-        change = torch.zeros_like(out) if d_source is None else d_source
-        if d_passed is not None:
-            change = change + d_passed * ctx.course.before(out, is_repeated=False)
-        return _recur(passed, change, ctx.course)
-
-
-def _recur(passed: Tensor, source: Tensor, course: Course) -> Tensor:
-    out, arriving = torch.empty_like(source), torch.zeros_like(source[0])
-    shift = _Shift(source[0], course.drift)
-    for k in _slice_order(len(source), course.forward):
-        torch.addcmul(source[k], passed[k], arriving, out=out[k])
-        arriving = shift.apply(out[k])
-    return out
-
-
-def _recur_transposed(passed: Tensor, out_bar: Tensor, course: Course) -> Tensor:
-    """The adjoint of `_recur` with respect to its source: the same rays, followed backward."""
-    source_bar, returning = torch.empty_like(out_bar), torch.zeros_like(out_bar[0])
-    shift = _Shift(out_bar[0], (-course.drift[0], -course.drift[1]))
-    for k in _slice_order(len(out_bar), -course.forward):
-        torch.add(out_bar[k], returning, out=source_bar[k])
-        returning = shift.apply(source_bar[k] * passed[k])
-    return source_bar
-
-
-def _slice_order(count: int, forward: int) -> range:
-    return range(count) if forward > 0 else range(count - 1, -1, -1)
-
-
-class _Shift:
-    """`_interpolate_upstream` along rows and columns of a slice, with zeros beyond the edges.
-
-    Slices are many and small, so the same buffers serve all of them. A slice v is copied into a
-    frame of zeros one row and one column larger, on the side from which light comes. For a drift
-    along the rows that is positive:
-
-        padded     row 0     0  0  0        here   = padded[1:]    (v itself)
-                   row 1     v0 v0 v0       behind = padded[:-1]   (the row before)
-                   row 2     v1 v1 v1       lerp(here, behind, drift): v where light was
-
-    A negative drift has the zeros last, and `here` and `behind` change places. Columns follow
-    likewise, from the result of the rows.
-    """
-
-    def __init__(self, like: Tensor, drift: tuple[float, float]):
-        channels, height, width = like.shape
-        self.weights = abs(drift[0]), abs(drift[1])
-        padded = like.new_zeros(channels, height + 1, width + 1)
-        self.rows_moved = like.new_empty(channels, height, width + 1)
-        self.result = torch.empty_like(like)
-        # where v itself begins: after the zeros if light comes from lower rows or columns
-        top, left = int(drift[0] > 0), int(drift[1] > 0)
-        self.inner = padded[:, top : top + height, left : left + width]
-        self.rows_here = padded[:, top : top + height]
-        self.rows_behind = padded[:, 1 - top : 1 - top + height]
-        self.columns_here = self.rows_moved[:, :, left : left + width]
-        self.columns_behind = self.rows_moved[:, :, 1 - left : 1 - left + width]
-
-    def apply(self, values: Tensor) -> Tensor:
-        """`values` where rays were one slice earlier; the same buffer at every call."""
-        self.inner.copy_(values)
-        torch.lerp(self.rows_here, self.rows_behind, self.weights[0], out=self.rows_moved)
-        return torch.lerp(self.columns_here, self.columns_behind, self.weights[1], out=self.result)

@@ -15,8 +15,6 @@ from torch import Tensor
 
 from ddrecon.grid import Grid
 from ddrecon.kernels.text import TextKernel
-from ddrecon.light.fused import shear_adjoint_code as adjoint_code
-from ddrecon.light.fused import shear_code as code
 from ddrecon.numerics.slicing import Slicing, across
 
 BLOCK = 256
@@ -82,80 +80,112 @@ class Sum:
 
     Row `light` of `numbers` [L, 4] holds the beam's slope by rows and by columns, its path in a
     slice [u] and the bound of corrections. `entered` is laid out as the field is. Only where it
-    `has_adjoint` what that needs is kept. `before` [2, K, rows, columns]: sums along rays of what
-    lies before the first slice, of the field and of its bends; `before_bar` their cotangent.
+    `has_adjoint` what that needs is kept.
     """
 
     def __init__(
-        self,
-        shear: Shear,
-        laid: Tensor,
-        numbers: Tensor,
-        light: int,
-        has_adjoint: bool = False,
-        before: Tensor | None = None,
+        self, shear: Shear, laid: Tensor, numbers: Tensor, light: int, has_adjoint: bool = False
     ):
         self.shear, self.laid = shear, laid
-        self.kernels = shear_kernels(laid.element_size() * 8)
         self.entered = torch.empty_like(laid)
         windows = laid.new_empty(1 + has_adjoint, len(laid) * shear.window)
-        self.masses, self.refinements = windows[0], windows[-1]
+        self.masses, self.corrections = windows[0], windows[-1]
         self.given = shear.record | {"light": light, "numbers": numbers, "field": laid}
-        self.given |= {"channels": len(laid), "before": before}
-        self.before = before
-        self.before_bar: Tensor | None = None
+        made = {"masses": self.masses, "corrections": self.corrections if has_adjoint else None}
+        kernels = shear_kernels(laid.element_size() * 8)
         rays, cells = shear.items(laid)
-        made = {"masses": self.masses, "refinements": self.refinements if has_adjoint else None}
-        self.kernels.rays.launch(rays, self.given, made)
-        self.kernels.cells.launch(cells, self.given | made, {"entered": self.entered})
+        kernels.sum_along_rays.launch(rays, self.given, made)
+        kernels.carry_to_cells.launch(cells, self.given | made, {"entered": self.entered})
 
     def adjoint(self, entered_bar: Tensor, field_bar: Tensor, varies: bool) -> Tensor | None:
         """The cotangent [4] of the beam's numbers, if it `varies`; adds to that of the field.
 
         To be called once. All cotangents are laid out as the field is.
         """
-        rays, cells = self.shear.items(self.laid)
-        counts = {"by_cells": cells, "by_rays": rays, "by_field": cells}
-        sums = {
-            name: self.laid.new_zeros(4 * count * varies, dtype=torch.float64)
-            for name, count in counts.items()
-        }
+        kernels, (rays, cells) = (
+            shear_kernels(self.laid.element_size() * 8),
+            self.shear.items(self.laid),
+        )
+        steps = (kernels.carry_back, cells), (kernels.sum_back, rays), (kernels.look_back, cells)
         given = self.given | {"varies": varies, "entered_bar": entered_bar}
-        made = sums | {"masses": self.masses, "refinements": self.refinements}
-        if self.before is not None:
-            made["before_bar"] = self.before_bar = torch.zeros_like(self.before)
-        made |= {"corrections_bar": torch.empty_like(entered_bar), "field_bar": field_bar}
-        self.kernels.cells_adjoint.launch(cells, given, made)
-        self.kernels.rays_adjoint.launch(rays, given, made)
-        self.kernels.field_adjoint.launch(cells, given, made)
-        if not varies:
-            return None
-        return torch.stack([each.view(-1, 4).sum(0) for each in sums.values()]).sum(0)
+        made = {"masses": self.masses, "corrections": self.corrections, "field_bar": field_bar}
+        made["corrections_bar"] = torch.empty_like(entered_bar)
+        found = self.laid.new_zeros(4, dtype=torch.float64)
+        for kernel, items in steps:
+            sums = found.new_zeros(items * varies, 4)
+            kernel.launch(items, given, made | {"sums": sums})
+            found += sums.sum(0)
+        return found if varies else None
 
 
-_GIVEN = """
-int slices, height, width, rows, columns, first_row, first_column, start, slice_stride, row_stride;
-int window_slice_stride, window_row_stride, is_slices_first, light, varies, first_slice, channels;
-F *numbers, *field, *entered, *masses, *refinements, *entered_bar, *corrections_bar, *field_bar;
-F *before, *after, *before_bar, *after_bar;
-double *by_cells, *by_rays, *by_field
+def change_sum(
+    shear: Shear,
+    light: int,
+    field: Tensor,
+    d_field: Tensor | None,
+    numbers: Tensor,
+    d_numbers: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """The mass up to where beam number `light` enters cells [K, z, y, x], and its change.
+
+    Of `d_numbers` that of the bound counts.
+    """
+    laid = _with_change(shear.lay(field), None if d_field is None else shear.lay(d_field))
+    kernels, (rays, cells) = shear_kernels(laid.element_size() * 8), shear.items(field)
+    numbers = _with_change(numbers, d_numbers)
+    given = shear.record | {"light": light, "numbers": numbers, "field": laid}
+    masses, entered = laid.new_empty(2 * len(laid) * shear.window), torch.empty_like(laid)
+    kernels.sum_along_rays_tangent.launch(rays, given, {"masses": masses})
+    kernels.carry_to_cells_tangent.launch(cells, given | {"masses": masses}, {"entered": entered})
+    value, change = (shear.lift(each.contiguous()) for each in entered.unbind(-1))
+    return value, change
+
+
+def _with_change(value: Tensor, change: Tensor | None) -> Tensor:
+    """Dual numbers [..., 2]."""
+    return torch.stack([value, torch.zeros_like(value) if change is None else change], -1)
+
+
+_HEADER = "light/fused/shear.h"
+_SLICES = (
+    "slices, height, width, rows, columns, first_row, first_column, start, slice_stride, "
+    "row_stride, window_slice_stride, window_row_stride, is_slices_first"
+)
+"""Members of `Slices`, and of a shear's record."""
+_GIVEN = f"""
+int {_SLICES}, light, varies; F *numbers, *field, *entered, *masses, *corrections;
+F *entered_bar, *corrections_bar, *field_bar; double *sums
 """
-_RETURNED = "masses refinements corrections_bar field_bar before_bar by_cells by_rays by_field"
+_RETURNED = "masses corrections corrections_bar field_bar sums"
 """What one adjoint after the other writes, and the next reads."""
 
 
 @functools.cache
 def shear_kernels(bits: int) -> SimpleNamespace:
-    """The kernels for numbers of so many `bits`."""
-    texts = {
-        "rays": (code.RAYS, "masses refinements after"),
-        "cells": (code.CELLS, "entered"),
-        "cells_adjoint": (adjoint_code.CELLS_ADJOINT, _RETURNED),
-        "rays_adjoint": (adjoint_code.RAYS_ADJOINT, _RETURNED),
-        "field_adjoint": (adjoint_code.FIELD_ADJOINT, _RETURNED),
+    """The kernels of `shear.h` for numbers of so many `bits`.
+
+    Tangents are given dual numbers in place of numbers.
+    """
+    calls = {
+        "sum_along_rays": "number[3], (const N*)field, (N*)masses, (N*)corrections",
+        "carry_to_cells": "number[3], (const N*)masses, (N*)entered",
+        "carry_back": "varies, masses, entered_bar, corrections_bar, sums",
+        "sum_back": "varies, entered_bar, corrections_bar, masses, corrections, sums",
+        "look_back": "varies, field, masses, corrections, field_bar, sums",
     }
-    kernels = {
-        name: TextKernel(f"shear_{name}", bits, text, _GIVEN, made)
-        for name, (text, made) in texts.items()
-    }
+    made = {"sum_along_rays": "masses corrections", "carry_to_cells": "entered"}
+
+    def kernel(name: str, call: str, number: str, suffix: str = "") -> TextKernel:
+        text = f"""
+            typedef {number} N;
+            const N* const number = (const N*)numbers + 4 * light;
+            const Shear<F, IS_GPU ? 1 : {BLOCK}> shear({{{_SLICES}}}, number);
+            shear.{name}(item, {call});
+        """
+        writes = made.get(name, _RETURNED)
+        return TextKernel(f"shear_{name}{suffix}", bits, text, _GIVEN, writes, _HEADER)
+
+    kernels = {name: kernel(name, call, "F") for name, call in calls.items()}
+    for name in made:
+        kernels[f"{name}_tangent"] = kernel(name, calls[name], "Dual<F>", "_tangent")
     return SimpleNamespace(**kernels)

@@ -8,13 +8,10 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.light.fused.shear import Shear
-from ddrecon.light.fused.shear_slabs import SlabShear
-from ddrecon.light.fused.tangents import BeamTangents
+from ddrecon.light.fused.shear import Shear, change_sum
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import Slicing, across
-from ddrecon.slabs.slab import Slab, whole_of
 
 
 def sum_mass(
@@ -29,7 +26,7 @@ def sum_mass(
 @remember
 def follow(
     grid: Grid, directions: Tensor, bound: Tensor | float
-) -> tuple[tuple[Shear | SlabShear, ...], Tensor]:
+) -> tuple[tuple[Shear, ...], Tensor]:
     """How beams along `directions` [L, 3] cross slices, and the numbers [L, 4] of each.
 
     These are the slope by rows and by columns, the path in a slice [u] and the `bound`.
@@ -40,23 +37,17 @@ def follow(
 
 
 @remember
-def _cross(grid: Grid, directions: Tensor) -> tuple[tuple[Shear | SlabShear, ...], Tensor]:
+def _cross(grid: Grid, directions: Tensor) -> tuple[tuple[Shear, ...], Tensor]:
     """The same without bounds: directions are read, whatever the `bound` is made of."""
-    speed = directions / directions.new_tensor(whole_of(grid).spacing)
+    speed = directions / directions.new_tensor(grid.spacing)
     slicings = [Slicing.of(each) for each in speed.tolist()]
     order = [[*across(slicing.axis), slicing.axis] for slicing in slicings]
     ordered = speed.gather(1, torch.tensor(order, device=speed.device))
     fastest = ordered[:, 2:].abs()
     slope = ordered[:, :2] / fastest
     slopes = [(row, column) for row, column in slope.tolist()]
-    shears: list[Shear | SlabShear]
-    if isinstance(grid, Slab):
-        ways = (speed[:, grid.axis] >= 0).tolist()
-        each = zip(slicings, slopes, ways, strict=True)
-        shears = [SlabShear(grid, slicing, one, is_upwards) for slicing, one, is_upwards in each]
-    else:
-        shears = [Shear(grid, *each) for each in zip(slicings, slopes, strict=True)]
-    return tuple(shears), torch.cat([slope, 1 / fastest], 1)
+    shears = tuple(Shear(grid, *each) for each in zip(slicings, slopes, strict=True))
+    return shears, torch.cat([slope, 1 / fastest], 1)
 
 
 class _SumMass(torch.autograd.Function):
@@ -66,7 +57,7 @@ class _SumMass(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(shear: Shear | SlabShear, field: Tensor, numbers: Tensor) -> Tensor:
+    def forward(shear: Shear, field: Tensor, numbers: Tensor) -> Tensor:
         return shear.lift(shear.sum(shear.lay(field.detach()), numbers, 0).entered)
 
     @staticmethod
@@ -88,8 +79,7 @@ class _SumMass(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: None, d_field: Tensor | None, d_numbers: Tensor | None) -> Tensor:
         def change(field: Tensor, numbers: Tensor, *changes: Tensor | None) -> Tensor:
-            beams = BeamTangents(field, changes[0], numbers, changes[1])
-            return beams.follow(ctx.shear, 0)[1]
+            return change_sum(ctx.shear, 0, field, changes[0], numbers, changes[1])[1]
 
         d_entered: Tensor = run_plainly(change, *ctx.saved_tensors, d_field, d_numbers)
         return d_entered

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from ddrecon.kernels.dual import split
 from ddrecon.light.fused.receive import MOST_BEAMS, Receiver
-from ddrecon.light.fused.shear import Shear
-from ddrecon.light.fused.shear_slabs import SlabShear
-from ddrecon.light.fused.tangents import BeamTangents, change_received
+from ddrecon.light.fused.shear import Shear, change_sum
+from ddrecon.light.fused.tangents import change_received
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 MOST_NUMBERS = 1 << 22
@@ -34,7 +33,7 @@ class Unscattered(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        shears: tuple[Shear | SlabShear, ...],
+        shears: tuple[Shear, ...],
         has_mass: bool,
         field: Tensor,
         scale: Tensor,
@@ -113,11 +112,13 @@ class Unscattered(torch.autograd.Function):
             (field, scale, numbers, weights), d_tensors = split(tensors)
             d_field, d_scale, d_numbers, d_weights = d_tensors
             receiver = Receiver(field, scale, numbers, weights)
-            beams = BeamTangents(field, d_field, numbers, d_numbers)
             d_given = {"field": d_field, "scale": d_scale, "all_weights": d_weights}
             d_moments, d_masses = receiver.new_moments(), []
             for lights in _batches(ctx.shears, field, receiver):
-                followed = [beams.follow(ctx.shears[light], light) for light in lights]
+                followed = [
+                    change_sum(ctx.shears[light], light, field, d_field, numbers, d_numbers)
+                    for light in lights
+                ]
                 entered, d_entered = (_stack(list(each)) for each in zip(*followed, strict=True))
                 d_given["entered"] = d_entered
                 change_received(receiver, lights[0], entered, d_given, d_moments)
@@ -136,15 +137,10 @@ def _stack(fields: list[Tensor]) -> Tensor:
     return fields[0][None] if len(fields) == 1 else torch.stack(fields)
 
 
-def _batches(shears: Sequence[Shear | SlabShear], field: Tensor, receiver: Receiver) -> list[range]:
-    """The numbers of beams, in parts small enough for their masses to be held at once.
-
-    In slabs one by one: all ranks exchange in the same order.
-    """
+def _batches(shears: Sequence[Shear], field: Tensor, receiver: Receiver) -> list[range]:
+    """The numbers of beams, in parts small enough for their masses to be held at once."""
     eighth = receiver.moments * receiver.colors // (8 * len(field))
     lights, size = len(shears), min(MOST_BEAMS, max(1, MOST_NUMBERS // field.numel(), eighth))
-    if any(isinstance(shear, SlabShear) for shear in shears):
-        size = 1
     return [range(first, min(first + size, lights)) for first in range(0, lights, size)]
 
 
@@ -156,9 +152,9 @@ class _Laid:
         self.across_x: Tensor | None = None
         self.shear: Shear | None = None
 
-    def of(self, shear: Shear | SlabShear) -> Tensor:
+    def of(self, shear: Shear) -> Tensor:
         """The field as `shear` lays it, the same tensor each time."""
-        if isinstance(shear, SlabShear) or shear.axis != 2:
+        if shear.axis != 2:
             return self.cells
         if self.across_x is None:
             self.across_x, self.shear = shear.lay(self.cells), shear

@@ -17,7 +17,7 @@ def jobs_of(phase: Phase) -> list[Job]:
 
 def slices_of(job: Job) -> list[int]:
     """The slices that a job goes through, counted from below."""
-    counted = range(job.job_from, job.job_to)
+    counted = range(job.slice_from, job.slice_to)
     return [s if job.way > 0 else DEPTH - 1 - s for s in counted]
 
 

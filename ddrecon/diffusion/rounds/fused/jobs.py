@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ddrecon.diffusion.rounds.fused.records import table
 from ddrecon.kernels.shares import count_shares
 
 MOST_OF_FEW, MOST = 9, 16
@@ -34,7 +35,7 @@ class Job(NamedTuple):
     """A row of numbers that kernels have of a job.
 
     Its `color`; the `way` in z, 1 or -1; groups of directions; slices as the way counts them, and
-    how many there are to the `middle`; whether it `adds` to what others have found; whose memory it
+    how many there are `to_middle`; whether it `adds` to what others have found; whose memory it
     works in; where its sums are, of numbers and of a field of its `own` color or of all (`shared`);
     and its `piece`.
     """
@@ -43,9 +44,9 @@ class Job(NamedTuple):
     way: int
     group_from: int
     group_to: int
-    job_from: int
-    job_to: int
-    middle: int
+    slice_from: int
+    slice_to: int
+    to_middle: int
     adds: int
     lane: int
     sums_at: int
@@ -64,12 +65,6 @@ class Lanes(NamedTuple):
     together: int
     pieces: int
     number: int
-
-    @staticmethod
-    def of_colors(threads: int, colors: int) -> Lanes:
-        """A thread does a color, one way after the other."""
-        together = min(threads, colors)
-        return Lanes(colors, together, 1, together)
 
     @staticmethod
     def of(threads: int, colors: int) -> Lanes:
@@ -112,8 +107,8 @@ class Phase(NamedTuple):
     def of(lanes: list[list[Job]]) -> Phase:
         """The phase of these jobs of each lane."""
         starts = list(accumulate(map(len, lanes), initial=0))
-        jobs = list(chain.from_iterable(lanes))
-        return Phase(*(torch.tensor(rows, dtype=torch.int32) for rows in (jobs, starts)))
+        jobs = table("Job", [job._asdict() for job in chain.from_iterable(lanes)])
+        return Phase(jobs, torch.tensor(starts, dtype=torch.int32))
 
 
 @functools.cache
@@ -132,34 +127,6 @@ def plan(lanes: Lanes, chunks: Chunks, depth: int, is_backward: bool) -> tuple[P
     if lanes.number == 1:
         return (Phase.of([list(chain(*chain(*parts)))]),)
     return tuple(map(Phase.of, parts))
-
-
-@functools.cache
-def plan_chunk(
-    lanes: Lanes, chunks: Chunks, way: int, number: int, slices: tuple[int, int], adds: bool
-) -> tuple[Phase, ...]:
-    """The phases in which all colors go through `slices` along a chunk of one `way`.
-
-    `lanes` are those `of_colors`. What is found is added to what there is where it `adds`.
-    """
-    (piece,) = chunks[way]
-    phases = []
-    for first in range(0, lanes.colors, lanes.together):
-        found: list[list[Job]] = [[] for _ in range(lanes.number)]
-        for lane, color in enumerate(range(first, min(first + lanes.together, lanes.colors))):
-            job = Job(
-                color, -1 if way else 1, *piece[number], *slices,
-                middle=0,
-                adds=int(adds),
-                lane=lane,
-                sums_at=way * lanes.colors + color,
-                own_bar=color,
-                shared_bar=lane,
-                piece=0,
-            )  # fmt: skip
-            found[lane].append(job)
-        phases.append(Phase.of(found))
-    return tuple(phases)
 
 
 def _part(
@@ -186,7 +153,7 @@ def _part(
         job = Job(
             color, -1 if way else 1, *own[piece][number],
             *(slices if lanes.number > 1 else (0, depth)),
-            middle=middles[way],
+            to_middle=middles[way],
             adds=int(number > 0 or phase > 0),
             lane=len(found) - 1,
             sums_at=(way * lanes.pieces + piece) * lanes.colors + color,

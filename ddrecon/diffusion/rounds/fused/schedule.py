@@ -12,12 +12,14 @@ import functools
 import math
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.characteristics import Course, Direction
 from ddrecon.diffusion.rounds.fused.jobs import Chunks
+from ddrecon.diffusion.rounds.fused.records import table
 from ddrecon.diffusion.rounds.fused.swept import units_of_parts
 from ddrecon.grid import Grid
 from ddrecon.numerics.harmonics import harmonics
@@ -72,87 +74,71 @@ class Step:
             is_along,
         )
 
+    def course(self) -> dict[str, Any]:
+        """What the struct `Course` of kernels says of it."""
+        fill = POINTS - len(self.points)
+        return {
+            "signs": self.signs, "axis": self.axis, "is_along": self.is_along,
+            "count": len(self.points), "points": self.points + self.points[:1] * fill,
+        }  # fmt: skip
+
+    def parts(self) -> list[float]:
+        """What `Parts` says: half the step and the weights."""
+        return [self.half, *self.weights, *[0.0] * (POINTS - len(self.points))]
+
     @property
     def is_up(self) -> bool:
         """Whether it belongs to the way up in z; within slices of each direction or its mirror."""
         return self.signs > (0, 0, 0)
 
 
-def turn(direction: Direction, axis: int) -> Direction:
-    """`direction` where z and the array `axis` have changed places."""
-    turned = list(direction)
-    turned[0], turned[axis] = turned[axis], turned[0]
-    z, y, x = turned
-    return z, y, x
-
-
 @functools.cache
-def steps_of(grid: Grid, count: int, axis: int = 0) -> tuple[tuple[Step, float], ...]:
-    """The step along each of `count` directions, and the quadrature's weight.
-
-    Of `grid`, z is the array `axis` of the grid that directions are of, and that axis is z.
-    """
+def steps_of(grid: Grid, count: int) -> tuple[tuple[Step, float], ...]:
+    """The step along each of `count` directions through `grid`, and the quadrature's weight."""
     points, weights = sphere_quadrature(torch.zeros((), dtype=torch.float64), count)
-    steps = (Step.of(grid, turn(tuple(point), axis)) for point in points.tolist())
+    steps = (Step.of(grid, (z, y, x)) for z, y, x in points.tolist())
     return tuple(zip(steps, weights.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
 class Tables:
-    """What kernels are given of directions; numbers of a group or direction lie side by side.
+    """What kernels are given of directions: a `Group`, `Course` and `Parts` of each.
 
-    `groups` [G, 8]: the way in y, first direction, how many, first pair, how many, how many of
-    these with harmonics odd in x, where their `matrices` are, directions before it in its chunk;
-    `points` [D, 16]: how many, the sign of x, whether along x, then z, y, x of each; `parts`
-    [D, 5]: half a step and weights; `pairs` [P, 2]: places in the group, the second -1 for none;
-    `moments` [K]: those even in x first, `even` of them. `chunks`: by way, and then by piece,
-    ranges of groups that go through the cells together, of at most `most` directions.
+    `pairs` [P, 2]: places in the group, the second -1 for none; `order` [K]: moments, those even in
+    x first. `chunks`: by way, and then by piece, ranges of groups that go through the cells
+    together, of at most `most` directions.
     """
 
     groups: Tensor
-    points: Tensor
+    courses: Tensor
     parts: Tensor
     pairs: Tensor
     matrices: Tensor
-    moments: Tensor
-    even: int
+    order: Tensor
     most: int
     chunks: Chunks
 
 
 @functools.cache
 def make_tables(
-    grid: Grid,
-    count: int,
-    moments: int,
-    most: int,
-    pieces: int,
-    dtype: torch.dtype,
-    axis: int = 0,
+    grid: Grid, count: int, moments: int, most: int, pieces: int, dtype: torch.dtype
 ) -> Tables:
     """The tables of `count` directions through `grid`, of light with so many `moments`.
 
-    On each way the directions are cut into chunks of about `most` at most, in `pieces`. `axis` as
-    of `steps_of`.
+    On each way the directions are cut into chunks of about `most` at most, in `pieces`.
     """
-    made = _Maker(moments, axis)
+    made, steps = _Maker(moments), steps_of(grid, count)
     chunks = []
-    steps = steps_of(grid, count, axis)
     for is_up in (True, False):
         units = _pairs([each for each in steps if each[0].is_up == is_up], made.odd > 0)
         chunks.append(made.add_way(units, most, pieces))
-
-    def whole(rows: list[list[int]]) -> Tensor:
-        return torch.tensor(rows, dtype=torch.int32)
-
     return Tables(
-        whole(made.groups),
-        whole(made.points),
-        torch.tensor(made.parts, dtype=dtype),
-        whole(made.pairs),
+        table("Group", made.groups),
+        table("Course", [step.course() for step in made.steps]),
+        torch.tensor([step.parts() for step in made.steps], dtype=dtype),
+        torch.tensor(made.pairs, dtype=torch.int32),
         torch.cat(made.matrices).to(dtype),
         torch.tensor(made.order, dtype=torch.int32),
-        moments - made.odd,
         made.most,
         tuple(chunks),
     )
@@ -175,20 +161,16 @@ def _pairs(steps: list[tuple[Step, float]], is_paired: bool) -> list[Unit]:
 class _Maker:
     """Tables while they are made, as lists."""
 
-    def __init__(self, moments: int, axis: int):
-        self.degree, self.axis = round(moments**0.5) - 1, axis
+    def __init__(self, moments: int):
+        self.degree = round(moments**0.5) - 1
         # A direction and its mirror image tell which harmonics are odd in x.
         odd = self._harmonics([(0.48, 0.6, 0.64)]) * self._harmonics([(0.48, 0.6, -0.64)])
         is_odd = (odd[:, 0] < 0).tolist()
         self.units = units_of_parts(self.degree)
         self.order = sorted(range(moments), key=lambda k: is_odd[k])
         self.odd, self.most = sum(is_odd), 0
-        self.groups, self.points, self.pairs = (
-            list[list[int]](),
-            list[list[int]](),
-            list[list[int]](),
-        )
-        self.parts, self.matrices = list[list[float]](), list[Tensor]()
+        self.groups, self.steps = list[dict[str, int]](), list[Step]()
+        self.pairs, self.matrices = list[list[int]](), list[Tensor]()
 
     def add_way(
         self, units: list[Unit], most: int, pieces: int
@@ -217,43 +199,30 @@ class _Maker:
 
     def _add_group(self, units: list[Unit], y_way: int, before: int) -> None:
         # Pairs with harmonics odd in x come first.
-        has_odd = [self.odd > 0 and unit[0][0].direction[2] != 0 for unit in units]
         units = sorted(units, key=lambda unit: -abs(unit[0][0].direction[2]))
-        first, first_pair = len(self.points), len(self.pairs)
+        odd_pairs = sum(self.odd > 0 and unit[0][0].direction[2] != 0 for unit in units)
+        self.groups.append(
+            {
+                "y_way": y_way, "begin": len(self.steps), "members": sum(map(len, units)),
+                "first_pair": len(self.pairs), "pairs": len(units), "odd_pairs": odd_pairs,
+                "matrices": sum(map(len, self.matrices)), "before": before,
+            }
+        )  # fmt: skip
+        place = 0
         for unit in units:
-            place = len(self.points) - first
             self.pairs.append([place, place + 1 if len(unit) > 1 else -1])
-            for step, _ in unit:
-                self._add_step(step)
-        at = sum(map(len, self.matrices))
-        members = len(self.points) - first
-        group = y_way, first, members, first_pair, len(units), sum(has_odd), at, before
-        self.groups.append(list(group))
+            self.steps += [step for step, _ in unit]
+            place += len(unit)
         # Y_k of pairs as sums over moments, and as sums over pairs; the same with weights.
         values = self._harmonics([unit[0][0].direction for unit in units])[self.order].T
         of_parts = self.units[self.order]
         weights = values.new_tensor([unit[0][1] for unit in units])[:, None]
         even = len(self.order) - self.odd
         for matrix in (values / of_parts, values * of_parts * weights):
-            parts = matrix[:, :even], matrix[: sum(has_odd), even:]
+            parts = matrix[:, :even], matrix[:odd_pairs, even:]
             self.matrices += [part.reshape(-1) for part in parts]
             self.matrices += [part.T.reshape(-1) for part in parts]
 
     def _harmonics(self, directions: list[Direction]) -> Tensor:
-        """Y_k [K, N] of `directions` as steps have them."""
-        points = [turn(direction, self.axis) for direction in directions]
-        return harmonics(torch.tensor(points, dtype=torch.float64), self.degree)
-
-    def _add_step(self, step: Step) -> None:
-        fill = POINTS - len(step.points)
-        points = step.points + step.points[:1] * fill
-        self.points.append(
-            [
-                len(step.points),
-                step.signs[2],
-                step.is_along,
-                *(n for point in points for n in point),
-                0,
-            ]
-        )
-        self.parts.append([step.half, *step.weights, *[0.0] * fill])
+        """Y_k [K, N] of `directions`."""
+        return harmonics(torch.tensor(directions, dtype=torch.float64), self.degree)

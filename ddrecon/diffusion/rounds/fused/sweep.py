@@ -16,9 +16,7 @@ from ddrecon.diffusion.rounds.fused.swept import (
     split,
     units_of_parts,
 )
-from ddrecon.diffusion.rounds.fused.tangents import CellTangents, RowTangents, changes_of
-from ddrecon.diffusion.rounds.fused.turned import Turned
-from ddrecon.grid import Grid
+from ddrecon.diffusion.rounds.fused.tangents import CellTangents, changes_of
 from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
@@ -26,7 +24,6 @@ from ddrecon.medium.coefficients import Medium
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 from ddrecon.numerics.harmonics import degrees_on
 from ddrecon.numerics.remember import remember
-from ddrecon.slabs.slab import Slab
 
 
 def sweep_fused(
@@ -51,13 +48,12 @@ def sweep_fused(
         source, units = Moments(beam), _units_of(factors)
         beam_factors = (units * each).expand(-1, colors)
     shares_field = medium.remaining.field is medium.extinction.field
-    grid = Turned.of(medium.grid) if isinstance(medium.grid, Slab) else medium.grid
     fields = medium.extinction.field, None if shares_field else medium.remaining.field
     light_parts = (None,) * PARTS if light is None else parts_of(light, colors)
-    *found, _, _ = _Sweep.apply(
+    *found, _ = _Sweep.apply(
         source.mean.is_cuda if by_cells is None else by_cells,
         torch.is_grad_enabled(),
-        grid,
+        medium.grid,
         directions,
         _scales(
             medium.extinction.scale,
@@ -65,21 +61,15 @@ def sweep_fused(
             inflow,
             colors,
         ),
-        *(_lay(field, grid) for field in fields),
+        *fields,
         _spread_factors(factors, colors),
         beam_factors,
-        *(_lay(part, grid) for part in (*light_parts, *parts_of(source, colors))),
+        *light_parts,
+        *parts_of(source, colors),
     )
-    if isinstance(grid, Turned):
-        found = [grid.lift(part) for part in found]
     mean, *rest = found
     z, y, x, higher = (*rest, None)[:4] if rest else (None, None, None, None)
     return Moments(mean, (z, y, x) if rest else None, higher)
-
-
-def _lay(field: Tensor | None, grid: Grid) -> Tensor | None:
-    """`field` as kernels go through it."""
-    return grid.lay(field) if isinstance(grid, Turned) and field is not None else field
 
 
 @remember
@@ -106,26 +96,26 @@ def _units_of(factors: Tensor) -> Tensor:
 class _Sweep(torch.autograd.Function):
     """The parts of light, and their derivatives by all tensors of `Swept`.
 
-    The last two are what `Rows` saves for the backward pass, where gradients may be asked for.
+    The last is what `Rows` saves for the backward pass, where gradients may be asked for.
     """
 
     @staticmethod
     def forward(by_cells: bool, may_save: bool, *given: Any) -> tuple[Any, ...]:
         swept, threads = Swept.of(*given), thread_count(Swept.of(*given).like)
         if by_cells:
-            return *split(swept.less_light(Cells(swept).follow())), None, None
+            return *split(swept.less_light(Cells(swept).follow())), None
         is_saved = may_save and any(
             isinstance(each, Tensor) and each.requires_grad for each in given
         )
         moments, saved = Rows(swept, threads).follow(is_saved)
-        return *split(moments), *saved
+        return *split(moments), saved
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Any, ...]) -> None:
         ctx.by_cells, _, grid, directions, *tensors = inputs
-        ctx.of, ctx.threads, ctx.saved = (grid, directions), thread_count(output[0]), output[-2:]
+        ctx.of, ctx.threads, ctx.saved = (grid, directions), thread_count(output[0]), output[-1]
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(*(one for one in ctx.saved if one is not None))
+        ctx.mark_non_differentiable(*([] if ctx.saved is None else [ctx.saved]))
         keep(ctx, *tensors)
 
     @staticmethod
@@ -134,7 +124,7 @@ class _Sweep(torch.autograd.Function):
         swept = Swept.of(*ctx.of, *ctx.saved_tensors)
         _, _, _, _, needs_scales, _, _, needs_factors, *needs_more = ctx.needs_input_grad
         needs_beam_factors, *needs_parts = needs_more
-        parts = (*bars[:-2], *[None] * PARTS)[:PARTS]
+        parts = (*bars[:-1], *[None] * PARTS)[:PARTS]
         if ctx.by_cells:
             found = Cells(swept).transpose(parts, needs_scales)
         else:
@@ -162,11 +152,10 @@ class _Sweep(torch.autograd.Function):
             swept = Swept.of(*ctx.of, *values)
             d_swept = changes_of(swept, *d_values)
             swept = swept.spelled()
-            tangents = (
-                CellTangents(swept, d_swept)
-                if ctx.by_cells
-                else RowTangents(swept, d_swept, ctx.threads)
-            )
-            return split(d_swept.less_light(tangents.change()))
+            if ctx.by_cells:
+                changed = CellTangents(swept, d_swept).change()
+            else:
+                changed, _ = Rows(swept, ctx.threads, d_swept).follow()
+            return split(d_swept.less_light(changed))
 
-        return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None, None
+        return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None

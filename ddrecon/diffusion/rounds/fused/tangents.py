@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.rounds.fused.by_cells import Cells
-from ddrecon.diffusion.rounds.fused.by_rows import Rows
 from ddrecon.diffusion.rounds.fused.swept import PARTS, Swept, in_parts
-from ddrecon.diffusion.rounds.fused.tangent_rows import tangent_kernel
 from ddrecon.kernels.dual import tangent_of, with_changes
 
 
@@ -40,34 +38,6 @@ def changes_of(swept: Swept, *changes: Tensor | None) -> Swept:
     return Swept.of(
         swept.grid, swept.directions, scales, extinction, scattering, factors, None, *parts
     )
-
-
-class RowTangents(Rows):
-    """The change of a sweep on a processor: light and its change go through the rows together."""
-
-    KINDS = ("", "d_")
-
-    def __init__(self, swept: Swept, changes: Swept, threads: int):
-        self.changes = changes
-        super().__init__(swept, threads)
-
-    def change(self) -> Tensor:
-        """The change of the moments of radiance [K, C, z, y, x]."""
-        changes, sums = self.changes, self._sums()
-        given = self._given() | {
-            "d_light_parts": changes.light, "d_source_parts": changes.source,
-            "d_factors": changes.factors, "d_scales": changes.scales,
-        }  # fmt: skip
-        lines = 2 * self._line_count(self.height + 2)
-        made = {"found": sums, **self._zeros(lines=lines)}
-        self._launch(tangent_kernel(self.bits, self._shares_field), False, given, made)
-        return sums.sum(0) if len(sums) > 1 else sums[0]
-
-    def _matter(self) -> list[Tensor]:
-        # Each with its change behind it: steps meet a medium where that changes, too.
-        return [
-            torch.cat(pair) for pair in zip(self.swept.fields, self.changes.fields, strict=True)
-        ]
 
 
 class CellTangents(Cells):

@@ -1,0 +1,113 @@
+#pragma once
+#include "ddrecon/diffusion/rounds/fused/lines.h"
+// Rows of moments from rows of radiance along directions, and the other way around (E17): products
+// of small matrices with rows. A direction and its mirror image in x, a pair, share sums over
+// moments even and odd in x.
+
+namespace ddrecon {
+
+// Radiance at cells of a row, by its pairs. The second of a pair is -1 where there is none.
+template <class F> struct Pairs {
+    const int* places;
+    int count, odd_count;
+    F* lines;
+    long long stride;
+    INLINE bool is_one(int p) const { return places[2 * p + 1] < 0; }
+    INLINE F* one(int p) const { return lines + places[2 * p] * stride; }
+    INLINE F* other(int p) const { return lines + places[2 * p + 1] * stride; }
+};
+
+// A moment of light; light is given as mean, flux along z, y, x, and what is higher, each of `all`
+// colors and cells.
+template <class F> INLINE const F* part_of(const F* const* parts, int k, long long all) {
+    const int places[4] = {0, 2, 1, 3};
+    return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
+}
+
+// Of moments to a DEGREE, those even in x come first.
+template <int DEGREE> struct Order {
+    static constexpr int EVEN = (DEGREE + 1) * (DEGREE + 2) / 2, ODD = DEGREE * (DEGREE + 1) / 2;
+    static constexpr int COUNT = EVEN + ODD;
+};
+// Sums of rows, each by a number, for each moment.
+template <class F, int COUNT, int TERMS> struct Sums {
+    const F* rows[COUNT][TERMS];
+    F by[COUNT][TERMS];
+};
+
+// Radiance of pairs from moments that are sums; rows are `ahead` of the next ones, which are asked
+// for in time.
+template <int DEGREE, int TERMS, class F>
+__attribute__((noinline)) void to_directions(
+    const F* matrix, const Sums<F, Order<DEGREE>::COUNT, TERMS>& sums, const Pairs<F>& pairs,
+    long long ahead, int from, int to) {
+    typedef Order<DEGREE> Own;
+    const F* odd_matrix = matrix + pairs.count * Own::EVEN;
+    in_steps<F>(from, to, [&](auto none, int c) HERE {
+        typedef decltype(none) T;
+        T in[Own::COUNT];
+        UNROLLED
+        for (int k = 0; k < Own::COUNT; ++k) {
+            in[k] = none;
+            UNROLLED
+            for (int i = 0; i < TERMS; ++i) {
+                const F* row = sums.rows[k][i] + c;
+                in[k] += sums.by[k][i] * read<T>(row);
+                if (sizeof(T) > sizeof(F)) __builtin_prefetch(row + ahead);
+            }
+        }
+        for (int p = 0; p < pairs.count; ++p) {
+            T sum = none, difference = none;
+            UNROLLED
+            for (int k = 0; k < Own::EVEN; ++k) sum += matrix[p * Own::EVEN + k] * in[k];
+            if (p < pairs.odd_count)
+                UNROLLED
+                for (int k = 0; k < Own::ODD; ++k)
+                    difference += odd_matrix[p * Own::ODD + k] * in[Own::EVEN + k];
+            write(pairs.one(p) + c, sum + difference);
+            if (!pairs.is_one(p)) write(pairs.other(p) + c, sum - difference);
+        }
+    });
+}
+
+// The transpose: moments that `found` rows get, or what is added to them. Those that nothing is in
+// yet begin with `first` in the mean, less the rows `taken`.
+template <int DEGREE, class F>
+__attribute__((noinline)) void to_moments(
+    const F* matrix, F* const* found, const F* const* taken, F first, bool is_adding,
+    const Pairs<F>& pairs, long long ahead, int width) {
+    typedef Order<DEGREE> Own;
+    const F* odd_matrix = matrix + pairs.count * Own::EVEN;
+    in_steps<F>(0, width, [&](auto none, int c) HERE {
+        typedef decltype(none) T;
+        T out[Own::COUNT];
+        UNROLLED
+        for (int k = 0; k < Own::COUNT; ++k) {
+            if (is_adding) {
+                out[k] = read<T>(found[k] + c);
+                if (sizeof(T) > sizeof(F)) __builtin_prefetch(found[k] + ahead + c);
+            } else {
+                out[k] = (k ? F(0) : first) - read<T>(taken[k] + c);
+            }
+        }
+        for (int p = 0; p < pairs.count; ++p) {
+            const T one = read<T>(pairs.one(p) + c);
+            T sum = one, difference = one;
+            if (!pairs.is_one(p)) {
+                const T other = read<T>(pairs.other(p) + c);
+                sum = one + other;
+                difference = one - other;
+            }
+            UNROLLED
+            for (int k = 0; k < Own::EVEN; ++k) out[k] += matrix[k * pairs.count + p] * sum;
+            if (p < pairs.odd_count)
+                UNROLLED
+                for (int k = 0; k < Own::ODD; ++k)
+                    out[Own::EVEN + k] += odd_matrix[k * pairs.odd_count + p] * difference;
+        }
+        UNROLLED
+        for (int k = 0; k < Own::COUNT; ++k) write(found[k] + c, out[k]);
+    });
+}
+
+} // namespace ddrecon

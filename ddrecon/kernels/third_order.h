@@ -1,0 +1,96 @@
+#pragma once
+#include "ddrecon/kernels/dual.h"
+// Interpolation among four neighbors on a line, to third order (`numerics/third_order.py`): what is
+// taken off linear interpolation where a field bends.
+
+namespace ddrecon {
+
+// Second differences, themselves interpolated the part `a` of the way from the second neighbor to
+// the third, are the neighbors weighed by these. F are numbers, N what they are of: dual numbers,
+// packets.
+template <class F, class N> INLINE void second_differences(N a, N* weight) {
+    weight[0] = F(1) - a;
+    weight[1] = F(3) * a - F(2);
+    weight[2] = F(1) - F(3) * a;
+    weight[3] = a;
+}
+
+// Within so many cells a place counts as on a cell's center, by its number of digits.
+template <class F> INLINE double kink_width(int size) {
+    return 16.0 * (sizeof(F) == 8 ? 0x1p-52 : 0x1p-23) * size;
+}
+
+// A place among points on a line, the part a of the way from point n to the next: q = n + a.
+template <class F> struct Place {
+    int n;
+    F a;
+    double q;
+    INLINE explicit Place(double q) : n((int)q), q(q) {
+        n -= n > q;
+        a = F(q - n);
+    }
+};
+
+// What points n - 1 to n + 2 count for at a place: linearly, and in what third order takes off
+// that. As dual numbers they change with the place along `way`: on a point by the mean of both
+// sides' slopes. Where `is_end`, nothing is taken off before point 0.
+template <class N> struct Taps {
+    N linear[4], bend[4];
+
+    template <class F>
+    INLINE Taps(const Place<F>& place, int size, bool is_end = false, int way = 0) {
+        const int nearest = (int)(place.q + 0.5);
+        const double off = place.q - nearest;
+        const bool is_kink = (off < 0 ? -off : off) < kink_width<F>(size);
+        N a = N(place.a), weight = N(F(0));
+        if constexpr (IS_DUAL<N>) a.by[way] = F(1);
+        linear[0] = linear[3] = N(F(0));
+        linear[1] = F(1) - a;
+        linear[2] = a;
+        if (!is_kink) weight = F(0.5) * a * (F(1) - a);
+        second_differences<F>(a, bend);
+        if constexpr (IS_DUAL<N>) {
+            if (is_kink) {
+                const int center = place.a < F(0.5) ? 1 : 2;
+                UNROLLED
+                for (int t = 0; t < 4; ++t)
+                    linear[t].by[way] = F(0.5) * F((t == center + 1) - (t == center - 1));
+                weight.by[way] = is_end && nearest == 0 ? F(0.25) : F(0);
+            }
+        }
+        UNROLLED
+        for (int t = 0; t < 4; ++t) bend[t] = weight * bend[t];
+    }
+    // Values a `stride` apart, by both: those of plain numbers leave out what counts for nothing.
+    template <class M> INLINE auto linearly(const M* value, int stride = 1) const {
+        const auto inner = linear[1] * value[stride] + linear[2] * value[2 * stride];
+        if constexpr (IS_DUAL<N>) {
+            return inner + linear[0] * value[0] + linear[3] * value[3 * stride];
+        } else {
+            return inner;
+        }
+    }
+    template <class M> INLINE auto bent(const M* value, int stride = 1) const {
+        return bend[0] * value[0] + bend[1] * value[stride] + bend[2] * value[2 * stride] +
+               bend[3] * value[3 * stride];
+    }
+};
+
+// x / sqrt(1 + (bound x)^2), with its slopes by both.
+template <class F> struct Bounded {
+    F value, by_x, by_bound;
+    INLINE Bounded(F x, F bound) {
+        const F part = F(1) / root(F(1) + bound * bound * x * x);
+        value = x * part;
+        by_x = part * part * part;
+        by_bound = -by_x * x * x * x * bound;
+    }
+};
+template <class F> INLINE F bounded(F x, F bound) { return Bounded<F>(x, bound).value; }
+template <class F, int COUNT>
+INLINE Dual<F, COUNT> bounded(const Dual<F, COUNT>& x, const Dual<F, COUNT>& bound) {
+    const Bounded<F> found(x.value, bound.value);
+    return x.chain(found.value, found.by_x, bound, found.by_bound);
+}
+
+} // namespace ddrecon
