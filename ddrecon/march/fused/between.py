@@ -10,8 +10,7 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.shares import count_shares
-from ddrecon.kernels.text import cut
-from ddrecon.march.fused.pixels import interpolation_kernel, judge_kernel, spread_kernel
+from ddrecon.kernels.text import TextKernel, cut
 from ddrecon.march.lattice import DOUBT, interpolate
 from ddrecon.numerics.autodiff import differentiate_once, keep
 
@@ -19,6 +18,40 @@ LENGTH = 256
 """Pixels that an item of a launch does on a processor."""
 FEW = 1 << 14
 """So many numbers of pixels are not worth a second thread."""
+
+
+_HEADER = "march/fused/pixels.h"
+_PIXELS = """
+int channels, rows, columns, length, total, pixels; F *values, *places; long *hit;
+"""
+_RECORD = (
+    "const Pixels<F> them = {values, channels, rows, columns, length, total, pixels, places, hit};"
+)
+
+
+@functools.cache
+def judge_kernel(bits: int) -> TextKernel:
+    """The kernel of `judge` of a lattice, an item of which is one of its rows."""
+    text = "judge(item, values, channels, rows, columns, behind, uneven, squares);"
+    given = "int channels, rows, columns; F *values, *behind, *uneven; double *squares"
+    return TextKernel("judge", bits, text, given, "uneven squares", _HEADER)
+
+
+@functools.cache
+def interpolation_kernel(bits: int) -> TextKernel:
+    """The kernel of values of `Pixels`, and of which are rough."""
+    text, given = (
+        "them.interpolate(item, uneven, bound, out, rough);",
+        "F *uneven, *bound, *out; int *rough",
+    )
+    return TextKernel("interpolate", bits, _RECORD + text, _PIXELS + given, "out rough", _HEADER)
+
+
+@functools.cache
+def spread_kernel(bits: int) -> TextKernel:
+    """The kernel of what cotangents of `Pixels` are for the lattice's values."""
+    text, given = "them.spread(item, out_bar, values_bar);", "F *out_bar, *values_bar"
+    return TextKernel("spread", bits, _RECORD + text, _PIXELS + given, "values_bar", _HEADER)
 
 
 def interpolate_pixels(
