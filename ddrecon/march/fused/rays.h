@@ -71,7 +71,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
     typedef typename Either<IS_TANGENT && VARIES_CURVES, D, V>::type Coefficient;
     // Of angles in tables, and of what is read there.
     typedef typename Either<
-        HAS_VIEW, E, typename Either<VARIES_RAYS || VARIES_ANGLES || VARIES_CURVES, N, V>::type>::type Angle;
+        HAS_VIEW, E,
+        typename Either<VARIES_RAYS || VARIES_ANGLES || VARIES_CURVES, N, V>::type>::type Angle;
     typedef typename Either<HAS_RUNGS, E, Angle>::type Curve;
     typedef typename Either<IS_TANGENT, Dual<W>, W>::type Mass;
     typedef Dual<V, IS_SLICED ? 2 : 3> Slope;
@@ -212,7 +213,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         if constexpr (IS_TANGENT) sample_part<1>(node, n, from, to);
         if constexpr (IS_TANGENT && VARIES_RAYS) move(node, n, from, to);
     }
-    template <int PART> void sample_part(Node& node, int n, int from, int to) const {
+    template <int PART> INLINE void sample_part(Node& node, int n, int from, int to) const {
         const F* const* fields = given.fields + PART * CHANNELS;
         const long long offset = slice(n);
 #if !defined(__CUDA_ARCH__)

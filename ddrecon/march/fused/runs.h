@@ -132,22 +132,22 @@ template <class F> struct Window {
           at_p((long long)P::lane_of(y.p, run.lane) * lines.row),
           first(run.first),
           stride(lines.column) {}
-    V row(const F* f, long long at) const {
+    INLINE V row(const F* f, long long at) const {
         if (stride == 1) return P::read(f + at + first);
         V x;
         for (int l = 0; l < LANES; ++l) x[l] = f[at + (long long)(first + l) * stride];
         return x;
     }
-    V along(V row) const {
+    INLINE V along(V row) const {
         const V one = Lanes::pick(row, i);
         return one + b * (Lanes::pick(row, j) - one);
     }
-    V linear(const F* f) const {
+    INLINE V linear(const F* f) const {
         const V top = along(row(f, at_i));
         return top + a * (along(row(f, at_j)) - top);
     }
     // As `Corners::curved`.
-    V curved(const F* f, const Place<F, V>& y, const Place<F, V>& x, V& bend) const {
+    INLINE V curved(const F* f, const Place<F, V>& y, const Place<F, V>& x, V& bend) const {
         const V row_i = row(f, at_i), row_j = row(f, at_j);
         const V i0 = Lanes::pick(row_i, i), i1 = Lanes::pick(row_i, j);
         const V j0 = Lanes::pick(row_j, i), j1 = Lanes::pick(row_j, j);
