@@ -30,13 +30,13 @@ from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused.cells import Cells
-from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.kernels import (
     Case,
     adjoint_kernel,
     integral_kernel,
     tangent_kernel,
 )
+from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.stretches import mark_kernel
 
 pytestmark = pytest.mark.slow

@@ -1,7 +1,7 @@
 #pragma once
 #include "ddrecon/march/fused/spread.h"
 // Pixels between the rays of a lattice: values, where they are in doubt, the adjoint. An item is
-// some pixels, or a row of the lattice. Pixels go in packets, as rays do; the lattice is a slice
+// some pixels. Pixels go in packets, as rays do; the lattice is a slice
 // whose cells are its rays, and values are to third order (`numerics/third_order.py`).
 
 namespace ddrecon {
@@ -122,41 +122,5 @@ template <class F> struct Pixels {
 #endif
     }
 };
-
-// Of the lattice's row `item`: how `uneven` [rows, columns] values are, the magnitudes of fourth
-// differences of radiance and of what is seen of light `behind` [1]; and `squares` [rows], the sum
-// of the squares of what is seen.
-template <class F> INLINE void judge(
-    int row, const F* values, int channels, int rows, int columns, const F* behind, F* uneven,
-    double* squares) {
-    const int size = rows * columns, colors = channels / 2;
-    const F light = behind[0];
-    auto fourth = [](const F* v, int at, int count, int stride) -> F {
-        auto held = [&](int i) -> int { return i < 0 ? 0 : (i < count ? i : count - 1); };
-        auto second = [&](int i) -> F {
-            i = held(i);
-            return v[held(i - 1) * stride] - F(2) * v[i * stride] + v[held(i + 1) * stride];
-        };
-        const F total = second(at - 1) - F(2) * second(at) + second(at + 1);
-        return total < F(0) ? -total : total;
-    };
-    double square = 0.0;
-    for (int j = 0; j < columns; ++j) {
-        F total = F(0);
-        for (int k = 0; k < channels; ++k) {
-            const F* __restrict v = values + k * size;
-            const F part =
-                fourth(v + j, row, rows, columns) + fourth(v + row * columns, j, columns, 1);
-            total += (k < colors ? F(1) : light) * part;
-        }
-        uneven[row * columns + j] = total;
-        for (int k = 0; k < colors; ++k) {
-            const int cell = k * size + row * columns + j;
-            const F seen = values[cell] + light * (F(1) - values[colors * size + cell]);
-            square += (double)(seen * seen);
-        }
-    }
-    squares[row] = square;
-}
 
 } // namespace ddrecon

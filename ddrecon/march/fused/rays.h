@@ -20,6 +20,8 @@ template <class F> struct Given {
     int ray_count, node_count, depth, rows, columns, words;
     int plane_stride, row_stride, column_stride;
     const F* const* fields;
+    // Where row k of an array begins that has a number of each ray.
+    INLINE long long row_of(int k) const { return (long long)k * ray_count; }
 };
 // The changes of some of that, those left out being 0; the fields' come behind the fields.
 template <class F> struct Changes {
@@ -140,8 +142,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         o1 = o2, d1 = d2;
         o2 = o, d2 = d;
     }
-    // Where row k of an array begins that has a number of each ray.
-    long long row_of(int k) const { return (long long)k * given.ray_count; }
+    long long row_of(int k) const { return given.row_of(k); }
     // What the rays have at `at` of an array, and its change.
     template <class X> X load(const F* array, const F* change, long long at, int step = 1) const {
         const V value = P::load(array + at, begin, step, last);
