@@ -16,7 +16,7 @@ template <class F, int COUNT = 1> struct Dual {
     INLINE Dual() {}
     INLINE Dual(F value) : value(value) {
         UNROLLED
-        for (int k = 0; k < COUNT; ++k) by[k] = F(0);
+        for (int k = 0; k < COUNT; ++k) by[k] = F{};
     }
     INLINE Dual(F value, F change) : value(value) {
         static_assert(COUNT == 1, "one change is for one direction");
@@ -46,32 +46,52 @@ template <class F, int COUNT = 1> struct Dual {
         for (int k = 0; k < COUNT; ++k) r.by[k] = by_this * by[k] + by_other * o.by[k];
         return r;
     }
-    INLINE Dual operator-() const { return chain(-value, F(-1)); }
-    INLINE Dual operator+(const Dual& o) const { return chain(value + o.value, F(1), o, F(1)); }
-    INLINE Dual operator-(const Dual& o) const { return chain(value - o.value, F(1), o, F(-1)); }
+    // 1, of vectors in all lanes.
+    static INLINE F one() { return 1 - F{}; }
+    INLINE Dual operator-() const { return chain(-value, -one()); }
+    INLINE Dual operator+(const Dual& o) const { return chain(value + o.value, one(), o, one()); }
+    INLINE Dual operator-(const Dual& o) const { return chain(value - o.value, one(), o, -one()); }
     INLINE Dual operator*(const Dual& o) const { return chain(value * o.value, o.value, o, value); }
     INLINE Dual operator/(const Dual& o) const {
-        const F inverse = F(1) / o.value, quotient = value * inverse;
+        const F inverse = 1 / o.value, quotient = value * inverse;
         return chain(quotient, inverse, o, -quotient * inverse);
     }
     INLINE Dual& operator+=(const Dual& o) { return *this = *this + o; }
     INLINE Dual& operator-=(const Dual& o) { return *this = *this - o; }
 };
-// With plain numbers, which are as well written before it.
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator+(F a, const Dual<F, COUNT>& b) {
-    return b.chain(a + b.value, F(1));
+// With plain numbers on either side, which of vectors may be one for all lanes.
+template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator+(A a, Dual<F, COUNT> b) {
+    b.value = a + b.value;
+    return b;
 }
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator-(F a, const Dual<F, COUNT>& b) {
-    return b.chain(a - b.value, F(-1));
+template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator+(Dual<F, COUNT> a, A b) {
+    a.value = a.value + b;
+    return a;
 }
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator*(F a, const Dual<F, COUNT>& b) {
-    return b.chain(a * b.value, a);
+template <class A, class F, int COUNT>
+INLINE Dual<F, COUNT> operator-(A a, const Dual<F, COUNT>& b) {
+    return a + -b;
 }
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator*(const Dual<F, COUNT>& a, F b) {
+template <class A, class F, int COUNT> INLINE Dual<F, COUNT> operator-(Dual<F, COUNT> a, A b) {
+    a.value = a.value - b;
+    return a;
+}
+template <class A, class F, int COUNT>
+INLINE Dual<F, COUNT> operator*(A a, const Dual<F, COUNT>& b) {
+    return b.chain(a * b.value, a - F{});
+}
+template <class A, class F, int COUNT>
+INLINE Dual<F, COUNT> operator*(const Dual<F, COUNT>& a, A b) {
     return b * a;
 }
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator/(F a, const Dual<F, COUNT>& b) {
-    return Dual<F, COUNT>(a) / b;
+template <class A, class F, int COUNT>
+INLINE Dual<F, COUNT> operator/(A a, const Dual<F, COUNT>& b) {
+    const F inverse = 1 / b.value, quotient = a * inverse;
+    return b.chain(quotient, -quotient * inverse);
+}
+template <class A, class F, int COUNT>
+INLINE Dual<F, COUNT> operator/(const Dual<F, COUNT>& a, A b) {
+    return a * (1 / (b - F{}));
 }
 
 // The value of a number of either kind, for comparisons; and a choice by one.
@@ -86,10 +106,6 @@ INLINE Dual<F, COUNT> pick(bool is, const Dual<F, COUNT>& one, const Dual<F, COU
     for (int k = 0; k < COUNT; ++k) r.by[k] = is ? one.by[k] : other.by[k];
     return r;
 }
-
-// Whether numbers N have derivatives.
-template <class N> constexpr bool IS_DUAL = false;
-template <class F, int COUNT> constexpr bool IS_DUAL<Dual<F, COUNT>> = true;
 
 // What a function of one number, `found` with its slope at the value of `x`, is of x itself.
 template <class F> INLINE F along(F, const Sloped<F>& found) { return found.value; }

@@ -44,7 +44,6 @@ template <class F> struct Packets {
     static INLINE W wide(V x) { return (double)x; }
     static INLINE V narrow(W x) { return F(x); }
     static INLINE V root(V x) { return sqrt(x); }
-    static INLINE V inverse_root(V x) { return F(1) / sqrt(x); }
     static INLINE V size(V x) { return x < F(0) ? -x : x; }
     static INLINE bool every(M is) { return is; }
     static INLINE F lane(V x, int) { return x; }
@@ -66,19 +65,6 @@ template <class F> struct Packets {
     static INLINE W wide(V x) { return __builtin_convertvector(x, W); }
     static INLINE V narrow(W x) { return __builtin_convertvector(x, V); }
     static INLINE V root(V x) { return __builtin_elementwise_sqrt(x); }
-    // 1 / root of x; by a step of Newton's from 14 bits where the processor has these.
-    static INLINE V inverse_root(V x) {
-#if defined(__AVX512F__)
-        if constexpr (sizeof(V) == 64 && sizeof(F) == 4) {
-            typedef float V32 __attribute__((vector_size(64)));
-            V32 known = __builtin_bit_cast(V32, x);
-            known = __builtin_ia32_rsqrt14ps512_mask(known, known, (unsigned short)-1);
-            const V r = __builtin_bit_cast(V, known);
-            return r * (F(1.5) - F(0.5) * x * r * r);
-        }
-#endif
-        return F(1) / root(x);
-    }
     static INLINE V size(V x) { return __builtin_elementwise_abs(x); }
     static INLINE bool every(M is) { return __builtin_reduce_and(is) != 0; }
     // Lanes in a mask as bits of a number, of which the first is the lowest; and back.

@@ -134,9 +134,13 @@ def is_rough(values: Tensor, tolerance: Tensor, places: Tensor) -> Tensor:
     That counts the errors of all of `values` [K, r, c] together, judged by fourth differences:
     they are large at edges sharper than the lattice as well.
     """
-    values = values.detach()
-    # Fourth differences along rows and columns; of each place, the largest of the four rays around.
-    uneven = sum(second_difference(second_difference(values, axis), axis).abs() for axis in (1, 2))
-    cells = max_pool2d(torch.as_tensor(uneven).sum(0, keepdim=True), 2, 1)[0]
+    # Of each place, the largest of the four rays around.
+    cells = max_pool2d(find_uneven(values.detach())[None], 2, 1)[0]
     rows, columns = places.detach().floor().long().unbind(-1)
     return DOUBT * cells[rows, columns] > tolerance
+
+
+def find_uneven(values: Tensor) -> Tensor:
+    """Magnitudes of fourth differences of `values` [K, r, c] along both axes: their sums [r, c]."""
+    rows, columns = (second_difference(second_difference(values, axis), axis) for axis in (1, 2))
+    return (rows.abs() + columns.abs()).sum(0)

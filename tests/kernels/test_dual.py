@@ -14,9 +14,6 @@ pytest.importorskip("warp")
 from ddrecon.diffusion.fused.system_kernels import system_kernel
 from ddrecon.kernels.dual import interleaved_tangent_of, pair, tangent_of, with_changes
 from ddrecon.kernels.text import BLOCK, TextKernel
-from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.packet_layout import Case
-from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
 
 COUNT = 37
 MADE = "half out other"
@@ -101,9 +98,7 @@ def test_lists_of_arrays_are_refused() -> None:
 
 @pytest.mark.slow
 def test_tangents_compile_for_graphics_cards(tmp_path: Path) -> None:
-    layout = Layout(3, 1, 3, (False, True), 0, 0, 1, 32)
     kernels = [
         tangent_of(system_kernel(True, 32)),
-        packet_tangent_kernel(layout, Case(True, True)),
     ]
     assert_compiles(kernels, tmp_path)

@@ -10,7 +10,6 @@ pytest.importorskip("warp")
 
 from ddrecon.errors import UsageError
 from ddrecon.kernels.text import BLOCK, TextKernel, cut
-from ddrecon.march.fused.packet_rays import ROW_OF
 
 TEXT = """
 for (int i = begin; i < end; ++i) {
@@ -127,9 +126,10 @@ def test_what_it_only_reads_it_cannot_write(capfd):
 
 @pytest.mark.slow
 def test_rows_of_many_rays_begin_beyond_the_numbers_of_an_int():
-    text, given = ROW_OF + "place[item] = row_of(row);", "int ray_count, row; long *place"
+    text = "Given<F> rays = {}; rays.ray_count = ray_count; place[item] = rays.row_of(row);"
     found = torch.empty(1, dtype=torch.int64)
-    kernel = TextKernel("find_row", 32, text, given, "place")
+    given = "int ray_count, row; long *place"
+    kernel = TextKernel("find_row", 32, text, given, "place", "march/fused/rays.h")
     kernel.launch(1, {"ray_count": 33_000_000, "row": 71}, {"place": found})
     assert found.item() == 33_000_000 * 71 > 2**31
 

@@ -30,13 +30,13 @@ from ddrecon.variables.values import value_of, with_values
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.march.fused.cells import Cells
-from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.packet_layout import Case
-from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
-from ddrecon.march.fused.packet_walks import (
-    packet_adjoint_kernel,
-    packet_integral_kernel,
+from ddrecon.march.fused.kernels import (
+    Case,
+    adjoint_kernel,
+    integral_kernel,
+    tangent_kernel,
 )
+from ddrecon.march.fused.layout import Layout
 from ddrecon.march.fused.stretches import mark_kernel
 
 pytestmark = pytest.mark.slow
@@ -299,9 +299,9 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     several = Layout(3, 3, 3, (False, True), 3, 3, 3, 64, "even", 1, 3, 3)
     steep = Layout(1, 1, 1, (True,), 0, 1, 1, 32, "steep", 1, 1, 1)
     moved, inside = Case(True, True, True), Case(False, True, True)
-    packets = [mark_kernel(32), packet_integral_kernel(several, True)]
-    packets += [packet_integral_kernel(steep, False), packet_tangent_kernel(one, inside)]
-    packets += [packet_adjoint_kernel(one, moved), packet_adjoint_kernel(several, Case(False))]
+    packets = [mark_kernel(32), integral_kernel(several, True)]
+    packets += [integral_kernel(steep, False), tangent_kernel(one, inside)]
+    packets += [adjoint_kernel(one, moved), adjoint_kernel(several, Case(False))]
     assert_compiles(packets, tmp_path)
 
 

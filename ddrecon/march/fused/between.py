@@ -10,15 +10,40 @@ from torch import Tensor
 
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.shares import count_shares
-from ddrecon.kernels.text import cut
-from ddrecon.march.fused.pixels import interpolation_kernel, judge_kernel, spread_kernel
-from ddrecon.march.lattice import DOUBT, interpolate
+from ddrecon.kernels.text import TextKernel, cut
+from ddrecon.march.lattice import DOUBT, find_uneven, interpolate
 from ddrecon.numerics.autodiff import differentiate_once, keep
 
 LENGTH = 256
 """Pixels that an item of a launch does on a processor."""
 FEW = 1 << 14
 """So many numbers of pixels are not worth a second thread."""
+
+
+_HEADER = "march/fused/pixels.h"
+_PIXELS = """
+int channels, rows, columns, length, total, pixels; F *values, *places; long *hit;
+"""
+_RECORD = (
+    "const Pixels<F> them = {values, channels, rows, columns, length, total, pixels, places, hit};"
+)
+
+
+@functools.cache
+def interpolation_kernel(bits: int) -> TextKernel:
+    """The kernel of values of `Pixels`, and of which are rough."""
+    text, given = (
+        "them.interpolate(item, uneven, bound, out, rough);",
+        "F *uneven, *bound, *out; int *rough",
+    )
+    return TextKernel("interpolate", bits, _RECORD + text, _PIXELS + given, "out rough", _HEADER)
+
+
+@functools.cache
+def spread_kernel(bits: int) -> TextKernel:
+    """The kernel of what cotangents of `Pixels` are for the lattice's values."""
+    text, given = "them.spread(item, out_bar, values_bar);", "F *out_bar, *values_bar"
+    return TextKernel("spread", bits, _RECORD + text, _PIXELS + given, "values_bar", _HEADER)
 
 
 def interpolate_pixels(
@@ -45,14 +70,11 @@ class _Interpolate(torch.autograd.Function):
     def forward(
         values: Tensor, places: Tensor, hit: Tensor, count: int, behind: Tensor, tolerance: float
     ) -> tuple[Tensor, Tensor]:
-        bits, (channels, rows, columns) = torch.finfo(values.dtype).bits, values.shape
-        uneven = values.new_empty(rows, columns)
-        squares = values.new_empty(rows, dtype=torch.float64)
-        seen = _lattice(values) | {"behind": behind}
-        judged = {"uneven": uneven, "squares": squares}
-        judge_kernel(bits).launch(rows, seen, judged, _threads(values))
-        brightness = (squares.sum() / (channels // 2 * rows * columns)).sqrt()
+        bits, channels = torch.finfo(values.dtype).bits, len(values)
+        scattered, opacity = values.chunk(2)
+        brightness = (scattered + behind * (1 - opacity)).square().mean(dtype=torch.float64).sqrt()
         bound = (tolerance / DOUBT * brightness).to(values.dtype).view(1)
+        uneven = find_uneven(torch.cat([scattered, behind * opacity]))
         out = values.new_zeros(channels, count)
         rough = hit.new_empty(hit.shape, dtype=torch.int32)
         items, given = _pixels(values, places, hit, count)
@@ -92,14 +114,9 @@ def _threads(pixels: Tensor, channels: int = 1) -> int:
     return 1 if pixels.numel() * channels < FEW else thread_count(pixels)
 
 
-def _lattice(values: Tensor) -> dict[str, Any]:
-    """The lattice's values and sizes, as kernels call them."""
-    channels, rows, columns = values.shape
-    return {"values": values, "channels": channels, "rows": rows, "columns": columns}
-
-
 def _pixels(values: Tensor, places: Tensor, hit: Tensor, count: int) -> tuple[int, dict[str, Any]]:
     """Items of a launch, and what they are given of `count` pixels, those in `hit` at `places`."""
     items, length = cut(len(places), LENGTH, places)
-    sizes = {"length": length, "total": len(places), "pixels": count}
-    return items, _lattice(values) | sizes | {"places": places, "hit": hit}
+    names = "channels", "rows", "columns", "length", "total", "pixels"
+    sizes = zip(names, (*values.shape, length, len(places), count), strict=True)
+    return items, {**dict(sizes), "values": values, "places": places, "hit": hit}

@@ -18,13 +18,12 @@ from ddrecon.march.lattice import Lattice
 from ddrecon.medium.phase import PhaseKind
 from ddrecon.medium.phase_cells import others_of
 from ddrecon.medium.phase_peak import SeenPhase
-from ddrecon.numerics.chebyshev import COEFFICIENTS
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
 
 class Packed(NamedTuple):
-    """Rays: `bundle` [R, 8] as of `packet_rays.GIVEN`; `origin` and `direction` [R, 3] in u."""
+    """Rays: `bundle` [R, 8] as of `Given` in `rays.h`; `origin` and `direction` [R, 3] in u."""
 
     bundle: Tensor
     origin: Tensor
@@ -35,8 +34,8 @@ class Along(NamedTuple):
     """Beams as rays see them.
 
     `angles` [2 beams, R]: of each the foot, then of each the square distance, or cosine and 1;
-    `polynomials` of E13; `factors`: p of a beam whose phase function is the same all along a ray
-    [C, R], else None.
+    `polynomials` of E13, by beam; `factors`: p of a beam whose phase function is the same all along
+    a ray [C, R], else None.
     """
 
     angles: Tensor
@@ -103,80 +102,52 @@ def _bundle(
 
 def see_beams(emission: Emission, layout: Layout, packed: Packed) -> Along:
     """The beams of `emission` along rays."""
-    has_peak = emission.peak is not None
-    phase, degree = emission.seen.phase, emission.seen.degree
-
-    def see(*towards: Tensor) -> Along:
-        if layout.form is not None:
-            others = others_of(phase)
-            given = phase.kind, layout.form, len(others)
-            return _see_cellwise(packed.direction, *given, *others, *towards)
-        numbers = len(phase.numbers)
-        return _see_directional(
-            packed.direction, phase.kind, degree, has_peak, numbers, *phase.numbers, *towards
-        )
-
-    towards = [beam.direction for beam in emission.beams if isinstance(beam, Beam)]
-    if len(towards) == len(emission.beams):
-        return see(*towards)
+    phase, has_peak = emission.seen.phase, emission.peak is not None
+    numbers = phase.numbers if layout.form is None else others_of(phase)
+    rows = layout.ray_terms if has_peak or layout.form else 0
     seen = []
     for beam in emission.beams:
         if isinstance(beam, Beam):
-            seen.append(see(beam.direction))
+            of_phase = phase.kind, emission.seen.degree, has_peak, layout.form, *numbers
+            seen.append(_see_beam(packed.direction, beam.direction, *of_phase))
         else:
             angles = torch.stack(beam.passing(packed.origin, packed.direction))
-            unused = angles.new_zeros(layout.ray_terms, angles.shape[1])
+            unused = angles.new_zeros(rows, angles.shape[1])
             seen.append(Along(angles, unused, (None,)))
-    feet, squares = zip(*(each.angles.split(1) for each in seen), strict=True)
+    if len(seen) == 1:
+        return seen[0]
+    none = packed.direction.new_empty(0, len(packed.direction))
     return Along(
-        torch.cat([*feet, *squares]),
-        torch.cat([each.polynomials for each in seen]),
+        torch.cat([none, *(each.angles[[k]] for k in (0, 1) for each in seen)]),
+        torch.cat([none, *(each.polynomials for each in seen)]),
         sum((each.factors for each in seen), ()),
     )
 
 
 @remember
-def _see_directional(
+def _see_beam(
     direction: Tensor,
+    towards: Tensor,
     kind: PhaseKind,
     degree: int,
     has_peak: bool,
-    numbers: int,
-    *tensors: Tensor,
+    form: str | None,
+    *numbers: Tensor,
 ) -> Along:
-    """Beams along rays of `direction` [R, 3], scattered by the phase function `kind`.
+    """A beam along `towards` seen by rays of `direction` [R, 3].
 
-    `tensors`: its `numbers`, and the unit vectors along which beams go.
+    It is scattered by the phase function `kind` of these `numbers`; or, where that has a `form`
+    because it differs from cell to cell, of these others.
     """
-    seen, towards = SeenPhase(kind(*tensors[:numbers]), degree), tensors[numbers:]
-    rays = len(direction)
-    cosines = [leaving_cosine(direction, each) for each in towards]
-    ones = direction.new_ones(len(towards), rays)
-    none = direction.new_zeros(0, rays)
+    cosine = leaving_cosine(direction, towards)
+    angles = torch.stack([cosine, torch.ones_like(cosine)])
+    if form is not None:
+        return Along(angles, find_along_rays(cosine, form, kind, numbers), (None,))
+    seen = SeenPhase(kind(*numbers), degree)
     if not has_peak:
-        unused = direction.new_zeros(len(towards) * COEFFICIENTS * seen.colors, rays)
-        factors = tuple(seen.value(cosine) for cosine in cosines)
-        return Along(torch.cat([none, *(c[None] for c in cosines), ones]), unused, factors)
-    # By beam, then by color, then by power.
-    fitted = [seen.polynomials(cosine).movedim(1, 0).flatten(0, 1) for cosine in cosines]
-    angles = torch.cat([none, *(cosine[None] for cosine in cosines), ones])
-    return Along(angles, torch.cat([none, *fitted]), (None,) * len(towards))
-
-
-@remember
-def _see_cellwise(
-    direction: Tensor, kind: PhaseKind, form: str, others: int, *tensors: Tensor
-) -> Along:
-    """Beams along rays, scattered by a phase function `kind` that differs from cell to cell.
-
-    `tensors`: so many `others` of its numbers, and the unit vectors along which beams go.
-    """
-    known, towards = tensors[:others], tensors[others:]
-    cosines = [leaving_cosine(direction, each) for each in towards]
-    none, ones = direction.new_zeros(0, len(direction)), direction.new_ones(1, len(direction))
-    rows = [find_along_rays(cosine, form, kind, known) for cosine in cosines]
-    angles = [none, *(cosine[None] for cosine in cosines), *[ones] * len(towards)]
-    return Along(torch.cat(angles), torch.cat([none, *rows]), (None,) * len(towards))
+        return Along(angles, cosine.new_empty(0, len(cosine)), (seen.value(cosine),))
+    # By color, then by power.
+    return Along(angles, seen.polynomials(cosine).movedim(1, 0).flatten(0, 1), (None,))
 
 
 def table_of(emission: Emission) -> Tensor:

@@ -20,11 +20,8 @@ import torch
 from torch import Tensor
 
 from ddrecon.march.emission import Emission
-from ddrecon.march.fused.layout import Layout
 from ddrecon.medium.phase import PhaseKind
 from ddrecon.medium.phase_cells import (
-    EVEN_STEPS,
-    STEEP_STEPS,
     at_ends,
     end_table,
     is_steep,
@@ -71,16 +68,6 @@ def table_of_cells(emission: Emission) -> Tensor:
     if emission.peak is None:
         return like.new_empty(0, 1)
     return _flatten(peak_tables(phase, emission.seen.degree), like.dtype)
-
-
-def last_rung(layout: Layout) -> int:
-    """The number of the last rung of tables, from 0 on."""
-    return STEEP_STEPS if layout.form == "steep" else EVEN_STEPS
-
-
-def table_rows(layout: Layout) -> int:
-    """Rows of the table of a color: values and slopes by angle, of all rungs if it has them."""
-    return 2 * (STEPS + 1) * (2 * (last_rung(layout) + 1) if layout.has_rungs else 1)
 
 
 @remember

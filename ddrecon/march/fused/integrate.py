@@ -9,19 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.kernels.dual import split
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.packets import LANES
 from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import cut
 from ddrecon.march.fused.cells import Cells
+from ddrecon.march.fused.kernels import Case, adjoint_kernel, integral_kernel, tangent_kernel
 from ddrecon.march.fused.layout import Layout
-from ddrecon.march.fused.packet_layout import Case
-from ddrecon.march.fused.packet_tangent import packet_tangent_kernel
-from ddrecon.march.fused.packet_walks import (
-    packet_adjoint_kernel,
-    packet_integral_kernel,
-)
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 NEIGHBORS, TURNS = 128, 8
@@ -30,32 +24,24 @@ often each thread has its turn, at most.
 """
 
 
+NAMES = "rays", "angles", "coefficients", "numbers", "table", "fronts"
+
+
 class Integrate(torch.autograd.Function):
-    """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `packet_rays.GIVEN` has.
+    """Outputs [outputs, R] and masses [K, R] of whole rays; arguments as `Given` of `rays.h`.
 
     The masses come once more in double precision, for the walk back. Differentiable in both modes
     with respect to all tensors.
     """
 
     @staticmethod
-    def forward(
-        layout: Layout,
-        cells: Cells,
-        rays: Tensor,
-        angles: Tensor,
-        coefficients: Tensor,
-        numbers: Tensor,
-        table: Tensor,
-        fronts: Tensor,
-        *fields: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        out = rays.new_empty(layout.outputs, len(rays))
+    def forward(layout: Layout, cells: Cells, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rays = tensors[0]
+        out, _ = _empty(layout, rays)
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
-        varied = rays, angles, coefficients, numbers, table, fronts
-        given = _packets(cells, varied, fields, thread_count(rays))
-        made = {"out": out, "masses": masses}
-        kernel = packet_integral_kernel(layout, cells.is_sliced)
-        kernel.launch(cut(len(rays), LANES, rays)[0], given, made)
+        packets, given = _packets(cells, tensors, thread_count(rays))
+        kernel = integral_kernel(layout, cells.is_sliced)
+        kernel.launch(packets, given, {"out": out, "masses": masses})
         return out, masses.to(rays.dtype, copy=True), masses
 
     @staticmethod
@@ -68,110 +54,116 @@ class Integrate(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Any, ...]:
+        masses, *tensors = ctx.saved_tensors
         out_bar, masses_bar = (
             room.zero_() if bar is None else bar
-            for bar, room in zip(bars, _empty(ctx.layout, ctx.saved_tensors[1]), strict=False)
+            for bar, room in zip(bars, _empty(ctx.layout, tensors[0]), strict=False)
         )
-        return None, None, *_transpose(ctx, out_bar, masses_bar)
+        ends = {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar}
+        return (
+            None,
+            None,
+            *_transpose(ctx.layout, ctx.cells, tensors, ctx.needs_input_grad[2:], ends),
+        )
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:
         def change(*tensors: Any) -> tuple[Tensor, Tensor]:
-            return _change(ctx.layout, ctx.cells, *split(tensors))
+            half = len(tensors) // 2
+            return _change(ctx.layout, ctx.cells, tensors[:half], tensors[half:])
 
         return *run_plainly(change, *ctx.saved_tensors[1:], *changes[2:]), None
 
 
-def _case(layout: Layout, cells: Cells, rays: bool, angles: bool) -> Case:
-    """What kernels are compiled for where `rays`, or `angles`, are varied."""
-    return Case(cells.is_sliced, rays, any(layout.beams) and (rays or angles))
+def _case(layout: Layout, cells: Cells, varied: Sequence[bool]) -> Case:
+    """What kernels are compiled for where those of `NAMES` are `varied`."""
+    rays, angles, coefficients, _, table, *_ = varied
+    turns = any(layout.beams) and (rays or angles)
+    return Case(cells.is_sliced, rays, turns, coefficients or table)
 
 
 def _change(
     layout: Layout, cells: Cells, values: Sequence[Tensor], d_values: Sequence[Tensor | None]
 ) -> tuple[Tensor, Tensor]:
     """The changes of outputs and masses with those of all tensors."""
-    rays, fields = values[0], values[6:]
-    d_out, d_masses = _empty(layout, rays)
-    d_rays, d_angles, d_coefficients, d_numbers, d_table, d_fronts, *d_fields = d_values
-    given = _packets(cells, values[:6], fields, thread_count(rays))
+    count, fields = len(NAMES), values[len(NAMES) :]
+    d_out, d_masses = _empty(layout, values[0])
+    packets, given = _packets(cells, values, thread_count(values[0]))
     nothing = torch.zeros_like(fields[0][0])
-    of_changes = _channels(d_fields, fields)
-    channels = [nothing if one is None else one for one in of_changes]
-    given["all_fields"] = [*given.pop("fields"), *channels]
-    given |= {"d_coefficients": d_coefficients, "d_table": d_table, "d_fronts": d_fronts}
-    given["d_numbers"] = torch.zeros_like(values[3]) if d_numbers is None else d_numbers
-    given |= {"d_rays": d_rays, "d_angles": d_angles}
+    channels = _channels(d_values[count:], fields)
+    given["fields"] += [nothing if one is None else one for one in channels]
+    given |= {f"d_{name}": one for name, one in zip(NAMES, d_values[:count], strict=True)}
+    if given["d_numbers"] is None:
+        given["d_numbers"] = torch.zeros_like(given["numbers"])
+    case = _case(layout, cells, [one is not None for one in d_values[:count]])
     made = {"d_out": d_out, "d_masses": d_masses}
-    case = _case(layout, cells, d_rays is not None, d_angles is not None)
-    packet_tangent_kernel(layout, case).launch(cut(len(rays), LANES, rays)[0], given, made)
+    tangent_kernel(layout, case).launch(packets, given, made)
     return d_out, d_masses
 
 
 def _empty(layout: Layout, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Room for the changes of outputs and masses."""
+    """Room for outputs and masses, or their changes."""
     count = len(rays)
     return rays.new_empty(layout.outputs, count), rays.new_empty(layout.extinction, count)
 
 
-def _transpose(ctx: Any, out_bar: Tensor, masses_bar: Tensor) -> list[Tensor | None]:
-    """Cotangents of all tensors whose gradients are asked for; of numbers and fronts always."""
-    layout, cells = ctx.layout, ctx.cells
-    needs_rays, needs_angles, needs_polynomials, _, needs_table, _ = ctx.needs_input_grad[2:8]
-    needs_fields = ctx.needs_input_grad[8:]
-    masses, rays, angles, coefficients, numbers, table, fronts, *fields = ctx.saved_tensors
-    packets, _ = cut(len(rays), LANES, rays)
-    polynomials_bar = rays.new_empty(coefficients.shape) if needs_polynomials else None
-    numbers_bar = masses.new_empty(len(numbers), packets)
+def _transpose(
+    layout: Layout,
+    cells: Cells,
+    tensors: Sequence[Tensor],
+    needs: Sequence[bool],
+    ends: dict[str, Tensor],
+) -> list[Tensor | None]:
+    """Cotangents of the `tensors` that `needs` them; of numbers and fronts always."""
+    rays, _, _, numbers, table, fronts, *fields = tensors
+    needs_table = needs[NAMES.index("table")]
     # Each thread adds to cells of its own: the same bits, whichever of them is faster.
-    wanted = list(zip(fields, needs_fields, strict=True))
-    numbers_of_one = sum(field.numel() for field, is_needed in wanted if is_needed)
-    numbers_of_one += table.numel() if needs_table else 0
-    threads = count_shares(thread_count(rays), rays.element_size() * numbers_of_one)
+    sums = [table if needs_table else None]
+    sums += [one if is_so else None for one, is_so in zip(fields, needs[len(NAMES) :], strict=True)]
+    size = rays.element_size() * sum(one.numel() for one in sums if one is not None)
+    threads = count_shares(thread_count(rays), size)
     shares = [
-        [field.new_zeros(field.shape) if is_needed else None for field, is_needed in wanted]
-        for _ in range(threads)
+        [None if one is None else one.new_zeros(one.shape) for one in sums] for _ in range(threads)
     ]
-    fronts_bar = fronts.new_empty(fronts.shape) if fronts.numel() else None
-    varied = rays, angles, coefficients, numbers, table, fronts
-    given = _packets(cells, varied, fields, threads)
-    given |= {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar, "packets": packets}
-    rays_bar = rays.new_empty(rays.shape) if needs_rays else None
-    made = {"numbers_bar": numbers_bar, "polynomials_bar": polynomials_bar, "rays_bar": rays_bar}
-    angles_bar = angles.new_empty(angles.shape) if needs_angles and any(layout.beams) else None
-    made |= {"fronts_bar": fronts_bar, "angles_bar": angles_bar}
-    tables = [torch.zeros_like(table if needs_table else table[:0]) for _ in shares]
-    own = [
-        {"bars": _channels(share, fields), "table_bar": table_bar if needs_table else None}
-        for share, table_bar in zip(shares, tables, strict=True)
-    ]
-    kernel = packet_adjoint_kernel(layout, _case(layout, cells, needs_rays, needs_angles))
-    kernel.launch(packets, given, made, shares=own)
+    own = [{"table_bar": one, "bars": _channels(of_fields, fields)} for one, *of_fields in shares]
+    packets, given = _packets(cells, tensors, threads)
+    numbers_bar = rays.new_empty(len(numbers), packets, dtype=torch.float64)
+    bars = {
+        f"{name}_bar": one.new_empty(one.shape) if is_so else None
+        for name, one, is_so in zip(NAMES[:3], tensors, needs, strict=False)
+    }
+    bars |= {"fronts_bar": fronts.new_empty(fronts.shape) if fronts.numel() else None}
+    kernel = adjoint_kernel(layout, _case(layout, cells, needs[: len(NAMES)]))
+    made = bars | {"numbers_bar": numbers_bar}
+    kernel.launch(packets, given | ends | {"packets": packets}, made, shares=own)
     for share in shares[1:]:
         for total, part in zip(shares[0], share, strict=True):
             if total is not None:
                 total += part
+    table_bar, *field_bars = shares[0]
+    rays_bar, angles_bar, coefficients_bar, fronts_bar = bars.values()
     numbers_bar = numbers_bar.sum(1).to(numbers.dtype)
-    found = [table_bar for table_bar in tables if table_bar is not None]
-    table_bar = functools.reduce(torch.add, found) if found else None
-    return [rays_bar, angles_bar, polynomials_bar, numbers_bar, table_bar, fronts_bar, *shares[0]]
+    return [rays_bar, angles_bar, coefficients_bar, numbers_bar, table_bar, fronts_bar, *field_bars]
 
 
-def _packets(
-    cells: Cells, varied: Sequence[Tensor], fields: Sequence[Tensor], threads: int
-) -> dict[str, Any]:
-    """What kernels in so many `threads` are given, by name."""
-    *varied, fronts = varied
-    names = "planes", "slices", "rays", "angles", "coefficients", "numbers", "table"
-    given: dict[str, Any] = dict(zip(names, (cells.planes, cells.order, *varied), strict=True))
-    given["fronts"] = fronts if fronts.numel() else None
-    given |= cells.strides(fields[0].shape)
-    given |= {"ray_count": len(varied[0]), "node_count": len(cells.planes)}
-    walked = cells.walked(varied[0])
-    given |= {"walked": walked, "words": 0 if walked is None else walked.shape[1]}
-    packets, _ = cut(len(varied[0]), LANES, varied[0])
-    given["dealt"] = deal(packets, threads)
-    return given | {"fields": _channels(fields, fields)}
+def _packets(cells: Cells, tensors: Sequence[Tensor], threads: int) -> tuple[int, dict[str, Any]]:
+    """How many packets there are, and what kernels in so many `threads` are given, by name."""
+    rays, fields = tensors[0], tensors[len(NAMES) :]
+    packets, _ = cut(len(rays), LANES, rays)
+    walked = cells.walked(rays)
+    given = {
+        "planes": cells.planes,
+        "slices": cells.order,
+        **{name: one if one.numel() else None for name, one in zip(NAMES, tensors, strict=False)},
+        **cells.strides(fields[0].shape),
+        "ray_count": len(rays),
+        "node_count": len(cells.planes),
+        "walked": walked,
+        "words": 0 if walked is None else walked.shape[1],
+        "dealt": deal(packets, threads),
+        "fields": _channels(fields, fields),
+    }
+    return packets, given
 
 
 @functools.lru_cache(maxsize=8)

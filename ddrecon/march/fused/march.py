@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -21,9 +23,9 @@ from ddrecon.march.fused.bundle import (
 )
 from ddrecon.march.fused.cells import cells_of
 from ddrecon.march.fused.cellwise import form_of
-from ddrecon.march.fused.compose import compose
 from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
+from ddrecon.march.integral import opacity_of
 from ddrecon.march.lattice import Lattice
 from ddrecon.medium.phase_cells import count_tables
 
@@ -89,10 +91,25 @@ def _integrate(
         packed.bundle.new_empty(layout.extinction, 0) if fronts is None else fronts,
         *fields,
     )
-    irradiances = [beam.irradiance for beam in emission.beams]
-    scales = emission.extinction.scale, emission.scattering.scale
-    remaining = None if emission.remaining is None else emission.remaining.scale
-    return compose(out, masses, *scales, irradiances, along.factors, remaining), masses
+    return _compose(emission, out, masses, along.factors), masses
+
+
+def _compose(
+    emission: Emission, out: Tensor, masses: Tensor, factors: tuple[Tensor | None, ...]
+) -> Tensor:
+    """Scattered radiance and opacity [2 C, R] from the integrals `out` [C (1 + beams), R].
+
+    What does not change along a ray is multiplied in here: the scale of kappa_s, or for diffuse
+    light that of what remains; beams' irradiances, and p where it is one of the `factors`
+    [1 or C, R] (E2); and E1's 1 - tau of what is behind, with `masses` [K, R].
+    """
+    diffuse, *arriving = out.split(emission.colors)
+    scattered = diffuse * (emission.remaining or emission.scattering).scale.view(-1, 1)
+    for beam, light, factor in zip(emission.beams, arriving, factors, strict=True):
+        weighted = light if factor is None else light * factor
+        strength = emission.scattering.scale * beam.irradiance / (4 * math.pi)
+        scattered = scattered + weighted * strength.view(-1, 1)
+    return torch.cat([scattered, opacity_of(emission, masses)])
 
 
 def layout_of(emission: Emission) -> Layout:

@@ -1,0 +1,412 @@
+#pragma once
+#include "ddrecon/march/fused/cells.h"
+#include "ddrecon/march/fused/layout.h"
+// A packet of rays: where its nodes lie, and what they emit.
+
+namespace ddrecon {
+
+// What a kernel is given. Nodes lie in `slices` [N] of `fields`, channels of cells, at `planes` [N]
+// across them [u]; or, where there are none, anywhere: at such parts of the way from near to far.
+// `rays` [R, 8]: origin and direction (in cells; across slices in u), near, far [u]. `angles`
+// [2 beams, R]: the cosine to directional light, or the foot of a point light, then its square
+// distance. `coefficients` [beams * RAY_TERMS, R]: the polynomials of E13, or what `cellwise.py`
+// has. `numbers`: scale and peak by color, bound of third-order corrections. `table`
+// [phases * (steps + 1) * 2, terms]: polynomials of point lights by angle. `fronts` [K, R]: the
+// mass before the rays, if any. `walked` [packets, words]: bits of the segments to be walked, if
+// not all are. Item i is packet i, or `dealt` [packets] says which.
+template <class F> struct Given {
+    const F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts;
+    const int *slices, *walked, *dealt;
+    int ray_count, node_count, depth, rows, columns, words;
+    int plane_stride, row_stride, column_stride;
+    const F* const* fields;
+    // Where row k of an array begins that has a number of each ray.
+    INLINE long long row_of(int k) const { return (long long)k * ray_count; }
+};
+// The changes of some of that, those left out being 0; the fields' come behind the fields.
+template <class F> struct Changes {
+    const F *rays, *angles, *coefficients, *numbers, *table, *fronts;
+};
+
+// Whether nodes lie in slices; and whether derivatives are asked for by rays, by the angles at
+// which they see point lights, which turn with them, and by p's coefficients or tables.
+template <bool SLICED, bool RAYS, bool ANGLES, bool CURVES> struct Case {
+    static constexpr bool IS_SLICED = SLICED, VARIES_RAYS = RAYS;
+    static constexpr bool VARIES_ANGLES = ANGLES, VARIES_CURVES = CURVES;
+};
+
+// A walk finds values; or values and changes, where numbers N are dual; or what an adjoint needs:
+// values, and p with its derivatives, a dual number E.
+enum Mode { VALUES, TANGENT, ADJOINT };
+
+template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
+    typedef Numbers<F> P;
+    typedef typename P::V V;
+    typedef typename P::W W;
+    typedef typename P::M M;
+    using L::BEAMS, L::C, L::CHANNELS, L::COLOR_STEP, L::CURVE_STEP, L::DIFFUSE_STEP;
+    using L::DIFFUSING_STEP, L::EXTINCTION, L::FIRST_DIFFUSE, L::FIRST_DIFFUSING, L::FIRST_MASS;
+    using L::FIRST_NUMBER, L::FIRST_OWN_SCATTERING, L::FIRST_PEAK, L::FIRST_SCATTERING;
+    using L::HAS_NUMBERS, L::HAS_PEAK, L::HAS_RUNGS, L::IS_LINEAR, L::IS_PEAK_FIELD, L::IS_STEEP;
+    using L::is_point, L::MASS_STEP, L::MASSES, L::NUMBER_STEP, L::OUT, L::PEAK_STEP, L::PHASE_STEP;
+    using L::PHASES, L::RAY_TERMS, L::SCATTERING, L::SCATTERING_STEP, L::TABLE_STEP, L::TERMS;
+    using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_CURVES, Which::VARIES_RAYS;
+    typedef ddrecon::Polynomial<F, TERMS> Polynomial;
+    typedef ddrecon::Point<F, TERMS> Point;
+    typedef ddrecon::Rungs<F, TERMS, IS_STEEP> Rungs;
+
+    // In an adjoint p has derivatives by the depth of the peak, by the number of the cell, and by
+    // two numbers of the angle: foot and square distance of a point light, part and cosine else.
+    static constexpr bool IS_TANGENT = MODE == TANGENT;
+    static constexpr bool HAS_VIEW =
+        MODE == ADJOINT && (VARIES_ANGLES || (VARIES_CURVES && HAS_NUMBERS && !IS_LINEAR));
+    static constexpr int DEPTH = 0, NUMBER = HAS_PEAK, VIEW = NUMBER + HAS_NUMBERS;
+    static constexpr int DIRECTIONS = VIEW + 2 * HAS_VIEW;
+    typedef Dual<V> D;
+    typedef Dual<V, DIRECTIONS ? DIRECTIONS : 1> Slopes;
+    typedef typename Either<IS_TANGENT, D, V>::type N;
+    typedef typename Either<MODE == ADJOINT, Slopes, N>::type E;
+    // Of distances along rays; of feet of point lights; of lengths, by either; of coefficients.
+    typedef typename Either<IS_TANGENT && VARIES_RAYS, D, V>::type Distance;
+    typedef typename Either<IS_TANGENT && VARIES_ANGLES, D, V>::type Foot;
+    typedef typename Either<IS_TANGENT && (VARIES_RAYS || VARIES_ANGLES), D, V>::type Length;
+    typedef typename Either<IS_TANGENT && VARIES_CURVES, D, V>::type Coefficient;
+    // Of angles in tables, and of what is read there.
+    typedef typename Either<
+        HAS_VIEW, E,
+        typename Either<VARIES_RAYS || VARIES_ANGLES || VARIES_CURVES, N, V>::type>::type Angle;
+    typedef typename Either<HAS_RUNGS, E, Angle>::type Curve;
+    typedef typename Either<IS_TANGENT, Dual<W>, W>::type Mass;
+    typedef Dual<V, IS_SLICED ? 2 : 3> Slope;
+
+    // Whether it `is_empty` for all lanes, and `is_lit`, has all its values; distances `s` sampled
+    // at and `t` held in the box; values; emission, depth, exp(-depth), and p; the beams' angles.
+    struct Node : Spot<F, IS_SLICED, V> {
+        Runs<F> runs;
+        bool is_empty, is_lit;
+        Distance s, t;
+        N v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT];
+        V held[MASSES + 1], decay[OUT];
+        E p[OUT];
+        Cubic<F, V> angle[BEAMS + 1];
+    };
+
+    const Given<F>& given;
+    const Changes<F> changes;
+    int item, last, begin, first_node = 0, last_node;
+    Distance o0, o1, o2, d0, d1, d2, near, far;
+    Foot foot[BEAMS + 1], across[BEAMS + 1];
+    Coefficient coefficients[BEAMS * RAY_TERMS + 1];
+    // Along y the packet's rays are closer together than along x; it `is_turned` where y are
+    // columns.
+    bool is_turned = false;
+    Lines lines;
+
+    Rays(int number, const Given<F>& given, const Changes<F>& changes)
+        : given(given),
+          changes(changes),
+          item(given.dealt ? given.dealt[number] : number),
+          last(given.ray_count - 1),
+          begin(item * LANES),
+          last_node(given.node_count - 1),
+          lines{given.rows, given.columns, given.row_stride, given.column_stride} {
+        Distance* const parts[] = {&o0, &o1, &o2, &d0, &d1, &d2, &near, &far};
+        UNROLLED
+        for (int k = 0; k < 8; ++k) *parts[k] = load<Distance>(given.rays, changes.rays, k, 8);
+        for (int b = 0; b < BEAMS; ++b) {
+            foot[b] = load<Foot>(given.angles, changes.angles, row_of(b));
+            across[b] = load<Foot>(given.angles, changes.angles, row_of(BEAMS + b));
+        }
+        if (HAS_PEAK || HAS_NUMBERS)
+            for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
+                coefficients[k] =
+                    load<Coefficient>(given.coefficients, changes.coefficients, row_of(k));
+        // Nodes before the box and behind it are held at its faces: between them nothing is added.
+        const V near = value_of(this->near), far = value_of(this->far);
+        while (first_node < last_node && P::every(value_of(distance(first_node + 1)) <= near))
+            ++first_node;
+        while (last_node > first_node && P::every(value_of(distance(last_node - 1)) >= far))
+            --last_node;
+        if (P::every(near >= far)) last_node = first_node;
+        if (LANES > 1 && IS_SLICED) turn();
+    }
+    void turn() {
+        const V s = value_of(distance((first_node + last_node) / 2));
+        const V y = value_of(o1) + s * value_of(d1), x = value_of(o2) + s * value_of(d2);
+        const int end = begin + LANES <= last ? LANES - 1 : last - begin;
+        const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
+        if (high * high <= wide * wide) return;
+        is_turned = true;
+        lines = {lines.columns, lines.rows, lines.column, lines.row};
+        const Distance o = o1, d = d1;
+        o1 = o2, d1 = d2;
+        o2 = o, d2 = d;
+    }
+    long long row_of(int k) const { return given.row_of(k); }
+    // What the rays have at `at` of an array, and its change.
+    template <class X> X load(const F* array, const F* change, long long at, int step = 1) const {
+        const V value = P::load(array + at, begin, step, last);
+        if constexpr (sizeof(X) == sizeof(V))
+            return value;
+        else
+            return {value, change ? P::load(change + at, begin, step, last) : P::all(F(0))};
+    }
+    // And a number that all rays share: a color's scale, its peak, or the bound.
+    N number(int k) const {
+        const V value = P::all(given.numbers[k]);
+        if constexpr (IS_TANGENT)
+            return {value, P::all(changes.numbers[k])};
+        else
+            return value;
+    }
+    Mass front(int k) const {
+        if (!given.fronts) return P::wide(N(P::all(F(0))));
+        return P::wide(load<N>(given.fronts, changes.fronts, row_of(k)));
+    }
+
+    // Whether segment n, behind node n - 1, is to be walked; the next stretch of such segments
+    // behind node `to`, and the one before node `from`: nodes `from` to `to`; whether there is one.
+    bool walks(int n) const {
+        return !given.walked ||
+               (given.walked[(long long)item * given.words + n / 32] >> (n % 32) & 1);
+    }
+    bool next_stretch(int& from, int& to) const {
+        for (from = to; from < last_node && !walks(from + 1);) ++from;
+        for (to = from; to < last_node && walks(to + 1);) ++to;
+        return from < to;
+    }
+    bool stretch_before(int& from, int& to) const {
+        for (to = from; to > first_node && !walks(to);) --to;
+        for (from = to; from > first_node && walks(from);) --from;
+        return from < to;
+    }
+
+    Distance distance(int n) const {
+        if (IS_SLICED) return (given.planes[n] - o0) / d0;
+        return near + given.planes[n] * (far - near);
+    }
+    long long slice(int n) const {
+        return IS_SLICED ? (long long)given.slices[n] * given.plane_stride : 0;
+    }
+    static bool is_bent(int c) { return c >= FIRST_MASS && c < FIRST_MASS + MASSES; }
+    // Where node n lies, and the matter there.
+    void locate(int n, Node& node) const {
+        node.s = distance(n);
+        node.t = P::least(P::most(node.s, near), far);
+        const V s = value_of(node.s);
+        node.y = Place<F, V>::at(value_of(o1) + s * value_of(d1), lines.rows);
+        node.x = Place<F, V>::at(value_of(o2) + s * value_of(d2), lines.columns);
+        if (!IS_SLICED) node.z = Place<F, V>::at(value_of(o0) + s * value_of(d0), given.depth);
+        node.find_corners(lines);
+        if (IS_SLICED) node.runs = Runs<F>(node.y, node.x, lines);
+        sample(node, n, 0, EXTINCTION);
+        if (SCATTERING) sample(node, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
+        node.is_empty = true;
+        for (int c = 0; c < FIRST_PEAK; ++c)
+            if (c < EXTINCTION || c >= FIRST_OWN_SCATTERING)
+                node.is_empty = node.is_empty && is_nothing(node.v[c]);
+    }
+    static bool is_nothing(const V& x) { return P::every(x == P::all(F(0))); }
+    static bool is_nothing(const D& x) { return is_nothing(x.value) && is_nothing(x.by[0]); }
+    // Values of channels `from` to before `to`, and their changes.
+    void sample(Node& node, int n, int from, int to) const {
+        sample_part<0>(node, n, from, to);
+        if constexpr (IS_TANGENT) sample_part<1>(node, n, from, to);
+        if constexpr (IS_TANGENT && VARIES_RAYS) move(node, n, from, to);
+    }
+    template <int PART> INLINE void sample_part(Node& node, int n, int from, int to) const {
+        const F* const* fields = given.fields + PART * CHANNELS;
+        const long long offset = slice(n);
+#if !defined(__CUDA_ARCH__)
+        if constexpr (IS_SLICED && HAS_PERMUTATION<F>)
+            if (node.runs.count <= MOST_RUNS && lines.columns >= LANES) {
+                for (int r = 0; r < node.runs.count; ++r) {
+                    const Window<F> w(node.runs.run[r], node.y, node.x, lines);
+                    for (int c = from; c < to; ++c) {
+                        V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
+                        const V v = is_bent(c) ? w.curved(fields[c] + offset, node.y, node.x, bend)
+                                               : w.linear(fields[c] + offset);
+                        known = P::pick(w.is_in, v, known);
+                        if (!is_bent(c)) continue;
+                        V& known_bend = P::template part<PART>(node.bend[c - FIRST_MASS]);
+                        known_bend = P::pick(w.is_in, bend, known_bend);
+                    }
+                }
+                return;
+            }
+#endif
+        for (int c = from; c < to; ++c) {
+            V bend = P::all(F(0));
+            P::template part<PART>(node.v[c]) =
+                node.value(fields[c] + offset, lines, is_bent(c), bend);
+            if (is_bent(c)) P::template part<PART>(node.bend[c - FIRST_MASS]) = bend;
+        }
+    }
+    // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
+    // bend of that each is handed to `take`.
+    template <class Take> void take_slopes(int n, V s, int from, int to, Take take) const {
+        const V y = value_of(o1) + s * value_of(d1), x = value_of(o2) + s * value_of(d2);
+        const V z = value_of(o0) + s * value_of(d0), none = P::all(F(0));
+        M is_kink = Kink<F>::is_at(y, lines.rows) | Kink<F>::is_at(x, lines.columns);
+        if (!IS_SLICED) is_kink = is_kink | Kink<F>::is_at(z, given.depth);
+        const bool has_kink = !P::every(P::pick(is_kink, P::all(F(1)), none) == none);
+        Spot<F, IS_SLICED, Slope> sides[2];
+        for (int i = 0; i < 1 + has_kink; ++i) {
+            const F side = has_kink ? F(2 * i - 1) : F(0);
+            sides[i].y = Kink<F>::template place<Slope>(y, lines.rows, side, 0);
+            sides[i].x = Kink<F>::template place<Slope>(x, lines.columns, side, 1);
+            if constexpr (!IS_SLICED)
+                sides[i].z = Kink<F>::template place<Slope>(z, given.depth, side, 2);
+            sides[i].find_corners(lines);
+        }
+        for (int c = from; c < to; ++c) {
+            const F* field = given.fields[c] + slice(n);
+            Slope bend(none), other(none);
+            Slope v = sides[0].value(field, lines, is_bent(c), bend);
+            if (has_kink) {
+                v = F(0.5) * (v + sides[1].value(field, lines, is_bent(c), other));
+                bend = F(0.5) * (bend + other);
+            }
+            take(c, v, bend);
+        }
+    }
+    // What values change by, as node n moves.
+    void move(Node& node, int n, int from, int to) const {
+        const Distance places[] = {o1 + node.s * d1, o2 + node.s * d2, o0 + node.s * d0};
+        auto along = [&](const Slope& slope) -> V {
+            V change = P::all(F(0));
+            for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k) change += slope.by[k] * places[k].by[0];
+            return change;
+        };
+        take_slopes(n, value_of(node.s), from, to, [&](int c, const Slope& v, const Slope& bend) {
+            node.v[c].by[0] += along(v);
+            if (is_bent(c)) node.bend[c - FIRST_MASS].by[0] += along(bend);
+        });
+    }
+
+    N peak_of(const Node& node, int c) const {
+        return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : number(C + c);
+    }
+    N number_of(const Node& node, int h) const { return node.v[FIRST_NUMBER + h * NUMBER_STEP]; }
+    int first_of(int b, int c) const { return b * RAY_TERMS + c * CURVE_STEP; }
+    // Whether p of a beam is by coefficients at all, and in which lanes it is.
+    bool has_curve(int b) const { return HAS_PEAK || IS_LINEAR || (is_point(b) && !IS_STEEP); }
+    M is_peaked(const Node& node, int c) const {
+        const V none = P::all(F(0));
+        return (IS_STEEP ? value_of(number_of(node, c * PHASE_STEP)) : F(1) + none) > none;
+    }
+    // In an adjoint, a number by which p has derivatives.
+    template <int DIRECTION, class X> static E seed(const X& x) {
+        E own(x);
+        if constexpr (MODE == ADJOINT) own.by[DIRECTION] = P::all(F(1));
+        return own;
+    }
+    // Where on its curve p is behind mass on both ways: by the depth of the peak, or by the number.
+    auto place_of(const Node& node, int c, const N& way) const {
+        if constexpr (HAS_PEAK)
+            return Polynomial::place(seed<DEPTH>(peak_of(node, c) * way));
+        else if constexpr (IS_LINEAR)
+            return seed<NUMBER>(number_of(node, c));
+        else
+            return P::all(F(0));
+    }
+    // Where beam b is in tables by angle at a node, and the cosine of that.
+    Cubic<F, Angle> see(const Node& node, int b, Angle& cosine) const {
+        Cubic<F, Angle> angle;
+        const Coefficient* given = coefficients + b * RAY_TERMS;
+        if constexpr (HAS_VIEW) {
+            if (is_point(b))
+                return Point::angle(
+                    seed<VIEW>(foot[b]), seed<VIEW + 1>(across[b]), E(node.t), cosine);
+            cosine = seed<VIEW + 1>(given[0]);
+            angle.part = seed<VIEW>(given[2]);
+        } else {
+            if (is_point(b))
+                return Point::angle(Angle(foot[b]), Angle(across[b]), Angle(node.t), cosine);
+            cosine = given[0], angle.part = given[2];
+        }
+        angle.first = P::whole(value_of(given[1]));
+        return angle;
+    }
+    // The coefficients of p of beam b in all tables, and p without a peak.
+    void read_tables(Node& node, int b, Curve* curves, E* plain) const {
+        Angle cosine;
+        const Cubic<F, Angle> angle = see(node, b, cosine);
+        node.angle[b] = angle.value();
+        for (int h = 0; h < PHASES; ++h) {
+            const F* const table = given.table + h * TABLE_STEP;
+            Curve* const curve = curves + h * TERMS;
+            V change[TERMS];
+            const bool changes_itself = IS_TANGENT && VARIES_CURVES && changes.table;
+            if constexpr (HAS_RUNGS) {
+                const auto rung = Rungs::rung(seed<NUMBER>(number_of(node, h)));
+                Rungs::curve(table, rung, angle, curve);
+                if (changes_itself)
+                    Rungs::curve(
+                        changes.table + h * TABLE_STEP, rung.value(), node.angle[b], change);
+            } else if (!IS_STEEP) {
+                Point::curve(angle, table, curve);
+                if (changes_itself)
+                    Point::curve(node.angle[b], changes.table + h * TABLE_STEP, change);
+            }
+            if constexpr (IS_TANGENT && VARIES_CURVES)
+                for (int k = 0; k < TERMS && changes_itself; ++k) curve[k].by[0] += change[k];
+            if constexpr (IS_STEEP)
+                plain[h] = henyey_greenstein<F>(seed<NUMBER>(number_of(node, h)), E(cosine));
+        }
+    }
+    // All else at node n: all outputs' emission, depth and p behind the mass `m`.
+    void emit(int n, Node& node, const Mass* m) const {
+        sample(node, n, EXTINCTION, FIRST_OWN_SCATTERING);
+        if (FIRST_PEAK < CHANNELS) sample(node, n, FIRST_PEAK, CHANNELS);
+        for (int k = 0; k < MASSES; ++k) {
+            const N bent = number(2 * C) * node.bend[k], held = F(1) / P::root(F(1) + bent * bent);
+            node.v[FIRST_MASS + k] -= node.bend[k] * held;
+            node.held[k] = value_of(held);
+        }
+        for (int c = 0; c < C; ++c) {
+            const N scattering = node.v[FIRST_DIFFUSING + c * DIFFUSING_STEP];
+            node.w[c] = scattering * node.v[FIRST_DIFFUSE + c * DIFFUSE_STEP];
+            node.u[c] = number(c) * P::narrow(m[c * MASS_STEP]);
+        }
+        for (int b = 0; b < BEAMS; ++b) {
+            const bool has_tables = is_point(b) || HAS_RUNGS;
+            Curve curves[PHASES * TERMS];
+            E plain[PHASES];
+            if (has_tables || IS_STEEP) read_tables(node, b, curves, plain);
+            for (int c = 0; c < C; ++c) {
+                const int i = C + b * C + c, h = c * PHASE_STEP;
+                const N scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
+                const N way = P::narrow(m[c * MASS_STEP]) +
+                              node.v[FIRST_MASS + b * EXTINCTION + c * MASS_STEP];
+                E p(P::all(F(1)));
+                if (has_curve(b)) {
+                    const auto place = place_of(node, c, way);
+                    p = has_tables
+                            ? Polynomial::template at<E>(curves + h * TERMS, place)
+                            : Polynomial::template at<E>(coefficients + first_of(b, c), place);
+                }
+                if (HAS_PEAK) p = P::most(p, E(P::all(F(0))));
+                if (IS_STEEP) p = HAS_PEAK ? P::pick(is_peaked(node, c), p, plain[h]) : plain[h];
+                node.p[i] = p;
+                if constexpr (MODE == ADJOINT)
+                    node.w[i] = scattering * p.value;
+                else
+                    node.w[i] = scattering * p;
+                node.u[i] = number(c) * way;
+            }
+        }
+        for (int i = 0; i < OUT; ++i) node.decay[i] = P::decay(value_of(node.u[i]));
+    }
+    Mass mass_between(const Node& a, const Node& b, int k) const {
+        return P::wide(F(0.5) * (a.v[k] + b.v[k]) * (b.t - a.t));
+    }
+    // What output i is integrated by: length, or for a point light the integral of 1 / r^2.
+    Length measure(const Node& a, const Node& b, int i) const {
+        const int beam = i / C - 1;
+        if (i < C || !is_point(beam)) return b.t - a.t;
+        return Point::subtended(Length(foot[beam]), Length(across[beam]), Length(a.t), Length(b.t));
+    }
+};
+
+} // namespace ddrecon
