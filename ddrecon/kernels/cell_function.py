@@ -29,7 +29,7 @@ def apply_cell(header: str, cell: str, outs: int, numbers: Tensor, *fields: Tens
     `numbers` [N, C or 1], N > 0, are the same in all cells of a color. All of it is differentiated,
     in both modes.
     """
-    colors = max(map(len, fields))
+    colors = max(numbers.shape[1], *map(len, fields))
     found: Tensors = _Cell.apply(header, cell, outs, numbers.expand(-1, colors), *fields)
     return found
 
@@ -84,14 +84,13 @@ def _run(
     **given: Any,
 ) -> tuple[Tensors, Tensor]:
     """What the kernel of that `kind` makes in all cells, and sums of cotangents [N, C * rows]."""
-    like = max(fields, key=len)
-    colors, *shape = like.shape
+    like, colors, shape = fields[0], numbers.shape[1], fields[0].shape[1:]
     # A row is a slice: a processor sees sooner that many arrays are gone through.
     width = 1 if like.is_cuda else math.prod(shape[1:])
     rows = math.prod(shape) // width
     is_back = kind == "cotangents"
     made: dict[str, Any] = {
-        "made": [like.new_empty(like.shape) for _ in range(len(fields) if is_back else outs)]
+        "made": [like.new_empty(colors, *shape) for _ in range(len(fields) if is_back else outs)]
     }
     if is_back:
         made["sums"] = like.new_empty(len(numbers), colors * rows)

@@ -12,6 +12,7 @@ template <class F> struct Sloped {
 };
 
 template <class F, int COUNT = 1> struct Dual {
+    typedef F Plain;
     F value, by[COUNT];
     INLINE Dual() {}
     INLINE Dual(F value) : value(value) {
@@ -57,18 +58,23 @@ template <class F, int COUNT = 1> struct Dual {
     INLINE Dual& operator+=(const Dual& o) { return *this = *this + o; }
     INLINE Dual& operator-=(const Dual& o) { return *this = *this - o; }
 };
-// With plain numbers, which are as well written before it.
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator+(F a, const Dual<F, COUNT>& b) {
+// With plain numbers, which are as well written before it; those of any type are numbers F.
+template <class F, int COUNT>
+INLINE Dual<F, COUNT> operator+(typename Dual<F, COUNT>::Plain a, const Dual<F, COUNT>& b) {
     return b.chain(a + b.value, F(1));
 }
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator-(F a, const Dual<F, COUNT>& b) {
+template <class F, int COUNT>
+INLINE Dual<F, COUNT> operator-(typename Dual<F, COUNT>::Plain a, const Dual<F, COUNT>& b) {
     return b.chain(a - b.value, F(-1));
 }
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator*(F a, const Dual<F, COUNT>& b) {
+template <class F, int COUNT>
+INLINE Dual<F, COUNT> operator*(typename Dual<F, COUNT>::Plain a, const Dual<F, COUNT>& b) {
     return b.chain(a * b.value, a);
 }
-template <class F, int COUNT> INLINE Dual<F, COUNT> operator/(F a, const Dual<F, COUNT>& b) {
-    return Dual<F, COUNT>(a) / b;
+template <class F, int COUNT>
+INLINE Dual<F, COUNT> operator/(typename Dual<F, COUNT>::Plain a, const Dual<F, COUNT>& b) {
+    const F inverse = 1 / b.value, quotient = a * inverse;
+    return b.chain(quotient, -quotient * inverse);
 }
 
 // The value of a number of either kind, for comparisons; and a choice by one.
@@ -89,6 +95,11 @@ template <class F> INLINE F along(F, const Sloped<F>& found) { return found.valu
 template <class F, int COUNT>
 INLINE Dual<F, COUNT> along(const Dual<F, COUNT>& x, const Sloped<F>& found) {
     return x.chain(found.value, found.slope);
+}
+// The root of a number > 0, or 0, where the slope counts as 0.
+template <class F, int COUNT> INLINE Dual<F, COUNT> root(const Dual<F, COUNT>& x) {
+    const F found = root(x.value);
+    return x.chain(found, found > F(0) ? F(0.5) / found : F(0));
 }
 
 } // namespace ddrecon

@@ -94,6 +94,14 @@ template <class F> INLINE F decay(F depth) {
 #endif
 }
 
+template <class F> INLINE F root(F x) {
+#if defined(__CUDA_ARCH__)
+    return sqrt(x);
+#else
+    return __builtin_elementwise_sqrt(x);
+#endif
+}
+
 // psi(d) = (1 - phi) / d with phi = (1 - exp(-d)) / d, for d from 0 to 1/2; and its derivative.
 template <class F> INLINE F psi_series(F depth) {
     return series<OfPsi, F, Format<F>::terms>(-depth);

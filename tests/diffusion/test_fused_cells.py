@@ -24,17 +24,18 @@ from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.fused import (
-    closure_kernels,
     flux_kernels,
     spread,
     system_kernels,
 )
 from ddrecon.diffusion.fused.product import multiply
+from ddrecon.kernels import cell_function
 
 pytestmark = pytest.mark.slow
 
 Shape = tuple[int, int, int]
 Found = tuple[list[Tensor], list[Tensor]]
+CLOSURE = "diffusion/fused/closure.h"
 SHAPES: list[Shape] = [(5, 7, 19), (2, 2, 2), (1, 4, 3), (3, 1, 2), (4, 3, 1), (1, 1, 1)]
 COLORS = [(1, 1), (1, 3), (3, 3)]
 """Of the medium and of the light."""
@@ -211,9 +212,9 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
         spread.spread_adjoint_kernel(64),
         flux_kernels.flux_kernel(True, 64),
         flux_kernels.flux_adjoint_kernel(True, 64),
-        closure_kernels.geometric_kernel(True, 32),
-        closure_kernels.geometric_adjoint_kernel(True, 32),
-        closure_kernels.smooth_adjoint_kernel(True, 64),
+        cell_function._kernel("values", CLOSURE, "Geometric<2>", 3, 1, 32),
+        cell_function._kernel("tangents", CLOSURE, "Smooth<2>", 2, 1, 64),
+        cell_function._kernel("cotangents", CLOSURE, "Smooth<2>", 2, 1, 64),
     ]
     assert_compiles(kernels, tmp_path)
 
