@@ -23,19 +23,14 @@ from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.diffusion.fused import (
-    flux_kernels,
-    spread,
-    system_kernels,
-)
-from ddrecon.diffusion.fused.product import multiply
-from ddrecon.kernels import cell_function
+from ddrecon.diffusion.fused import faces
+from ddrecon.diffusion.fused.product import cotangents_kernel, multiply, product_kernel
+from ddrecon.kernels.cell_function import RowFunction
 
 pytestmark = pytest.mark.slow
 
 Shape = tuple[int, int, int]
 Found = tuple[list[Tensor], list[Tensor]]
-CLOSURE = "diffusion/fused/closure.h"
 SHAPES: list[Shape] = [(5, 7, 19), (2, 2, 2), (1, 4, 3), (3, 1, 2), (4, 3, 1), (1, 1, 1)]
 COLORS = [(1, 1), (1, 3), (3, 3)]
 """Of the medium and of the light."""
@@ -205,16 +200,17 @@ def test_threads_change_no_bit():
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
+    system = RowFunction(
+        faces.HEADER, "Flow<SYSTEM, 1, 0, 1>", ((),) * 5, 1, faces.PLACE, faces.GIVEN
+    )
+    flux = RowFunction(faces.HEADER, "Flow<FLUX, 2, 3, 0>", ((),) * 3, 1, faces.PLACE, faces.GIVEN)
+    closure = RowFunction("diffusion/fused/closure.h", "Smooth<2>", ((),), 1)
     kernels = [
-        system_kernels.system_kernel(True, 32),
-        system_kernels.system_adjoint_kernel(True, 32),
-        spread.spread_kernel(32),
-        spread.spread_adjoint_kernel(64),
-        flux_kernels.flux_kernel(True, 64),
-        flux_kernels.flux_adjoint_kernel(True, 64),
-        cell_function._kernel("values", CLOSURE, "Geometric<2>", 3, 1, 32),
-        cell_function._kernel("tangents", CLOSURE, "Smooth<2>", 2, 1, 64),
-        cell_function._kernel("cotangents", CLOSURE, "Smooth<2>", 2, 1, 64),
+        *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
+        *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),
+        *(closure.kernel(kind, 2, 64) for kind in ("values", "tangents", "cotangents")),
+        product_kernel(True, 32),
+        cotangents_kernel(32),
     ]
     assert_compiles(kernels, tmp_path)
 

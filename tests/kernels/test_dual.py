@@ -11,7 +11,6 @@ from torch import Tensor
 pytest.importorskip("warp")
 
 
-from ddrecon.diffusion.fused.system_kernels import system_kernel
 from ddrecon.kernels.dual import interleaved_tangent_of, pair, tangent_of, with_changes
 from ddrecon.kernels.text import BLOCK, TextKernel
 from ddrecon.light.fused.shear import shear_kernels
@@ -104,7 +103,6 @@ def test_lists_of_arrays_are_refused() -> None:
 def test_tangents_compile_for_graphics_cards(tmp_path: Path) -> None:
     layout = Layout(3, 1, 3, (False, True), 0, 0, 1, 32)
     kernels = [
-        tangent_of(system_kernel(True, 32)),
         interleaved_tangent_of(shear_kernels(64).rays),
         packet_tangent_kernel(layout, Case(True, True)),
     ]
