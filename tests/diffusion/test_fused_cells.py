@@ -204,11 +204,9 @@ def test_kernels_compile_for_graphics_cards(tmp_path: Path):
         faces.HEADER, "Flow<SYSTEM, 1, 0, 1>", ((),) * 5, 1, faces.PLACE, faces.GIVEN
     )
     flux = RowFunction(faces.HEADER, "Flow<FLUX, 2, 3, 0>", ((),) * 3, 1, faces.PLACE, faces.GIVEN)
-    closure = RowFunction("diffusion/fused/closure.h", "Smooth<2>", ((),), 1)
     kernels = [
         *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
         *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),
-        *(closure.kernel(kind, 2, 64) for kind in ("values", "tangents", "cotangents")),
         product_kernel(True, 32),
         cotangents_kernel(32),
     ]

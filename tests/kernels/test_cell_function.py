@@ -1,16 +1,25 @@
 """Functions of a cell: values, tangents and cotangents of all of them."""
 
+from pathlib import Path
+
 import pytest
 import torch
+from graphics_cards import assert_compiles
 from torch import Tensor
 from torch.autograd.gradcheck import gradcheck
 
 pytest.importorskip("warp", reason="Warp is not installed (extra `warp`)")
 
-from ddrecon.kernels.cell_function import apply_cell
+from ddrecon.kernels.cell_function import RowFunction, apply_cell
 
 GAIN = "diffusion/rounds/fused/gain.h"
-CELLS = [(GAIN, "Gain<1, 0, 1>", 10, 8, 3), (GAIN, "Gain<0, 1, 0>", 2, 2, 3)]
+CLOSURE = "diffusion/fused/closure.h"
+CELLS = [
+    (GAIN, "Gain<1, 0, 1>", 10, 8, 3),
+    (GAIN, "Gain<0, 1, 0>", 2, 2, 3),
+    (CLOSURE, "Geometric<2>", 3, 1, 2),
+    (CLOSURE, "Smooth<1>", 1, 1, 2),
+]
 """Header, function, fields, outs, numbers."""
 
 
@@ -32,3 +41,12 @@ def test_derivatives_are_those_of_values(
     for each in given:
         each.requires_grad_()
     assert gradcheck(find, given, check_forward_ad=True)
+
+
+def test_they_compile_for_graphics_cards(tmp_path: Path) -> None:
+    kernels = [
+        RowFunction(header, name, ((),) * outs, 1).kernel(kind, ins, 32)
+        for header, name, ins, outs, _ in CELLS
+        for kind in ("values", "tangents", "cotangents")
+    ]
+    assert_compiles(kernels, tmp_path)

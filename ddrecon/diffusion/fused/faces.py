@@ -79,9 +79,8 @@ def _find(
     shapes = [(colors, z, y, x)] * (outs or 1)
     if not outs:
         shapes += (own, z, y, x), (own, z - 1, y, x), (own, z, y - 1, x), (own, z, y, x - 1)
-    more = dict(zip(("nz", "ny", "nx"), (z, y, x), strict=True))
-    more |= dict(zip(("hz", "hy", "hx"), medium.grid.spacing, strict=True))
-    more |= {"own": own, "sign": sign}
+    sizes = dict(zip(("hz", "hy", "hx"), medium.grid.spacing, strict=True))
+    more = {"nz": z, "ny": y, "nx": x, "own": own, "sign": sign, **sizes}
     function = RowFunction(HEADER, flow, tuple(shapes), x, PLACE, GIVEN, more, added, alike)
     numbers = torch.stack([number.reshape(-1).expand(colors) for number in each])
     return function.apply(numbers, fields[0], scattering.field, *fields[1:])

@@ -24,11 +24,6 @@ from ddrecon.renderer import solve_light
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.diffusion.rounds.fused.blend import blend_adjoint_kernel, blend_kernel
 from ddrecon.diffusion.rounds.fused.by_cells import cell_kernels
-from ddrecon.diffusion.rounds.fused.gain import (
-    GainCase,
-    gain_adjoint_kernel,
-    gain_kernel,
-)
 from ddrecon.diffusion.rounds.fused.sweep import sweep_fused
 
 pytestmark = pytest.mark.slow
@@ -238,8 +233,5 @@ def test_light_after_rounds_is_that_of_torch(g: float):
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
     kernels = [*cell_kernels(32, False, True)]
-    for is_off in (True, False):
-        case = GainCase(True, False, is_off)
-        kernels += [gain_kernel(case, 32), gain_adjoint_kernel(case, 32)]
     kernels += [blend_kernel(32), blend_adjoint_kernel(32)]
     assert_compiles(kernels, tmp_path)
