@@ -17,11 +17,11 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, interpolate
 
 from ddrecon.grid import Grid
+from ddrecon.medium.coefficients import Coefficient
 from ddrecon.settings import FLOOR
 from ddrecon.slabs.exchange import gather_own
 from ddrecon.slabs.slab import Slab, whole_of
 
-Shape = tuple[int, int, int]
 BACKGROUND = 0.01
 """Optical thickness, across a side of the box, of a haze that gives an empty box distances too.
 
@@ -53,48 +53,55 @@ def geometric(transport_extinction: Tensor, grid: Grid, floor: float = FLOOR) ->
     continued to second order and stays positive.
     """
     # D = 1 / (spreading (1 + ratio)), with spreading = 4 / distance
-    spreading = 4 * inverse_distance(transport_extinction, grid)
+    weight = Coefficient(transport_extinction.new_ones(()), transport_extinction)
+    spreading = 4 * inverse_distance([weight], grid)
     ratio = 3 * transport_extinction / spreading
     inverse = torch.where(ratio < 0, 1 - ratio + ratio**2, 1 / (1 + ratio.clamp(min=0)))
     return inverse / spreading
 
 
-def inverse_distance(weight: Tensor, grid: Grid) -> Tensor:
-    """The mean of 1 / distance [1/u] from each cell to all `weight` [C, z, y, x] >= 0.
+def inverse_distance(weight: Sequence[Coefficient], grid: Grid) -> Tensor:
+    """The mean of 1 / distance [1/u] from each cell to all `weight`, `[C, z, y, x]`.
 
+    The weight is a sum of coefficients >= 0: a field that colors share is transformed once for all.
     It is computed on a coarse grid and interpolated. Outside a sphere this is
     1 / (distance to its center), exactly: Newton's shell theorem.
     """
-    inverse = _inverse_distance(coarse_mean(weight, grid), whole_of(grid))
-    if isinstance(grid, Slab):
-        # Axis by axis; that along the slab's is of the whole grid.
-        whole = _with_entry(inverse.shape[1:], grid.axis, grid.whole.shape[grid.axis])
-        inverse = grid.cut(_interpolate(inverse, whole))
-    return _interpolate(inverse, grid.shape)
+    whole = whole_of(grid)
+    coarse, even = coarse_grid(whole), haze(whole)
+    masses = [(term.scale, _coarse_mean(term.field, grid)) for term in weight]
+    like = masses[0][1]
+    potentials = even * _even_potential(coarse, like.dtype, like.device)
+    total = like.new_tensor(even * coarse.cells)
+    for scale, mass in masses:
+        potentials = potentials + scale * potential(mass, coarse)
+        total = total + scale * mass.sum((1, 2, 3), keepdim=True)
+    z, y, x = (_weights(axis, grid, few, like) for axis, few in enumerate(coarse.shape))
+    return (z @ (y @ (potentials / total)).flatten(2)).unflatten(2, (len(y), -1)) @ x.mT
 
 
-def _inverse_distance(mean: Tensor, grid: Grid) -> Tensor:
-    """The mean of 1 / distance [1/u] on the coarse grid, from the `mean` weight of its cells."""
-    mass = mean + haze(grid)
-    return potential(mass, coarse_grid(grid)) / mass.sum((1, 2, 3), keepdim=True)
-
-
-def coarse_mean(weight: Tensor, grid: Grid) -> Tensor:
-    """The mean `weight` of the cells of the coarse grid; in slabs of all ranks' together."""
+def _coarse_mean(field: Tensor, grid: Grid) -> Tensor:
+    """The mean of `field` in the cells of the coarse grid; in slabs of all ranks' together."""
     coarse = coarse_grid(whole_of(grid))
     if isinstance(grid, Slab):
-        own = _with_entry(coarse.shape, grid.axis, grid.size)
-        weight = gather_own(adaptive_avg_pool3d(grid.own(weight), own), grid)
-    return adaptive_avg_pool3d(weight, coarse.shape)
+        z, y, x = (grid.size if axis == grid.axis else n for axis, n in enumerate(coarse.shape))
+        field = gather_own(adaptive_avg_pool3d(grid.own(field), (z, y, x)), grid)
+    return adaptive_avg_pool3d(field, coarse.shape)
 
 
-def _with_entry(shape: Sequence[int], axis: int, cells: int) -> Shape:
-    z, y, x = (cells if a == axis else n for a, n in enumerate(shape))
-    return z, y, x
+def _weights(axis: int, grid: Grid, few: int, like: Tensor) -> Tensor:
+    """The matrix [cells, few] that interpolates linearly to the cells of `grid` along `axis`."""
+    weights = _all_weights(whole_of(grid).shape[axis], few, like.dtype, like.device)
+    return (
+        weights[grid.first : grid.last] if isinstance(grid, Slab) and grid.axis == axis else weights
+    )
 
 
-def _interpolate(u: Tensor, shape: Shape) -> Tensor:
-    return interpolate(u[None], size=shape, mode="trilinear")[0]
+@functools.lru_cache(maxsize=32)
+@torch.inference_mode(False)
+def _all_weights(cells: int, few: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    unit = torch.eye(few, dtype=torch.float64)[None]
+    return interpolate(unit, size=cells, mode="linear")[0].mT.to(device, dtype)
 
 
 def coarse_grid(grid: Grid) -> Grid:
@@ -117,6 +124,13 @@ def potential(mass: Tensor, grid: Grid) -> Tensor:
     summed = [torch.fft.irfftn(torch.fft.rfftn(color, wide) * spectrum, wide) for color in mass]
     depth, height, width = grid.shape
     return torch.stack(summed)[:, :depth, :height, :width]
+
+
+@functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
+def _even_potential(grid: Grid, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The potential of a mass of 1 in every cell, `[1, z, y, x]`."""
+    return potential(torch.ones(1, *grid.shape, dtype=dtype, device=device), grid)
 
 
 @functools.lru_cache(maxsize=8)

@@ -59,7 +59,7 @@ class DiffusionProblem:
     def system(self) -> tuple[Operator, Tensor]:
         """A and the right side of E7."""
         if is_fused():
-            from ddrecon.diffusion.fused.system import assemble_system
+            from ddrecon.diffusion.fused.faces import assemble_system
 
             z, y, x, loss, right = assemble_system(
                 self.medium, self.diffusion, self.source, self.outside
@@ -89,7 +89,7 @@ class DiffusionProblem:
         if not self.has_flux:
             return None
         if is_fused():
-            from ddrecon.diffusion.fused.flux import find_flux
+            from ddrecon.diffusion.fused.faces import find_flux
 
             return find_flux(
                 self.medium,
@@ -114,7 +114,7 @@ class DiffusionProblem:
         if flux is None:
             return right + source
         if is_fused():
-            from ddrecon.diffusion.fused.spread import spread_flux
+            from ddrecon.diffusion.fused.faces import spread_flux
 
             return spread_flux(self.medium, self.diffusion, flux, (right, source))
         z, y, x = (

@@ -95,7 +95,7 @@ class Operator:
             # Each rank has the rows of its own cells: so a face that two have is counted once.
             adjoint = self.ghosts.without(adjoint)
         if current_engine() == "warp":
-            from ddrecon.diffusion.fused.cotangents import find_cotangents  # imports Warp
+            from ddrecon.diffusion.fused.product import find_cotangents  # imports Warp
 
             return find_cotangents((self.loss, *self.conductances), adjoint, u)
         conductance_bars = (

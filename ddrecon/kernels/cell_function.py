@@ -4,14 +4,15 @@
                                numbers, extinction, scattering, *change, *off)
 
 Values, tangents and cotangents are the same code, of plain numbers and of dual ones (`dual.h`);
-`cells.h` goes through the cells.
+`cells.h` goes through the cells. A `RowFunction` may look beyond its cell (`faces.h`).
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -29,88 +30,119 @@ def apply_cell(header: str, cell: str, outs: int, numbers: Tensor, *fields: Tens
     `numbers` [N, C or 1], N > 0, are the same in all cells of a color. All of it is differentiated,
     in both modes.
     """
-    colors = max(map(len, fields))
-    found: Tensors = _Cell.apply(header, cell, outs, numbers.expand(-1, colors), *fields)
-    return found
+    colors, (z, y, x) = max(numbers.shape[1], *map(len, fields)), fields[0].shape[1:]
+    # A row is a slice: a processor sees sooner that many arrays are gone through.
+    function = RowFunction(header, cell, ((colors, z, y, x),) * outs, y * x)
+    return function.apply(numbers.expand(-1, colors), *fields)
 
 
-class _Cell(torch.autograd.Function):
-    """A function of a cell, in all cells."""
+@dataclass(frozen=True)
+class RowFunction:
+    """What finds arrays of these `shapes`, in rows of so many cells: a `name` in a `header`.
+
+    `find_values` and its like are given the row, then what stands in `place`: made of `more`,
+    which C++ has as it is `declared`. The last fields, as many as are `added`, are but added to
+    what is found, one after another. As many before them as are `alike` have the same cotangents as
+    those before these.
+    """
+
+    header: str
+    name: str
+    shapes: tuple[tuple[int, ...], ...]
+    width: int
+    place: str = ""
+    declared: str = ""
+    more: Mapping[str, Any] = field(default_factory=dict)
+    added: int = 0
+    alike: int = 0
+
+    def apply(self, numbers: Tensor, *fields: Tensor) -> Tensors:
+        """What is found of `numbers` [N, C] and `fields` [C or 1, z, y, x], with derivatives."""
+        found: Tensors = _Found.apply(self, numbers, *fields)
+        return found
+
+    def run(
+        self, kind: str, numbers: Tensor, fields: Sequence[Tensor], **given: Any
+    ) -> tuple[Tensors, Tensor]:
+        """What the kernel of that `kind` makes in all cells, and sums of cotangents [N, C * rows].
+
+        "values"; "tangents" of what is `given`, `d_numbers` and `d_fields`; or "cotangents" from
+        `bars`, those of what was found.
+        """
+        like, colors, shape = fields[0], numbers.shape[1], fields[0].shape[1:]
+        width = 1 if like.is_cuda else self.width
+        items = colors * math.prod(shape) // width
+        made: dict[str, Any]
+        if kind == "cotangents":
+            bars = [like.new_empty(colors, *shape) for _ in range(len(fields) - self.alike)]
+            made = {"made": bars + bars[len(bars) - self.alike :]}
+            made["sums"] = like.new_empty(len(numbers), items)
+        else:
+            made = {"made": [like.new_empty(each) for each in self.shapes]}
+        own = {
+            "width": width,
+            "rows": items // colors,
+            "colors": colors,
+            "numbers": numbers,
+            "fields": fields,
+            "is_each": [len(field) == colors for field in fields],
+        }
+        self.kernel(kind, len(fields), 8 * like.element_size()).launch(
+            items, {**own, **self.more, **given}, made
+        )
+        return tuple(made["made"]), made.get("sums", like)
+
+    def kernel(self, kind: str, ins: int, bits: int) -> TextKernel:
+        """The kernel of "values", "tangents" or "cotangents", for so many fields."""
+        code = self.header, self.name, self.place, self.declared, len(self.shapes)
+        return _kernel(kind, ins, bits, *code)
+
+
+class _Found(torch.autograd.Function):
+    """What a function finds in all cells."""
 
     @staticmethod
-    def forward(header: str, cell: str, outs: int, numbers: Tensor, *fields: Tensor) -> Tensors:
-        return _run("values", header, cell, outs, numbers, fields)[0]
+    def forward(function: RowFunction, numbers: Tensor, *fields: Tensor) -> Tensors:
+        return function.run("values", numbers, fields)[0]
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
-        ctx.header, ctx.cell, ctx.outs = inputs[:3]
-        keep(ctx, *inputs[3:])
+        ctx.function, *tensors = inputs
+        # Nothing depends on what something is added to.
+        keep(ctx, *tensors[: len(tensors) - ctx.function.added])
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        numbers, *fields = ctx.saved_tensors
-        found, sums = _run("cotangents", ctx.header, ctx.cell, ctx.outs, numbers, fields, bars=bars)
+        (numbers, *fields), added = ctx.saved_tensors, ctx.function.added
+        found, sums = ctx.function.run("cotangents", numbers, fields, bars=bars)
         numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
         field_bars = (bar.sum_to_size(one.shape) for bar, one in zip(found, fields, strict=True))
-        return None, None, None, numbers_bar, *field_bars
+        return None, numbers_bar, *field_bars, *(bars * added)[:added]
 
     @staticmethod
-    def jvp(ctx: Any, *changes: Any) -> Tensors:
+    def jvp(ctx: Any, _: None, *changes: Tensor | None) -> Tensors:
         def change(*tensors: Any) -> Tensors:
-            half = len(tensors) // 2
-            values, (d_numbers, *d_fields) = (
-                tensors[:half],
-                [
-                    torch.zeros_like(value) if d_value is None else d_value.expand_as(value)
-                    for value, d_value in zip(tensors[:half], tensors[half:], strict=True)
-                ],
+            kept = len(tensors) - len(changes)
+            d_values = tensors[kept:]
+            # The change stands for what something is added to, as well.
+            values = *tensors[:kept], *d_values[kept:]
+            d_numbers, *d_fields = (
+                torch.zeros_like(value) if d_value is None else d_value.expand_as(value)
+                for value, d_value in zip(values, d_values, strict=True)
             )
-            numbers, *fields = values
-            code = ctx.header, ctx.cell, ctx.outs, numbers, fields
-            return _run("tangents", *code, d_numbers=d_numbers, d_fields=d_fields)[0]
+            given = {"d_numbers": d_numbers, "d_fields": d_fields}
+            return ctx.function.run("tangents", values[0], values[1:], **given)[0]
 
-        found: Tensors = run_plainly(change, *ctx.saved_tensors, *changes[3:])
+        found: Tensors = run_plainly(change, *ctx.saved_tensors, *changes)
         return found
 
 
-def _run(
-    kind: str,
-    header: str,
-    cell: str,
-    outs: int,
-    numbers: Tensor,
-    fields: Sequence[Tensor],
-    **given: Any,
-) -> tuple[Tensors, Tensor]:
-    """What the kernel of that `kind` makes in all cells, and sums of cotangents [N, C * rows]."""
-    like = max(fields, key=len)
-    colors, *shape = like.shape
-    # A row is a slice: a processor sees sooner that many arrays are gone through.
-    width = 1 if like.is_cuda else math.prod(shape[1:])
-    rows = math.prod(shape) // width
-    is_back = kind == "cotangents"
-    made: dict[str, Any] = {
-        "made": [like.new_empty(like.shape) for _ in range(len(fields) if is_back else outs)]
-    }
-    if is_back:
-        made["sums"] = like.new_empty(len(numbers), colors * rows)
-    own = {
-        "width": width,
-        "rows": rows,
-        "colors": colors,
-        "numbers": numbers,
-        "fields": fields,
-        "is_each": [len(field) == colors for field in fields],
-    }
-    kernel = _kernel(kind, header, cell, len(fields), outs, 8 * like.element_size())
-    kernel.launch(colors * rows, own | given, made)
-    return tuple(made["made"]), made.get("sums", like)
-
-
 @functools.cache
-def _kernel(kind: str, header: str, cell: str, ins: int, outs: int, bits: int) -> TextKernel:
-    """The kernel of `values`, `tangents` or `cotangents`, an item of which does a row."""
+def _kernel(
+    kind: str, ins: int, bits: int, header: str, name: str, place: str, declared: str, outs: int
+) -> TextKernel:
+    """The kernel an item of which does a row."""
     more, arguments, made = {
         "values": (f"*made[{outs}]", "numbers, made", "made"),
         "tangents": (
@@ -122,7 +154,10 @@ def _kernel(kind: str, header: str, cell: str, ins: int, outs: int, bits: int) -
             f"*bars[{outs}], *made[{ins}], *sums", "numbers, bars, made, sums", "made sums"
         ),
     }[kind]  # fmt: skip
-    name = f"{cell.split('<')[0].lower()}_{kind}"
-    text = f"find_{kind}<{cell}>(Row(item, width, rows, colors), is_each, fields, {arguments});"
-    given = f"int width, rows, colors, is_each[{ins}]; F *fields[{ins}], *numbers, {more}"
-    return TextKernel(name, bits, text, given, made, header)
+    title = f"{name.split('<')[0].lower()}_{kind}"
+    text = "const Row row(item, width, rows, colors);"
+    text += f"find_{kind}<{name}>(row, {place}is_each, fields, {arguments});"
+    given = (
+        f"int width, rows, colors, is_each[{ins}]; F *fields[{ins}], *numbers, {more};{declared}"
+    )
+    return TextKernel(title, bits, text, given, made, header)

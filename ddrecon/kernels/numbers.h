@@ -24,8 +24,14 @@
 #if defined(__clang__) && !defined(__CUDA_ARCH__)
 // Before a loop: no turn reads what another writes, which clang cannot see of many arrays.
 #define INDEPENDENT _Pragma("clang loop vectorize(assume_safety)")
+// The same where the loop has sums, of which several turns at once need more numbers than registers
+// hold.
+#define SUMMING \
+    INDEPENDENT \
+    _Pragma("clang loop interleave_count(1)")
 #else
 #define INDEPENDENT
+#define SUMMING
 #endif
 
 namespace ddrecon {

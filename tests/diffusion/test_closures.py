@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ddrecon.diffusion.closures import CLOSURES, FLOOR, geometric, inverse_distance
 from ddrecon.grid import Grid
+from ddrecon.medium.coefficients import Coefficient
 
 each_closure = pytest.mark.parametrize("closure", CLOSURES.values(), ids=CLOSURES.keys())
 
@@ -64,9 +65,9 @@ def test_distances_are_those_summed_cell_by_cell():
     expected = (weight.flatten(1) @ (1 / apart) / weight.flatten(1).sum(1, keepdim=True)).view_as(
         weight
     )
-    torch.testing.assert_close(
-        inverse_distance(weight - 0.03 / sum(grid.extent), grid), expected, rtol=1e-12, atol=0
-    )
+    without_haze = Coefficient(torch.ones(()), weight - 0.03 / sum(grid.extent))
+    found = inverse_distance([without_haze], grid)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
 
 
 def sphere(grid: Grid, radius: float) -> tuple[Tensor, Tensor]:
@@ -95,9 +96,8 @@ def test_distances_on_a_fine_grid_are_interpolated():
     grid = Grid((48, 48, 48), (-0.5,) * 3, (0.5,) * 3)
     distance, kappa = sphere(grid, 0.3)
     outside = distance > 0.35
-    torch.testing.assert_close(
-        1 / inverse_distance(kappa, grid)[outside], distance[outside], rtol=0.03, atol=0
-    )
+    found = 1 / inverse_distance([Coefficient(torch.ones(()), kappa)], grid)
+    torch.testing.assert_close(found[outside], distance[outside], rtol=0.03, atol=0)
 
 
 def test_finite_differences_may_step_below_zero():

@@ -23,13 +23,9 @@ from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.diffusion.fused import (
-    closure_kernels,
-    flux_kernels,
-    spread,
-    system_kernels,
-)
-from ddrecon.diffusion.fused.product import multiply
+from ddrecon.diffusion.fused import faces
+from ddrecon.diffusion.fused.product import cotangents_kernel, multiply, product_kernel
+from ddrecon.kernels.cell_function import RowFunction
 
 pytestmark = pytest.mark.slow
 
@@ -204,16 +200,15 @@ def test_threads_change_no_bit():
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
+    system = RowFunction(
+        faces.HEADER, "Flow<SYSTEM, 1, 0, 1>", ((),) * 5, 1, faces.PLACE, faces.GIVEN
+    )
+    flux = RowFunction(faces.HEADER, "Flow<FLUX, 2, 3, 0>", ((),) * 3, 1, faces.PLACE, faces.GIVEN)
     kernels = [
-        system_kernels.system_kernel(True, 32),
-        system_kernels.system_adjoint_kernel(True, 32),
-        spread.spread_kernel(32),
-        spread.spread_adjoint_kernel(64),
-        flux_kernels.flux_kernel(True, 64),
-        flux_kernels.flux_adjoint_kernel(True, 64),
-        closure_kernels.geometric_kernel(True, 32),
-        closure_kernels.geometric_adjoint_kernel(True, 32),
-        closure_kernels.smooth_adjoint_kernel(True, 64),
+        *(system.kernel(kind, 6, 32) for kind in ("values", "tangents", "cotangents")),
+        *(flux.kernel(kind, fields, 64) for kind, fields in (("values", 12), ("cotangents", 9))),
+        product_kernel(True, 32),
+        cotangents_kernel(32),
     ]
     assert_compiles(kernels, tmp_path)
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
-from graphics_cards import assert_compiles
 from media import dense_matrix, random_values
 from test_multigrid import FORMS, operator_of, patchy, patchy_box, uneven
 from torch import Tensor
@@ -22,7 +20,6 @@ from ddrecon.errors import SolveError
 from ddrecon.grid import Grid
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.diffusion.fused.cotangents import cotangents_kernel
 from ddrecon.diffusion.solvers.fused import hierarchy, stages
 from ddrecon.diffusion.solvers.fused import multigrid as fused
 from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy
@@ -262,8 +259,3 @@ def test_arrays_of_a_hierarchy_do_not_overlap(shape: tuple[int, int, int]):
         begins = [begin for begin in begins if begin]
         assert len(set(begins)) == len(begins)
         assert max(begins, default=0) <= getattr(found, kind)
-
-
-def test_cotangents_compile_for_graphics_cards(tmp_path: Path):
-    """The solve itself is torch's there."""
-    assert_compiles([cotangents_kernel(32)], tmp_path)

@@ -11,7 +11,6 @@ from torch import Tensor
 pytest.importorskip("warp")
 
 
-from ddrecon.diffusion.fused.system_kernels import system_kernel
 from ddrecon.kernels.dual import interleaved_tangent_of, pair, tangent_of, with_changes
 from ddrecon.kernels.text import BLOCK, TextKernel
 
@@ -94,11 +93,3 @@ def test_lists_of_arrays_are_refused() -> None:
     for find in (lambda: tangent_of(listed), lambda: interleaved_tangent_of(listed)):
         with pytest.raises(ValueError, match="fields"):
             find()
-
-
-@pytest.mark.slow
-def test_tangents_compile_for_graphics_cards(tmp_path: Path) -> None:
-    kernels = [
-        tangent_of(system_kernel(True, 32)),
-    ]
-    assert_compiles(kernels, tmp_path)

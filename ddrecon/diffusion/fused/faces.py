@@ -1,28 +1,86 @@
-"""C++ that kernels of cells and their faces share: neighbors, and the factors of faces."""
+"""The system of E7 and the flux of E5 as functions of tensors, with derivatives, by `faces.h`."""
 
-FACES = """
-const bool zl = z > 0, zh = z < nz - 1, yl = y > 0, yh = y < ny - 1;
-// From a cell to its neighbors across each face; to itself where the box ends.
-const long long to_zl = zl ? -plane : 0, to_zh = zh ? plane : 0;
-const long long to_yl = yl ? -nx : 0, to_yh = yh ? nx : 0;
-// With this t, 2 a t is the harmonic mean of D = a here and D = b beyond (E7); on the box it is
-// what escapes there, 1 / (2 + h / (2 a)) (E6).
-auto share = [](F a, F b, F h, bool inside) HERE -> F {
-    return (inside ? b : F(1)) / (inside ? a + b : F(4) * a + h);
-};
-// (p + p beyond) / 2, or (h / 2) p on the box: what Q1 drives through a face, p = kappa_s Q1.
-auto driven = [](F p, F beyond, F h, bool inside) HERE -> F {
-    return F(0.5) * (inside ? p + beyond : h * p);
-};
-// All cells of the part, with whether and where there are neighbors along x. Beside the ends of a
-// row lie other rows, which may be read for nothing, but for the first row and the last.
-auto each = [&](auto&& cell) HERE {
-    if (row > 0 && row < nz * ny - 1) {
-#pragma clang loop vectorize(assume_safety)
-        for (int i = begin; i < end; ++i) cell(i, i > 0, i < nx - 1, -1, 1);
-    } else {
-        for (int i = begin; i < end; ++i)
-            cell(i, i > 0, i < nx - 1, i > 0 ? -1 : 0, i < nx - 1 ? 1 : 0);
-    }
-};
-"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ddrecon.kernels.cell_function import RowFunction, Tensors
+from ddrecon.light.moments import Moments, Vector
+from ddrecon.medium.coefficients import Medium
+
+HEADER = "diffusion/fused/faces.h"
+PLACE = "Mesh<F>(row, nz, ny, nx, hz, hy, hx), own, F(sign), "
+GIVEN = "int nz, ny, nx, own, sign; F hz, hy, hx"
+
+
+def assemble_system(medium: Medium, diffusion: Tensor, source: Moments, outside: Tensor) -> Tensors:
+    """Conductances along z, y, x, loss and right side of E7; `source` holds Q0 and Q1."""
+    absorption, flux = medium.absorption, source.flux or ()
+    is_shared = absorption.field is medium.remaining.field
+    fields = [source.mean, *(() if is_shared else (absorption.field,)), *flux]
+    flow = f"Flow<SYSTEM, {len(flux) // 3}, 0, {int(is_shared)}>"
+    numbers = [outside, absorption.scale]
+    right, loss, *conductances = _find(flow, medium, numbers, [diffusion, *fields])
+    return *conductances, loss, right
+
+
+def find_flux(
+    medium: Medium,
+    diffusion: Tensor,
+    flux: Vector | None,
+    outside: Tensor,
+    mean: Tensor,
+    more: Vector | None = None,
+    begun: Vector | None = None,
+    sign: int = 1,
+) -> Vector:
+    """L1 of L0 = `mean` (E5, E6) for Q1 = `flux` + `more`.
+
+    Times the `sign`, and added to a flux that is `begun`.
+    """
+    fluxes, start = [*(flux or ()), *(more or ())], begun or ()
+    flow = f"Flow<FLUX, {len(fluxes) // 3}, {len(start)}, 0>"
+    fields = [diffusion, mean, *fluxes, *start]
+    alike = max(len(fluxes) - 3, 0)
+    z, y, x = _find(flow, medium, [outside], fields, 3, len(start), alike, sign)
+    return z, y, x
+
+
+def spread_flux(
+    medium: Medium, diffusion: Tensor, flux: Vector, begun: tuple[Tensor, Tensor]
+) -> Tensor:
+    """The sum of what is `begun`, less div(D kappa_s `flux`), all [C, z, y, x]."""
+    fields = [diffusion, *flux, *begun]
+    (right,) = _find("Flow<GAIN, 1, 2, 0>", medium, [], fields, 1, len(begun))
+    return right
+
+
+def _find(
+    flow: str,
+    medium: Medium,
+    others: Sequence[Tensor],
+    fields: Sequence[Tensor],
+    outs: int = 0,
+    added: int = 0,
+    alike: int = 0,
+    sign: int = 1,
+) -> Tensors:
+    """What a `flow` finds of `fields`, D first, and of kappa_s's scale and `others`.
+
+    So many `outs` of all cells, or the system; the last fields are `added` and `alike`.
+    """
+    (z, y, x), own, scattering = medium.grid.shape, len(fields[0]), medium.remaining
+    each = scattering.scale, *others
+    colors = max(number.numel() for number in each)
+    colors = max(colors, *map(len, fields))
+    shapes = [(colors, z, y, x)] * (outs or 1)
+    if not outs:
+        shapes += (own, z, y, x), (own, z - 1, y, x), (own, z, y - 1, x), (own, z, y, x - 1)
+    sizes = dict(zip(("hz", "hy", "hx"), medium.grid.spacing, strict=True))
+    more = {"nz": z, "ny": y, "nx": x, "own": own, "sign": sign, **sizes}
+    function = RowFunction(HEADER, flow, tuple(shapes), x, PLACE, GIVEN, more, added, alike)
+    numbers = torch.stack([number.reshape(-1).expand(colors) for number in each])
+    return function.apply(numbers, fields[0], scattering.field, *fields[1:])

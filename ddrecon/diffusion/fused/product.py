@@ -1,43 +1,17 @@
-"""A u of the diffusion operator, and S - A u, in one pass over the light (E7)."""
+"""A u of the diffusion operator, S - A u, and cotangents, in one pass over the light (E7, E9)."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.fused.cotangents import find_cotangents
-from ddrecon.diffusion.fused.faces import FACES
 from ddrecon.diffusion.operator import Operator
-from ddrecon.grid import Grid
-from ddrecon.kernels.rows import launch_rows, row_kernel
+from ddrecon.kernels.text import TextKernel
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
-
-_PRODUCT = """
-const F *u = light + c * size + start, *own_loss = loss + color(loss_colors, size) + start;
-const F* before = begun ? begun + c * size + start : u;
-F* out = product + c * size + start;
-const F kept = begun ? F(1) : F(0), times = F(sign);
-const F* cz = conductance_z + color(z_colors, plane * (nz - 1)) + start;
-const F* cy
-    = conductance_y + color(y_colors, (plane - nx) * nz) + ((long long)z * (ny - 1) + y) * nx;
-const F* cx = nx == 1
-    ? u : conductance_x + color(x_colors, (size / nx) * (nx - 1)) + (long long)row * (nx - 1);
-// Where there is no face, the difference across it is zero.
-const F *cz_low = zl ? cz - plane : u, *cz_high = zh ? cz : u;
-const F *cy_low = yl ? cy - nx : u, *cy_high = yh ? cy : u;
-each([&](int i, bool xl, bool xh, int to_xl, int to_xh) HERE {
-    const F here = u[i];
-    const F change = own_loss[i] * here
-        + cz_low[i] * (here - u[i + to_zl]) + cz_high[i] * (here - u[i + to_zh])
-        + cy_low[i] * (here - u[i + to_yl]) + cy_high[i] * (here - u[i + to_yh])
-        + (xl ? cx[i + to_xl] * (here - u[i + to_xl]) : F(0))
-        + (xh ? cx[i] * (here - u[i + to_xh]) : F(0));
-    out[i] = kept * before[i] + times * change;
-});
-"""
 
 
 def multiply(
@@ -54,16 +28,24 @@ def multiply(
 
     Times the `sign`, and added to what is `begun`.
     """
-    product = u.new_empty(u.shape)
-    given: dict[str, Any] = {
-        "light": u, "loss": loss, "conductance_z": z, "conductance_y": y, "conductance_x": x,
-        "loss_colors": len(loss), "z_colors": len(z), "y_colors": len(y), "x_colors": len(x),
-        "begun": begun, "sign": sign,
-    }  # fmt: skip
-    _, depth, height, width = u.shape
-    unit = Grid((depth, height, width), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    launch_rows(product_kernel, unit, len(u), given, {"product": product})
+    product, matrix = u.new_empty(u.shape), (loss, z, y, x)
+    given = {"matrix": matrix, "light": u, "begun": begun, "sign": sign}
+    kernel = product_kernel(begun is not None, 8 * u.element_size())
+    items, mesh = _rows(u, matrix)
+    kernel.launch(len(u) * items, mesh | given, {"product": product})
     return product
+
+
+def find_cotangents(like: tuple[Tensor, ...], adjoint: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+    """loss_bar and c_bar of each axis, of the shapes of `like`, the loss and the conductances.
+
+    `adjoint` and `u`: lambda and the light [C, z, y, x].
+    """
+    bars = [each.new_empty(each.shape) for each in like]
+    items, mesh = _rows(u, like)
+    given = {"adjoint": adjoint, "light": u}
+    cotangents_kernel(8 * u.element_size()).launch(items, mesh | given, {"bars": bars})
+    return tuple(bars)
 
 
 def find_imbalance(operator: Operator, right: Tensor, u: Tensor) -> Tensor:
@@ -90,27 +72,51 @@ class _Imbalance(torch.autograd.Function):
         return bar, multiply(bar, *matrix, sign=-1), *find_cotangents(tuple(matrix), bar, u)
 
     @staticmethod
-    def jvp(ctx: Any, d_right: Tensor | None, d_u: Tensor | None, *d_matrix: Any) -> Tensor:
-        def change(u: Tensor, d_right: Tensor | None, d_u: Tensor | None, *tensors: Any) -> Tensor:
-            matrix, d_parts = tensors[:4], tensors[4:]
-            found = torch.zeros_like(u) if d_right is None else d_right
-            # dS - A du - dA u
-            if d_u is not None:
-                found = multiply(d_u, *matrix, begun=found, sign=-1)
-            d_matrix = (
-                torch.zeros_like(part) if d_part is None else d_part
-                for part, d_part in zip(matrix, d_parts, strict=True)
+    def jvp(ctx: Any, *changes: Tensor | None) -> Tensor:
+        def change(*tensors: Any) -> Tensor:
+            (u, *matrix), changes = tensors[:5], tensors[5:]
+            d_right, d_u, *d_matrix = (
+                torch.zeros_like(value) if d_value is None else d_value
+                for value, d_value in zip((u, u, *matrix), changes, strict=True)
             )
+            # dS - A du - dA u
+            found = multiply(d_u, *matrix, begun=d_right, sign=-1)
             return multiply(u, *d_matrix, begun=found, sign=-1)
 
-        u, *matrix = ctx.saved_tensors
-        d_imbalance: Tensor = run_plainly(change, u, d_right, d_u, *matrix, *d_matrix)
+        d_imbalance: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_imbalance
 
 
+def _rows(u: Tensor, matrix: Sequence[Tensor]) -> tuple[int, dict[str, Any]]:
+    """Rows of a color, and what kernels are given of them and of the `matrix`."""
+    colors, nz, ny, nx = u.shape
+    width = 1 if u.is_cuda else nx
+    rows = nz * ny * nx // width
+    is_each = [len(part) == colors for part in matrix]
+    names = "width", "rows", "colors", "nz", "ny", "nx", "is_each"
+    values = width, rows, colors, nz, ny, nx, is_each
+    return rows, dict(zip(names, values, strict=True))
+
+
+_HEADER = "diffusion/fused/product.h"
+_ROWS = "int width, rows, colors, nz, ny, nx, is_each[4];"
+_TEXT = """
+const Row row(item, width, rows, colors);
+const Mesh<F> mesh(row, nz, ny, nx, F(1), F(1), F(1));
+"""
+
+
 @functools.cache
-def product_kernel(bits: int) -> Any:
+def product_kernel(is_begun: bool, bits: int) -> TextKernel:
     """The kernel of A u; loss and conductances have all colors or one."""
-    arrays = "light loss conductance_z conductance_y conductance_x begun"
-    numbers = "loss_colors z_colors y_colors x_colors sign"
-    return row_kernel("multiply_operator", bits, FACES + _PRODUCT, arrays, "product", numbers)
+    call = f"multiply<{int(is_begun)}>(row, mesh, F(sign), is_each, matrix, light, begun, product);"
+    given = _ROWS + "int sign; F *matrix[4], *light, *begun, *product"
+    return TextKernel("multiply_operator", bits, _TEXT + call, given, "product", _HEADER)
+
+
+@functools.cache
+def cotangents_kernel(bits: int) -> TextKernel:
+    """The kernel of loss_bar and c_bar, of a row of cells in all colors."""
+    call = "find_matrix_bars(row, mesh, colors, is_each, adjoint, light, bars);"
+    given = _ROWS + "F *adjoint, *light, *bars[4]"
+    return TextKernel("matrix_bars", bits, _TEXT + call, given, "bars", _HEADER)

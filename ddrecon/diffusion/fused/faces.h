@@ -1,0 +1,248 @@
+#pragma once
+#include "ddrecon/diffusion/fused/mesh.h"
+// What flows through the faces of cells (E5 to E7 of docs/theory.md). A cell goes through all six
+// of its faces: for what it gains, and in the other direction for what its numbers count.
+
+namespace ddrecon {
+
+// Numbers and their changes, side by side.
+template <class F> struct Pairs {
+    const F *value, *change;
+    INLINE Dual<F> operator[](long long i) const { return {value[i], change[i]}; }
+};
+template <class F> INLINE void put(F* to, F x) { *to = x; }
+template <class F> INLINE void put(F* to, const Dual<F>& x) { *to = x.by[0]; }
+
+// What a face conducts between D here and there: h times their harmonic mean... and on the box
+// 1 / (2 + h / (2 D)); with its slopes.
+template <class F> struct Conduction {
+    F value, by_here, by_there;
+};
+template <class F> INLINE Conduction<F> conduct(F here, F there, F h, bool inside) {
+    const F inverse = 1 / (inside ? here + there : 4 * here + h);
+    const F share = (inside ? there : F(1)) * inverse, other = inside ? here * inverse : F(0);
+    return {2 * here * share, 2 * share * share * (inside ? F(1) : h), 2 * other * other};
+}
+template <class F> INLINE F conducted(F here, F there, F h, bool inside) {
+    return conduct(here, there, h, inside).value;
+}
+template <class F>
+INLINE Dual<F> conducted(const Dual<F>& here, const Dual<F>& there, F h, bool inside) {
+    const Conduction<F> c = conduct(here.value, there.value, h, inside);
+    return here.chain(c.value, c.by_here, there, c.by_there);
+}
+
+enum { GAIN, FLUX, SYSTEM };
+// L1, or what cells gain from Q1, or all of E7. Of fields: D, kappa_s, then L0 or Q0, kappa_a
+// unless it is SHARED with kappa_s, Q1 along z, y and x, the sum of so many FLUXES, and what is
+// BEGUN. Of numbers: what the fields of kappa_s and kappa_a are times, and the radiance outside.
+template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
+    static constexpr bool HAS_MEAN = WHAT != GAIN, IS_SYSTEM = WHAT == SYSTEM;
+    enum {
+        D,
+        SCATTERING,
+        MEAN,
+        ABSORBING = SHARED ? 1 : 3,
+        Q = 2 + HAS_MEAN + (IS_SYSTEM && !SHARED)
+    };
+    enum { GIVEN = Q + 3 * FLUXES, INS = GIVEN + BEGUN, MADE = FLUXES ? Q + 3 : Q };
+    enum { OUTS = WHAT == FLUX ? 3 : WHAT == GAIN ? 1 : 5 };
+    enum { S, OUTSIDE, A, NUMBERS = 1 + WHAT };
+
+    // The row in what is found, or in its cotangents; loss and conductances have `own` colors.
+    template <class F, class P> INLINE static void rows_of(
+        const Row& row, const Mesh<F>& mesh, P* const* arrays, P** found, int own) {
+        UNROLLED
+        for (int k = 0; k < OUTS; ++k) found[k] = arrays[k] + row.at;
+        if constexpr (IS_SYSTEM) {
+            const int color = own > 1 ? row.color : 0;
+            found[1] = arrays[1] + (own > 1 ? row.at : row.start);
+            UNROLLED
+            for (int a = 0; a < 3; ++a) found[2 + a] = mesh.at_faces(arrays[2 + a], a, color);
+        }
+    }
+    // Q1 along an axis, `at` a cell or that beyond its face.
+    template <class In, class At> INLINE static auto flux(const In* in, int axis, At at) {
+        auto q = at(in[Q + axis]);
+        UNROLLED
+        for (int k = 1; k < FLUXES; ++k) q += at(in[Q + 3 * k + axis]);
+        return q;
+    }
+    // What drives light out of a cell through a face, which then conducts it.
+    template <class N, class M, class In>
+    INLINE static N drive(const M& mesh, const In* in, const N* number, int axis, int side, int i) {
+        const bool inside = mesh.inside(axis, side, i);
+        typedef typename M::Number F;
+        const F h = mesh.h[axis], half = side ? F(0.5) : F(-0.5);
+        N driven = F(0);
+        if constexpr (FLUXES > 0) {
+            const N here =
+                in[SCATTERING][i] * flux(in, axis, [&](const In& f) HERE { return f[i]; });
+            const N there =
+                mesh.beyond(in[SCATTERING], axis, side, i) *
+                flux(in, axis, [&](const In& f) HERE { return mesh.beyond(f, axis, side, i); });
+            driven = half * number[S] * pick(inside, N(here + there), N(h * here));
+        }
+        if constexpr (WHAT == FLUX) {
+            const N u = in[MEAN][i], there = mesh.beyond(in[MEAN], axis, side, i);
+            driven += pick(inside, N((1 / h) * (u - there)), N(u - number[OUTSIDE]));
+        } else if constexpr (IS_SYSTEM) {
+            driven -= pick(inside, N(F(0)), number[OUTSIDE]);
+        }
+        return driven;
+    }
+
+    // Out: L1 along each axis; or the right side, and of `is_own` loss and conductances.
+    template <class N, class M, class In, class F> INLINE static void find(
+        const Row& row, const M& mesh, const In* in, const N* number, F* const* out, bool is_own,
+        F times) {
+        INDEPENDENT
+        for (int i = 0; i < row.width; ++i) {
+            N along[3], above[3], lost = F(0), escape = F(0);
+            UNROLLED
+            for (int a = 0; a < 3; ++a) {
+                const F per_h = 1 / mesh.h[a];
+                UNROLLED
+                for (int side = 0; side < 2; ++side) {
+                    const bool inside = mesh.inside(a, side, i);
+                    const N there = mesh.beyond(in[D], a, side, i);
+                    const N c = conducted<F>(in[D][i], there, mesh.h[a], inside);
+                    const N flow = c * drive(mesh, in, number, a, side, i);
+                    along[a] = side ? flow - along[a] : flow;
+                    lost += per_h * flow;
+                    escape += pick(inside, N(F(0)), N(per_h * c));
+                    above[a] = per_h * per_h * c;
+                }
+            }
+            if constexpr (WHAT == FLUX) {
+                UNROLLED
+                for (int a = 0; a < 3; ++a) {
+                    along[a] = F(1.5) * times * along[a];
+                    if constexpr (BEGUN > 0) along[a] += in[GIVEN + a][i];
+                }
+                UNROLLED
+                for (int a = 0; a < 3; ++a) put(out[a] + i, along[a]);
+            } else {
+                N right = -lost;
+                UNROLLED
+                for (int k = 0; k < BEGUN; ++k) right += in[GIVEN + k][i];
+                if constexpr (IS_SYSTEM) {
+                    right += number[S] * in[SCATTERING][i] * in[MEAN][i];
+                    const N loss = number[A] * in[ABSORBING][i] + escape;
+                    if (is_own) put(out[1] + i, loss);
+                    UNROLLED
+                    for (int a = 0; a < 3; ++a)
+                        if (is_own && mesh.inside(a, 1, i)) put(out[2 + a] + i, above[a]);
+                }
+                put(out[0] + i, right);
+            }
+        }
+    }
+
+    // Cotangents `out` of the fields but for what is begun, and of one of the fluxes; and the row's
+    // part `sum` of those of numbers.
+    template <class M, class F> INLINE static void find_back(
+        const Row& row, const M& mesh, const F* const* in, const F* number, const F* const* bar,
+        F* const* out, F* sum, bool is_own, F times) {
+        REORDERED
+        F of_s = 0, of_a = 0, of_outside = 0;
+        SUMMING
+        for (int i = 0; i < row.width; ++i) {
+            const F loss_bar = IS_SYSTEM && is_own ? bar[1][i] : F(0),
+                    s = number[S] * in[SCATTERING][i];
+            F d_bar = 0, s_bar = 0, u_bar = 0, a_bar = 0, q_bar[3];
+            UNROLLED
+            for (int a = 0; a < 3; ++a) {
+                const F h = mesh.h[a], per_h = 1 / h;
+                const F* const r = bar[WHAT == FLUX ? a : 0];
+                F p_bar = 0;
+                UNROLLED
+                for (int side = 0; side < 2; ++side) {
+                    const bool inside = mesh.inside(a, side, i);
+                    const Conduction<F> c =
+                        conduct(in[D][i], mesh.beyond(in[D], a, side, i), h, inside);
+                    const F there = inside ? mesh.beyond(r, a, side, i) : F(0);
+                    // Of what flows out through this face, and of what it conducts.
+                    const F flow_bar = WHAT == FLUX ? F(side ? 1.5 : -1.5) * times * (r[i] + there)
+                                                    : (there - r[i]) * per_h;
+                    F c_bar = flow_bar * drive(mesh, in, number, a, side, i);
+                    if constexpr (IS_SYSTEM) {
+                        const F face_bar = is_own ? mesh.at_face(bar[2 + a], a, side, i) : F(0);
+                        c_bar += inside ? per_h * per_h * face_bar : per_h * loss_bar;
+                    }
+                    const F drive_bar = c.value * flow_bar;
+                    d_bar += c.by_here * c_bar;
+                    p_bar += (inside ? F(1) : h) * (side ? F(0.5) : F(-0.5)) * drive_bar;
+                    u_bar += (inside ? per_h : F(1)) * drive_bar;
+                    of_outside -= inside ? F(0) : drive_bar;
+                }
+                if constexpr (FLUXES > 0)
+                    s_bar += p_bar * flux(in, a, [&](const F* f) HERE { return f[i]; });
+                q_bar[a] = s * p_bar;
+            }
+            if constexpr (IS_SYSTEM) {
+                s_bar += in[MEAN][i] * bar[0][i];
+                u_bar = s * bar[0][i];
+                a_bar = number[A] * loss_bar;
+                of_a += in[ABSORBING][i] * loss_bar;
+            }
+            of_s += in[SCATTERING][i] * s_bar;
+            out[D][i] = d_bar;
+            out[SCATTERING][i] = number[S] * s_bar + (SHARED ? a_bar : F(0));
+            if constexpr (HAS_MEAN) out[MEAN][i] = u_bar;
+            if constexpr (IS_SYSTEM && !SHARED) out[ABSORBING][i] = a_bar;
+            UNROLLED
+            for (int a = 0; a < (FLUXES ? 3 : 0); ++a) out[Q + a][i] = q_bar[a];
+        }
+        sum[S] = of_s;
+        if constexpr (HAS_MEAN) sum[OUTSIDE] = of_outside;
+        if constexpr (IS_SYSTEM) sum[A] = of_a;
+    }
+};
+
+// What an item does: its row's values, changes, or cotangents.
+template <class Flow, class F> INLINE void find_values(
+    const Row& row, const Mesh<F>& mesh, int own, F times, const int* is_each,
+    const F* const* fields, const F* numbers, F* const* made) {
+    const F* in[Flow::INS];
+    F number[Flow::NUMBERS], *out[Flow::OUTS];
+    row.in_all<Flow::INS>(fields, is_each, in);
+    row.of_color<Flow::NUMBERS>(numbers, number);
+    Flow::rows_of(row, mesh, made, out, own);
+    mesh.visit([&](const auto& mesh)
+                   HERE { Flow::find(row, mesh, in, number, out, row.color < own, times); });
+}
+template <class Flow, class F> INLINE void find_tangents(
+    const Row& row, const Mesh<F>& mesh, int own, F times, const int* is_each,
+    const F* const* fields, const F* const* d_fields, const F* numbers, const F* d_numbers,
+    F* const* made) {
+    const F *in[Flow::INS], *d_in[Flow::INS];
+    F number[Flow::NUMBERS], d_number[Flow::NUMBERS], *out[Flow::OUTS];
+    row.in_all<Flow::INS>(fields, is_each, in);
+    row.in_all<Flow::INS>(d_fields, is_each, d_in);
+    row.of_color<Flow::NUMBERS>(numbers, number);
+    row.of_color<Flow::NUMBERS>(d_numbers, d_number);
+    Flow::rows_of(row, mesh, made, out, own);
+    Pairs<F> pairs[Flow::INS];
+    Dual<F> duals[Flow::NUMBERS];
+    for (int k = 0; k < Flow::INS; ++k) pairs[k] = {in[k], d_in[k]};
+    for (int k = 0; k < Flow::NUMBERS; ++k) duals[k] = {number[k], d_number[k]};
+    mesh.visit([&](const auto& mesh)
+                   HERE { Flow::find(row, mesh, pairs, duals, out, row.color < own, times); });
+}
+template <class Flow, class F> INLINE void find_cotangents(
+    const Row& row, const Mesh<F>& mesh, int own, F times, const int* is_each,
+    const F* const* fields, const F* numbers, const F* const* bars, F* const* made, F* sums) {
+    const F *in[Flow::GIVEN], *bar[Flow::OUTS];
+    F number[Flow::NUMBERS], sum[Flow::NUMBERS], *out[Flow::MADE];
+    row.in_all<Flow::GIVEN>(fields, is_each, in);
+    row.of_color<Flow::NUMBERS>(numbers, number);
+    row.in_all<Flow::MADE>(made, out);
+    Flow::rows_of(row, mesh, bars, bar, own);
+    mesh.visit([&](const auto& mesh) HERE {
+        Flow::find_back(row, mesh, in, number, bar, out, sum, row.color < own, times);
+    });
+    for (int k = 0; k < Flow::NUMBERS; ++k) sums[k * row.items + row.item] = sum[k];
+}
+
+} // namespace ddrecon
