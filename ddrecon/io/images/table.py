@@ -18,13 +18,13 @@ from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images import srgb
-from ddrecon.io.images.hdr import read_hdr
 from ddrecon.io.images.oiio import (
     has_deep_colors,
     has_exr,
     is_deep_png,
     read_deep_png,
     read_exr,
+    read_hdr,
     read_tiff,
     write_exr,
 )
