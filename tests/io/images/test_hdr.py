@@ -75,7 +75,7 @@ REFUSED = {
     "one correction": ("-Y 2 +X 9", HEADER + b"COLORCORR=1\n", "no exposure"),
     "turned": ("+Y 2 +X 9", HEADER, "turned rows"),
     "no size": ("-Y two +X 9", HEADER, "is damaged"),
-    "too large": ("-Y 60000 +X 60000", HEADER, "GiB"),
+    "too large": ("-Y 20000 +X 20000", HEADER, "malicious"),
 }
 
 
