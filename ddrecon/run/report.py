@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, median
-from typing import Any
 
 from ddrecon.engine import name_engines
 from ddrecon.reconstruct.log import Row
@@ -18,6 +17,7 @@ from ddrecon.report.page import (
     section,
     side_by_side,
     table,
+    versions,
     warnings,
     write_page,
 )
@@ -41,7 +41,7 @@ def write_run_report(path: Path, findings: Findings) -> None:
     """Writes the report of `findings` to `path`."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene, has_slabs(scene)))
-    versions = [(k, _format(v)) for k, v in findings.environment.items() if k != "engines"]
+    environment = {k: v for k, v in findings.environment.items() if k != "engines"}
     diagnoses = [diagnosis["text"] for diagnosis in findings.summary["diagnoses"]]
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),
@@ -52,7 +52,7 @@ def write_run_report(path: Path, findings: Findings) -> None:
         section("Timings", _timings(findings.rows)),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
         section("Settings", fold("scene.yaml, all defaults filled in", findings.settings)),
-        section("Versions", table(["", ""], versions)),
+        section("Versions", versions(environment)),
     ]
     title = f"ddrecon: {path.absolute().parent.name}"
     write_page(path, title, _lead(findings), sections, is_alive=True)
@@ -105,7 +105,3 @@ def _timings(rows: Sequence[Row]) -> str:
         times = f"{median(seconds):.3f}", f"{sum(seconds):.1f}"
         lines.append((f"{cells:,}", len(timed), *times, *(f"{count:.1f}" for count in solves)))
     return table(TIMING_HEAD, lines)
-
-
-def _format(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
