@@ -14,9 +14,7 @@ from statistics import mean, median
 import torch
 from torch import Tensor
 
-from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.reconstruct.log import Row
-from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.scene import View
 
 OVERFIT = 6.0
@@ -31,11 +29,6 @@ WORTHWHILE = 0.1
 """A run is unfinished where as many iterations again would take this part off its loss."""
 SURE = 3.0
 """So many standard errors are no chance: the loss differs from view to view."""
-LATE = 0.25
-"""The last part of a run."""
-DRIFT = 0.005
-"""Relative changes over the last part of a run that are not rest."""
-REFLECTION = ("albedo", "sigma_s")
 
 
 @dataclass(frozen=True)
@@ -46,43 +39,15 @@ class Diagnosis:
     text: str
 
 
-class LateMeans:
-    """The mean value of each parameter where the last part of a run begins."""
-
-    def __init__(self) -> None:
-        self.means: dict[str, float] = {}
-        self.place: int | None = None
-
-    def note(self, run: Reconstruction) -> None:
-        """Notes the means, if `run` comes there now; after every iteration."""
-        place, begin = run.schedule.place(run.iteration), int((1 - LATE) * run.schedule.planned)
-        was, self.place = place - 1 if self.place is None else self.place, place
-        if was < begin <= place:
-            self.means = _means(run)
-
-    def moved(self, run: Reconstruction) -> dict[str, float]:
-        """By what factor each mean has changed since, for those above 0."""
-        now = _means(run)
-        return {
-            name: now[name] / was for name, was in self.means.items() if min(was, now[name]) > 0
-        }
-
-
-def _means(run: Reconstruction) -> dict[str, float]:
-    return {parameter.name: float(parameter.value.detach().mean()) for parameter in run.parameters}
-
-
 def diagnose(
     views: Sequence[View],
     images: Mapping[str, Tensor],
     quality: Mapping[str, Mapping[str, float]],
     rows: Sequence[Row],
-    moved: Mapping[str, float],
 ) -> list[Diagnosis]:
     """What seems to be wrong with a run that has rendered `images` of its `views`.
 
-    `quality` has the PSNR of each, `rows` are its log, and `moved` is by what factor each parameter
-    has changed, in the mean, over the last quarter of the run.
+    `quality` has the PSNR of each, `rows` are its log.
     """
     seen = [view for view in views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
@@ -95,7 +60,6 @@ def diagnose(
         "cameras": find_shift(trained, images, least),
         # What is overfit would only become more so.
         "unfinished": None if overfit else find_falling(rows),
-        "drift": find_drift(moved) if least < 1 else None,
     }
     return [Diagnosis(kind, text) for kind, text in told.items() if text is not None]
 
@@ -213,22 +177,6 @@ def promised(losses: Sequence[float], more: int, sure: float = SURE) -> float:
     q = ratio ** (1 / count)
     left = fall * count * (1 - q) * ratio**2 / (q * (1 - ratio) ** 2)
     return left * (1 - q**more)
-
-
-def find_drift(moved: Mapping[str, float]) -> str | None:
-    """Whether light and albedo still move against each other, so that pictures stay the same."""
-    lights = {n: f for n, f in moved.items() if n.rpartition(".")[2] in BRIGHTNESS}
-    media = {n: f for n, f in moved.items() if n in REFLECTION}
-    for light, brighter in lights.items():
-        for medium, whiter in media.items():
-            one, other = math.log(brighter), math.log(whiter)
-            if min(abs(one), abs(other)) > DRIFT and one * other < 0:
-                return (
-                    f"drift: {light} and {medium} still move against each other (by factors of "
-                    f"{brighter:.3f} and {whiter:.3f} over the last quarter of the run): pictures "
-                    "hardly tell them apart; fix one of them"
-                )
-    return None
 
 
 def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:

@@ -18,7 +18,7 @@ from ddrecon.renderer import LightField, view_image
 from ddrecon.report.page import movie, paragraph, picture, side_by_side
 from ddrecon.report.pictures import find_white, pixels, projections, slices
 from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
-from ddrecon.run.findings import Findings
+from ddrecon.run.quality import Findings
 from ddrecon.scene import Scene, View
 from ddrecon.turntable import place_turntable, upright_axis
 from ddrecon.variables.values import fields_of

@@ -20,10 +20,9 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, newest_checkpoint, save_checkpoint
-from ddrecon.run.diagnoses import LateMeans, diagnose
-from ddrecon.run.findings import Findings, given_fields, solve
+from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import compared_by, render_run, render_views
+from ddrecon.run.quality import Findings, compared_by, given_fields, render_run, render_views, solve
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
@@ -70,7 +69,6 @@ class RunFolder:
             remove_temporaries(path)
         self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
         self.saved, self.next_save = -1, 0.0
-        self.late = LateMeans()
         self.save_every = CHECKPOINT_SECONDS
 
     def start(self, run: Reconstruction) -> None:
@@ -130,7 +128,7 @@ class RunFolder:
         images, quality = render_views(run, scene, light_field)
         self._pictures(scene, images, "")
         log, environment = self.log.rows(run.iteration), self.environment
-        diagnoses = diagnose(scene.views, images, quality, log, self.late.moved(run))
+        diagnoses = diagnose(scene.views, images, quality, log)
         told = [vars(diagnosis) for diagnosis in diagnoses]
         summary = _summary(run) | {"views": quality, "diagnoses": told}
         write_json(self.path / "summary.json", summary)
