@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ddrecon.engine import name_engines
 from ddrecon.io.images import srgb
-from ddrecon.io.images.webp import webp_of
+from ddrecon.io.images.movies import webp_of
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.report.curve import draw_curve

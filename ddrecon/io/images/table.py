@@ -18,6 +18,7 @@ from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images import srgb
+from ddrecon.io.images.movies import encode
 from ddrecon.io.images.oiio import (
     has_deep_colors,
     has_exr,
@@ -102,11 +103,7 @@ def write_preview(path: Path, pixels: np.ndarray) -> None:
 
 def png_of(pixels: np.ndarray) -> bytes:
     """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
-    import imageio.v3 as iio
-
-    encoded = srgb.encode_bytes(pixels)
-    content: bytes = iio.imwrite("<bytes>", encoded, plugin="pillow", extension=".png")
-    return content
+    return encode(srgb.encode_bytes(pixels), ".png")
 
 
 def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
