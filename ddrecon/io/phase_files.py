@@ -35,6 +35,7 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise FormatError(path, f"its first column is {name!r}; call it angle (degrees) or cosine")
     if len(first) < 4:
         raise FormatError(path, f"has {len(first)} angles; a table needs at least 4")
+    _require_colors(path, len(values))
     if name == "cosine" and np.abs(first).max() > 1 + 1e-6:
         raise FormatError(path, "has cosines beyond -1 and 1; are they degrees? call them angle")
     angles = np.arccos(first.clip(-1, 1)) if name == "cosine" else np.radians(first)
@@ -60,12 +61,18 @@ def read_moments(path: Path) -> np.ndarray:
     name, first, values = _read_columns(path, DEGREES)
     if first is not None and not np.array_equal(first, np.arange(len(first))):
         raise FormatError(path, f"its column {name} must count 0, 1, 2, ...")
+    _require_colors(path, len(values))
     if values.shape[1] < 2 or (values[:, 0] <= 0).any():
         raise FormatError(path, "needs chi_0 above 0, and chi_1, one a row")
     moments = values / values[:, :1]
     if np.abs(moments).max() > 1 + 1e-6:
         raise FormatError(path, "has moments larger than chi_0; divide each by 2 l + 1")
     return moments
+
+
+def _require_colors(path: Path, count: int) -> None:
+    if count not in (1, 3):
+        raise FormatError(path, f"has {count} columns of values; expected 1, or 3 for r, g, b")
 
 
 def _read_columns(path: Path, known: Sequence[str]) -> tuple[str, np.ndarray | None, np.ndarray]:
@@ -81,10 +88,6 @@ def _read_columns(path: Path, known: Sequence[str]) -> tuple[str, np.ndarray | N
     if not np.isfinite(columns).all():
         raise FormatError(path, "holds numbers that are not finite")
     first, values = (columns[0], columns[1:]) if name in known else (None, columns)
-    if (first is not None and len(values) not in (1, 3)) or (first is None and len(values) > 3):
-        raise FormatError(
-            path, f"has {len(values)} columns of values; expected 1, or 3 for r, g, b"
-        )
     return name, first, values
 
 
