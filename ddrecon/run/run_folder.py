@@ -161,19 +161,15 @@ class RunFolder:
         Maps become files of their own, but for those that are `stored`.
         """
         parameters: dict[str, Any] = {}
+        coefficients = "density", *EXTINCTION_AND_ALBEDO
         for name in variable_names(scene):
-            is_told = is_of_volume(name) and split_name(name)[1] not in (
-                "density",
-                *EXTINCTION_AND_ALBEDO,
-            )
-            if is_told and (value := value_of(scene, name)).ndim < 2:
+            is_light, value = name.startswith("lights."), value_of(scene, name)
+            if is_light and value.ndim >= 3:
+                parameters[name] = stored.get(name) or self._store(scene, name)
+            elif is_light or (
+                is_of_volume(name) and value.ndim < 2 and split_name(name)[1] not in coefficients
+            ):
                 parameters[name] = value.tolist()
-        for name in variable_names(scene):
-            if name.startswith("lights."):
-                if (value := value_of(scene, name)).ndim < 3:
-                    parameters[name] = value.tolist()
-                else:
-                    parameters[name] = stored.get(name) or self._store(scene, name)
         for view in scene.views:
             matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
             parameters[f"views.{view.name}.camera"] = {"matrix": matrix}
