@@ -17,6 +17,7 @@ from ddrecon.engine import name_engines
 from ddrecon.io.images import srgb
 from ddrecon.io.images.movies import webp_of
 from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
@@ -130,7 +131,7 @@ def view_section(findings: Findings) -> list[str]:
     """Target and render of the first views, those held out first, and a table of all."""
     views = [view for view in findings.scene.views if view.image is not None]
     shown = sorted(views, key=lambda view: not view.is_test)[:SHOWN]
-    white = median(find_white(pixels(_target(view))) for view in shown)
+    white = median(find_white(pixels(target_of(view))) for view in shown)
     most = min(LARGEST, int((PIXELS / (2 * len(shown))) ** 0.5))
     parts = [
         paragraph(
@@ -149,15 +150,9 @@ def view_section(findings: Findings) -> list[str]:
     return [*parts, unfolded("All views", _view_table(findings), is_open=False)]
 
 
-def _target(view: View) -> Tensor:
-    if view.image is None:
-        raise ValueError(f"view {view.name} has no image")
-    return view.image
-
-
 def _figure(findings: Findings, view: View, white: float, most: int) -> str:
     target, render = (
-        _displayed(image, white, most) for image in (_target(view), findings.images[view.name])
+        _displayed(image, white, most) for image in (target_of(view), findings.images[view.name])
     )
     caption = f"{view.name}: {_quality_text(findings.quality[view.name])}"
     return pair(webp_of(target), webp_of(render), caption)

@@ -129,8 +129,7 @@ class RunFolder:
         self._pictures(scene, images, "")
         log, environment = self.log.rows(run.iteration), self.environment
         diagnoses = diagnose(scene.views, images, quality, log)
-        told = [vars(diagnosis) for diagnosis in diagnoses]
-        summary = _summary(run) | {"views": quality, "diagnoses": told}
+        summary = _summary(run) | {"views": quality, "diagnoses": diagnoses}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
         given = given_fields(run.scene)

@@ -69,7 +69,7 @@ def kinds_at(scene: Scene, *stops: int) -> list[list[str]]:
             for view in scene.views
         }
         diagnoses = diagnose(scene.views, images, quality, rows)
-        told.append([each.kind for each in diagnoses])
+        told.append([each["kind"] for each in diagnoses])
     return told
 
 
