@@ -8,17 +8,13 @@ whose weight comes out a rounding below zero, so there each color is traced by i
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
 
 from torch import Tensor
 
-from ddrecon.light.lights import Light
+from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light
 from ddrecon.medium.phase import PhaseFunction
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.scene import Scene
-
-COLORED = ("irradiance", "radiance", "intensity")
-"""What lights have by color."""
 
 
 def pick_color(scene: Scene, color: int) -> Scene:
@@ -53,10 +49,13 @@ def _pick_number(number: Tensor, color: int) -> Tensor:
 
 
 def _pick_light(light: Light, color: int) -> Light:
-    power: dict[str, Any] = {
-        name: _pick(value, color) for name, value in vars(light).items() if name in COLORED
-    }
-    return replace(light, **power)
+    if isinstance(light, DirectionalLight):
+        return replace(light, irradiance=_pick(light.irradiance, color))
+    if isinstance(light, AmbientLight):
+        return replace(light, radiance=_pick(light.radiance, color))
+    if isinstance(light, EnvironmentLight):
+        return replace(light, radiance=_pick(light.radiance, color))
+    return replace(light, intensity=_pick(light.intensity, color))
 
 
 def _pick(value: Tensor, color: int) -> Tensor:

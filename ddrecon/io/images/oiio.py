@@ -126,21 +126,12 @@ def read_tiff(path: Path) -> np.ndarray:
     return pixels[..., 0] if pixels.shape[2] == 1 else pixels
 
 
-def is_deep_png(path: Path) -> bool:
-    """Whether the file at `path` is a PNG of 16 bits a channel."""
-    return _head(path)[24:25] == b"\x10"
-
-
 def has_deep_colors(path: Path) -> bool:
     """Whether the file at `path` is a PNG of several channels of 16 bits."""
-    return is_deep_png(path) and _head(path)[25] in DEEP_COLORS
-
-
-def _head(path: Path) -> bytes:
-    """The beginning of the file at `path` where it is a PNG, with all 26 bytes; else nothing."""
     with path.open("rb") as stream:
         head = stream.read(26)
-    return head if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) == 26 else b""
+    is_png = head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) == 26
+    return is_png and head[24] == 16 and head[25] in DEEP_COLORS
 
 
 def read_deep_png(path: Path) -> np.ndarray:
