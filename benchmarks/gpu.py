@@ -14,13 +14,10 @@ import time
 from dataclasses import replace
 
 import torch
+from scaling import start_run
 
 from ddrecon.bench.plume import plume_scene
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.renderer import render_each
-from ddrecon.scene import Scene
-from ddrecon.settings import OptimizeSettings, ParameterSettings
 
 SMALL = "64 x 96 x 64, 512 x 512, density (the paper: 22.5 iterations a second on an RTX 2080 Ti)"
 JOINT = (
@@ -36,32 +33,23 @@ CASES = {
 """Cells across, pixels across, whether colored fields are optimized too, and iterations."""
 
 
-def scene_of(cells: int, pixels: int, is_joint: bool, device: torch.device) -> Scene:
-    """A plume to reconstruct from its image, from half its density."""
+def run_of(cells: int, pixels: int, is_joint: bool, device: torch.device) -> Reconstruction:
+    """A reconstruction of a plume from its image, from half its density."""
     scene = plume_scene(cells, pixels, torch.float32, device)
-    if is_joint:
-        volume, shape = scene.volume, (3, *scene.volume.grid.shape)
-        colors = torch.tensor([1.0, 0.9, 0.7], device=device).view(3, 1, 1, 1)
-        fields = {
-            name: (getattr(volume, name) * colors).expand(shape).contiguous()
-            for name in ("sigma_a", "sigma_s")
-        }
-        scene = replace(scene, volume=replace(volume, **fields))
-    with torch.no_grad():
-        (image,) = render_each(scene, scene.views, SolveMemory())
-    names = ("density", "sigma_a", "sigma_s") if is_joint else ("density",)
-    starts = {name: 0.5 * getattr(scene.volume, name) for name in names}
-    settings = OptimizeSettings(
-        {name: ParameterSettings(field=True) for name in names}, iterations=1000, refine_at=()
-    )
-    return replace(
-        scene, views=[replace(scene.views[0], image=image)], optimize=settings, starts=starts
-    )
+    if not is_joint:
+        return start_run(scene)
+    volume, shape = scene.volume, (3, *scene.volume.grid.shape)
+    colors = torch.tensor([1.0, 0.9, 0.7], device=device).view(3, 1, 1, 1)
+    fields = {
+        name: (getattr(volume, name) * colors).expand(shape).contiguous()
+        for name in ("sigma_a", "sigma_s")
+    }
+    joint = replace(scene, volume=replace(volume, **fields))
+    return start_run(joint, ("density", *fields))
 
 
-def measure(name: str, scene: Scene, iterations: int, device: torch.device) -> str:
+def measure(name: str, run: Reconstruction, iterations: int, device: torch.device) -> str:
     """One line of the table."""
-    run = Reconstruction(scene)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     run.step()
@@ -97,8 +85,8 @@ def main() -> None:
     )
     print("| case | seconds an iteration | iterations a second | peak memory |\n|---|---|---|---|")
     for name, (cells, pixels, is_joint, iterations) in CASES.items():
-        scene = scene_of(cells // arguments.shrink, pixels // arguments.shrink, is_joint, device)
-        print(measure(name, scene, iterations, device), flush=True)
+        shrunk = cells // arguments.shrink, pixels // arguments.shrink
+        print(measure(name, run_of(*shrunk, is_joint, device), iterations, device), flush=True)
 
 
 if __name__ == "__main__":

@@ -22,9 +22,8 @@ import torch
 from numpy.typing import NDArray
 from paper_figures import Array, save, show, show_signed
 from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, as_options, ddrecon, rewrite_table
-from path_replay import ALBEDO, Replay, why_not
+from path_replay import ALBEDO, DENSITY, Replay, why_not
 
-from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.io.volumes.table import read_field, write_field
 from ddrecon.scene_file.build import load_scene
 

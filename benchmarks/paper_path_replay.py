@@ -25,9 +25,8 @@ import numpy as np
 import torch
 from paper_figures import Array, project, save, show
 from paper_page import CONFIGS, PICTURES, ROOT, SHAPES, rewrite_table
-from path_replay import HEADROOM, Replay, why_not
+from path_replay import DENSITY, HEADROOM, Replay, why_not
 
-from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter

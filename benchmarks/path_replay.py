@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ddrecon.bench.path_tracing import DENSITY
 from ddrecon.grid import Grid
 from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
 from ddrecon.reference.trace import load_mitsuba, make_mitsuba_objects
@@ -26,8 +25,8 @@ from ddrecon.scene import Scene
 
 RING = 2
 HEADROOM = 2.0
-ALBEDO = ".albedo.value.value"
-"""How the name of a constant albedo ends among Mitsuba's parameters."""
+DENSITY, ALBEDO = ".sigma_t.data", ".albedo.value.value"
+"""How the names of density and of a constant albedo end among Mitsuba's parameters."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +66,10 @@ class Replay:
             pad_density(density, self.headroom).numpy()[..., None]
         )
         self.parameters.update()
+
+    def image(self, seed: int, paths: int) -> np.ndarray:
+        """The image [h, w, 3] by so many `paths` a pixel, float32."""
+        return np.array(self.module.render(self.scene, sensor=0, seed=seed, spp=paths), np.float32)
 
     def gradients(
         self, loss_of: Callable[[Any], Any], names: list[str], seed: int, paths: int

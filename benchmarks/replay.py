@@ -11,15 +11,39 @@ cells, each with that of the most paths.
 from __future__ import annotations
 
 import argparse
-import statistics
+from statistics import median
+from time import perf_counter
 
 import torch
+from path_replay import DENSITY, Replay, why_not
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d
 
-from ddrecon.bench.measure import blocks_of, correlation, shoot
-from ddrecon.bench.path_tracing import PathTracer
+from ddrecon.bench.measure import Shot, shoot
 from ddrecon.bench.plume import plume_scene
+from ddrecon.scene import Scene
 
-REPEATS = 5
+REPEATS, BLOCK = 5, 4
+
+
+def replay_shot(replay: Replay, scene: Scene, paths: int, seed: int) -> Shot:
+    """The image and the gradient of its mean, by so many `paths` a pixel."""
+    import drjit
+
+    density = scene.volume.density
+    start = perf_counter()
+    image = torch.from_numpy(replay.image(seed, paths))
+    middle = perf_counter()
+    name = replay.name(DENSITY)
+    _, (found,) = replay.gradients(lambda image: drjit.mean(image, axis=None), [name], seed, paths)
+    gradient = replay.by_density(found, density)
+    return Shot(image, gradient, middle - start, perf_counter() - middle, paths)
+
+
+def by_amount(shot: Shot, density: Tensor) -> Tensor:
+    """What changes as all density of a block grows by a factor; empty cells have no part in it."""
+    blocks = [max(1, size // BLOCK) for size in density.shape]
+    return adaptive_avg_pool3d((shot.gradient * density)[None], blocks).flatten().double()
 
 
 def main() -> None:
@@ -28,30 +52,30 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=512)
     parser.add_argument("--cells", type=int, default=64)
     parser.add_argument("--paths", type=int, nargs="+", default=[4, 16])
-    arguments = parser.parse_args()
-    scene = plume_scene(arguments.cells, arguments.pixels, torch.float32, torch.device("cpu"))
-    ours = [shoot(scene, blocks_of(scene)) for _ in range(REPEATS + 1)][1:]
-    tracer = PathTracer(scene, has_gradient=True)
-    if tracer.replay is None:
-        raise SystemExit("path replay needs the variant llvm_ad_rgb: set DRJIT_LIBLLVM_PATH")
-    tracer.shoot(1, seed=len(arguments.paths))
-    theirs = [tracer.shoot(paths, seed) for seed, paths in enumerate(arguments.paths)]
-    rows = {"ours": ours[0]} | {
-        f"Mitsuba, {paths} paths a pixel": shot
-        for paths, shot in zip(arguments.paths, theirs, strict=True)
-    }
-    seconds = {name: (shot.image_seconds, shot.gradient_seconds) for name, shot in rows.items()}
-    seconds["ours"] = (
-        statistics.median(s.image_seconds for s in ours),
-        statistics.median(s.gradient_seconds for s in ours),
+    given = parser.parse_args()
+    if lacking := why_not():
+        raise SystemExit(f"path replay {lacking}")
+    scene = plume_scene(given.cells, given.pixels, torch.float32, torch.device("cpu"))
+    replay = Replay.of(scene)
+    rows = {"ours": [shoot(scene) for _ in range(REPEATS + 1)][1:]}
+    replay_shot(replay, scene, 1, len(given.paths))  # compiles
+    for seed, paths in enumerate(given.paths):
+        rows[f"Mitsuba, {paths} paths a pixel"] = [replay_shot(replay, scene, paths, seed)]
+    print(
+        "| | image s | gradient s | both s | times ours | correlation |\n|---|---|---|---|---|---|"
     )
-    print("| | image s | gradient s | times ours | correlation |\n|---|---|---|---|---|")
-    for name, shot in rows.items():
-        image, gradient = seconds[name]
-        found = correlation(shot.by_amount, theirs[-1].by_amount)
+    best, base = by_amount(list(rows.values())[-1][0], scene.volume.density), 0.0
+    for name, shots in rows.items():
+        image, gradient = (
+            median(part)
+            for part in zip(*((s.image_seconds, s.gradient_seconds) for s in shots), strict=True)
+        )
+        base = base or image + gradient
+        found = by_amount(shots[0], scene.volume.density)
+        correlation = float(torch.corrcoef(torch.stack([found, best]))[0, 1])
         print(
-            f"| {name} | {image:.2f} | {gradient:.2f} | "
-            f"{(image + gradient) / sum(seconds['ours']):.0f} | {found:.3f} |"
+            f"| {name} | {image:.2f} | {gradient:.2f} | {image + gradient:.2f} | "
+            f"{(image + gradient) / base:.0f} | {correlation:.3f} |"
         )
 
 

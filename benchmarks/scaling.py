@@ -66,22 +66,15 @@ def with_colors(scene: Scene, count: int) -> Scene:
     return replace(scene, volume=replace(scene.volume, sigma_s=scene.volume.sigma_s * colors))
 
 
-def start_run(scene: Scene) -> Reconstruction:
-    """A reconstruction of `scene` from half its density."""
+def start_run(scene: Scene, names: Sequence[str] = ("density",)) -> Reconstruction:
+    """A reconstruction of the fields `names` of `scene`, from half of each."""
     with torch.no_grad():
         images = render_each(scene, scene.views, SolveMemory())
     views = [replace(view, image=image) for view, image in zip(scene.views, images, strict=True)]
-    settings = OptimizeSettings(
-        {"density": ParameterSettings(field=True)},
-        iterations=1000,
-        refine_at=(),
-        views_per_iteration=0,
-    )
-    return Reconstruction(
-        replace(
-            scene, views=views, optimize=settings, starts={"density": 0.5 * scene.volume.density}
-        )
-    )
+    fields = {name: ParameterSettings(field=True) for name in names}
+    settings = OptimizeSettings(fields, iterations=1000, refine_at=(), views_per_iteration=0)
+    starts = {name: 0.5 * getattr(scene.volume, name) for name in names}
+    return Reconstruction(replace(scene, views=views, optimize=settings, starts=starts))
 
 
 def seconds(scene: Scene, repeat: int) -> float:

@@ -17,7 +17,6 @@ EXTRAS = {
     "matplotlib": "plot",
     "mitsuba": "reference",
     "imageio_ffmpeg": "mp4",
-    "tensorboard": "tensorboard",
     "warp": "fast",
     "miepython": "mie",
 }

@@ -10,28 +10,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import ddrecon
-from ddrecon.io.volumes.field import Field
 
 CANDIDATES = (sys.executable, "/usr/bin/python3")
 IMPORT = """
 import importlib.util as u, numpy
 exit(not (u.find_spec('openvdb') or u.find_spec('pyopenvdb')))
-"""
-READ = """
-import sys
-from pathlib import Path
-import numpy as np
-from ddrecon.io.volumes.table import field_names, read_field
-path = Path(sys.argv[1])
-arrays = {}
-for name in field_names(path):
-    field = read_field(path, name)
-    arrays |= {f"{name}.values": field.values, f"{name}.bounds": field.bounds}
-np.savez(path.with_suffix(".found.npz"), **arrays)
 """
 NAMES = """
 import json, sys
@@ -64,14 +50,6 @@ def run(code: str, *arguments: object) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-def read_all(path: Path) -> dict[str, Field]:
-    """All fields of the .vdb at `path`, read by our reader."""
-    run(READ, path)
-    with np.load(path.with_suffix(".found.npz")) as found:
-        names = dict.fromkeys(key.rpartition(".")[0] for key in found)
-        return {name: Field(found[f"{name}.values"], found[f"{name}.bounds"]) for name in names}
 
 
 def described(code: str, path: Path) -> object:

@@ -1,69 +1,58 @@
 """Time and error of each variant's image, and of the gradient of its mean by density.
 
 Variants take turns. The numerical error is against the same model solved exactly, in double
-precision; the whole error is against path tracing.
+precision; the whole error is against path tracing by Mitsuba 3.
 """
 
 from __future__ import annotations
 
-import statistics
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from statistics import median
 from time import perf_counter
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d
 
-from ddrecon.bench.variants import Variant, exact_scene, model_of
+from ddrecon.bench.report import Row, with_best
+from ddrecon.bench.variants import QUICK, Sweep, Variant, exact_scene, model_of, variants_of
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.errors import SolveError
 from ddrecon.progress import Progress
+from ddrecon.reference.trace import Traced, Tracer
 from ddrecon.renderer import render_each
 from ddrecon.scene import Scene
 from ddrecon.variables.values import with_values
 
-BLOCK = 4
-"""Gradients are compared as sums over blocks of so many cells along each side."""
+TURNS = 2
+PATHS, QUICK_PATHS = (4, 16, 64), (4, 16)
+"""Paths a pixel that Mitsuba is tried with.
+
+The truth is the mean of `TRUTH_PASSES` of the most, by other paths, whose seeds begin at
+`TRUTH_SEED`.
+"""
+TRUTH_PASSES, TRUTH_SEED = 4, 1000
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image [3, h, w] of a scene's first view, and the `gradient` of its mean by density.
+    """One image [3, h, w] of a scene's first view, and the `gradient` [z, y, x] of its mean.
 
-    `gradient` is summed over blocks [z, y, x], and so is `by_amount`, the gradient times density:
-    what changes as all density there grows by a factor. Empty cells, which path tracers do not see,
-    have no part in it.
+    `gradient` is by density; None of path tracing. `iterations` are the first solve's, or samples a
+    pixel.
     """
 
     image: Tensor
-    gradient: Tensor
-    by_amount: Tensor
+    gradient: Tensor | None
     image_seconds: float
     gradient_seconds: float
     iterations: int
 
 
-@dataclass
-class Timing:
-    """The shots of one variant; `seconds` are medians over the turns."""
-
-    shots: list[Shot] = field(default_factory=list)
-
-    @property
-    def seconds(self) -> tuple[float, float]:
-        """Median seconds of an image, and of an image with its gradient."""
-        image = [shot.image_seconds for shot in self.shots]
-        both = [shot.image_seconds + shot.gradient_seconds for shot in self.shots]
-        return statistics.median(image), statistics.median(both)
-
-
-def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
-    """An image of the first view of `scene`, rendered from nothing, with its gradient.
-
-    The gradient is that of the image's mean by density, summed to `blocks`.
-    """
+def shoot(scene: Scene) -> Shot:
+    """An image of the first view of `scene`, rendered from nothing, with its gradient."""
     density = scene.volume.density.detach().clone().requires_grad_()
     varied, memory = with_values(scene, {"density": density}), SolveMemory()
     start = _now(density)
@@ -72,28 +61,59 @@ def shoot(scene: Scene, blocks: tuple[int, int, int]) -> Shot:
     (gradient,) = torch.autograd.grad(image.mean(), density)
     end = _now(density)
     iterations = memory.records[0].iterations if memory.records else 0
-    sums = block_sums(gradient, blocks), block_sums(gradient * density.detach(), blocks)
-    return Shot(image.detach(), *sums, middle - start, end - middle, iterations)
+    return Shot(image.detach(), gradient, middle - start, end - middle, iterations)
+
+
+def trace(tracer: Tracer, samples: int, seed: int = 0) -> Shot:
+    """An image by so many paths a pixel."""
+    start = perf_counter()
+    image = torch.from_numpy(tracer.trace(0, seed, samples)).movedim(-1, 0)
+    return Shot(image, None, perf_counter() - start, 0.0, samples)
+
+
+def run_bench(
+    scene: Scene, double: Scene, tracer: Tracer | None, is_quick: bool, progress: Progress
+) -> list[Row]:
+    """A row for every variant of `scene` and for path tracing.
+
+    `double` is `scene` in double precision; without `tracer` there is no path tracing.
+    """
+    variants = variants_of(scene, QUICK if is_quick else Sweep())
+    exact = exact_shots(variants, double, progress)
+    contestants: dict[str, Callable[[], Shot]] = {
+        variant.name: functools.partial(shoot, variant.change(scene)) for variant in variants
+    }
+    truth = None
+    if tracer is not None:
+        paths = QUICK_PATHS if is_quick else PATHS
+        seeds = range(TRUTH_SEED, TRUTH_SEED + TRUTH_PASSES)
+        truth = Traced.of([trace(tracer, paths[-1], seed).image.numpy() for seed in seeds])
+        contestants |= {
+            f"Mitsuba {samples} paths a pixel": functools.partial(trace, tracer, samples)
+            for samples in paths
+        }
+    shots = measure(contestants, 1 if is_quick else TURNS, progress)
+    return with_best([row_of(name, each, exact.get(name), truth) for name, each in shots.items()])
 
 
 def measure(
     contestants: Mapping[str, Callable[[], Shot]], turns: int, progress: Progress
-) -> dict[str, Timing]:
-    """The timings by name of all `contestants` that can be solved.
+) -> dict[str, list[Shot]]:
+    """The shots by name of all `contestants` that can be solved.
 
     Each runs once in every turn, so that what else runs slows all alike. One is run once before,
     uncounted: the first work of a process takes longer.
     """
-    timings = {name: Timing() for name in contestants}
+    shots: dict[str, list[Shot]] = {name: [] for name in contestants}
     with suppress(SolveError):
         next(iter(contestants.values()))()
     for turn, name in progress(
         [(turn, name) for turn in range(turns) for name in contestants], "bench"
     ):
-        if turn == len(timings[name].shots):
+        if turn == len(shots[name]):
             with suppress(SolveError):
-                timings[name].shots.append(contestants[name]())
-    return {name: timing for name, timing in timings.items() if timing.shots}
+                shots[name].append(contestants[name]())
+    return {name: each for name, each in shots.items() if each}
 
 
 def exact_shots(variants: Sequence[Variant], scene: Scene, progress: Progress) -> dict[str, Shot]:
@@ -101,42 +121,37 @@ def exact_shots(variants: Sequence[Variant], scene: Scene, progress: Progress) -
 
     Alike models are solved once.
     """
-    blocks, known = blocks_of(scene), dict[tuple[object, ...], Shot]()
+    known = dict[tuple[object, ...], Shot]()
     for variant in progress(variants, "exact solutions"):
         changed = variant.change(scene)
         if model_of(changed) not in known:
-            known[model_of(changed)] = shoot(exact_scene(changed), blocks)
+            known[model_of(changed)] = shoot(exact_scene(changed))
     return {variant.name: known[model_of(variant.change(scene))] for variant in variants}
 
 
-def blocks_of(scene: Scene) -> tuple[int, int, int]:
-    """How many blocks of cells gradients are summed over along z, y, x."""
-    z, y, x = (max(1, size // BLOCK) for size in scene.volume.grid.shape)
-    return z, y, x
+def row_of(name: str, shots: Sequence[Shot], exact: Shot | None, truth: Traced | None) -> Row:
+    """The row of what took these `shots`; times are medians."""
+    shot = shots[0]
+    seconds = [(each.image_seconds, each.image_seconds + each.gradient_seconds) for each in shots]
+    image_seconds, both_seconds = map(median, zip(*seconds, strict=True))
+    row = Row(name, image_seconds, both_seconds, shot.iterations)
+    if exact is not None and exact.gradient is not None and shot.gradient is not None:
+        row = replace(
+            row,
+            image_numerical=relative_error(shot.image, exact.image),
+            gradient_numerical=relative_error(shot.gradient, exact.gradient),
+        )
+    if truth is not None:
+        error = truth.error(shot.image.numpy())
+        row = replace(row, image_error=error, image_noise=truth.noise)
+    return row
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
     """Relative RMS error."""
-    return float(
-        (found.double() - expected.double()).norm()
-        / expected.double().norm().clamp(min=torch.finfo(torch.float64).tiny)
-    )
-
-
-def correlation(one: Tensor, other: Tensor) -> float:
-    """Pearson's correlation of two arrays of the same shape."""
-    return float(
-        torch.corrcoef(torch.stack([one.flatten().double(), other.flatten().double()]))[0, 1]
-    )
-
-
-def block_sums(gradient: Tensor, blocks: tuple[int, int, int]) -> Tensor:
-    """`gradient` [z, y, x] summed over `blocks`, whatever its own grid.
-
-    It is the effect of scaling density there.
-    """
-    mean = adaptive_avg_pool3d(gradient[None], blocks)[0]
-    return mean * (gradient.numel() / mean.numel())
+    tiny = torch.finfo(torch.float64).tiny
+    away = (found.double() - expected.double()).norm()
+    return float(away / expected.double().norm().clamp(min=tiny))
 
 
 def _now(like: Tensor) -> float:

@@ -1,8 +1,10 @@
-"""The scene that is measured where none is given: a gray smoke plume under one light."""
+"""The scene that is measured: one of a file, or a gray smoke plume under one light."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,10 +13,31 @@ from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.medium.coefficients import Volume
+from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene, View
 
 SIGMA_T, ALBEDO = 30.0, 0.95
 """About 8 optical depths across the plume where it is densest."""
+QUICK_CELLS = 60_000
+"""A quick bench is of a scene made coarser until it has no more cells than this."""
+
+
+def load_pair(
+    load: Callable[[torch.dtype], Scene] | None, device: torch.device, is_quick: bool
+) -> tuple[Scene, Scene]:
+    """The scene that `load` gives, or else the plume, with one view: in float32 and in float64."""
+    pair = []
+    for dtype in (torch.float32, torch.float64):
+        if load is None:
+            cells, pixels = (32, 128) if is_quick else (64, 256)
+            scene = plume_scene(cells, pixels, dtype, device)
+        else:
+            scene, factor = load(dtype), 1
+            while is_quick and scene.volume.grid.cells / factor**3 > QUICK_CELLS:
+                factor += 1
+            scene = scene_at_level(scene, factor)
+        pair.append(replace(scene, views=scene.views[:1]))
+    return pair[0], pair[1]
 
 
 def plume_scene(cells: int, pixels: int, dtype: torch.dtype, device: torch.device) -> Scene:

@@ -1,20 +1,23 @@
-"""The table and the record of a bench: one row per variant, errors beside the time they take."""
+"""The table, the plot and the page of a bench: one row per variant, error beside time."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from ddrecon.bench.measure import Shot, Timing, correlation, relative_error
-from ddrecon.bench.path_tracing import Truth
+from ddrecon.errors import MissingExtraError
+from ddrecon.extras import load_extra
+from ddrecon.io.files.json_file import write_json
 from ddrecon.reference.trace import error_text, least_error
 from ddrecon.report import page
-from ddrecon.report.page import paragraph, picture, section, write_page
+from ddrecon.report.page import paragraph, picture, section, versions, write_page
+from ddrecon.scene import Scene
+
+FLOOR = 1e-8
+"""Errors below this are drawn here."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +26,9 @@ class Row:
 
     Seconds are medians, `both_seconds` of image and gradient. `image_numerical` and
     `gradient_numerical` are against the same model solved exactly. `image_error` is against path
-    tracing, whose `image_noise` is subtracted in quadrature; `gradient_correlation` is with path
-    replay's gradient times density. `iterations` are the first solve's, or samples a pixel.
-    `is_best`: no other row is faster and as close to the truth, as far as that can be told.
+    tracing, whose `image_noise` is subtracted in quadrature. `iterations` are the first solve's, or
+    samples a pixel. `is_best`: no other row is faster and as close to the truth, as far as that can
+    be told.
     """
 
     name: str
@@ -36,17 +39,7 @@ class Row:
     gradient_numerical: float | None = None
     image_error: float | None = None
     image_noise: float = 0.0
-    gradient_correlation: float | None = None
     is_best: bool = False
-
-
-def rows_of(
-    timings: Mapping[str, Timing], exact: Mapping[str, Shot], truth: Truth | None
-) -> list[Row]:
-    """A row for every contestant that was measured; `exact` holds the exact solutions, if any."""
-    return with_best(
-        [_row(name, timing, exact.get(name), truth) for name, timing in timings.items()]
-    )
 
 
 def with_best(rows: Sequence[Row]) -> list[Row]:
@@ -71,24 +64,6 @@ def error_of(row: Row) -> float:
     return math.inf if row.image_numerical is None else row.image_numerical
 
 
-def _row(name: str, timing: Timing, exact: Shot | None, truth: Truth | None) -> Row:
-    shot = timing.shots[0]
-    row = Row(name, *timing.seconds, shot.iterations)
-    if exact is not None:
-        row = replace(
-            row,
-            image_numerical=relative_error(shot.image, exact.image),
-            gradient_numerical=relative_error(shot.gradient, exact.gradient),
-        )
-    if truth is not None:
-        error = truth.image.error(shot.image.numpy())
-        row = replace(row, image_error=error, image_noise=truth.image.noise)
-        if truth.by_amount is not None:
-            expected = torch.from_numpy(truth.by_amount.image)
-            row = replace(row, gradient_correlation=correlation(shot.by_amount, expected))
-    return row
-
-
 HEAD = [
     "variant",
     "image s",
@@ -98,7 +73,6 @@ HEAD = [
     "image num. error",
     "gradient num. error",
     "image error",
-    "gradient corr.",
     "",
 ]
 """The columns of the table."""
@@ -106,48 +80,99 @@ HEAD = [
 
 def cells(rows: Sequence[Row]) -> list[list[str]]:
     """The rows as text under `HEAD`; times also as multiples of the first row's."""
-    return [_cells(row, rows[0]) for row in rows]
-
-
-def _cells(row: Row, base: Row) -> list[str]:
-    times = [
-        f"{row.image_seconds:.3f}",
-        f"{row.both_seconds:.3f}",
-        f"{row.both_seconds / base.both_seconds:.2f}",
-        str(row.iterations),
+    return [
+        [
+            row.name,
+            f"{row.image_seconds:.3f}",
+            f"{row.both_seconds:.3f}",
+            f"{row.both_seconds / rows[0].both_seconds:.2f}",
+            str(row.iterations),
+            "" if row.image_numerical is None else f"{row.image_numerical:.1e}",
+            "" if row.gradient_numerical is None else f"{row.gradient_numerical:.1e}",
+            "" if row.image_error is None else error_text(row.image_error, row.image_noise),
+            "best" if row.is_best else "",
+        ]
+        for row in rows
     ]
-    numerical = [
-        "" if value is None else f"{value:.1e}"
-        for value in (row.image_numerical, row.gradient_numerical)
+
+
+def bench_lines(rows: Sequence[Row]) -> list[str]:
+    """The rows as a Markdown table, and what they are compared with."""
+    lines = [f"| {' | '.join(line)} |" for line in (HEAD, ["---"] * len(HEAD), *cells(rows))]
+    return [*lines, *_remarks(rows)]
+
+
+def _remarks(rows: Sequence[Row]) -> list[str]:
+    """How path tracing compares; nothing without it."""
+    base, last = rows[0], rows[-1]
+    if last.image_error is None:
+        return []
+    ratio = last.image_seconds / base.image_seconds
+    return [
+        f"image error is against path tracing, whose noise, {last.image_noise:.2g}, is subtracted; "
+        f"{last.name} take {ratio:.3g} times as long as base"
     ]
-    error = "" if row.image_error is None else error_text(row.image_error, row.image_noise)
-    correlated = "" if row.gradient_correlation is None else f"{row.gradient_correlation:.3f}"
-    return [row.name, *times, *numerical, error, correlated, "best" if row.is_best else ""]
 
 
-def table(rows: Sequence[Row]) -> list[str]:
-    """The rows as a Markdown table."""
-    return [f"| {' | '.join(line)} |" for line in (HEAD, ["---"] * len(HEAD), *cells(rows))]
+def describe(rows: Sequence[Row], scene: Scene, environment: dict[str, Any]) -> dict[str, Any]:
+    """The bench as plain values."""
+    height, width = scene.views[0].camera.size
+    has_truth = rows[0].image_error is not None
+    return {
+        "scene": {"cells": list(reversed(scene.volume.grid.shape)), "pixels": [width, height]},
+        "truth_noise": {"image": rows[0].image_noise} if has_truth else None,
+        "environment": environment,
+        "rows": [asdict(row) for row in rows],
+    }
 
 
-def write_bench_report(
-    path: Path,
-    rows: Sequence[Row],
-    remarks: Sequence[str],
-    plot: bytes | None,
-    environment: Mapping[str, Any],
-) -> None:
-    """Writes `rows`, `remarks` on them, the `plot` (a PNG) if any, and versions as a page."""
-    caption = "numbers are those of the legend; the line joins the best"
-    drawn = [section("Error against time", picture(plot, caption, 1080))] if plot else []
-    versions = [
-        (key, " ".join(map(str, value)) if isinstance(value, list) else value)
-        for key, value in environment.items()
-    ]
+def write_bench(folder: Path, rows: Sequence[Row], report: dict[str, Any]) -> str:
+    """Where bench.json, report.html and, with matplotlib, bench.png were written, in words.
+
+    `report` is what `describe` gives of the `rows`.
+    """
+    write_json(folder / "bench.json", report)
+    plot, notice, drawn = folder / "bench.png", f"written to {folder}", []
+    try:
+        draw(rows, plot)
+        caption = "numbers are those of the table's rows; the line joins the best"
+        drawn = [section("Error against time", picture(plot.read_bytes(), caption, 1080))]
+    except MissingExtraError as error:
+        notice = f"{notice}, without a plot: {error}"
     sections = [
         *drawn,
-        section("Variants", page.table(HEAD, cells(rows)), *map(paragraph, remarks)),
-        section("Versions", page.table(["", ""], versions)),
+        section("Variants", page.table(HEAD, cells(rows)), *map(paragraph, _remarks(rows))),
+        section("Versions", versions(report["environment"])),
     ]
     lead = "Speed against error: medians of whole renders, in one run."
-    write_page(path, "ddrecon bench", lead, sections)
+    write_page(folder / "report.html", "ddrecon bench", lead, sections)
+    return notice
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Writes a PNG of times against errors: of the image, and of image and gradient.
+
+    Dots have the numbers of their rows, and a color for each kind of variant. Raises
+    MissingExtraError where matplotlib is not installed.
+    """
+    load_extra("matplotlib", "a plot").use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(15, 6.5), layout="constrained")
+    kinds = list(dict.fromkeys(row.name.split(" ")[0] for row in rows))
+    for number, row in enumerate(rows, 1):
+        color, label = f"C{kinds.index(row.name.split(' ')[0]) % 10}", f"{number}  {row.name}"
+        dots = (row.image_seconds, error_of(row)), (row.both_seconds, row.gradient_numerical)
+        for axis, (seconds, error) in zip(axes, dots, strict=True):
+            if error is not None:
+                place = seconds, max(error, FLOOR)
+                axis.plot(*place, "o", color=color, label=label)
+                axis.annotate(str(number), place, (0, 6), textcoords="offset points", ha="center")
+    front = sorted((row.image_seconds, max(error_of(row), FLOOR)) for row in rows if row.is_best)
+    axes[0].step(*zip(*front, strict=True), where="post", color="0.6", linewidth=1, zorder=1)
+    for axis, what in zip(axes, ("an image", "an image and its gradient"), strict=True):
+        axis.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel="relative error")
+        axis.grid(which="major", alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

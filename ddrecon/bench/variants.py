@@ -81,41 +81,31 @@ def model_of(scene: Scene) -> tuple[object, ...]:
 
 
 def _variants(sweep: Sweep) -> Iterator[Variant]:
-    for solver in SOLVERS:
-        yield _vary_diffusion("solver", solver, solver=solver)
-    for tolerance in sweep.tolerances:
-        yield _vary_diffusion("tolerance", tolerance, tolerance=tolerance)
-    for closure in CLOSURES:
-        yield _vary_diffusion("closure", closure, closure=closure)
-    for model in sweep.models:
-        yield _vary_diffusion("model", model, model=model, transport_rounds=None)
+    for name, values in (
+        ("solver", SOLVERS),
+        ("tolerance", sweep.tolerances),
+        ("closure", CLOSURES),
+        ("model", sweep.models),
+    ):
+        # Rounds are as many as the model has by default.
+        more = {"transport_rounds": None} if name == "model" else {}
+        yield from (_vary(name, value, "diffusion", {name: value, **more}) for value in values)
     for rounds, degree in sweep.rounds:
-        yield _vary_diffusion(
-            "rounds",
-            f"{rounds}, degree {degree}",
-            transport_rounds=rounds,
-            degree=degree,
-        )
+        changes = {"transport_rounds": rounds, "degree": degree}
+        yield _vary("rounds", f"{rounds}, degree {degree}", "diffusion", changes)
     for steps in sweep.steps:
-        yield _vary_march("steps", steps, steps_per_voxel=steps)
+        yield _vary("steps", steps, "render", {"steps_per_voxel": steps})
     for tolerance in sweep.pixels:
-        yield _vary_march("pixels", tolerance, tolerance=tolerance)
+        yield _vary("pixels", tolerance, "render", {"tolerance": tolerance})
     for factor in sweep.coarser:
         yield Variant("grid", f"{factor} times coarser", functools.partial(_coarsen, factor))
 
 
-def _vary_diffusion(factor: str, value: object, **changes: Any) -> Variant:
-    return Variant(
-        factor,
-        str(value),
-        lambda scene: replace(scene, diffusion=replace(scene.diffusion, **changes)),
-    )
+def _vary(factor: str, value: object, section: str, changes: dict[str, Any]) -> Variant:
+    def change(scene: Scene) -> Scene:
+        return replace(scene, **{section: replace(getattr(scene, section), **changes)})
 
-
-def _vary_march(factor: str, value: object, **changes: Any) -> Variant:
-    return Variant(
-        factor, str(value), lambda scene: replace(scene, render=replace(scene.render, **changes))
-    )
+    return Variant(factor, str(value), change)
 
 
 def _coarsen(factor: int, scene: Scene) -> Scene:

@@ -53,7 +53,7 @@ THREADING = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "30000"}
 
 That is 1.5 times faster than sleeping at once, without the stalls of endless spinning.
 """
-SHARED = ("optimize", "render", "uncertainty", "bench")
+SHARED = ("optimize", "render", "uncertainty")
 """Commands whose work the ranks of torchrun share; others are the first rank's alone."""
 DTYPE = click.option(
     "--dtype", type=click.Choice(["float32", "float64"]), default="float32", show_default=True

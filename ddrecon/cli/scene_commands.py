@@ -150,9 +150,6 @@ def render(
     help="Write pictures every K iterations.",
 )
 @click.option(
-    "--tensorboard", "has_events", is_flag=True, help="Also write the loss log for TensorBoard."
-)
-@click.option(
     "--watch", "is_watched", is_flag=True, help="Also serve the run's page, as ddrecon watch does."
 )
 @click.option(
@@ -173,7 +170,6 @@ def optimize(
     iterations: int | str | None,
     resume: bool,
     preview_every: int | None,
-    has_events: bool,
     is_watched: bool,
     has_uncertainty: bool,
 ) -> None:
@@ -182,10 +178,7 @@ def optimize(
     from ddrecon.ranks import is_first
     from ddrecon.reconstruct.shares import require_sharing
     from ddrecon.run.drive import drive_run, follow_run, open_run, summary_lines
-    from ddrecon.run.events import require_tensorboard
 
-    if has_events:
-        require_tensorboard()
     if iterations is not None:
         session = session.with_overrides(f"optimize.iterations={iterations}")
     scene_file = session.read(scene)
@@ -205,8 +198,8 @@ def optimize(
     ):
         if is_watched:
             folder.save_often(SAVE_EVERY)
-        settings = preview_every, session.is_quiet, has_events
-        summary = drive_run(run, folder, *settings, is_last=not has_uncertainty)
+        is_last = not has_uncertainty
+        summary = drive_run(run, folder, preview_every, session.is_quiet, is_last)
         lines = summary_lines(summary, output)
         if has_uncertainty:
             record, more = add_uncertainty(run, output, session.is_quiet)

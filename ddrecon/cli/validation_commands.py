@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, SHARE, in_session
+from ddrecon.cli.command import DTYPE, OUTPUT, OVERWRITE, REPORT, SCENE, in_session
 
 if TYPE_CHECKING:
     from ddrecon.cli.session import Session
@@ -124,7 +124,6 @@ def reference(
 )
 @OVERWRITE
 @REPORT
-@SHARE
 @in_session
 def bench(
     session: Session,
@@ -140,13 +139,7 @@ def bench(
     if is_hard and (scene is not None or is_quick):
         raise click.UsageError("--hard has cases of its own: leave out SCENE and --quick")
     from ddrecon.io.files.folders import claim_folder
-    from ddrecon.ranks import rank_count
 
-    if rank_count() > 1:
-        if scene is None or is_hard or output is not None:
-            raise click.UsageError("torchrun shares the views of a SCENE: name one, and no -o")
-        _bench_shared(session, scene)
-        return
     with nullcontext() if output is None else claim_folder(output, may_exist=overwrite):
         if is_hard:
             _bench_hard(session, output)
@@ -156,9 +149,11 @@ def bench(
 
 def _bench_speed(session: Session, path: Path | None, is_quick: bool, output: Path | None) -> None:
     """Measures the scene at `path`, or the plume, and writes what was asked for."""
-    from ddrecon.bench.path_tracing import PathTracer
-    from ddrecon.bench.run import bench_lines, describe, load_pair, run_bench, write_bench
+    from ddrecon.bench.measure import run_bench
+    from ddrecon.bench.plume import load_pair
+    from ddrecon.bench.report import bench_lines, describe, write_bench
     from ddrecon.errors import MissingExtraError, SceneError
+    from ddrecon.reference.trace import open_tracer
 
     load = None if path is None else lambda dtype: replace(session, dtype=dtype).load(path)
     scene, double = load_pair(load, session.device, is_quick)
@@ -166,29 +161,13 @@ def _bench_speed(session: Session, path: Path | None, is_quick: bool, output: Pa
         raise click.UsageError("the derivative by the density is measured; name a scene of one")
     tracer = None
     try:
-        tracer = PathTracer(scene, has_gradient=not is_quick)
+        tracer = open_tracer(scene, scene.views, threads=session.threads)
     except (MissingExtraError, SceneError) as error:
         click.echo(f"without path tracing: {error}", err=True)
-    rows, truth = run_bench(scene, double, tracer, is_quick, session.progress)
-    measured = describe(rows, truth, scene, session.environment())
+    rows = run_bench(scene, double, tracer, is_quick, session.progress)
+    measured = describe(rows, scene, session.environment())
     written = [] if output is None else [write_bench(output, rows, measured)]
     session.show(measured, [*bench_lines(rows), *written])
-
-
-def _bench_shared(session: Session, path: Path) -> None:
-    """Measures what it brings that ranks share the views of the scene at `path`."""
-    import torch
-
-    from ddrecon.bench.shared import describe_shared, measure_shared, shared_lines
-    from ddrecon.ranks import is_first
-    from ddrecon.reconstruct.shares import require_sharing
-
-    scene = replace(session, dtype=torch.float32).load(path)
-    require_sharing(scene)
-    measured = measure_shared(scene, session.progress)
-    if is_first():
-        report = describe_shared(measured, session.environment())
-        session.show(report, shared_lines(scene, measured))
 
 
 def _bench_hard(session: Session, output: Path | None) -> None:

@@ -39,8 +39,7 @@ def watch(session: Session, run: Path, port: int | None) -> None:
 
     Ctrl-C ends it.
     """
-    from ddrecon.run.live import LiveRun
-    from ddrecon.run.serve import listen, serve_page, url_of
+    from ddrecon.run.live import LiveRun, listen, serve_page, url_of
 
     live = LiveRun(run)
     with listen(port) as listening, serve_page(live.page, listening) as server:
@@ -51,8 +50,7 @@ def watch(session: Session, run: Path, port: int | None) -> None:
 @contextmanager
 def watched(folder: Path) -> Iterator[None]:
     """The page of the run in `folder`, by a process of its own that ends soon after the block."""
-    from ddrecon.run.live import serve_run
-    from ddrecon.run.serve import listen, url_of
+    from ddrecon.run.live import listen, serve_run, url_of
 
     with listen(None) as listening:
         click.echo(f"{url_of(listening)} shows the run", err=True)

@@ -6,6 +6,7 @@ names the columns; `#` begins a comment. Archives (.npz) have arrays of these na
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ SUFFIXES = (".csv", ".txt", ".npz")
 MAX_BYTES = 1 << 26
 ABSCISSAS = ("angle", "cosine")
 """The first column: scattering angles in degrees, or their cosines."""
+DEGREES = ("l", "degree")
+"""The first column of moments, if it is not one of them."""
 ENDS = 1e-3
 """How far [rad] a table may begin from 0 and end from pi."""
 
@@ -27,19 +30,17 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     C is 1, or 3 where there is a column a color. Raises FormatError.
     """
-    with guard_reading(path):
-        names, columns = _read_columns(path)
-    name = names[0] if names else ""
-    if name not in ABSCISSAS:
+    name, first, values = _read_columns(path, ABSCISSAS)
+    if first is None:
         raise FormatError(path, f"its first column is {name!r}; call it angle (degrees) or cosine")
-    if columns.shape[1] < 4:
-        raise FormatError(path, f"has {columns.shape[1]} angles; a table needs at least 4")
-    _require_colors(path, len(columns) - 1)
-    if name == "cosine" and np.abs(columns[0]).max() > 1 + 1e-6:
+    if len(first) < 4:
+        raise FormatError(path, f"has {len(first)} angles; a table needs at least 4")
+    _require_colors(path, len(values))
+    if name == "cosine" and np.abs(first).max() > 1 + 1e-6:
         raise FormatError(path, "has cosines beyond -1 and 1; are they degrees? call them angle")
-    angles = np.arccos(columns[0].clip(-1, 1)) if name == "cosine" else np.radians(columns[0])
+    angles = np.arccos(first.clip(-1, 1)) if name == "cosine" else np.radians(first)
     order = np.argsort(angles)
-    angles, values = angles[order], columns[1:, order]
+    angles, values = angles[order], values[:, order]
     if (np.diff(angles) <= 0).any():
         row = int(np.argmax(np.diff(angles) <= 0))
         raise FormatError(path, f"has the angle {np.degrees(angles[row]):g} degrees twice")
@@ -57,16 +58,13 @@ def read_moments(path: Path) -> np.ndarray:
 
     Raises FormatError.
     """
-    with guard_reading(path):
-        names, columns = _read_columns(path)
-    if names and names[0] in ("l", "degree"):
-        if not np.array_equal(columns[0], np.arange(columns.shape[1])):
-            raise FormatError(path, f"its column {names[0]} must count 0, 1, 2, ...")
-        columns = columns[1:]
-    _require_colors(path, len(columns))
-    if columns.shape[1] < 2 or (columns[:, 0] <= 0).any():
+    name, first, values = _read_columns(path, DEGREES)
+    if first is not None and not np.array_equal(first, np.arange(len(first))):
+        raise FormatError(path, f"its column {name} must count 0, 1, 2, ...")
+    _require_colors(path, len(values))
+    if values.shape[1] < 2 or (values[:, 0] <= 0).any():
         raise FormatError(path, "needs chi_0 above 0, and chi_1, one a row")
-    moments = columns / columns[:, :1]
+    moments = values / values[:, :1]
     if np.abs(moments).max() > 1 + 1e-6:
         raise FormatError(path, "has moments larger than chi_0; divide each by 2 l + 1")
     return moments
@@ -77,57 +75,53 @@ def _require_colors(path: Path, count: int) -> None:
         raise FormatError(path, f"has {count} columns of values; expected 1, or 3 for r, g, b")
 
 
-def _read_columns(path: Path) -> tuple[list[str], np.ndarray]:
-    """Names of columns, none without a header, and the columns [k, n] of finite numbers."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise FormatError(path, f"is no table; expected {', '.join(SUFFIXES)}")
-    if path.suffix.lower() == ".npz":
-        names, columns = _read_archive(path)
-    else:
-        names, columns = _read_text(path)
+def _read_columns(path: Path, known: Sequence[str]) -> tuple[str, np.ndarray | None, np.ndarray]:
+    """The name of the first column, "" without a header; that column, if it is `known`; the others.
+
+    All are finite.
+    """
+    with guard_reading(path):
+        if path.suffix.lower() not in SUFFIXES:
+            raise FormatError(path, f"is no table; expected {', '.join(SUFFIXES)}")
+        is_archive = path.suffix.lower() == ".npz"
+        name, columns = _read_archive(path, known) if is_archive else _read_text(path)
     if not np.isfinite(columns).all():
         raise FormatError(path, "holds numbers that are not finite")
-    return names, columns
+    first, values = (columns[0], columns[1:]) if name in known else (None, columns)
+    return name, first, values
 
 
-def _read_archive(path: Path) -> tuple[list[str], np.ndarray]:
-    """Arrays called angle, cosine or degree, then `value` [n] or [n, 3]."""
+def _read_archive(path: Path, known: Sequence[str]) -> tuple[str, np.ndarray]:
+    """Arrays called as one of `known`, then `value` [n] or [n, 3]."""
     arrays = read_arrays(path)
-    first = [name for name in (*ABSCISSAS, "l", "degree") if name in arrays]
     if "value" not in arrays or arrays["value"].ndim not in (1, 2):
         raise FormatError(path, "has no array 'value' [n] or [n, 3]")
     values = np.atleast_2d(arrays["value"].T).astype(np.float64)
-    columns = [np.atleast_1d(arrays[name]).astype(np.float64) for name in first[:1]]
-    if any(column.shape != values.shape[1:] for column in columns):
-        raise FormatError(path, f"{first[0]} and value have different lengths")
-    return [*first[:1], *(["value"] * len(values))], np.concatenate(
-        [*(c[None] for c in columns), values]
-    )
+    name = next((name for name in known if name in arrays), "")
+    if not name:
+        return name, values
+    if arrays[name].shape != values.shape[1:]:
+        raise FormatError(path, f"{name} and value have different lengths")
+    return name, np.vstack([arrays[name], values])
 
 
-def _read_text(path: Path) -> tuple[list[str], np.ndarray]:
+def _read_text(path: Path) -> tuple[str, np.ndarray]:
+    """The name of the first column, and columns of numbers below a line of names, if any."""
     if path.stat().st_size > MAX_BYTES:
         raise FormatError(path, f"is larger than {MAX_BYTES >> 20} MiB; it is no table")
-    names: list[str] = []
-    rows: list[list[float]] = []
+    name, rows = "", list[list[float]]()
     for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
         entries = line.split("#")[0].replace(",", " ").replace(";", " ").split()
-        if not entries:
-            continue
         try:
-            rows.append([float(entry) for entry in entries])
+            row = [float(entry) for entry in entries]
         except ValueError:
-            if rows or names:
-                raise FormatError(
-                    path, f"line {number} is not numbers: {line.strip()[:40]!r}"
-                ) from None
-            names = [entry.strip("\"'").lower() for entry in entries]
-        if rows and len(rows[-1]) != len(names or rows[0]):
-            raise FormatError(
-                path,
-                f"line {number} has {len(rows[-1])} numbers, but there are"
-                f" {len(names or rows[0])} columns",
-            )
+            if rows or name:
+                raise FormatError(path, f"line {number} is not numbers: {line[:40]!r}") from None
+            name, row = entries[0].strip("\"'").lower(), []
+        rows += [row] if row else []
+        if row and len(row) != len(rows[0]):
+            told = f"line {number} has {len(row)} numbers, those before {len(rows[0])}"
+            raise FormatError(path, told)
     if not rows:
         raise FormatError(path, "holds no numbers")
-    return names, np.array(rows).T
+    return name, np.array(rows).T

@@ -52,16 +52,14 @@ def mitsuba_lights(lights: Sequence[Light]) -> dict[str, dict[str, Any]]:
 
 def _light(light: DirectionalLight | PointLight) -> dict[str, Any]:
     if isinstance(light, DirectionalLight):
+        irradiance = _color(light.irradiance)
         return {
             "type": "directional",
             "direction": light.direction.tolist(),
-            "irradiance": _color(light.irradiance),
+            "irradiance": irradiance,
         }
-    return {
-        "type": "point",
-        "position": light.position.tolist(),
-        "intensity": _color(light.intensity),
-    }
+    intensity = _color(light.intensity)
+    return {"type": "point", "position": light.position.tolist(), "intensity": intensity}
 
 
 def _environment(light: EnvironmentLight, ambient: np.ndarray) -> dict[str, Any]:

@@ -24,9 +24,9 @@ from ddrecon.cameras import Camera, cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase_blend import Mixture
 from ddrecon.reference.mitsuba_lights import mitsuba_lights
-from ddrecon.reference.mitsuba_phase import mitsuba_phase
-from ddrecon.reference.mitsuba_volume import grid_volume, place
 from ddrecon.scene import Scene, View
 
 LONGEST = 1024
@@ -41,6 +41,8 @@ GRAY = 1e-5
 FINER, MANY = 3, 2**20
 NEAR = 1e-4
 """How far from the eye Mitsuba's rays start, in diagonals of the box; it wants more than 0."""
+COSINES = 1 << 15
+"""Steps of Mitsuba's tables, which are linear between even cosines: the first is 0.6 degrees."""
 SQUARE = 1e-5
 """Pixels this little off square are taken for square: the error is that part of the height."""
 MEDIUM = "medium"
@@ -91,10 +93,10 @@ def _medium(volume: Volume) -> dict[str, Any]:
         field, scale = sigma_t * volume.density, 1.0
     return {
         "type": "heterogeneous",
-        "sigma_t": grid_volume(field, volume.grid),
+        "sigma_t": _grid_volume(field, volume.grid),
         "scale": scale,
         "albedo": _albedo(volume),
-        "phase": mitsuba_phase(volume.phase, volume.grid),
+        "phase": _phase(volume.phase, volume.grid),
     }
 
 
@@ -131,15 +133,61 @@ def _albedo(volume: Volume) -> Any:
         extinction > 0, scattering / torch.where(extinction > 0, extinction, 1), 0
     ).clamp(max=1)
     if albedo[0].numel() > 1:
-        return grid_volume(albedo, volume.grid)
+        return _grid_volume(albedo, volume.grid)
     return albedo.item() if albedo.numel() == 1 else tuple(albedo.flatten().tolist())
+
+
+def _phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
+    """`phase` as `hg`, `blendphase`, `rayleigh`, or by its values as `tabphase`.
+
+    A weight that differs from cell to cell is a volume on `grid`. Raises SceneError for what
+    Mitsuba has not: phase functions that differ by color, and a g that does so from cell to cell.
+    """
+    if phase.colors > 1:
+        raise SceneError("volume.phase: differs by color, and Mitsuba's phase functions have none")
+    if isinstance(phase, HenyeyGreenstein) and phase.cells is not None:
+        raise SceneError(
+            "volume.g: differs from cell to cell, and Mitsuba's hg has one g;"
+            " it knows two_lobe and blend with a weight per cell"
+        )
+    if isinstance(phase, HenyeyGreenstein):
+        return {"type": "hg", "g": phase.g.item()}
+    if isinstance(phase, Rayleigh):
+        return {"type": "rayleigh"}
+    if isinstance(phase, Mixture):
+        first, second = (_phase(part, grid) for part in phase.parts)
+        rest = 1 - (phase.weight if phase.cells is None else phase.cells).detach().cpu()
+        weight = rest.item() if phase.cells is None else _grid_volume(rest, grid)
+        return {"type": "blendphase", "weight": weight, "first": first, "second": second}
+    cosines = torch.linspace(-1, 1, COSINES + 1, dtype=torch.float64)
+    values = phase.kind(*(each.detach().cpu().double() for each in phase.numbers)).value(cosines)
+    return {"type": "tabphase", "values": ", ".join(f"{value:.7g}" for value in values[0].tolist())}
+
+
+def _grid_volume(values: Tensor, grid: Grid) -> dict[str, Any]:
+    """`values` [C, z, y, x] on the box of `grid`."""
+    array = np.ascontiguousarray(values.permute(1, 2, 3, 0).float().numpy())
+    lower, upper = (np.array(corner) for corner in grid.bounds_xyz)
+    return {
+        "type": "gridvolume",
+        "grid": array,
+        "raw": True,
+        "to_world": _place(lower, upper - lower),
+    }
+
+
+def _place(origin: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The transform [4, 4] that scales by `scale` [3] and then shifts by `origin` [3]."""
+    matrix = np.diag([*scale, 1.0])
+    matrix[:3, 3] = origin
+    return matrix
 
 
 def _box(grid: Grid) -> dict[str, Any]:
     """The box, whose faces do nothing but hold the medium; Mitsuba's cube runs from -1 to 1."""
     return {
         "type": "cube",
-        "to_world": place(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2),
+        "to_world": _place(np.array(grid.center_xyz), np.array(grid.extent[::-1]) / 2),
         "bsdf": {"type": "null"},
         "interior": {"type": "ref", "id": MEDIUM},
     }

@@ -6,7 +6,7 @@ Text is escaped here; parts made here are put together as they are.
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -112,6 +112,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     ]
     text = "".join(f"<tr>{line}</tr>" for line in (above, *lines))
     return f'<div class="scroll"><table>{text}</table></div>'
+
+
+def versions(environment: Mapping[str, Any]) -> str:
+    """A table of what took part."""
+    told = {k: " ".join(map(str, v)) if isinstance(v, list) else v for k, v in environment.items()}
+    return table(["", ""], list(told.items()))
 
 
 def picture(png: bytes, caption: str, width: int = 600) -> str:

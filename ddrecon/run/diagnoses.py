@@ -1,4 +1,4 @@
-"""What seems to be wrong with a run, told by its pictures, its log and how its parameters move.
+"""What seems to be wrong with a run, told by its pictures and its log.
 
 Each function returns a sentence, with what to do, or None where there is nothing to say.
 """
@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from statistics import mean, median
 
 import torch
 from torch import Tensor
 
-from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.reconstruct.log import Row
-from ddrecon.reconstruct.loop import Reconstruction
+from ddrecon.reconstruct.objective import target_of
 from ddrecon.scene import View
 
 OVERFIT = 6.0
@@ -31,45 +29,6 @@ WORTHWHILE = 0.1
 """A run is unfinished where as many iterations again would take this part off its loss."""
 SURE = 3.0
 """So many standard errors are no chance: the loss differs from view to view."""
-LATE = 0.25
-"""The last part of a run."""
-DRIFT = 0.005
-"""Relative changes over the last part of a run that are not rest."""
-REFLECTION = ("albedo", "sigma_s")
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What is wrong, in a word that names its `kind` and in a sentence."""
-
-    kind: str
-    text: str
-
-
-class LateMeans:
-    """The mean value of each parameter where the last part of a run begins."""
-
-    def __init__(self) -> None:
-        self.means: dict[str, float] = {}
-        self.place: int | None = None
-
-    def note(self, run: Reconstruction) -> None:
-        """Notes the means, if `run` comes there now; after every iteration."""
-        place, begin = run.schedule.place(run.iteration), int((1 - LATE) * run.schedule.planned)
-        was, self.place = place - 1 if self.place is None else self.place, place
-        if was < begin <= place:
-            self.means = _means(run)
-
-    def moved(self, run: Reconstruction) -> dict[str, float]:
-        """By what factor each mean has changed since, for those above 0."""
-        now = _means(run)
-        return {
-            name: now[name] / was for name, was in self.means.items() if min(was, now[name]) > 0
-        }
-
-
-def _means(run: Reconstruction) -> dict[str, float]:
-    return {parameter.name: float(parameter.value.detach().mean()) for parameter in run.parameters}
 
 
 def diagnose(
@@ -77,12 +36,11 @@ def diagnose(
     images: Mapping[str, Tensor],
     quality: Mapping[str, Mapping[str, float]],
     rows: Sequence[Row],
-    moved: Mapping[str, float],
-) -> list[Diagnosis]:
+) -> list[dict[str, str]]:
     """What seems to be wrong with a run that has rendered `images` of its `views`.
 
-    `quality` has the PSNR of each, `rows` are its log, and `moved` is by what factor each parameter
-    has changed, in the mean, over the last quarter of the run.
+    `quality` has the PSNR of each, `rows` are its log. Each is a word that names its `kind`, and a
+    sentence, its `text`.
     """
     seen = [view for view in views if view.image is not None]
     trained = [view for view in seen if not view.is_test]
@@ -95,9 +53,8 @@ def diagnose(
         "cameras": find_shift(trained, images, least),
         # What is overfit would only become more so.
         "unfinished": None if overfit else find_falling(rows),
-        "drift": find_drift(moved) if least < 1 else None,
     }
-    return [Diagnosis(kind, text) for kind, text in told.items() if text is not None]
+    return [{"kind": kind, "text": text} for kind, text in told.items() if text is not None]
 
 
 def find_overfit(views: Sequence[View], quality: Mapping[str, Mapping[str, float]]) -> str | None:
@@ -141,9 +98,9 @@ def find_exposure(views: Sequence[View], images: Mapping[str, Tensor], least: fl
             odd[view.name] = gain / usual
     if not odd:
         return None
-    named = ", ".join(f"{name} ({gain:.2f} times)" for name, gain in _worst(odd))
     return (
-        f"exposure? pictures brighter or darker, as a whole, than the others say: {named}; give "
+        "exposure? pictures brighter or darker, as a whole, than the others say: "
+        f"{_name_worst(odd, '.2f', 'times')}; give "
         "all one exposure and white balance, or optimize them (views.*.exposure)"
     )
 
@@ -160,10 +117,9 @@ def find_shift(views: Sequence[View], images: Mapping[str, Tensor], least: float
             moves[view.name] = math.hypot(right, down)
     if not moves:
         return None
-    named = ", ".join(f"{name} ({move:.1f} pixels)" for name, move in _worst(moves))
     return (
-        f"cameras? renders fit better when moved: {named}; check poses and intrinsics, or optimize "
-        "the poses (views.NAME.camera)"
+        f"cameras? renders fit better when moved: {_name_worst(moves, '.1f', 'pixels')}; check "
+        "poses and intrinsics, or optimize the poses (views.NAME.camera)"
     )
 
 
@@ -215,22 +171,6 @@ def promised(losses: Sequence[float], more: int, sure: float = SURE) -> float:
     return left * (1 - q**more)
 
 
-def find_drift(moved: Mapping[str, float]) -> str | None:
-    """Whether light and albedo still move against each other, so that pictures stay the same."""
-    lights = {n: f for n, f in moved.items() if n.rpartition(".")[2] in BRIGHTNESS}
-    media = {n: f for n, f in moved.items() if n in REFLECTION}
-    for light, brighter in lights.items():
-        for medium, whiter in media.items():
-            one, other = math.log(brighter), math.log(whiter)
-            if min(abs(one), abs(other)) > DRIFT and one * other < 0:
-                return (
-                    f"drift: {light} and {medium} still move against each other (by factors of "
-                    f"{brighter:.3f} and {whiter:.3f} over the last quarter of the run): pictures "
-                    "hardly tell them apart; fix one of them"
-                )
-    return None
-
-
 def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:
     """By how many pixels (right, down) the render `image` [3, h, w] is to be moved to fit best.
 
@@ -238,7 +178,7 @@ def best_shift(view: View, image: Tensor) -> tuple[tuple[float, float], float]:
     Gauss-Newton: the residual is fitted by the derivatives of the render along both axes (central
     differences; Lucas and Kanade 1981).
     """
-    target, weight = _picture(view), _weight(view)
+    target, weight = target_of(view), _weight(view)
     if min(image.shape[1:]) < 3:
         return (0.0, 0.0), 0.0
     inner = (slice(None), slice(1, -1), slice(1, -1))
@@ -261,24 +201,18 @@ def _gain(view: View, image: Tensor, usual: float) -> tuple[float, float]:
     And the part that it explains of what the `usual` factor leaves.
     """
     weight = _weight(view)
-    picture, render = ((x * weight).double().flatten() for x in (_picture(view), image))
+    picture, render = ((x * weight).double().flatten() for x in (target_of(view), image))
     left, power = picture - usual * render, float(render @ render) or 1e-30
     change = float(left @ render) / power
     return max(usual + change, 1e-12), change**2 * power / max(float(left @ left), 1e-30)
 
 
-def _picture(view: View) -> Tensor:
-    if view.image is None:
-        raise ValueError(f"view {view.name} has no image")
-    return view.image
-
-
 def _weight(view: View) -> Tensor:
     """1 where a pixel counts, [1, h, w]."""
-    picture = _picture(view)
-    return torch.ones_like(picture[:1]) if view.mask is None else view.mask[None]
+    return torch.ones_like(target_of(view)[:1]) if view.mask is None else view.mask[None]
 
 
-def _worst(numbers: Mapping[str, float]) -> list[tuple[str, float]]:
+def _name_worst(numbers: Mapping[str, float], form: str, unit: str) -> str:
     """At most four of `numbers`, by name: those farthest from 1 as factors."""
-    return sorted(numbers.items(), key=lambda item: -abs(math.log(item[1])))[:4]
+    worst = sorted(numbers.items(), key=lambda item: -abs(math.log(item[1])))[:4]
+    return ", ".join(f"{name} ({number:{form}} {unit})" for name, number in worst)

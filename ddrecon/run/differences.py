@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,37 +26,28 @@ def fingerprint(scene_file: SceneFile, dtype: torch.dtype) -> dict[str, Any]:
     Less what a resumed run may change: the number of iterations, and learning rates.
     """
     scene = describe(scene_file)
-    settings = {
-        name: _without(given, "lr") for name, given in scene["optimize"]["parameters"].items()
-    }
-    scene["optimize"] = {**_without(scene["optimize"], "iterations"), "parameters": settings}
+    scene["optimize"].pop("iterations", None)
+    for settings in scene["optimize"]["parameters"].values():
+        settings.pop("lr", None)
     contents = {f"the content of {path}": _digest(path) for path in referenced_files(scene_file)}
     return scene | contents | {"--dtype": str(dtype).removeprefix("torch.")}
 
 
-def differences(old: Any, new: Any) -> list[str]:
+def differences(old: Any, new: Any, key: str = "") -> list[str]:
     """The differences between two trees of mappings, lists and plain values, a text for each.
 
-    A text reads `key.path is A there, B now`.
+    A text reads `key.path is A there, B now`; `key` is where both trees stand.
     """
+    one, other = _entries(old), _entries(new)
+    if one is None or other is None:
+        return [f"{key} is {_shorten(old)} there, {_shorten(new)} now"] if old != new else []
     return [
-        f"{key} is {_shorten(before)} there, {_shorten(after)} now"
-        for key, before, after in _changes("", old, new)
-    ]
-
-
-def _changes(key: str, old: Any, new: Any) -> Iterator[tuple[str, Any, Any]]:
-    old_entries, new_entries = _entries(old), _entries(new)
-    if old_entries is None or new_entries is None:
-        if old != new:
-            yield key, old, new
-        return
-    for name in dict.fromkeys([*old_entries, *new_entries]):
-        yield from _changes(
-            f"{key}.{name}" if key else str(name),
-            old_entries.get(name, ABSENT),
-            new_entries.get(name, ABSENT),
+        text
+        for name in dict.fromkeys([*one, *other])
+        for text in differences(
+            one.get(name, ABSENT), other.get(name, ABSENT), f"{key}.{name}" if key else str(name)
         )
+    ]
 
 
 def _entries(value: Any) -> Mapping[Any, Any] | None:
@@ -76,10 +67,6 @@ def _shorten(value: Any) -> str:
         return "absent"
     text = json.dumps(value)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
-
-
-def _without(entries: Mapping[str, Any], name: str) -> dict[str, Any]:
-    return {key: value for key, value in entries.items() if key != name}
 
 
 def _digest(path: Path) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
-from ddrecon.run.events import event_log
 from ddrecon.run.leftovers import remove_run
 from ddrecon.run.quality import describe_loss, loss_text, render_run
 from ddrecon.run.report_volume import turntable_images
@@ -120,13 +119,12 @@ def drive_run(
     folder: RunFolder,
     preview_every: int | None,
     is_quiet: bool,
-    has_events: bool = False,
     is_last: bool = True,
 ) -> dict[str, Any]:
     """The summary of `run`, advanced until it is done, its results in `folder`.
 
-    `preview_every` counts iterations between pictures; `has_events` logs for TensorBoard as well.
-    Unless this `is_last` of what they do, ranks stay together.
+    `preview_every` counts iterations between pictures. Unless this `is_last` of what they do, ranks
+    stay together.
     An interrupt (SIGINT or SIGTERM) takes effect between two iterations, and writes a checkpoint
     before it is passed on. So do a divergence and the end of another rank; any other failure leaves
     the checkpoints written so far.
@@ -135,21 +133,15 @@ def drive_run(
     # Nor is a checkpoint torn, by torchrun, which ends all ranks where it sees one that has ended.
     with defer_interrupt() as asked:
         try:
-            with (
-                event_log(folder.path, run.iteration) if has_events else nullcontext() as events,
-                tqdm(
-                    total=total, initial=run.iteration, desc="optimize", **bar_settings(is_quiet)
-                ) as bar,
-            ):
+            with tqdm(
+                total=total, initial=run.iteration, desc="optimize", **bar_settings(is_quiet)
+            ) as bar:
                 if not is_quiet:
                     tqdm.write(loss_text(describe_loss(run.settings, run.train)), file=sys.stderr)
                 while not run.is_done:
                     folder.save_in_time(run)
                     row = run.step()
                     folder.log.add(row)
-                    folder.late.note(run)
-                    if events is not None:
-                        events.log(row)
                     bar.set_postfix_str(progress_text(run.total, row), refresh=False)
                     bar.update()
                     if preview_every and row.iteration % preview_every == 0:

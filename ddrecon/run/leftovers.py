@@ -21,7 +21,7 @@ SAMPLE_FILES = (
 """What files of `ddrecon uncertainty` are called."""
 RUN_FILES = (
     *("scene.yaml", "result.yaml", "environment.json", "parameters.json", "summary.json"),
-    *("loss.csv", "report.html", *CHECKPOINT_FILES, "tensorboard/events.out.tfevents.*"),
+    *("loss.csv", "report.html", *CHECKPOINT_FILES),
     *("lights.[0-9]*.*.npy", "lights.[0-9]*.*.exr", "lights.[0-9]*.*.tif"),
     *("previews/*.slices.png", "previews/*.[0-9][0-9][0-9][0-9][0-9][0-9].png"),
     *(f"uncertainty/{name}" for name in SAMPLE_FILES),

@@ -1,37 +1,40 @@
 """The page of a run while it goes on: what its folder holds, made into the report's own sections.
 
 The loss is that of `loss.csv`. Volume and views are those of the last checkpoint, rendered here,
-beside what is asked for meanwhile.
+beside what is asked for meanwhile. It is served on this machine's own address, for its own browsers
+only.
 """
 
 from __future__ import annotations
 
 import signal
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing import parent_process
 from pathlib import Path
-from socket import socket
+from socket import create_server, socket
 from socketserver import BaseServer
-from threading import Thread
+from threading import Lock, Thread
 from time import monotonic
 
 import torch
 
-from ddrecon.errors import DdreconError
+from ddrecon.errors import DdreconError, UsageError
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.report.page import page_text, section, side_by_side
 from ddrecon.run.checkpoint import load_checkpoint, newest_checkpoint
-from ddrecon.run.findings import Findings, given_fields
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import render_run
-from ddrecon.run.report import curves
-from ddrecon.run.report_views import view_section
+from ddrecon.run.quality import Findings, given_fields, render_run
+from ddrecon.run.report import curves, view_section
 from ddrecon.run.report_volume import volume_section
 from ddrecon.run.run_folder import require_run
-from ddrecon.run.serve import serve_page
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import AUTO, Iterations
 
+HOST = "127.0.0.1"
+PORT = 8765
+"""Where a page is served if that is free, and nothing else is asked for."""
 REPORT = "report.html"
 SHARE = 0.25
 """Volume and views are made in this part of the time at most: the run needs the machine."""
@@ -128,3 +131,57 @@ def _end_with_parent(server: BaseServer) -> None:
     if (parent := parent_process()) is not None:
         parent.join()
         server.shutdown()
+
+
+def listen(port: int | None) -> socket:
+    """A socket that listens at `port` of localhost; None: at PORT, or a free one if it is taken.
+
+    Browsers that ask before a page is served there wait for it. Raises UsageError where `port` is
+    taken.
+    """
+    if port is None:
+        try:
+            return create_server((HOST, PORT))
+        except OSError:
+            port = 0
+    try:
+        return create_server((HOST, port))
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"--port {port}: {reason}; leave it out for a free one") from error
+
+
+def url_of(listening: socket) -> str:
+    """What a browser is given to see what is served at the socket."""
+    return f"http://{HOST}:{listening.getsockname()[1]}/"
+
+
+@contextmanager
+def serve_page(page: Callable[[], str], listening: socket) -> Iterator[ThreadingHTTPServer]:
+    """A server of `page()`, made anew for each request, at the socket `listening`."""
+    lock = Lock()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            # A site elsewhere may give its own name this address, to read what is here.
+            name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+            if self.path != "/" or name not in (HOST, "localhost"):
+                self.send_error(404)
+                return
+            with lock:
+                content = page().encode("utf-8")
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(content)))
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, *_: object) -> None:
+            """Requests are not told."""
+
+    server = ThreadingHTTPServer(listening.getsockname(), Handler, bind_and_activate=False)
+    server.socket.close()
+    server.socket = listening
+    with server:
+        yield server

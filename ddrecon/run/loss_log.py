@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,6 @@ from ddrecon.io.files.atomic import flush, refusals, replace_file
 from ddrecon.reconstruct.log import Row
 
 COLUMNS = [field.name for field in fields(Row)]
-READERS: dict[Any, Callable[[str], Any]] = {
-    "int": int,
-    "float": float,
-    "float | None": lambda text: float(text) if text else None,
-}
-"""What reads the text of a cell, by the type of its column."""
 
 
 class LossLog:
@@ -76,14 +70,16 @@ def _row(line: str) -> Row | None:
     """What `line` says; None where it is not whole, or no number stands where one should."""
     cells = line.split(",")
     try:
-        return Row(*(READERS[f.type](cell) for f, cell in zip(fields(Row), cells, strict=True)))
+        return Row(*(_read(f.type, cell) for f, cell in zip(fields(Row), cells, strict=True)))
     except ValueError:
         return None
 
 
+def _read(kind: Any, cell: str) -> Any:
+    """What `cell` holds, by the type of its column."""
+    return int(cell) if kind == "int" else None if not cell and "None" in kind else float(cell)
+
+
 def _cells(row: Row) -> list[Any]:
     values = (getattr(row, name) for name in COLUMNS)
-    return [
-        "" if value is None else f"{value:.8g}" if isinstance(value, float) else value
-        for value in values
-    ]
+    return [f"{value:.8g}" if isinstance(value, float) else value for value in values]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -17,10 +18,16 @@ from ddrecon.io.images.movies import encode_frames, write_animation, write_mp4
 from ddrecon.io.images.table import PREVIEW, read_image, write_picture
 from ddrecon.losses import Target
 from ddrecon.progress import Progress
-from ddrecon.ranks import cells_are_shared, is_first, own_rank, rank_count, sum_numbers
+from ddrecon.ranks import (
+    cells_are_shared,
+    is_first,
+    own_rank,
+    rank_count,
+    sum_numbers,
+    sum_over_ranks,
+)
 from ddrecon.renderer import LightField, solve_light, view_components, view_picture
 from ddrecon.report.pictures import diverging, find_white, pixels
-from ddrecon.run.shared_views import bring, render_in_turns
 from ddrecon.scene import Scene, View
 from ddrecon.scene_file.problems import suggestion
 from ddrecon.terms import needed_terms
@@ -44,7 +51,7 @@ def render_to_folder(
         start = perf_counter()
         light_field = solve_light(scene, memory)
         light_seconds = perf_counter() - start
-        turns = render_in_turns(
+        turns = _render_in_turns(
             views,
             lambda view: _names(view, has_components),
             lambda view: _images(light_field, scene, view, has_components),
@@ -107,8 +114,8 @@ def render_gradient_to_folder(
         taken = dict(zip(taken, sum_numbers(list(taken.values())), strict=True))
     for view in views:
         names = _names(view, has_components)
-        images = bring(view, found, names)
-        derivatives = bring(view, derived, [_derived(view.name, name) for name in names])
+        images = _bring(view, found, names)
+        derivatives = _bring(view, derived, [_derived(view.name, name) for name in names])
         if not is_first():
             continue
         for name in names:
@@ -216,3 +223,38 @@ def _images(
     named = {"reduced": reduced, "single": single, "multiple": multiple}
     parts_of = {f"{view.name}.{name}": part for name, part in named.items()}
     return {view.name: reduced + single + multiple, **parts_of}
+
+
+def _render_in_turns(
+    views: Sequence[View],
+    names_of: Callable[[View], Sequence[str]],
+    images_of: Callable[[View], Mapping[str, Tensor]],
+    progress: Progress,
+) -> Iterator[tuple[View, Mapping[str, Tensor], float]]:
+    """Each of `views`, its images as `images_of` gives them, and the seconds that they took.
+
+    `names_of` says what these are called. With several ranks the seconds are those of a turn; where
+    they share out cells, all render each view together.
+    """
+    if cells_are_shared():
+        for view in progress(views, "render"):
+            start = perf_counter()
+            yield view, images_of(view), perf_counter() - start
+        return
+    ranks = rank_count()
+    for begin in progress(range(0, len(views), ranks), "render"):
+        turn, start = views[begin : begin + ranks], perf_counter()
+        own = [view.name for view in turn[own_rank() : own_rank() + 1]]
+        images = images_of(turn[own_rank()]) if own else {}
+        seconds = perf_counter() - start
+        for view in turn:
+            yield view, _bring(view, images if view.name in own else {}, names_of(view)), seconds
+
+
+def _bring(view: View, images: Mapping[str, Tensor], names: Sequence[str]) -> Mapping[str, Tensor]:
+    """The images of `view` called `names`, from the rank that has them as `images`."""
+    if rank_count() == 1 or cells_are_shared():
+        return images
+    nothing = view.camera.pose.new_zeros(3, *view.camera.size)
+    stack = torch.stack([images.get(name, nothing) for name in names])
+    return dict(zip(names, sum_over_ranks([stack])[0], strict=True))

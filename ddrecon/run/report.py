@@ -1,31 +1,51 @@
-"""The report of a finished reconstruction, `report.html`: curves, pictures and tables."""
+"""The report of a finished reconstruction, `report.html`: curves, pictures and tables.
+
+Target and render of a view stand side by side as they are displayed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
 
+import numpy as np
+from torch import Tensor
+
 from ddrecon.engine import name_engines
+from ddrecon.io.images import srgb
+from ddrecon.io.images.movies import webp_of
 from ddrecon.reconstruct.log import Row
+from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.shares import has_slabs
 from ddrecon.report.curve import draw_curve
 from ddrecon.report.page import (
     fold,
+    grid,
     items,
+    pair,
     paragraph,
     section,
     side_by_side,
     table,
+    unfolded,
+    versions,
     warnings,
     write_page,
 )
-from ddrecon.run.findings import Findings
-from ddrecon.run.report_views import view_section
+from ddrecon.report.pictures import find_white, pixels, shrink
+from ddrecon.run.quality import Findings
 from ddrecon.run.report_volume import turntable, volume_section
+from ddrecon.scene import View
 from ddrecon.terms import engine_of_scene, needed_terms
 
+SHOWN = 24
+"""Views whose pictures are on the page; all are in the folder."""
+PIXELS = 1_200_000
+"""So many pixels all pictures of views have together, at most."""
+LARGEST = 256
+"""Pixels along the longer side of a picture, at most."""
 TIMING_HEAD = [
     "cells",
     "iterations",
@@ -41,7 +61,7 @@ def write_run_report(path: Path, findings: Findings) -> None:
     """Writes the report of `findings` to `path`."""
     scene, needs = findings.scene, "What this scene needed, and so was computed:"
     engines = name_engines(engine_of_scene(scene, has_slabs(scene)))
-    versions = [(k, _format(v)) for k, v in findings.environment.items() if k != "engines"]
+    environment = {k: v for k, v in findings.environment.items() if k != "engines"}
     diagnoses = [diagnosis["text"] for diagnosis in findings.summary["diagnoses"]]
     sections = [
         *([warnings(diagnoses)] if diagnoses else []),
@@ -52,7 +72,7 @@ def write_run_report(path: Path, findings: Findings) -> None:
         section("Timings", _timings(findings.rows)),
         section("Physics", paragraph(needs), items([*needed_terms(scene), f"engine {engines}"])),
         section("Settings", fold("scene.yaml, all defaults filled in", findings.settings)),
-        section("Versions", table(["", ""], versions)),
+        section("Versions", versions(environment)),
     ]
     title = f"ddrecon: {path.absolute().parent.name}"
     write_page(path, title, _lead(findings), sections, is_alive=True)
@@ -107,5 +127,57 @@ def _timings(rows: Sequence[Row]) -> str:
     return table(TIMING_HEAD, lines)
 
 
-def _format(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+def view_section(findings: Findings) -> list[str]:
+    """Target and render of the first views, those held out first, and a table of all."""
+    views = [view for view in findings.scene.views if view.image is not None]
+    shown = sorted(views, key=lambda view: not view.is_test)[:SHOWN]
+    white = median(find_white(pixels(target_of(view))) for view in shown)
+    most = min(LARGEST, int((PIXELS / (2 * len(shown))) ** 0.5))
+    parts = [
+        paragraph(
+            f"The picture on the left, its render on the right, as displayed (sRGB; radiance "
+            f"{white:.3g} is white). Move over a picture to shift the line between them; "
+            "'difference' shows what differs in them, four times enlarged around gray."
+        )
+    ]
+    for label, is_test in (("Held out", True), ("Trained on", False)):
+        group = [view for view in shown if view.is_test == is_test]
+        if group:
+            figures = [_figure(findings, view, white, most) for view in group]
+            parts.append(unfolded(f"{label}: {len(group)}", grid(figures), is_open=True))
+    if len(views) > SHOWN:
+        parts.append(paragraph(f"{len(views) - SHOWN} more views are in previews/."))
+    return [*parts, unfolded("All views", _view_table(findings), is_open=False)]
+
+
+def _figure(findings: Findings, view: View, white: float, most: int) -> str:
+    target, render = (
+        _displayed(image, white, most) for image in (target_of(view), findings.images[view.name])
+    )
+    caption = f"{view.name}: {_quality_text(findings.quality[view.name])}"
+    return pair(webp_of(target), webp_of(render), caption)
+
+
+def _displayed(image: Tensor, white: float, most: int) -> np.ndarray:
+    return srgb.encode_bytes(pixels(shrink(image, most)) / white)
+
+
+def _view_table(findings: Findings) -> str:
+    rows = []
+    for view in findings.scene.views:
+        height, width = view.camera.size
+        split = "test" if view.is_test else "train"
+        quality = findings.quality.get(view.name)
+        told = (f"{quality['psnr']:.2f}", f"{quality['ssim']:.4f}") if quality else ("", "")
+        rows.append((view.name, split, f"{width} x {height}", f"{view.weight:g}", *told))
+    return table(["view", "split", "pixels", "weight", "PSNR [dB]", "SSIM"], rows)
+
+
+def _quality_text(quality: Mapping[str, Any]) -> str:
+    """PSNR and SSIM, and the exposure and offset that a held-out picture was compared with."""
+    text = f"{quality['psnr']:.2f} dB, SSIM {quality['ssim']:.4f}"
+    for key in ("exposure", "offset"):
+        if f"fitted_{key}" in quality:
+            values = ", ".join(f"{value:.3g}" for value in quality[f"fitted_{key}"])
+            text += f", {key} {values} fitted to it"
+    return text

@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from ddrecon.cameras import Camera
-from ddrecon.io.images.movies import SECONDS, encode_frames
+from ddrecon.io.images.movies import encode_frames, moving_webp_of
 from ddrecon.io.images.table import png_of
-from ddrecon.io.images.webp import moving_webp_of
 from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.renderer import LightField, view_image
 from ddrecon.report.page import movie, paragraph, picture, side_by_side
 from ddrecon.report.pictures import find_white, pixels, projections, slices
 from ddrecon.report.volumes import Shown, find_white_value, volume_viewer
-from ddrecon.run.findings import Findings
+from ddrecon.run.quality import Findings
 from ddrecon.scene import Scene, View
 from ddrecon.turntable import place_turntable, upright_axis
 from ddrecon.variables.values import fields_of
@@ -87,7 +86,7 @@ def turntable(findings: Findings) -> str:
         f"Once around the upright axis, from {first}; radiance {white:.3g} is white. "
         "Larger: ddrecon render RUN --ring 60"
     )
-    return movie(moving_webp_of(encode_frames(images, white), SECONDS), caption)
+    return movie(moving_webp_of(encode_frames(images, white)), caption)
 
 
 def turntable_images(scene: Scene, light_field: LightField) -> list[Tensor]:

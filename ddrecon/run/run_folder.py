@@ -20,10 +20,9 @@ from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.support import describe_support
 from ddrecon.report.pictures import comparison, slices
 from ddrecon.run.checkpoint import LAST, newest_checkpoint, save_checkpoint
-from ddrecon.run.diagnoses import LateMeans, diagnose
-from ddrecon.run.findings import Findings, given_fields, solve
+from ddrecon.run.diagnoses import diagnose
 from ddrecon.run.loss_log import LossLog
-from ddrecon.run.quality import compared_by, render_run, render_views
+from ddrecon.run.quality import Findings, compared_by, given_fields, render_run, render_views, solve
 from ddrecon.run.report import write_run_report
 from ddrecon.run.result import RESULT, describe_result, result_names
 from ddrecon.scene import Scene
@@ -70,7 +69,6 @@ class RunFolder:
             remove_temporaries(path)
         self.checkpoints, self.log = path / CHECKPOINTS, LossLog(path / "loss.csv")
         self.saved, self.next_save = -1, 0.0
-        self.late = LateMeans()
         self.save_every = CHECKPOINT_SECONDS
 
     def start(self, run: Reconstruction) -> None:
@@ -130,9 +128,8 @@ class RunFolder:
         images, quality = render_views(run, scene, light_field)
         self._pictures(scene, images, "")
         log, environment = self.log.rows(run.iteration), self.environment
-        diagnoses = diagnose(scene.views, images, quality, log, self.late.moved(run))
-        told = [vars(diagnosis) for diagnosis in diagnoses]
-        summary = _summary(run) | {"views": quality, "diagnoses": told}
+        diagnoses = diagnose(scene.views, images, quality, log)
+        summary = _summary(run) | {"views": quality, "diagnoses": diagnoses}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
         given = given_fields(run.scene)
@@ -163,19 +160,15 @@ class RunFolder:
         Maps become files of their own, but for those that are `stored`.
         """
         parameters: dict[str, Any] = {}
+        coefficients = "density", *EXTINCTION_AND_ALBEDO
         for name in variable_names(scene):
-            is_told = is_of_volume(name) and split_name(name)[1] not in (
-                "density",
-                *EXTINCTION_AND_ALBEDO,
-            )
-            if is_told and (value := value_of(scene, name)).ndim < 2:
+            is_light, value = name.startswith("lights."), value_of(scene, name)
+            if is_light and value.ndim >= 3:
+                parameters[name] = stored.get(name) or self._store(scene, name)
+            elif is_light or (
+                is_of_volume(name) and value.ndim < 2 and split_name(name)[1] not in coefficients
+            ):
                 parameters[name] = value.tolist()
-        for name in variable_names(scene):
-            if name.startswith("lights."):
-                if (value := value_of(scene, name)).ndim < 3:
-                    parameters[name] = value.tolist()
-                else:
-                    parameters[name] = stored.get(name) or self._store(scene, name)
         for view in scene.views:
             matrix = [*view.camera.pose.tolist(), [0, 0, 0, 1]]
             parameters[f"views.{view.name}.camera"] = {"matrix": matrix}

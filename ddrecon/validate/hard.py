@@ -6,6 +6,7 @@ lose no light and have no radiance below zero.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -30,141 +31,96 @@ NEGATIVE = 1e-7
 
 
 @dataclass(frozen=True)
-class Rendered:
-    """One case in one precision.
-
-    `image` is [3, h, w], `gradient` that of its mean by density [z, y, x]; `iterations` and
-    `balance` are of the solve.
-    """
-
-    image: Tensor
-    gradient: Tensor
-    iterations: int
-    balance: Balance
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether image and gradient are."""
-        return bool(self.image.isfinite().all()) and bool(self.gradient.isfinite().all())
-
-
-@dataclass(frozen=True)
 class HardResult:
-    """The result of a case.
+    """The result of a case, or the `error` of a solve that gave up.
 
-    `iterations` to `energy` are of float32; errors are relative RMS; `lowest` is a part of the
-    brightest pixel.
+    `iterations` to `energy` are of float32; errors are relative RMS, absolute where nothing is;
+    `lowest` is a part of the brightest pixel.
     """
 
     case: str
-    is_finite: bool
-    iterations: int
-    residual: float
-    attainable: float
-    image_error: float
-    gradient_error: float
-    lowest: float
-    energy: float
-    energy_double: float
+    error: str = ""
+    is_finite: bool = True
+    iterations: int = 0
+    residual: float = math.nan
+    attainable: float = math.nan
+    image_error: float = math.nan
+    gradient_error: float = math.nan
+    lowest: float = math.nan
+    energy: float = math.nan
+    energy_double: float = math.nan
 
     def failures(self) -> list[str]:
-        """The bounds that are not kept (a NaN keeps none)."""
+        """The bounds that are not kept (a NaN keeps none), or the error."""
+        is_balanced = self.energy <= ENERGY[torch.float32]
         bounds = {
             "finite": self.is_finite,
             "residual": self.residual <= TOLERANCE[torch.float32] + ROUNDINGS * self.attainable,
             "image": self.image_error <= SINGLE_FROM_DOUBLE,
             "gradient": self.gradient_error <= SINGLE_FROM_DOUBLE,
             "radiance": self.lowest >= -NEGATIVE,
-            "energy": self.energy <= ENERGY[torch.float32]
-            and self.energy_double <= ENERGY[torch.float64],
+            "energy": is_balanced and self.energy_double <= ENERGY[torch.float64],
         }
-        return [name for name, is_kept in bounds.items() if not is_kept]
+        return (
+            [self.error]
+            if self.error
+            else [name for name, is_kept in bounds.items() if not is_kept]
+        )
 
     def row(self) -> str:
         """The case as a line of the table."""
-        numbers = (
-            self.residual,
-            self.attainable,
-            self.image_error,
-            self.gradient_error,
-            self.lowest,
-            self.energy,
-            self.energy_double,
-        )
-        verdict = f"FAIL: {', '.join(self.failures())}" if self.failures() else "pass"
+        failures = self.failures()
+        verdict = f"FAIL: {', '.join(failures)}" if failures else "pass"
+        numbers = [] if self.error else [f"{getattr(self, name):>14.1e}" for name in NUMBERS]
         return " | ".join(
-            [
-                f"| {self.case:<41}",
-                f"{self.iterations:>10}",
-                *(f"{number:>14.1e}" for number in numbers),
-                f"{verdict} |",
-            ]
+            [f"| {self.case:<41}", f"{self.iterations:>10}", *numbers, f"{verdict} |"]
         )
 
 
-@dataclass(frozen=True)
-class Unsolved:
-    """A case whose solve gave up, and why."""
-
-    case: str
-    error: str
-
-    def failures(self) -> list[str]:
-        """What went wrong."""
-        return [self.error]
-
-    def row(self) -> str:
-        """The case as a line of the table."""
-        return f"| {self.case:<41} | {self.error} |"
+NUMBERS = tuple(field.name for field in fields(HardResult))[4:]
+"""The columns of the table between iterations and verdict."""
 
 
-def run_cases(device: torch.device, progress: Progress) -> list[HardResult | Unsolved]:
+def run_cases(device: torch.device, progress: Progress) -> list[HardResult]:
     """The result of every case of `CASES`."""
     return [run_case(name, CASES[name], device) for name in progress(list(CASES), "hard cases")]
 
 
-def run_case(name: str, case: HardCase, device: torch.device) -> HardResult | Unsolved:
+def run_case(name: str, case: HardCase, device: torch.device) -> HardResult:
     """The result of `case`, called `name`, rendered in both precisions."""
     try:
-        single, double = (_render(case, dtype, device) for dtype in (torch.float32, torch.float64))
+        (image, gradient, iterations, balance), (exact, exact_gradient, _, exact_balance) = (
+            _render(case, dtype, device) for dtype in (torch.float32, torch.float64)
+        )
     except SolveError as error:
-        return Unsolved(name, str(error))
-    brightest = float(single.image.max().clamp(min=torch.finfo(torch.float32).tiny))
+        return HardResult(name, str(error))
+    results = image, gradient, exact, exact_gradient
     return HardResult(
         name,
-        single.is_finite and double.is_finite,
-        single.iterations,
-        single.balance.residual,
-        single.balance.attainable,
-        _error(single.image, double.image),
-        _error(single.gradient, double.gradient),
-        float(single.image.min()) / brightest,
-        single.balance.energy,
-        double.balance.energy,
+        "",
+        all(bool(result.isfinite().all()) for result in results),
+        iterations,
+        balance.residual,
+        balance.attainable,
+        _error(image, exact),
+        _error(gradient, exact_gradient),
+        float(image.min() / image.max().clamp(min=torch.finfo(image.dtype).tiny)),
+        balance.energy,
+        exact_balance.energy,
     )
 
 
-def table(results: Sequence[HardResult | Unsolved]) -> list[str]:
+def table(results: Sequence[HardResult]) -> list[str]:
     """The results as a table, and how many cases failed."""
-    names = [
-        field.name.replace("_", " ")
-        for field in fields(HardResult)
-        if field.name not in ("case", "is_finite", "iterations")
-    ]
-    header = " | ".join(
-        [f"| {'case':<41}", "iterations", *(f"{name:>14}" for name in names), "verdict |"]
-    )
+    names = [f"{name.replace('_', ' '):>14}" for name in NUMBERS]
+    header = " | ".join([f"| {'case':<41}", "iterations", *names, "verdict |"])
     rule = "|" + "---|" * (header.count("|") - 1)
     failed = sum(bool(result.failures()) for result in results)
-    return [
-        header,
-        rule,
-        *(result.row() for result in results),
-        f"{len(results)} cases, {failed} failed",
-    ]
+    rows = [result.row() for result in results]
+    return [header, rule, *rows, f"{len(results)} cases, {failed} failed"]
 
 
-def describe(results: Sequence[HardResult | Unsolved]) -> dict[str, Any]:
+def describe(results: Sequence[HardResult]) -> dict[str, Any]:
     """The results as plain values, for a JSON file."""
     cases = [
         {**asdict(result), "failures": result.failures(), "passed": not result.failures()}
@@ -173,17 +129,20 @@ def describe(results: Sequence[HardResult | Unsolved]) -> dict[str, Any]:
     return {"passed": all(case["passed"] for case in cases), "cases": cases}
 
 
-def _render(case: HardCase, dtype: torch.dtype, device: torch.device) -> Rendered:
+def _render(
+    case: HardCase, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, int, Balance]:
+    """The image [3, h, w], the gradient of its mean by density [z, y, x], iterations, balance."""
     scene, memory = case.scene(dtype, device), SolveMemory()
     density = scene.volume.density.requires_grad_()
     image = render(scene, memory=memory)[0]
     (gradient,) = torch.autograd.grad(image.mean(), density)
     density.requires_grad_(False)
-    balance = (
-        balance_of(scene, memory.last["forward", 0]) if memory.records else Balance(0.0, 0.0, 0.0)
-    )
+    balance = Balance(0.0, 0.0, 0.0)
+    if memory.records:
+        balance = balance_of(scene, memory.last["forward", 0])
     iterations = sum(record.iterations for record in memory.records)
-    return Rendered(image.detach(), gradient, iterations, balance)
+    return image.detach(), gradient, iterations, balance
 
 
 def _error(single: Tensor, double: Tensor) -> float:

@@ -178,8 +178,7 @@ def test_overwrite_starts_afresh(succeed: Run, density_of: DensityOf) -> None:
     earlier = ["-D", "views.1.name=other", "-D", "optimize.parameters.sigma_s={field: true}"]
     succeed(*OPTIMIZE, "out", *earlier, "--iterations", "1", "--preview-every", "1")
     names = "notes.txt", "volumes/mine.npz", "previews/mine.png", "uncertainty/notes.txt"
-    options = "uncertainty/uncertainty.json", "tensorboard/events.out.tfevents.1.host"
-    options += ("lights.1.radiance.npy",)
+    options = "uncertainty/uncertainty.json", "lights.1.radiance.npy"
     for path in (Path("out", name) for name in names + options):
         path.parent.mkdir(exist_ok=True)
         path.write_text(path.name)
@@ -247,20 +246,6 @@ def test_the_report_shows_every_view_field_and_setting(succeed: Run) -> None:
         "torch",
     ):
         assert told in text
-
-
-def test_the_log_goes_to_tensorboard_too_and_goes_on_there(succeed: Run) -> None:
-    accumulator = pytest.importorskip(
-        "tensorboard.backend.event_processing.event_accumulator", reason="TensorBoard is an extra"
-    )
-    succeed(*OPTIMIZE, "out", "--tensorboard", "--iterations", "3")
-    succeed(*OPTIMIZE, "out", "--tensorboard", "--resume", "--iterations", "5")
-    events = accumulator.EventAccumulator("out/tensorboard").Reload()
-    log = rows("out")
-    assert [event.step for event in events.Scalars("loss")] == [1, 2, 3, 4, 5]
-    assert [event.value for event in events.Scalars("loss")] == pytest.approx(
-        [float(row["loss"]) for row in log], rel=1e-6
-    )
 
 
 def test_the_camera_of_a_view_that_is_not_looked_at_is_refused(

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from ddrecon.io.files.folders import claim_folder
-from ddrecon.io.files.lock import LOCK
+from ddrecon.io.files.folders import LOCK, claim_folder
 
 COMMANDS = {
     "optimize": ["optimize", "scene.yaml", "-q", "-o", "out", "--iterations", "1"],

@@ -20,8 +20,7 @@ from tqdm import tqdm
 
 from ddrecon.errors import UsageError
 from ddrecon.progress import bar_room
-from ddrecon.run.live import LiveRun
-from ddrecon.run.serve import HOST, listen, serve_page, url_of
+from ddrecon.run.live import HOST, LiveRun, listen, serve_page, url_of
 
 Run = Callable[..., Result]
 

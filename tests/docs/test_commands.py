@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ddrecon.bench import run as bench_run
+from ddrecon.bench import plume
 from ddrecon.cli.commands import main
-from ddrecon.errors import MissingExtraError
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.scene import Scene
 from ddrecon.validate.hard_cases import CASES
@@ -67,22 +66,18 @@ def coarse(load: Callable[..., tuple[Scene, Scene]]) -> Callable[..., list[Scene
     return lambda *arguments: [scene_at_level(scene, 4) for scene in load(*arguments)]
 
 
-def refuse(scene: Scene, has_gradient: bool) -> None:
-    raise MissingExtraError("no path tracing in this test")
-
-
 @pytest.fixture
 def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder with the project's configs and data in it; few hard cases; a bench of few cells,
-    without path tracing.
+    """A folder with the project's configs and data in it; few hard cases; a bench of few cells
+    and paths.
     """
     monkeypatch.chdir(tmp_path)
     for name in ("configs", "data"):
         (tmp_path / name).symlink_to(ROOT / name)
     for name in list(CASES)[2:]:
         monkeypatch.delitem(CASES, name)
-    monkeypatch.setattr(bench_run, "load_pair", coarse(bench_run.load_pair))
-    monkeypatch.setattr("ddrecon.bench.path_tracing.PathTracer", refuse)
+    monkeypatch.setattr(plume, "load_pair", coarse(plume.load_pair))
+    monkeypatch.setattr("ddrecon.bench.measure.QUICK_PATHS", (1, 2))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -1,10 +1,7 @@
 """Tangents of kernels are those of what their texts compute."""
 
-from pathlib import Path
-
 import pytest
 import torch
-from graphics_cards import assert_compiles
 from media import random_values
 from torch import Tensor
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from shared_runs import RENDER, TESTS, VIEWS, Job, Runs, job, run_jobs
 
 pytestmark = pytest.mark.slow
-BENCH = ["bench", "scene.yaml", "--engine", "torch"]
 WARM = "-D", "volume.resolution=[6, 25, 5]", "--engine", "torch"
 TALL = *WARM, "-D", "diffusion.warm_start=false"
 ROUNDS = "-D", "diffusion.transport_rounds=1", "-D", "diffusion.degree=1"
@@ -45,7 +42,6 @@ JOBS = {
     "cells refused": job(2, "none", *TALL, *CELLS, "-D", "diffusion.model=flux_limited"),
     "tall": {"ranks": 1, "arguments": [*RENDER, "tall", *TALL]},
     "tall cells": {"ranks": 2, "arguments": [*RENDER, "tall cells", *TALL, *CELLS]},
-    "measured": {"ranks": 2, "arguments": [*BENCH, "--json", "bench.json"]},
 }
 
 
@@ -105,11 +101,3 @@ def test_ranks_say_at_the_end_of_a_run_how_sure_it_is(runs: Runs, output: str) -
     for known, found in zip(one, other, strict=True):
         for key, value in np.load(known).items():
             np.testing.assert_allclose(np.load(found)[key], value, rtol=1e-5, atol=1e-6)
-
-
-def test_bench_measures_one_rank_and_all(runs: Runs) -> None:
-    assert runs.codes["measured"] == [0, 0]
-    one, both = json.loads((runs.folder / "bench.json").read_text())["iterations"]
-    assert (one["ranks"], both["ranks"]) == (1, 2)
-    # One exchanges nothing; two at least the derivative by each cell, in single precision.
-    assert one["bytes"] == 0 and both["bytes"] > 4 * 8 * 6 * 5

@@ -1,9 +1,13 @@
-"""Moving pictures: animated PNG, which needs nothing more, and MP4, an extra."""
+"""Moving pictures as animated PNG, and MP4 (an extra); pictures within pages as WebP.
+
+Frames and images are 8-bit sRGB, uint8 [n, h, w, 3] and [h, w, 3].
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +17,8 @@ from ddrecon.io.images import srgb
 
 SECONDS = 4.0
 """How long a movie takes from its first frame back to it."""
+QUALITY = 82
+"""Of moving WebP, which is looked at in passing."""
 
 
 def encode_frames(frames: Sequence[np.ndarray], white: float) -> np.ndarray:
@@ -20,25 +26,34 @@ def encode_frames(frames: Sequence[np.ndarray], white: float) -> np.ndarray:
     return np.stack([srgb.encode_bytes(frame / white) for frame in frames])
 
 
-def animation_of(frames: np.ndarray) -> bytes:
-    """`frames`, 8-bit [n, h, w, 3], as an animated PNG that goes on for ever."""
+def encode(pixels: np.ndarray, extension: str, **settings: Any) -> bytes:
+    """An image or frames as a file of this kind, by Pillow."""
     import imageio.v3 as iio
 
     content: bytes = iio.imwrite(
-        "<bytes>",
-        frames,
-        plugin="pillow",
-        extension=".png",
-        duration=1000 * SECONDS / len(frames),
-        loop=0,
+        "<bytes>", pixels, plugin="pillow", extension=extension, **settings
     )
     return content
 
 
+def webp_of(image: np.ndarray) -> bytes:
+    """`image`, every pixel as it is: smaller than PNG."""
+    return encode(image, ".webp", lossless=True, quality=90, method=4)
+
+
+def moving_webp_of(frames: np.ndarray) -> bytes:
+    """`frames` as moving WebP that goes on for ever: far smaller than PNG."""
+    return encode(frames, ".webp", quality=QUALITY, **_timing(frames))
+
+
 def write_animation(path: Path, frames: np.ndarray) -> None:
-    """Writes `frames`, 8-bit [n, h, w, 3], as an animated PNG to `path`."""
+    """Writes `frames` as an animated PNG that goes on for ever to `path`."""
     with replace_file(path) as temporary:
-        temporary.write_bytes(animation_of(frames))
+        temporary.write_bytes(encode(frames, ".png", **_timing(frames)))
+
+
+def _timing(frames: np.ndarray) -> dict[str, Any]:
+    return {"duration": 1000 * SECONDS / len(frames), "loop": 0}
 
 
 def require_mp4() -> None:
@@ -47,7 +62,7 @@ def require_mp4() -> None:
 
 
 def write_mp4(path: Path, frames: np.ndarray) -> None:
-    """Writes `frames`, 8-bit [n, h, w, 3], as H.264 in MP4; raises MissingExtraError.
+    """Writes `frames` as H.264 in MP4; raises MissingExtraError.
 
     H.264 takes even sizes only: a last odd row or column is repeated.
     """

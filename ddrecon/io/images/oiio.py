@@ -1,10 +1,11 @@
-"""EXR, float TIFF and PNG of 16 bits a channel, through OpenImageIO (extra `exr`).
+"""EXR, HDR, float TIFF and PNG of 16 bits a channel, through OpenImageIO (extra `exr`).
 
-EXR and TIFF are linear; alpha, where present, is premultiplied by convention.
+All but PNG are linear; alpha, where present, is premultiplied by convention.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +23,7 @@ BEGINNINGS = {
     "EXR": (b"v/1\1",),
     "TIFF": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
     "PNG": (b"\x89PNG",),
+    "HDR": (b"#?",),
 }
 """How files of a kind begin: OpenImageIO alone would go on to try all that it knows."""
 FLOATS = ("half", "float", "double")
@@ -29,6 +31,8 @@ BLACK_IS_ZERO, RGB = 1, 2
 TOP_LEFT = 1
 DEEP_COLORS = (2, 4, 6)
 """PNG's types of color but gray alone, which Pillow reads in full, and palettes."""
+HDR_HEADER = re.compile(rb"(.*?)\n\r?\n[^\n]*\n(..)", re.DOTALL)
+"""Its lines, then the size, then how the first row of pixels begins."""
 
 
 def has_exr() -> bool:
@@ -52,6 +56,42 @@ def read_exr(path: Path) -> np.ndarray:
         kept = [spec.channelindex(name) for name in _color_names(spec.channelnames, path)]
         pixels = _pixels(path, file, "float")[..., kept]
     return pixels[..., 0] if len(kept) == 1 else pixels
+
+
+def read_hdr(path: Path) -> np.ndarray:
+    """The pixels of the Radiance picture at `path`, float32 [h, w, 3], exposure divided out.
+
+    Raises FormatError for rows that are turned, or encoded as before Radiance 2.0.
+    """
+    with path.open("rb") as stream:
+        head = HDR_HEADER.match(stream.read(65536))
+    with _opened(path, "HDR") as (file, spec):
+        if spec.get_int_attribute("Orientation", TOP_LEFT) != TOP_LEFT:
+            raise FormatError(path, "has turned rows; save it with rows from the top, or as .exr")
+        flat = 4 * spec.width * spec.height
+        if head is None or (head[2] != b"\2\2" and path.stat().st_size - head.start(2) < flat):
+            raise FormatError(path, "is cut short or encoded in an old way; save it as .exr")
+        pixels = _pixels(path, file, "float")
+    with np.errstate(over="ignore"):
+        return (pixels / _hdr_exposure(path, head[1])).astype(np.float32)
+
+
+def _hdr_exposure(path: Path, header: bytes) -> np.ndarray:
+    """What the values of a Radiance picture were multiplied by, [1] or [3]."""
+    factor = np.ones(1)
+    for name, text in re.findall(rb"^(EXPOSURE|COLORCORR) *=(.*)$", header, re.MULTILINE):
+        try:
+            values = np.array([float(word) for word in text.split()])
+        except ValueError:
+            values = np.zeros(0)
+        if (
+            len(values) != (1 if name == b"EXPOSURE" else 3)
+            or not (np.isfinite(values) & (values > 0)).all()
+        ):
+            shown = text.strip().decode(errors="replace")
+            raise FormatError(path, f"is damaged: {shown!r} is no exposure or color correction")
+        factor = factor * values
+    return factor
 
 
 def read_tiff(path: Path) -> np.ndarray:
@@ -86,21 +126,12 @@ def read_tiff(path: Path) -> np.ndarray:
     return pixels[..., 0] if pixels.shape[2] == 1 else pixels
 
 
-def is_deep_png(path: Path) -> bool:
-    """Whether the file at `path` is a PNG of 16 bits a channel."""
-    return _head(path)[24:25] == b"\x10"
-
-
 def has_deep_colors(path: Path) -> bool:
     """Whether the file at `path` is a PNG of several channels of 16 bits."""
-    return is_deep_png(path) and _head(path)[25] in DEEP_COLORS
-
-
-def _head(path: Path) -> bytes:
-    """The beginning of the file at `path` where it is a PNG, with all 26 bytes; else nothing."""
     with path.open("rb") as stream:
         head = stream.read(26)
-    return head if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) == 26 else b""
+    is_png = head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) == 26
+    return is_png and head[24] == 16 and head[25] in DEEP_COLORS
 
 
 def read_deep_png(path: Path) -> np.ndarray:

@@ -18,13 +18,13 @@ from ddrecon.io.files.arrays import as_float32, check_size, read_npy
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.io.files.reading import guard_reading
 from ddrecon.io.images import srgb
-from ddrecon.io.images.hdr import read_hdr
+from ddrecon.io.images.movies import encode
 from ddrecon.io.images.oiio import (
     has_deep_colors,
     has_exr,
-    is_deep_png,
     read_deep_png,
     read_exr,
+    read_hdr,
     read_tiff,
     write_exr,
 )
@@ -61,8 +61,7 @@ def read_image(path: Path) -> Image:
 
     Raises FormatError when it is damaged, of an unknown kind, or has NaN or infinite pixels.
     """
-    values = _read_values(path)
-    step = _step(path)
+    values, step = _read_values(path)
     if values.ndim == 2:
         return Image(np.repeat(values[..., None], 3, axis=2), None, step)
     if values.shape[2] == 3:
@@ -102,11 +101,7 @@ def write_preview(path: Path, pixels: np.ndarray) -> None:
 
 def png_of(pixels: np.ndarray) -> bytes:
     """`pixels` [h, w, 3], linear, as an 8-bit sRGB PNG, clipped to [0, 1]."""
-    import imageio.v3 as iio
-
-    encoded = srgb.encode_bytes(pixels)
-    content: bytes = iio.imwrite("<bytes>", encoded, plugin="pillow", extension=".png")
-    return content
+    return encode(srgb.encode_bytes(pixels), ".png")
 
 
 def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = None) -> list[Path]:
@@ -119,14 +114,18 @@ def write_picture(stem: Path, pixels: np.ndarray, preview: np.ndarray | None = N
     return [*write_linear(stem, pixels), path]
 
 
-def _read_values(path: Path) -> np.ndarray:
-    reader = READERS.get(path.suffix.lower())
+def _read_values(path: Path) -> tuple[np.ndarray, float]:
+    """Linear values [h, w], or [h, w, c] with c of 3 or 4, and the `step` of an image."""
+    reader, step = READERS.get(path.suffix.lower()), 0.0
     if reader is None:
         raise FormatError(
             path, f"unknown image format {path.suffix!r}; known: {', '.join(READERS)}"
         )
     with guard_reading(path):
         values = reader(path)
+        if reader is _read_encoded:
+            step = 1 / 65535 if values.dtype == np.uint16 else 1 / 255
+            values = _decode(values)
     if (
         values.ndim not in (2, 3)
         or (values.ndim == 3 and values.shape[2] not in (3, 4))
@@ -137,14 +136,7 @@ def _read_values(path: Path) -> np.ndarray:
         )
     values = as_float32(values)
     _require_finite(values, path)
-    return values
-
-
-def _step(path: Path) -> float:
-    """The step between neighboring sRGB values of the image at `path`; 0 where it is linear."""
-    if READERS[path.suffix.lower()] is not _read_encoded:
-        return 0.0
-    return 1 / 65535 if is_deep_png(path) else 1 / 255
+    return values, step
 
 
 def _require_finite(values: np.ndarray, path: Path) -> None:
@@ -164,6 +156,7 @@ def _read_array(path: Path) -> np.ndarray:
 
 
 def _read_encoded(path: Path) -> np.ndarray:
+    """The values as stored: 8 or 16 bits of sRGB, or one."""
     import imageio.v3 as iio
     from PIL import Image as Pillow
 
@@ -172,7 +165,7 @@ def _read_encoded(path: Path) -> np.ndarray:
     if not any(start.startswith(head) and start.endswith(tail) for head, tail in BEGINNINGS):
         raise FormatError(path, "is no PNG, JPEG or WebP image")
     if has_deep_colors(path):
-        return _decode(read_deep_png(path))
+        return read_deep_png(path)
     with Pillow.open(path) as picture:
         width, height = picture.size
     check_size(16 * width * height, path, f"an image of {width} x {height} pixels")
@@ -180,7 +173,7 @@ def _read_encoded(path: Path) -> np.ndarray:
     stored = iio.imread(path, plugin="pillow", index=0)
     if mode not in {"1", "L", "LA", "P", "RGB", "RGBA"} and stored.dtype != np.uint16:
         raise FormatError(path, f"has color mode {mode}; save it as RGB or RGBA")
-    return _decode(stored)
+    return stored
 
 
 def _decode(stored: np.ndarray) -> np.ndarray:

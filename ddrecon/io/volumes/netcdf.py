@@ -41,36 +41,27 @@ def write_netcdf(
     `bounds` [2, 3], its corners (x, y, z), are written as coordinates and their bounds; `constants`
     as attributes of the file.
     """
-    netcdf = load_for_file("netCDF4", path)
     z, y, x = next(iter(fields.values())).shape[:3]
-    with replace_file(path) as temporary, netcdf.Dataset(temporary, "w") as file:
+    box = np.asarray(bounds, np.float64)
+    with (
+        replace_file(path) as temporary,
+        load_for_file("netCDF4", path).Dataset(temporary, "w") as file,
+    ):
         file.setncatts({"Conventions": "CF-1.11", **constants})
-        for axis, count, low, high in zip(
-            "xyz", (x, y, z), *np.asarray(bounds, np.float64), strict=True
-        ):
-            _write_axis(file, axis, np.linspace(low, high, count + 1))
+        for name, count in {"x": x, "y": y, "z": z, "corner": 2, COLOR: 3}.items():
+            file.createDimension(name, count)
+        for axis, count, low, high in zip("xyz", (x, y, z), *box, strict=True):
+            edges = np.linspace(low, high, count + 1)
+            centers = file.createVariable(axis, "f8", (axis,))
+            corners = file.createVariable(f"{axis}_bounds", "f8", (axis, "corner"))
+            told = {"long_name": f"{axis} of cell centers", "bounds": corners.name}
+            centers.setncatts({"axis": axis.upper(), **told})
+            centers[:] = (edges[:-1] + edges[1:]) / 2
+            corners[:] = np.column_stack([edges[:-1], edges[1:]])
         for name, values in fields.items():
-            if values.ndim == 4 and COLOR not in file.dimensions:
-                file.createDimension(COLOR, 3)
-            variable = file.createVariable(
-                name, "f4", ("z", "y", "x", COLOR)[: values.ndim], compression="zlib", shuffle=True
-            )
+            axes = ("z", "y", "x", COLOR)[: values.ndim]
+            variable = file.createVariable(name, "f4", axes, compression="zlib", shuffle=True)
             variable[:] = as_float32(values)
-
-
-def _write_axis(file: Any, axis: str, edges: np.ndarray) -> None:
-    file.createDimension(axis, len(edges) - 1)
-    if "corner" not in file.dimensions:
-        file.createDimension("corner", 2)
-    centers, corners = (
-        file.createVariable(axis, "f8", (axis,)),
-        file.createVariable(f"{axis}_bounds", "f8", (axis, "corner")),
-    )
-    centers.setncatts(
-        {"axis": axis.upper(), "long_name": f"{axis} of cell centers", "bounds": corners.name}
-    )
-    centers[:] = (edges[:-1] + edges[1:]) / 2
-    corners[:] = np.column_stack([edges[:-1], edges[1:]])
 
 
 def netcdf_names(path: Path) -> list[str]:
@@ -129,27 +120,25 @@ def _arrange(path: Path, file: Any, variable: Any) -> tuple[np.ndarray, list[str
     """
     # What is masked (_FillValue) is NaN, which `check_field` refuses.
     values = np.ma.filled(np.ma.asarray(variable[...], np.float64), np.nan)
-    kept, places = [], {}
-    for index, dimension in enumerate(variable.dimensions):
-        axis = _axis_of(file, dimension)
-        if axis is None and values.shape[index] > 1:
+    axes = [_axis_of(file, dimension) for dimension in variable.dimensions]
+    for axis, dimension, count in zip(axes, variable.dimensions, values.shape, strict=True):
+        if axis is None and count > 1:
             raise FormatError(
                 path,
-                f"{variable.name} has {values.shape[index]} entries along {dimension!r}; "
+                f"{variable.name} has {count} entries along {dimension!r}; "
                 f"choose one (ncks -d {dimension},0)",
             )
-        if axis is not None:
-            places[axis] = dimension
-            kept.append(axis)
-    if sorted(kept) not in (["x", "y", "z"], [COLOR, "x", "y", "z"]):
+    order = [axis for axis in ("z", "y", "x", COLOR) if axis in axes]
+    if order[:3] != ["z", "y", "x"] or len(order) != len(axes) - axes.count(None):
         raise FormatError(
             path,
             f"{variable.name} has the dimensions {', '.join(variable.dimensions)}; "
             "expected x, y and z: rename them so",
         )
-    values = values.reshape([len(file.dimensions[places[axis]]) for axis in kept])
-    order = ["z", "y", "x", COLOR][: len(kept)]
-    return values.transpose([kept.index(axis) for axis in order]), [places[axis] for axis in "zyx"]
+    others = [index for index, axis in enumerate(axes) if axis is None]
+    values = values.transpose([*map(axes.index, order), *others])
+    known = [variable.dimensions[axes.index(axis)] for axis in "zyx"]
+    return values.reshape(values.shape[: len(order)]), known
 
 
 def _side(path: Path, file: Any, dimension: str) -> tuple[int, np.ndarray | None]:

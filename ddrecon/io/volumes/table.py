@@ -15,8 +15,7 @@ from ddrecon.io.volumes.mitsuba import read_vol, write_vol
 from ddrecon.io.volumes.netcdf import netcdf_names, read_netcdf, write_netcdf
 from ddrecon.io.volumes.npz import npz_names, read_npz, write_npz
 from ddrecon.io.volumes.tiff_stack import read_stack, write_stack
-from ddrecon.io.volumes.vdb import write_vdb
-from ddrecon.io.volumes.vdb_reader import read_vdb, vdb_names
+from ddrecon.io.volumes.vdb import read_vdb, vdb_names, write_vdb
 from ddrecon.io.volumes.vti import refuse_vti, write_vti
 
 

@@ -1,4 +1,6 @@
-"""A lock keeps others out of a folder while its process lives, and no longer."""
+"""A lock keeps others out of a folder while its process lives, and no longer; files are written
+where nothing is, unless it may be replaced, and only into existing folders.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,16 @@ from pathlib import Path
 import pytest
 
 from ddrecon.errors import UsageError
-from ddrecon.io.files.lock import LOCK, hold_lock
+from ddrecon.io.files.folders import LOCK, hold_lock, require_free_files
+
+SCRIPT = """
+import os, sys
+from pathlib import Path
+from ddrecon.io.files.folders import hold_lock
+with hold_lock(Path(sys.argv[1])):
+    exec(sys.argv[2])
+"""
+HOLD = sys.executable, "-c", SCRIPT
 
 
 def holder(folder: Path) -> dict[str, object]:
@@ -21,9 +32,7 @@ def holder(folder: Path) -> dict[str, object]:
 
 
 def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path: Path) -> None:
-    script = "import sys; from pathlib import Path; from ddrecon.io.files.lock import hold_lock\n"
-    script += "with hold_lock(Path(sys.argv[1])): print('held', flush=True); input()"
-    command = [sys.executable, "-c", script, tmp_path]
+    command = [*HOLD, tmp_path, "print('held', flush=True); input()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as first:
         assert first.stdout is not None and first.stdout.readline() == b"held\n"
         for _ in range(2):
@@ -37,19 +46,8 @@ def test_a_second_holder_is_refused_and_told_which_process_is_the_first(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_goes_when_the_block_fails(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), hold_lock(tmp_path):
-        assert holder(tmp_path)["pid"] == os.getpid()
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_killed_process_blocks_nobody(tmp_path: Path) -> None:
-    script = (
-        "import os, sys; from pathlib import Path; from ddrecon.io.files.lock import hold_lock\n"
-    )
-    script += "with hold_lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
-    assert subprocess.run([sys.executable, "-c", script, tmp_path]).returncode == -9
+    assert subprocess.run([*HOLD, tmp_path, "os.kill(os.getpid(), 9)"]).returncode == -9
     assert holder(tmp_path)["pid"] != os.getpid()
     with hold_lock(tmp_path):
         assert holder(tmp_path)["pid"] == os.getpid()
@@ -70,7 +68,7 @@ def test_of_several_processes_that_ask_at_once_one_goes_in(tmp_path: Path) -> No
 import os, sys
 from pathlib import Path
 from ddrecon.errors import UsageError
-from ddrecon.io.files.lock import hold_lock
+from ddrecon.io.files.folders import hold_lock
 folder, inside = Path(sys.argv[1]), Path(sys.argv[2])
 entered = 0
 while entered < 100:
@@ -111,3 +109,20 @@ def test_what_cannot_be_locked_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("fcntl.flock", refuse)
     with pytest.raises(UsageError, match="cannot be locked: Function not implemented"):
         hold_lock(tmp_path).__enter__()
+
+
+def test_every_file_that_is_there_is_named_unless_it_may_be(tmp_path: Path) -> None:
+    paths = [tmp_path / name for name in ("one", "two", "three")]
+    for path in paths[1:]:
+        path.touch()
+    with pytest.raises(UsageError, match=r"/two, .*/three: already there; .* say --overwrite"):
+        require_free_files(paths, may_exist=False)
+    require_free_files(paths, may_exist=True)
+
+
+@pytest.mark.parametrize("may_exist", [False, True])
+def test_a_folder_that_is_missing_or_a_file_is_refused(tmp_path: Path, may_exist: bool) -> None:
+    (tmp_path / "file").touch()
+    for folder in ("gone", "file"):
+        with pytest.raises(UsageError, match=f"there is no folder .*{folder}"):
+            require_free_files([tmp_path / folder / "one"], may_exist=may_exist)

@@ -8,7 +8,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from image_files import write_exr as save_exr
 from image_files import write_tiff
@@ -16,37 +16,15 @@ from PIL import Image as Pillow
 
 from ddrecon.errors import FormatError
 from ddrecon.io.images import srgb
-from ddrecon.io.images import table as images
 from ddrecon.io.images.oiio import write_exr
 from ddrecon.io.images.table import read_image, read_mask, write_linear, write_preview
-
-SIZES = st.tuples(st.integers(1, 7), st.integers(1, 9))
 
 
 def pixels_of(seed: int, *shape: int) -> np.ndarray:
     return (10 * np.random.default_rng(seed).standard_normal(shape)).astype(np.float32)
 
 
-def write_npy(path: Path, pixels: np.ndarray) -> None:
-    np.save(path, pixels)
-
-
-WRITERS = {".exr": write_exr, ".tif": write_tiff, ".tiff": write_tiff, ".npy": write_npy}
-
-
-@pytest.mark.parametrize("suffix", WRITERS)
-@settings(max_examples=15)
-@given(size=SIZES, seed=st.integers(0, 2**32 - 1))
-def test_float_images_come_back_bit_for_bit(
-    tmp_path_factory: pytest.TempPathFactory, suffix: str, size: tuple[int, int], seed: int
-):
-    path = tmp_path_factory.mktemp("image") / f"a{suffix.upper()}"
-    pixels = pixels_of(seed, *size, 3)
-    WRITERS[suffix](path.with_suffix(suffix), pixels)
-    path.with_suffix(suffix).rename(path)
-    image = read_image(path)
-    assert image.pixels.dtype == np.float32 and np.array_equal(image.pixels, pixels)
-    assert image.size == size and image.coverage is None
+WRITERS = {".exr": write_exr, ".tif": write_tiff, ".npy": np.save}
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".tif"])
@@ -100,33 +78,6 @@ def test_exr_of_other_channels_lists_them(tmp_path: Path):
         read_image(save_exr(tmp_path / "a.exr", ["depth", "normal"], planes))
 
 
-@pytest.mark.parametrize("suffix", images.READERS)
-def test_damaged_and_absent_files_are_refused(tmp_path: Path, suffix: str):
-    path = tmp_path / f"a{suffix}"
-    with pytest.raises(FormatError):
-        read_image(path)
-    for data in (b"", b"nonsense" * 50):
-        path.write_bytes(data)
-        with pytest.raises(FormatError, match=path.name):
-            read_image(path)
-
-
-@pytest.mark.parametrize("suffix", images.READERS)
-@pytest.mark.parametrize("part", [0.1, 0.5])
-def test_truncated_files_are_refused(tmp_path: Path, suffix: str, part: float):
-    path = tmp_path / f"a{suffix}"
-    pixels = np.abs(pixels_of(3, 40, 40, 3))
-    if suffix in WRITERS:
-        WRITERS[suffix](path, pixels)
-    elif suffix == ".hdr":
-        path.write_bytes(b"#?RADIANCE\n\n-Y 40 +X 40\n" + bytes([100, 128, 0, 130]) * 1600)
-    else:
-        iio.imwrite(path, (pixels * 10 % 255).astype(np.uint8))
-    path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
-    with pytest.raises(FormatError):
-        read_image(path)
-
-
 @pytest.mark.parametrize("suffix", WRITERS)
 @pytest.mark.parametrize(("value", "what"), [(np.nan, "NaN"), (-np.inf, "infinite")])
 def test_flawed_pixels_are_located_and_counted(
@@ -145,12 +96,6 @@ def test_flawed_pixels_are_located_and_counted(
 def test_arrays_of_other_shapes_are_refused(tmp_path: Path, shape: tuple[int, ...]):
     np.save(tmp_path / "a.npy", np.zeros(shape))
     with pytest.raises(FormatError, match=r"expected \[h, w\]"):
-        read_image(tmp_path / "a.npy")
-
-
-def test_pickles_are_refused(tmp_path: Path):
-    np.save(tmp_path / "a.npy", np.array([[{}]], dtype=object), allow_pickle=True)
-    with pytest.raises(FormatError, match="Python objects"):
         read_image(tmp_path / "a.npy")
 
 
@@ -225,12 +170,21 @@ def test_gray_with_alpha_palette_and_single_bits_are_read(tmp_path: Path):
     assert np.allclose(read_image(tmp_path / "1.png").pixels, 1)
 
 
-def test_16_bit_gray_uses_its_whole_range(tmp_path: Path):
-    stored = np.array([[0, 30000, 65535]], np.uint16)
-    iio.imwrite(tmp_path / "a.png", stored)
-    assert np.allclose(
-        read_image(tmp_path / "a.png").pixels[..., 0], srgb.decode(stored / 65535), atol=1e-6
-    )
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_all_sixteen_bits_are_kept(tmp_path: Path, channels: int):
+    """By a tenth of the step between values of 8 bits."""
+    stored = np.random.default_rng(channels).integers(0, 2**16, (7, 5, channels), np.uint16)
+    module = pytest.importorskip("OpenImageIO", reason="colors of 16 bits are an extra")
+    spec = module.ImageSpec(5, 7, channels, "uint16")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    file = module.ImageOutput.create("a.png")
+    assert file.open(str(tmp_path / "a.png"), spec) and file.write_image(stored) and file.close()
+    image, has_alpha = read_image(tmp_path / "a.png"), channels % 2 == 0
+    linear = srgb.decode(stored[..., : channels - has_alpha] / 65535)
+    alpha = stored[..., -1:] / 65535 if has_alpha else np.ones(1)
+    np.testing.assert_allclose(image.pixels, np.broadcast_to(linear * alpha, (7, 5, 3)), atol=1e-6)
+    assert image.step == 1 / 65535 and (image.coverage is not None) == has_alpha
+    assert not has_alpha or np.allclose(image.coverage, alpha[..., 0], atol=1e-6)
 
 
 def test_four_inks_are_not_taken_for_alpha(tmp_path: Path):

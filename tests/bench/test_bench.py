@@ -1,0 +1,78 @@
+"""What a bench measures, and what it makes of its measurements."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ddrecon.bench.measure import Shot, measure, row_of, shoot
+from ddrecon.bench.plume import plume_scene
+from ddrecon.bench.report import Row, bench_lines, cells, with_best
+from ddrecon.errors import SolveError
+from ddrecon.reference.trace import Traced
+from ddrecon.scene import Scene
+
+
+@pytest.fixture
+def plume() -> Scene:
+    return plume_scene(8, 4, torch.float64, torch.device("cpu"))
+
+
+def test_the_gradient_is_the_slope_of_the_mean_of_the_image(plume: Scene) -> None:
+    """Along density itself, by a central difference."""
+
+    def mean(factor: float) -> float:
+        volume = replace(plume.volume, density=factor * plume.volume.density)
+        return float(shoot(replace(plume, volume=volume)).image.mean())
+
+    along = (shoot(plume).gradient * plume.volume.density).sum()
+    assert float(along) == pytest.approx((mean(1.0001) - mean(0.9999)) / 0.0002, rel=1e-4)
+
+
+def test_one_that_cannot_be_solved_leaves_the_others_and_the_scene_as_they_were(
+    plume: Scene,
+) -> None:
+    (light,) = plume.lights
+    unsolvable = replace(plume, lights=[replace(light, irradiance=math.inf * light.irradiance)])
+    with pytest.raises(SolveError):
+        shoot(unsolvable)
+    contestants = {"unsolvable": lambda: shoot(unsolvable), "plume": lambda: shoot(plume)}
+    shots = measure(contestants, 2, lambda items, what: items)
+    assert list(shots) == ["plume"] and len(shots["plume"]) == 2
+    assert not plume.volume.density.requires_grad
+    assert math.isfinite(float(shots["plume"][0].gradient.sum()))
+
+
+def test_the_best_are_those_that_no_other_beats_in_both_time_and_error() -> None:
+    told = {"a": (1, 0.3), "b": (2, 0.4), "c": (3, 0.1), "d": (4, 0.1), "e": (5, 0.05)}
+    rows = [Row(name, time, time, 1, image_error=error) for name, (time, error) in told.items()]
+    assert [row.name for row in with_best(rows) if row.is_best] == ["a", "c", "e"]
+
+
+def test_nothing_is_made_of_errors_that_the_noise_of_the_truth_hides() -> None:
+    image = torch.ones(3, 2, 2)
+    truth = Traced(image.numpy(), 0.09)
+    told = {"base": (1.02, 1.0), "slower": (1.0, 2.0), "Mitsuba 16 paths a pixel": (1.3, 72.0)}
+    rows = with_best(
+        [
+            row_of(name, [Shot(factor * image, None, seconds, 0.0, 16)], None, truth)
+            for name, (factor, seconds) in told.items()
+        ]
+    )
+    assert [line[7] for line in cells(rows)] == ["< 0.03", "< 0.03", "0.286"]
+    assert [row.name for row in rows if row.is_best] == ["base"]
+    assert "16 paths a pixel take 72 times as long as base" in bench_lines(rows)[-1]
+
+
+def test_rows_hold_medians_and_errors_of_what_can_be_compared() -> None:
+    image, gradient = torch.ones(3, 2, 2), torch.arange(8.0).view(2, 2, 2)
+    shots = [Shot(1.1 * image, 2 * gradient, t, 2 * t, 7) for t in (5.0, 1.0, 2.0)]
+    row = row_of("ours", shots, Shot(image, gradient, 9.0, 9.0, 9), Traced(image.numpy(), 0.0))
+    assert (row.image_seconds, row.both_seconds, row.iterations) == (2.0, 6.0, 7)
+    assert row.image_error == pytest.approx(row.image_numerical) == pytest.approx(0.1)
+    assert row.gradient_numerical == pytest.approx(1)
+    alone = row_of("alone", shots, None, None)
+    assert alone.image_numerical is None and alone.image_error is None
