@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 @in_session
 def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: int) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
-    from ddrecon.validate.gradcheck import check_parameters, describe
+    from ddrecon.validate.gradcheck import check_parameters, describe, table
 
     checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
-    session.show(describe(checks), [line for check in checks for line in check.lines()])
+    session.show(describe(checks), table(checks))
     if not all(check.has_passed for check in checks):
         sys.exit(1)
 

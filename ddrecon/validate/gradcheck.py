@@ -62,14 +62,6 @@ class EntryCheck:
     steps: tuple[float, ...]
     differences: tuple[float, ...]
 
-    def row(self) -> str:
-        """The check as a line of the table."""
-        value = "" if self.value is None else f"{self.value:.4g}"
-        return (
-            f"{self.entry:>24}  {value:>10}  {self.adjoint:14.7e}  {self.difference:14.7e}"
-            f"  {self.step:8.1e}  {self.error:14.1e}"
-        )
-
 
 @dataclass(frozen=True)
 class GradientCheck:
@@ -98,19 +90,22 @@ class GradientCheck:
             entry.error <= AGREE_DIFFERENCES for entry in self.entries
         )
 
-    def lines(self) -> list[str]:
-        """The check as a table."""
-        header = (
-            f"{self.parameter:>24}  {'value':>10}  {'adjoint':>14}  {'difference':>14}"
-            f"  {'step':>8}  {'relative error':>14}"
-        )
-        verdict = (
-            f"{self.parameter}: {'pass' if self.has_passed else 'FAIL'}"
-            f"; tangent against adjoint {self.modes_error:.1e} (allowed {AGREE_MODES:.0e})"
-            f"; central differences {self.worst.error:.1e} at worst, {self.worst.entry}"
-            f" (allowed {AGREE_DIFFERENCES:.0e})"
-        )
-        return [header, *(entry.row() for entry in self.entries), verdict]
+    def row(self) -> str:
+        """The check as a line of the table."""
+        verdict, worst = "pass" if self.has_passed else "FAIL", self.worst
+        numbers = f"{self.modes_error:.1e} | {worst.error:.1e} | {worst.entry} | {worst.step:.1e}"
+        return f"| {self.parameter} | {verdict} | {numbers} | {worst.adjoint:.7e} |"
+
+
+HEAD = (
+    f"| parameter | verdict | tangent - adjoint (allowed {AGREE_MODES:.0e}) "
+    f"| differences - adjoint (allowed {AGREE_DIFFERENCES:.0e}) | at worst | step | derivative |"
+)
+
+
+def table(checks: Sequence[GradientCheck]) -> list[str]:
+    """The checks as a table in Markdown; errors are relative."""
+    return [HEAD, "|" + "---|" * (HEAD.count("|") - 1), *(check.row() for check in checks)]
 
 
 def check_parameters(
