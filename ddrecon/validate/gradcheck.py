@@ -242,29 +242,21 @@ def _check_way(loss: Loss, values: Mapping[str, Tensor], way: _Way) -> EntryChec
     Where none agrees, shorter ones follow: in thick cells, or beside an albedo of 1, all of the
     usual ones may be too long. What rounding makes of those is no excuse.
     """
-    steps, differences, errors = list[float](), list[float](), list[float]()
+    tried = list[tuple[float, float, float]]()
     shorter = [way.steps[-1] * SHORTER**power for power in range(1, MORE + 1)]
-    for step in (*way.steps, *shorter):
-        is_usual = len(steps) < len(way.steps)
-        if not is_usual and min(errors) <= AGREE_DIFFERENCES:
+    for index, step in enumerate((*way.steps, *shorter)):
+        is_usual, difference, error = index < len(way.steps), math.nan, math.inf
+        if not is_usual and min(tried)[0] <= AGREE_DIFFERENCES:
             break
-        steps.append(step)
-        differences.append(math.nan)
-        errors.append(math.inf)
         # A step that leaves what is physical may have no solution.
         with contextlib.suppress(SolveError):
-            differences[-1], rounding = _difference(loss, values, way.direction, step)
-            errors[-1] = _error(differences[-1], way, rounding if is_usual else 0.0)
-    best = errors.index(min(errors))
+            difference, rounding = _difference(loss, values, way.direction, step)
+            error = _error(difference, way, rounding if is_usual else 0.0)
+        tried.append((error, step, difference))
+    _, steps, differences = zip(*tried, strict=True)
+    error, step, difference = min(tried)
     return EntryCheck(
-        way.label,
-        way.value,
-        way.adjoint,
-        differences[best],
-        steps[best],
-        errors[best],
-        tuple(steps),
-        tuple(differences),
+        way.label, way.value, way.adjoint, difference, step, error, steps, differences
     )
 
 
