@@ -34,7 +34,7 @@ COMMANDS = {
     "plume": "python benchmarks/reconstruction.py plume",
     "gallery": "python benchmarks/reconstruction.py gallery",
     "capture": "python benchmarks/reconstruction.py capture",
-    "replay": "python benchmarks/replay.py --paths 4 16",
+    "replay": "python benchmarks/path_replay.py --paths 4 16",
     "engines": "python benchmarks/engines.py",
     "tangents": "python benchmarks/engines.py --tangents",
     "launches": "python benchmarks/launches.py",

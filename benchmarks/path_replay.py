@@ -1,29 +1,42 @@
 """Path replay backpropagation in Mitsuba 3 (Vicini, Speierer and Jakob 2021), with room above the
-densest cell.
+densest cell; and the plume's image and gradient by every cell's density, by us and by it.
+
+    DRJIT_LIBLLVM_PATH=... python benchmarks/path_replay.py [--pixels 512] [--paths 4 16]
 
 Mitsuba's majorant is the greatest extinction in the grid. Where extinction reaches it there are no
 null collisions, and those carry the derivative of transmittance: path replay does not see it there.
 So cells are added around the grid, outside the box that holds the medium, one of them HEADROOM
 times as dense as the densest within; images are the same.
+
+Times are of this run only, on as many threads for both. Gradients are compared as sums of density
+times gradient over blocks of 4^3 cells, each with that of the most paths. Needs the variant
+`llvm_ad_rgb`.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from statistics import median
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d
 
+from ddrecon.bench.measure import Shot, shoot
+from ddrecon.bench.plume import plume_scene
 from ddrecon.grid import Grid
 from ddrecon.reference.mitsuba_scene import LONGEST, MEDIUM, mitsuba_scene
 from ddrecon.reference.trace import load_mitsuba, make_mitsuba_objects
 from ddrecon.scene import Scene
 
 RING = 2
+REPEATS, BLOCK = 5, 4
 HEADROOM = 2.0
 DENSITY, ALBEDO = ".sigma_t.data", ".albedo.value.value"
 """How the names of density and of a constant albedo end among Mitsuba's parameters."""
@@ -127,3 +140,60 @@ def why_not() -> str | None:
     except ImportError:
         return "needs Mitsuba 3: pip install ddrecon[reference]"
     return None if os.environ.get("DRJIT_LIBLLVM_PATH") else "needs an LLVM: set DRJIT_LIBLLVM_PATH"
+
+
+def replay_shot(replay: Replay, scene: Scene, paths: int, seed: int) -> Shot:
+    """The image and the gradient of its mean, by so many `paths` a pixel."""
+    import drjit
+
+    density = scene.volume.density
+    start = perf_counter()
+    image = torch.from_numpy(replay.image(seed, paths))
+    middle = perf_counter()
+    name = replay.name(DENSITY)
+    _, (found,) = replay.gradients(lambda image: drjit.mean(image, axis=None), [name], seed, paths)
+    gradient = replay.by_density(found, density)
+    return Shot(image, gradient, middle - start, perf_counter() - middle, paths)
+
+
+def by_amount(shot: Shot, density: Tensor) -> Tensor:
+    """What changes as all density of a block grows by a factor; empty cells have no part in it."""
+    blocks = [max(1, size // BLOCK) for size in density.shape]
+    return adaptive_avg_pool3d((shot.gradient * density)[None], blocks).flatten().double()
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--pixels", type=int, default=512)
+    parser.add_argument("--cells", type=int, default=64)
+    parser.add_argument("--paths", type=int, nargs="+", default=[4, 16])
+    given = parser.parse_args()
+    if lacking := why_not():
+        raise SystemExit(f"path replay {lacking}")
+    scene = plume_scene(given.cells, given.pixels, torch.float32, torch.device("cpu"))
+    replay = Replay.of(scene, headroom=1.0)  # as Mitsuba comes, and fastest
+    rows = {"ours": [shoot(scene) for _ in range(REPEATS + 1)][1:]}
+    replay_shot(replay, scene, 1, len(given.paths))  # compiles
+    for seed, paths in enumerate(given.paths):
+        rows[f"Mitsuba, {paths} paths a pixel"] = [replay_shot(replay, scene, paths, seed)]
+    print(
+        "| | image s | gradient s | both s | times ours | correlation |\n|---|---|---|---|---|---|"
+    )
+    best, base = by_amount(list(rows.values())[-1][0], scene.volume.density), 0.0
+    for name, shots in rows.items():
+        image, gradient = (
+            median(part)
+            for part in zip(*((s.image_seconds, s.gradient_seconds) for s in shots), strict=True)
+        )
+        base = base or image + gradient
+        found = by_amount(shots[0], scene.volume.density)
+        correlation = float(torch.corrcoef(torch.stack([found, best]))[0, 1])
+        print(
+            f"| {name} | {image:.2f} | {gradient:.2f} | {image + gradient:.2f} | "
+            f"{(image + gradient) / base:.0f} | {correlation:.3f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

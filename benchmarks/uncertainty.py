@@ -12,7 +12,6 @@ python benchmarks/uncertainty.py exact|brute|real [SCENE] [-D KEY=VALUE] [--draw
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -206,7 +205,11 @@ def main() -> None:
     given = parser.parse_args()
     use_engine(given.engine)
     if given.kind == "real":
-        print(json.dumps(real_case(given.scene, given.overrides, given.samples), indent=1))
+        print("| what | found |\n|---|---|")
+        for key, value in real_case(given.scene, given.overrides, given.samples).items():
+            print(
+                f"| {key} | {value:.3g} |" if isinstance(value, float) else f"| {key} | {value} |"
+            )
         return
     overrides = given.overrides or SMALL
     scene = load_scene(given.scene, overrides=overrides)

@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 @in_session
 def gradcheck(session: Session, scene: Path, names: tuple[str, ...], samples: int) -> None:
     """Check tangent against adjoint against finite differences of the program, in float64."""
-    from ddrecon.validate.gradcheck import check_parameters, describe
+    from ddrecon.validate.gradcheck import check_parameters, describe, table
 
     checks = check_parameters(session.load(scene), names, samples, session.seed, session.progress)
-    session.show(describe(checks), [line for check in checks for line in check.lines()])
+    session.show(describe(checks), table(checks))
     if not all(check.has_passed for check in checks):
         sys.exit(1)
 
@@ -86,7 +86,6 @@ def reference(
     from ddrecon.reference.compare import (
         compare_to_folder,
         reference_lines,
-        trace_to_folder,
         write_reference_report,
     )
     from ddrecon.reference.trace import open_tracer
@@ -95,12 +94,9 @@ def reference(
     views = session.pick_views(loaded, names)
     tracer = open_tracer(loaded, views, threads=session.threads)
     with claim_folder(output, may_exist=overwrite):
+        shown = None if is_only_traced else loaded
         settings = output, samples, session.seed, session.progress
-        compared = (
-            trace_to_folder(tracer, views, *settings)
-            if is_only_traced
-            else compare_to_folder(tracer, loaded, views, *settings)
-        )
+        compared = compare_to_folder(tracer, shown, views, *settings)
         report = write_reference_report(output, compared, session.environment())
     session.show(report, reference_lines(report, output))
 

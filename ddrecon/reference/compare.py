@@ -28,27 +28,9 @@ SEEDS = 2**30
 """Seeds that Mitsuba takes."""
 
 
-def trace_to_folder(
-    tracer: Tracer, views: Sequence[View], folder: Path, samples: int, seed: int, progress: Progress
-) -> dict[str, Any]:
-    """Writes the images of `views`, traced with `samples` paths a pixel, and returns a report.
-
-    They are NAME.* in `folder`. `tracer` must be of these views, `samples` at least 2; `progress`
-    is told of the passes of each view.
-    """
-    report = _start_report(tracer, samples, seed)
-    for index, view in enumerate(views):
-        traced, seconds = _trace(tracer, index, view.name, samples, seed, progress)
-        report["views"][view.name] = {"noise": traced.noise, "seconds": {"reference": seconds}}
-        report["files"][view.name] = [
-            path.name for path in write_picture(folder / view.name, traced.image)
-        ]
-    return report
-
-
 def compare_to_folder(
     tracer: Tracer,
-    scene: Scene,
+    scene: Scene | None,
     views: Sequence[View],
     folder: Path,
     samples: int,
@@ -58,24 +40,42 @@ def compare_to_folder(
     """Writes traced and our own images of `views` of `scene`, and returns a report with our errors.
 
     They are NAME.reference.*, NAME.ours.*, NAME.difference.* (ours less the reference) and
-    NAME.comparison.png in `folder`. Arguments are those of `trace_to_folder`.
+    NAME.comparison.png in `folder`; without `scene` the traced ones alone, NAME.*. `tracer` must be
+    of these views, and each is traced with `samples` >= 2 paths a pixel; `progress` is told of the
+    passes of each view.
     """
-    report = _start_report(tracer, samples, seed)
-    start = perf_counter()
-    with torch.no_grad():
-        light_field = solve_light(scene, SolveMemory())
-    report["seconds"] = {"light": perf_counter() - start}
-    for index, view in enumerate(views):
-        traced, seconds = _trace(tracer, index, view.name, samples, seed, progress)
+    passes, samples_per_pass = _split(samples)
+    settings = {
+        "samples_per_pixel": passes * samples_per_pass,
+        "passes": passes,
+        "seed": seed,
+        "variant": tracer.module.variant(),
+        "integrator": "volpath",
+        "longest_path": LONGEST,
+        "russian_roulette": False,
+        "colors_traced_apart": len(tracer.scenes) > 1,
+    }
+    report: dict[str, Any] = {"settings": settings, "views": {}, "files": {}}
+    if scene is not None:
         start = perf_counter()
         with torch.no_grad():
-            ours = view_image(light_field, scene, view.camera).cpu()
-        times = {"reference": seconds, "ours": perf_counter() - start}
-        theirs = torch.from_numpy(traced.image).permute(2, 0, 1).to(ours)
-        report["views"][view.name] = _measure(traced, ours, theirs) | {"seconds": times}
-        report["files"][view.name] = [
-            path.name for path in _write(folder / view.name, ours, theirs)
-        ]
+            light_field = solve_light(scene, SolveMemory())
+        report["seconds"] = {"light": perf_counter() - start}
+    for index, view in enumerate(views):
+        traced, seconds = _trace(tracer, index, view.name, samples, seed, progress)
+        measured: dict[str, Any] = {"noise": traced.noise, "seconds": {"reference": seconds}}
+        if scene is None:
+            written = write_picture(folder / view.name, traced.image)
+        else:
+            start = perf_counter()
+            with torch.no_grad():
+                ours = view_image(light_field, scene, view.camera).cpu()
+            measured["seconds"]["ours"] = perf_counter() - start
+            theirs = torch.from_numpy(traced.image).permute(2, 0, 1).to(ours)
+            measured |= _measure(traced, ours, theirs)
+            written = _write(folder / view.name, ours, theirs)
+        report["views"][view.name] = measured
+        report["files"][view.name] = [path.name for path in written]
     return report
 
 
@@ -91,22 +91,6 @@ def write_reference_report(
     whole = report | {"environment": environment | {"mitsuba": mitsuba.__version__}}
     write_json(folder / "reference.json", whole)
     return whole
-
-
-def _start_report(tracer: Tracer, samples: int, seed: int) -> dict[str, Any]:
-    """A report of the settings, and as yet of no view."""
-    passes, samples_per_pass = _split(samples)
-    settings = {
-        "samples_per_pixel": passes * samples_per_pass,
-        "passes": passes,
-        "seed": seed,
-        "variant": tracer.module.variant(),
-        "integrator": "volpath",
-        "longest_path": LONGEST,
-        "russian_roulette": False,
-        "colors_traced_apart": len(tracer.scenes) > 1,
-    }
-    return {"settings": settings, "views": {}, "files": {}}
 
 
 def _split(samples: int) -> tuple[int, int]:
@@ -134,7 +118,6 @@ def _measure(traced: Traced, ours: Tensor, theirs: Tensor) -> dict[str, Any]:
     return {
         "error": traced.error(image),
         "distance": traced.distance(image),
-        "noise": traced.noise,
         "psnr": psnr(ours, theirs, None),
         "brightness": float(image.mean()) / mean if mean > 0 else None,
     }

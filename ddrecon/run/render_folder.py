@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -51,12 +51,7 @@ def render_to_folder(
         start = perf_counter()
         light_field = solve_light(scene, memory)
         light_seconds = perf_counter() - start
-        turns = _render_in_turns(
-            views,
-            lambda view: _names(view, has_components),
-            lambda view: _images(light_field, scene, view, has_components),
-            progress,
-        )
+        turns = _render_in_turns(light_field, scene, views, has_components, progress)
         for view, images, taken in turns:
             if not is_first():
                 continue
@@ -226,29 +221,25 @@ def _images(
 
 
 def _render_in_turns(
-    views: Sequence[View],
-    names_of: Callable[[View], Sequence[str]],
-    images_of: Callable[[View], Mapping[str, Tensor]],
+    light_field: LightField,
+    scene: Scene,
+    views: list[View],
+    has_components: bool,
     progress: Progress,
 ) -> Iterator[tuple[View, Mapping[str, Tensor], float]]:
-    """Each of `views`, its images as `images_of` gives them, and the seconds that they took.
+    """Each of `views`, its images, and the seconds that they took.
 
-    `names_of` says what these are called. With several ranks the seconds are those of a turn; where
-    they share out cells, all render each view together.
+    With several ranks these are of a turn, in which each renders one view; where they share out
+    cells, all render each view together.
     """
-    if cells_are_shared():
-        for view in progress(views, "render"):
-            start = perf_counter()
-            yield view, images_of(view), perf_counter() - start
-        return
-    ranks = rank_count()
+    ranks, rank = (1, 0) if cells_are_shared() else (rank_count(), own_rank())
     for begin in progress(range(0, len(views), ranks), "render"):
         turn, start = views[begin : begin + ranks], perf_counter()
-        own = [view.name for view in turn[own_rank() : own_rank() + 1]]
-        images = images_of(turn[own_rank()]) if own else {}
+        has_own = rank < len(turn)
+        images = _images(light_field, scene, turn[rank], has_components) if has_own else {}
         seconds = perf_counter() - start
         for view in turn:
-            yield view, _bring(view, images if view.name in own else {}, names_of(view)), seconds
+            yield view, _bring(view, images, _names(view, has_components)), seconds
 
 
 def _bring(view: View, images: Mapping[str, Tensor], names: Sequence[str]) -> Mapping[str, Tensor]:

@@ -62,14 +62,6 @@ class EntryCheck:
     steps: tuple[float, ...]
     differences: tuple[float, ...]
 
-    def row(self) -> str:
-        """The check as a line of the table."""
-        value = "" if self.value is None else f"{self.value:.4g}"
-        return (
-            f"{self.entry:>24}  {value:>10}  {self.adjoint:14.7e}  {self.difference:14.7e}"
-            f"  {self.step:8.1e}  {self.error:14.1e}"
-        )
-
 
 @dataclass(frozen=True)
 class GradientCheck:
@@ -98,19 +90,22 @@ class GradientCheck:
             entry.error <= AGREE_DIFFERENCES for entry in self.entries
         )
 
-    def lines(self) -> list[str]:
-        """The check as a table."""
-        header = (
-            f"{self.parameter:>24}  {'value':>10}  {'adjoint':>14}  {'difference':>14}"
-            f"  {'step':>8}  {'relative error':>14}"
-        )
-        verdict = (
-            f"{self.parameter}: {'pass' if self.has_passed else 'FAIL'}"
-            f"; tangent against adjoint {self.modes_error:.1e} (allowed {AGREE_MODES:.0e})"
-            f"; central differences {self.worst.error:.1e} at worst, {self.worst.entry}"
-            f" (allowed {AGREE_DIFFERENCES:.0e})"
-        )
-        return [header, *(entry.row() for entry in self.entries), verdict]
+    def row(self) -> str:
+        """The check as a line of the table."""
+        verdict, worst = "pass" if self.has_passed else "FAIL", self.worst
+        numbers = f"{self.modes_error:.1e} | {worst.error:.1e} | {worst.entry} | {worst.step:.1e}"
+        return f"| {self.parameter} | {verdict} | {numbers} | {worst.adjoint:.7e} |"
+
+
+HEAD = (
+    f"| parameter | verdict | tangent - adjoint (allowed {AGREE_MODES:.0e}) "
+    f"| differences - adjoint (allowed {AGREE_DIFFERENCES:.0e}) | at worst | step | derivative |"
+)
+
+
+def table(checks: Sequence[GradientCheck]) -> list[str]:
+    """The checks as a table in Markdown; errors are relative."""
+    return [HEAD, "|" + "---|" * (HEAD.count("|") - 1), *(check.row() for check in checks)]
 
 
 def check_parameters(
@@ -247,29 +242,21 @@ def _check_way(loss: Loss, values: Mapping[str, Tensor], way: _Way) -> EntryChec
     Where none agrees, shorter ones follow: in thick cells, or beside an albedo of 1, all of the
     usual ones may be too long. What rounding makes of those is no excuse.
     """
-    steps, differences, errors = list[float](), list[float](), list[float]()
+    tried = list[tuple[float, float, float]]()
     shorter = [way.steps[-1] * SHORTER**power for power in range(1, MORE + 1)]
-    for step in (*way.steps, *shorter):
-        is_usual = len(steps) < len(way.steps)
-        if not is_usual and min(errors) <= AGREE_DIFFERENCES:
+    for index, step in enumerate((*way.steps, *shorter)):
+        is_usual, difference, error = index < len(way.steps), math.nan, math.inf
+        if not is_usual and min(tried)[0] <= AGREE_DIFFERENCES:
             break
-        steps.append(step)
-        differences.append(math.nan)
-        errors.append(math.inf)
         # A step that leaves what is physical may have no solution.
         with contextlib.suppress(SolveError):
-            differences[-1], rounding = _difference(loss, values, way.direction, step)
-            errors[-1] = _error(differences[-1], way, rounding if is_usual else 0.0)
-    best = errors.index(min(errors))
+            difference, rounding = _difference(loss, values, way.direction, step)
+            error = _error(difference, way, rounding if is_usual else 0.0)
+        tried.append((error, step, difference))
+    _, steps, differences = zip(*tried, strict=True)
+    error, step, difference = min(tried)
     return EntryCheck(
-        way.label,
-        way.value,
-        way.adjoint,
-        differences[best],
-        steps[best],
-        errors[best],
-        tuple(steps),
-        tuple(differences),
+        way.label, way.value, way.adjoint, difference, step, error, steps, differences
     )
 
 

@@ -22,7 +22,7 @@ GRADCHECK = ["gradcheck", "scene.yaml", "-q", "--samples", "2"]
 def test_the_program_passes(run: Run) -> None:
     result = run(*GRADCHECK, *SMALL, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (0, "")
-    assert result.stdout.splitlines()[-1].startswith("density: pass")
+    assert result.stdout.splitlines()[-1].startswith("| density | pass |")
     report = json.loads(Path("report.json").read_text())
     assert report["passed"] is True
     (check,) = report["checks"]
@@ -56,7 +56,7 @@ def test_a_wrong_derivative_fails(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(point, "image_loss", detaching_part(point.image_loss))
     result = run(*GRADCHECK, *SMALL, *SIMPLE, "--json", "report.json")
     assert (result.exit_code, result.stderr) == (1, "")
-    assert result.stdout.splitlines()[-1].startswith("density: FAIL")
+    assert result.stdout.splitlines()[-1].startswith("| density | FAIL |")
     report = json.loads(Path("report.json").read_text())
     assert report["passed"] is False
     assert all(

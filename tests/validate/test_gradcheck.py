@@ -38,19 +38,19 @@ def check(*names: str, samples: int = 2, overrides: tuple[str, ...] = ()) -> lis
 @pytest.mark.parametrize("name", NAMES)
 def test_every_parameter_passes(name: str) -> None:
     (result,) = check(name)
-    assert result.has_passed, "\n".join(result.lines())
+    assert result.has_passed, result
     assert any(entry.adjoint != 0 for entry in result.entries)
 
 
 @pytest.mark.parametrize("name", ["sigma_t", "albedo"])
 def test_the_other_pair_of_cross_sections_passes(name: str) -> None:
     (result,) = check(name)
-    assert result.has_passed, "\n".join(result.lines())
+    assert result.has_passed, result
 
 
 def test_g_of_each_cell_passes() -> None:
     (result,) = check("g", overrides=("optimize.parameters.g={init: -0.6, field: true}",))
-    assert result.has_passed, "\n".join(result.lines())
+    assert result.has_passed, result
 
 
 def test_albedo_1_of_thick_cells_passes() -> None:
@@ -58,7 +58,7 @@ def test_albedo_1_of_thick_cells_passes() -> None:
     thick = "volume.sigma_a=0", "volume.sigma_s=1e3", "diffusion.transport_rounds=0"
     plain = "lights=[{type: ambient, radiance: 1}]", "optimize={parameters: {albedo: {}}}"
     (result,) = check("albedo", overrides=(*thick, *plain))
-    assert result.has_passed, "\n".join(result.lines())
+    assert result.has_passed, result
     assert any(math.isnan(value) for entry in result.entries for value in entry.differences)
 
 
@@ -67,7 +67,7 @@ def test_all_at_once_pass() -> None:
     # None of them alone: `test_every_parameter_passes` checks those.
     (result,) = check_parameters(scene, NAMES, 0, 0, lambda names, _: names[:0])
     assert result.parameter == TOGETHER
-    assert result.has_passed, "\n".join(result.lines())
+    assert result.has_passed, result
 
 
 def test_empty_cells_are_among_those_of_density() -> None:
@@ -83,7 +83,7 @@ def test_forward_peaks_and_backward_scattering_pass() -> None:
         for result in check(
             "g", "sigma_s", samples=1, overrides=(f"optimize.parameters.g.init={g}",)
         ):
-            assert result.has_passed, "\n".join(result.lines())
+            assert result.has_passed, result
 
 
 def test_an_unknown_parameter_is_refused() -> None:
