@@ -178,7 +178,7 @@ const auto go_up = [&](int s, int matrix, const F* source, const F* u, F* out, F
         stencil(l, z, z > 0 ? slot(4 + ((z - 1) & 3)) : y, y,
                 z < l.nz - 1 ? slot(4 + ((z + 1) & 3)) : y, source + z * slice, F(1) - STEP0, STEP0,
                 STEP0, o);
-        if (is_finest) total += inner_of(z, l.nx, source + z * slice, o);
+        if (is_finest) total += inner(source + z * slice, o, slice);
         else {
             const F* __restrict scale = l.scale + z * slice;
             for (Size i = 0; i < slice; ++i) o[i] *= scale[i];

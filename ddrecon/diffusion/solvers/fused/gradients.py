@@ -51,7 +51,7 @@ if (act == START) {
         const Size at_ = z * slice;
         F* const right = slot(4);
         take(l.scale + at_, b + at_, right, slice);
-        norm += inner_of(z, l.nx, right, right);
+        norm += inner(right, right, slice);
         if (has_guess) {
             for (; ready <= z + 1 && ready < l.nz; ++ready) {
                 F* __restrict v = slot(ready & 3);
@@ -63,7 +63,7 @@ if (act == START) {
             stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v,
                     right, F(-1), F(1), F(1), r + at_);
             for (Size i = 0; i < slice; ++i) y[at_ + i] = v[i];
-            square += inner_of(z, l.nx, r + at_, r + at_);
+            square += inner(r + at_, r + at_, slice);
         } else
             for (Size i = 0; i < slice; ++i) { r[at_ + i] = right[i]; y[at_ + i] = F(0); }
     }
@@ -101,7 +101,7 @@ if (act == DIRECT && !is_done) {
         stencil(l, z, z > 0 ? slot((z - 1) & 3) : v, v, z < l.nz - 1 ? slot((z + 1) & 3) : v, v,
             F(1),
                 F(0), F(-1), q + z * slice);
-        curved += inner_of(z, l.nx, v, q + z * slice);
+        curved += inner(v, q + z * slice, slice);
     }
     sum(CURVED_ROW) = curved;
 }
@@ -120,7 +120,7 @@ if (act == ADVANCE) {
                 solution[i] += step * v[i];
                 left[i] -= step * product[i];
             }
-            square += inner_of(z, l.nx, left, left);
+            square += inner(left, left, slice);
         }
         sum(RESIDUAL_ROW + later) = square;
     }

@@ -15,7 +15,6 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.fused.prepare import prepare_kernel
 from ddrecon.diffusion.solvers.fused.stages import (
-    MATRIX,
     Axes,
     Shape,
     Stages,
@@ -42,8 +41,7 @@ class Hierarchy:
 
     Which axes are strong is known only with the conductances of each level. So that nobody waits
     for them, a hierarchy is made with the axes of the last one of its shape; `strengths` then say
-    whether these were right. `shares`: of a color, so that threads have equally many. `work`: the
-    last grid's matrix, where that grid is part of one that ranks have together.
+    whether these were right. `shares`: of a color, so that threads have equally many.
     """
 
     stages: Stages
@@ -51,7 +49,6 @@ class Hierarchy:
     data: Tensor
     strengths: Tensor
     is_checked: bool = False
-    work: Tensor | None = None
 
     @staticmethod
     def of(operator: Operator) -> Hierarchy:
@@ -82,11 +79,8 @@ class Hierarchy:
     def array(self, stage: int, name: str) -> Tensor:
         """What the table calls so, of the cells of a `stage`, [matrices, z, y, x] (a view)."""
         shape, colors = self.stages.shape(stage), self.stages.colors
-        begin, numbers = self.stages.column(stage, name), self.data
-        if name in MATRIX:
-            assert self.work is not None
-            numbers = self.work
-        return numbers[begin : begin + colors * math.prod(shape)].view(colors, *shape)
+        begin = self.stages.column(stage, name)
+        return self.data[begin : begin + colors * math.prod(shape)].view(colors, *shape)
 
     @property
     def axes(self) -> Axes:
@@ -128,11 +122,10 @@ def shape_of(operator: Operator) -> tuple[Shape, int]:
 
 def make(operator: Operator, axes: Axes) -> Hierarchy:
     """The grids of `operator` that come about by coarsening these `axes`."""
-    (shape, colors), ghosts = shape_of(operator), operator.ghosts
-    stages, loss = stages_of(shape, colors, axes, ghosts is not None), operator.loss
+    shape, colors = shape_of(operator)
+    stages, loss = stages_of(shape, colors, axes), operator.loss
     shares, threads = shares_of(math.prod(shape), colors, loss)
     levels, few = len(stages.levels) - 1, math.prod(stages.shape(stages.levels[-1]))
-    is_solved = levels > 0 and ghosts is None
     data, work = borrow(stages.data, loss), borrow(stages.work, loss)
     strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
     made = {
@@ -140,7 +133,7 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
         "work": work,
         "scratch": loss.new_empty(colors * shares * 3 * (shape[2] + 3)),
         "strengths": strengths,
-        "dense": loss.new_empty(2 * colors * few**2 if is_solved else 0, dtype=torch.float64),
+        "dense": loss.new_empty(2 * colors * few**2 if levels else 0, dtype=torch.float64),
     }
     given: dict[str, Any] = {"table": table_of(stages, loss.device), "colors": colors}
     given["finest_parts"] = shares
@@ -151,20 +144,15 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
     def do(step: str, stage: int, parts: int, threads: int) -> None:
         kernel.launch(colors * parts, threads, step=STEPS[step], stage=stage, parts=parts)
 
-    hierarchy = Hierarchy(stages, shares, data, strengths, work=None if ghosts is None else work)
+    hierarchy = Hierarchy(stages, shares, data, strengths)
     do("scale cells", 0, shares, threads)
-    if ghosts is not None:
-        # Outermost cells have neighbors that are not here.
-        for name in ("SCALE", "TAKEN"):
-            ghosts.fill(hierarchy.array(0, name))
     do("scale faces", 0, shares, threads)
     second = stages.levels[1] if levels else 0
     for stage in range(second):
         do("weights", stage, shares, threads)
         do("coarse cells", stage, shares, threads)
-    if is_solved:
+    if levels:
         do("all but first", second, 1, min(threads, colors))
-    if ghosts is None:
-        give_back(work)
+    give_back(work)
     weakref.finalize(hierarchy, give_back, data)
     return hierarchy

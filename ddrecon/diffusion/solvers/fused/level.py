@@ -10,9 +10,8 @@ GIVEN = """
 long *table; F *data, *vectors, *scratch; double *sums;
 long first_vector, vector_size, scratch_size; double tolerance, tiny;
 int iteration, matrices, all_colors, shares;
-int from_z, to_z, from_y, to_y, from_x, to_x;
 """
-"""What both kernels of a solve are given. Cells `from` and `to` which count in inner products."""
+"""What both kernels of a solve are given."""
 
 # What neighbors send to cell i: conductance times value, faces lying at the cell below them.
 LEVEL = (
@@ -57,19 +56,6 @@ const auto inner = [](const F* __restrict a, const F* __restrict b, Size count) 
         for (int k = 0; k < 16; ++k) part[k] += (double)a[i + k] * (double)b[i + k];
     for (; i < count; ++i) total += (double)a[i] * (double)b[i];
     for (int k = 0; k < 16; ++k) total += part[k];
-    return total;
-};
-// The part of an inner product of slice z; cells of other ranks do not count.
-const auto inner_of = [&](int z, int nx, const F* a, const F* b) -> double {
-    if (z < from_z || z >= to_z) return 0.0;
-    const bool is_whole = to_x - from_x == nx;
-    const int rows = is_whole ? 1 : to_y - from_y;
-    const Size count = is_whole ? (Size)(to_y - from_y) * nx : to_x - from_x;
-    double total = 0.0;
-    for (int y = 0; y < rows; ++y) {
-        const Size start = (Size)(from_y + y) * nx + from_x;
-        total += inner(a + start, b + start, count);
-    }
     return total;
 };
 """

@@ -15,7 +15,6 @@ from torch import Tensor
 from ddrecon.diffusion.operator import Operator
 from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy
 from ddrecon.diffusion.solvers.fused.run import Run
-from ddrecon.diffusion.solvers.fused.slabs import solve_in_slabs
 from ddrecon.diffusion.solvers.scaled import Solution
 from ddrecon.kernels.spare import trim_freed_memory
 
@@ -37,9 +36,7 @@ def solve(
     Its residual may be above `tolerance` then.
     """
     made = source.new_empty(source.shape)
-    # The same on all ranks: of the largest slab.
-    layers = 1.0 if (ghosts := operator.ghosts) is None else ghosts.most / source.shape[ghosts.axis]
-    if layers * source[0].numel() < ALONE:
+    if source[0].numel() < ALONE:
         return _solve_checked(operator, source, guess, tolerance, most, made)
     if source.nbytes >= TRIMMED:
         trim_freed_memory()
@@ -69,8 +66,6 @@ def _solve_checked(
     made: Tensor,
 ) -> Solution:
     """The solution, written to `made`, by a hierarchy that coarsens the axes it should."""
-    if operator.ghosts is not None:
-        return solve_in_slabs(operator, operator.ghosts, source, guess, tolerance, most, made)
     hierarchy = operator.once(Hierarchy.of)
     solution, strengths = _solve(hierarchy, source, guess, tolerance, most, made)
     while not hierarchy.is_checked:

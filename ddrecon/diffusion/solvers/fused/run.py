@@ -7,7 +7,6 @@ them as they are.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -38,10 +37,7 @@ class Verdict:
 
 
 class Run:
-    """A solve under way: its vectors, and the launches that change them.
-
-    In inner products those cells count that are between two along each axis, `counted`; or all.
-    """
+    """A solve under way: its vectors, and the launches that change them."""
 
     def __init__(
         self,
@@ -49,7 +45,6 @@ class Run:
         source: Tensor,
         guess: Tensor | None,
         tolerance: float,
-        counted: Sequence[tuple[int, int]] = (),
     ):
         self.hierarchy, self.source, stages = hierarchy, source, hierarchy.stages
         self.colors, (_, y, x) = len(source), source.shape[1:]
@@ -76,8 +71,6 @@ class Run:
             "all_colors": self.colors,
             "shares": self.shares,
         }
-        for axis, ends in zip("zyx", counted or [(0, n) for n in source.shape[1:]], strict=True):
-            given |= {f"from_{axis}": ends[0], f"to_{axis}": ends[1]}
         made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
         guessed = None if guess is None or guess.shape != source.shape else guess
         guesses = {"source": source, "guess": guessed, "has_guess": int(guessed is not None)}

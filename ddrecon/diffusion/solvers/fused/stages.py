@@ -91,11 +91,8 @@ def margin(width: int) -> int:
 
 
 @functools.cache
-def stages_of(shape: Shape, colors: int, axes: Axes, is_open: bool = False) -> Stages:
-    """The stages of `shape` cells and matrices of so many `colors`.
-
-    The last one is not solved directly where they are `is_open`.
-    """
+def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
+    """The stages of `shape` cells and matrices of so many `colors`."""
     rows, sizes = list(_rows(shape, axes)), {"data": 0, "work": 0, "vectors": 0}
     levels = [i for i, row in enumerate(rows) if row["IS_LEVEL"]]
     following = dict(itertools.pairwise(levels))
@@ -115,7 +112,7 @@ def stages_of(shape: Shape, colors: int, axes: Axes, is_open: bool = False) -> S
             row |= {name: take("data", coarse) for name in COLUMNS[9:11]}
         if row["IS_LEVEL"] and not (is_last and i > 0):
             row |= {name: take("data", colors * cells) for name in COLUMNS[11:16]}
-        if is_last and not is_open:
+        if is_last:
             row["INVERSE"] = take("data", colors * cells**2)
         if row["IS_LEVEL"] and i > 0:
             row |= {name: take("vectors", cells) for name in COLUMNS[17:19]}
