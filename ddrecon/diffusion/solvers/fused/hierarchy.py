@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.fused.prepare import prepare_kernel
+from ddrecon.diffusion.operator import AXES, Operator, lower_cells
+from ddrecon.diffusion.solvers.fused.kernels import MAKING, prepare_kernel
 from ddrecon.diffusion.solvers.fused.stages import (
+    MATRIX,
     Axes,
     Shape,
     Stages,
@@ -22,12 +23,12 @@ from ddrecon.diffusion.solvers.fused.stages import (
     stages_of,
     strong_axes,
 )
+from ddrecon.diffusion.solvers.hierarchy import Coarsest
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.spare import borrow, give_back
 
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
-STEPS = {"scale cells": 0, "scale faces": 1, "weights": 2, "coarse cells": 3, "all but first": 4}
 _last_axes: dict[tuple[Shape, int], Axes] = {}
 """What hierarchies of a shape and so many colors coarsened last: where the next begins to try.
 
@@ -78,9 +79,7 @@ class Hierarchy:
 
     def array(self, stage: int, name: str) -> Tensor:
         """What the table calls so, of the cells of a `stage`, [matrices, z, y, x] (a view)."""
-        shape, colors = self.stages.shape(stage), self.stages.colors
-        begin = self.stages.column(stage, name)
-        return self.data[begin : begin + colors * math.prod(shape)].view(colors, *shape)
+        return self.stages.view(self.data, stage, name, self.stages.shape(stage))
 
     @property
     def axes(self) -> Axes:
@@ -125,7 +124,7 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
     shape, colors = shape_of(operator)
     stages, loss = stages_of(shape, colors, axes), operator.loss
     shares, threads = shares_of(math.prod(shape), colors, loss)
-    levels, few = len(stages.levels) - 1, math.prod(stages.shape(stages.levels[-1]))
+    levels = len(stages.levels) - 1
     data, work = borrow(stages.data, loss), borrow(stages.work, loss)
     strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
     made = {
@@ -133,26 +132,33 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
         "work": work,
         "scratch": loss.new_empty(colors * shares * 3 * (shape[2] + 3)),
         "strengths": strengths,
-        "dense": loss.new_empty(2 * colors * few**2 if levels else 0, dtype=torch.float64),
     }
     given: dict[str, Any] = {"table": table_of(stages, loss.device), "colors": colors}
     given["finest_parts"] = shares
-    for name, tensor in zip(("z", "y", "x", "loss"), (*operator.conductances, loss), strict=True):
-        given |= {f"given_{name}": tensor, f"shared_{name}": int(len(tensor) < colors)}
+    matrix = *operator.conductances, loss
+    given |= {"matrix": matrix, "is_each": [len(tensor) == colors for tensor in matrix]}
     kernel = prepare_kernel(loss.element_size() * 8).bind(given, made)
 
     def do(step: str, stage: int, parts: int, threads: int) -> None:
-        kernel.launch(colors * parts, threads, step=STEPS[step], stage=stage, parts=parts)
+        kernel.launch(colors * parts, threads, step=MAKING[step], stage=stage, parts=parts)
 
     hierarchy = Hierarchy(stages, shares, data, strengths)
-    do("scale cells", 0, shares, threads)
-    do("scale faces", 0, shares, threads)
+    do("SCALE_CELLS", 0, shares, threads)
+    do("SCALE_FACES", 0, shares, threads)
     second = stages.levels[1] if levels else 0
     for stage in range(second):
-        do("weights", stage, shares, threads)
-        do("coarse cells", stage, shares, threads)
+        do("WEIGHTS", stage, shares, threads)
+        do("COARSE_CELLS", stage, shares, threads)
     if levels:
-        do("all but first", second, 1, min(threads, colors))
+        do("ALL_BUT_FIRST", second, 1, min(threads, colors))
+        last = stages.levels[-1]
+        cells = stages.shape(last)
+        few = math.prod(cells)
+        # Faces lie at the cell below them.
+        *faces, lost = (stages.view(work, last, name, cells) for name in MATRIX)
+        z, y, x = (lower_cells(c, axis) for axis, c in zip(AXES, faces, strict=True))
+        inverse = Coarsest.of(Operator((z, y, x), lost)).inverse
+        stages.view(data, last, "INVERSE", (few, few)).copy_(inverse)
     give_back(work)
     weakref.finalize(hierarchy, give_back, data)
     return hierarchy

@@ -12,17 +12,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.solvers.fused.cycle import SLOTS, cycle_kernel
-from ddrecon.diffusion.solvers.fused.gradients import gradient_kernel
 from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, table_of
+from ddrecon.diffusion.solvers.fused.kernels import (
+    ACTS,
+    LEGS,
+    SLOTS,
+    SUMS,
+    VECTORS,
+    cycle_kernel,
+    gradient_kernel,
+)
 from ddrecon.diffusion.solvers.fused.stages import margin
-from ddrecon.diffusion.solvers.fused.sums import ROWS
 from ddrecon.kernels.spare import borrow, give_back
-
-DOWN, COARSER, UP = range(3)
-START, CHOOSE, DIRECT, ADVANCE = range(4)
-SOLUTION, RESIDUAL, CORRECTION, VECTORS = 0, 1, 4, 6
-"""Vectors of a solve by their numbers, and how many there are."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,12 @@ class Run:
         self.shares, self.threads = shares_of(cells, self.colors, source)
         # solution, residual, two directions, what the cycle makes, A d
         size = -(-self.colors * cells // 16) * 16 + edge
-        self.places = [edge + k * size for k in range(VECTORS)]
-        self.vectors = borrow(VECTORS * size + edge, source)
+        self.places = [edge + k * size for k in range(VECTORS["VECTORS"])]
+        self.vectors = borrow(len(self.places) * size + edge, source)
         self.coarser = borrow(self.colors * stages.vectors, source).zero_()
         slots = SLOTS * (-(-y * x // 16) * 16 + 2 * edge)
         self.scratch = borrow(self.colors * self.shares * slots, source)
-        self.sums = source.new_empty(len(ROWS) * self.colors * self.shares, dtype=torch.float64)
+        self.sums = source.new_empty(SUMS["SUMS"] * self.colors * self.shares, dtype=torch.float64)
         self.tiny, self.tolerance = torch.finfo(source.dtype).tiny, tolerance
         given = {
             "table": table_of(stages, source.device),
@@ -73,7 +74,7 @@ class Run:
         }
         made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
         guessed = None if guess is None or guess.shape != source.shape else guess
-        guesses = {"source": source, "guess": guessed, "has_guess": int(guessed is not None)}
+        guesses = {"source": source, "guess": guessed, "item_parts": self.shares}
         bits = source.element_size() * 8
         self.gradient = gradient_kernel(bits).bind(given | guesses, made)
         coarser = {"coarser": self.coarser}
@@ -82,12 +83,12 @@ class Run:
     def iterate(self, first: int, last: int) -> None:
         """Launches these iterations."""
         if first == 0:
-            self.advance(START, 0)
-            self.advance(CHOOSE, 0)
+            self.advance("START", 0)
+            self.advance("CHOOSE", 0)
         for iteration in range(first, last):
-            for leg in (DOWN, COARSER, UP):
+            for leg in LEGS:
                 self.cycle_leg(leg, iteration)
-            for act in (DIRECT, ADVANCE):
+            for act in ("DIRECT", "ADVANCE"):
                 self.advance(act, iteration)
 
     def verdict(self, launched: int) -> tuple[Verdict, list[float]]:
@@ -102,10 +103,10 @@ class Run:
             ]
             return [math.sqrt(sum(part)) for part in parts]
 
-        left, norm = norms(ROWS.index("RESIDUAL") + launched % 2), norms(ROWS.index("SOURCE_NORM"))
+        left, norm = norms(SUMS["RESIDUAL"] + launched % 2), norms(SUMS["SOURCE_NORM"])
         relative = [a / max(b, self.tiny) for a, b in zip(left, norm, strict=True)]
         worst = math.nan if any(map(math.isnan, relative)) else max(relative)
-        begin = (ROWS.index("COUNT") + launched % 2) * size
+        begin = (SUMS["COUNT"] + launched % 2) * size
         count = max(found[begin : begin + size])
         return Verdict(int(count), worst), found[len(self.sums) :]
 
@@ -116,7 +117,7 @@ class Run:
     def value(self, made: Tensor) -> Tensor:
         """`made`, the solution u = S y; nothing else can be asked for after it."""
         # The last act: what it was computed in is free again.
-        torch.mul(self.vector(SOLUTION), self.hierarchy.scale, out=made)
+        torch.mul(self.vector(VECTORS["Y"]), self.hierarchy.scale, out=made)
         self.end()
         return made
 
@@ -124,12 +125,13 @@ class Run:
         """Gives back what it was computed in."""
         give_back(self.vectors, self.coarser, self.scratch)
 
-    def cycle_leg(self, leg: int, iteration: int) -> None:
+    def cycle_leg(self, leg: str, iteration: int) -> None:
         parts, threads = self.shares, self.threads
-        if leg == COARSER:
+        if leg == "COARSER":
             parts, threads = 1, min(self.threads, self.colors)
-        self.cycle.launch(self.colors * parts, threads, leg=leg, iteration=iteration, parts=parts)
+        changed = {"leg": LEGS[leg], "iteration": iteration, "item_parts": parts}
+        self.cycle.launch(self.colors * parts, threads, **changed)
 
-    def advance(self, act: int, iteration: int) -> None:
+    def advance(self, act: str, iteration: int) -> None:
         items = self.colors * self.shares
-        self.gradient.launch(items, self.threads, act=act, iteration=iteration)
+        self.gradient.launch(items, self.threads, act=ACTS[act], iteration=iteration)
