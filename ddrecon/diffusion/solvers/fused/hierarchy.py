@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import weakref
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,16 +57,13 @@ class Hierarchy:
         axes = _last_axes.get((shape, colors))
         if axes is not None:
             return make(operator, axes)
-        made = make(operator, first_guess(shape))
-        return made.checked(operator, made.strengths.tolist())
+        return make(operator, first_guess(shape)).checked(operator)
 
-    def checked(self, operator: Operator, strengths: Sequence[float]) -> Hierarchy:
-        """This hierarchy if it coarsens the axes it should by `strengths`, else one that does."""
-        shape, colors = shape_of(operator)
-        made = self
-        while (axes := strong_axes(shape, made.stages.axes, made.means(strengths))) != made.axes:
+    def checked(self, operator: Operator) -> Hierarchy:
+        """This hierarchy if it coarsens the axes it should, else one that does."""
+        (shape, colors), made = shape_of(operator), self
+        while (axes := strong_axes(shape, made.axes, made.means())) != made.axes:
             made = make(operator, axes)
-            strengths = made.strengths.tolist()
         _last_axes[shape, colors] = axes
         made.is_checked = True
         return made
@@ -86,9 +82,9 @@ class Hierarchy:
         """The axes that each level coarsens."""
         return self.stages.axes
 
-    def means(self, strengths: Sequence[float]) -> list[list[float]]:
+    def means(self) -> list[list[float]]:
         """The mean scaled conductance along each axis, of each level that is coarsened."""
-        found, begin = [], 0
+        strengths, found, begin = self.strengths.tolist(), [], 0
         for number, stage in enumerate(self.stages.levels[: len(self.axes)]):
             shape = self.stages.shape(stage)
             end = begin + 3 * self.stages.colors * (self.shares if number == 0 else 1)
@@ -108,9 +104,9 @@ def shares_of(cells: int, colors: int, like: Tensor) -> tuple[int, int]:
 
 
 @functools.cache
-def table_of(stages: Stages, device: torch.device) -> Tensor:
-    """The table of `stages` for kernels on `device`."""
-    return torch.tensor(stages.table, dtype=torch.int64, device=device)
+def table_of(stages: Stages) -> Tensor:
+    """The table of `stages` for kernels."""
+    return torch.tensor(stages.table, dtype=torch.int64)
 
 
 def shape_of(operator: Operator) -> tuple[Shape, int]:
@@ -133,7 +129,7 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
         "scratch": loss.new_empty(colors * shares * 3 * (shape[2] + 3)),
         "strengths": strengths,
     }
-    given: dict[str, Any] = {"table": table_of(stages, loss.device), "colors": colors}
+    given: dict[str, Any] = {"table": table_of(stages), "colors": colors}
     given["finest_parts"] = shares
     matrix = *operator.conductances, loss
     given |= {"matrix": matrix, "is_each": [len(tensor) == colors for tensor in matrix]}
