@@ -113,5 +113,10 @@ template <class F, int COUNT>
 INLINE Dual<F, COUNT> along(const Dual<F, COUNT>& x, const Sloped<F>& found) {
     return x.chain(found.value, found.slope);
 }
+// The root of a number > 0, or 0, where the slope counts as 0.
+template <class F, int COUNT> INLINE Dual<F, COUNT> root(const Dual<F, COUNT>& x) {
+    const F found = root(x.value);
+    return x.chain(found, found > F(0) ? F(0.5) / found : F(0));
+}
 
 } // namespace ddrecon

@@ -10,18 +10,12 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from ddrecon.engine import current_engine
 from ddrecon.ranks import own_rank, sum_over_ranks, swap_with_neighbors
 from ddrecon.slabs.exchange import join_parts
 from ddrecon.slabs.slab import Slab
 
-LAYERS, MORE = 2, 4
-"""Layers of ghosts; slabs have halos of more.
-
-With `MORE`, all that a cycle of multigrid does to own cells of a grid needs one exchange: two
-relaxations, a residual and two relaxations more, each of which reaches a cell further, but for the
-one that begins at zero.
-"""
+LAYERS = 2
+"""Layers of ghosts; slabs have halos of more."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +32,8 @@ class Ghosts:
     @staticmethod
     def of(slab: Slab) -> Ghosts:
         """The ghosts of `slab`."""
-        most = MORE if current_engine() == "warp" else LAYERS
-        below, above = (min(most, halo) for halo in slab.halo)
+        below, above = (min(LAYERS, halo) for halo in slab.halo)
         return Ghosts(slab.axis + 1, (below, above), tuple(slab.sizes))
-
-    @property
-    def most(self) -> int:
-        """How many layers a rank has at most, its ghosts among them; the same on all ranks."""
-        return max(self.sizes) + 2 * max(self.layers)
 
     @property
     def size(self) -> int:

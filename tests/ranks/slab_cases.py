@@ -285,7 +285,6 @@ FEW = [name for name in CASES if name.startswith(("exchange", "system"))]
 FEW += ["light along x", "rounds along x"]
 FUSED = ["light along x", "light along y", "forward peak", "all per cell"]
 FUSED += ["environment", "lattice", "inside", "rounds along z"]
-FUSED += [f"solve along {axis}" for axis in SHAPES]
 GROUPS = {"few": FEW, "others": [name for name in CASES if name not in FEW], "fused": FUSED}
 """Cases that tell most in little time, the others, and those in which slabs have fused kernels."""
 

@@ -32,8 +32,9 @@ def multigrid(
 
     Raises SolveError when it is not reached.
     """
-    # Fused, a thread does slices. On a GPU it does a cell, by torch's operations.
-    if current_engine() == "warp" and has_kernels("diffusion", source.is_cuda):
+    # Fused, a thread does slices. On a GPU, where one does a cell, and in slabs it is all torch's.
+    is_fused = current_engine() == "warp" and has_kernels("diffusion", source.is_cuda)
+    if is_fused and operator.ghosts is None:
         from ddrecon.diffusion.solvers.fused.multigrid import solve  # imports Warp
 
         solution = solve(operator, source, guess, tolerance, MAX_ITERATIONS)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import functools
 import math
 import weakref
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.fused.prepare import prepare_kernel
+from ddrecon.diffusion.operator import AXES, Operator, lower_cells
+from ddrecon.diffusion.solvers.fused.kernels import MAKING, prepare_kernel
 from ddrecon.diffusion.solvers.fused.stages import (
     MATRIX,
     Axes,
@@ -23,12 +22,12 @@ from ddrecon.diffusion.solvers.fused.stages import (
     stages_of,
     strong_axes,
 )
+from ddrecon.diffusion.solvers.hierarchy import Coarsest
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.spare import borrow, give_back
 
 SMALL = 30_000
 """So few cells, of all colors, are best done by one thread."""
-STEPS = {"scale cells": 0, "scale faces": 1, "weights": 2, "coarse cells": 3, "all but first": 4}
 _last_axes: dict[tuple[Shape, int], Axes] = {}
 """What hierarchies of a shape and so many colors coarsened last: where the next begins to try.
 
@@ -42,8 +41,7 @@ class Hierarchy:
 
     Which axes are strong is known only with the conductances of each level. So that nobody waits
     for them, a hierarchy is made with the axes of the last one of its shape; `strengths` then say
-    whether these were right. `shares`: of a color, so that threads have equally many. `work`: the
-    last grid's matrix, where that grid is part of one that ranks have together.
+    whether these were right. `shares`: of a color, so that threads have equally many.
     """
 
     stages: Stages
@@ -51,7 +49,6 @@ class Hierarchy:
     data: Tensor
     strengths: Tensor
     is_checked: bool = False
-    work: Tensor | None = None
 
     @staticmethod
     def of(operator: Operator) -> Hierarchy:
@@ -60,16 +57,13 @@ class Hierarchy:
         axes = _last_axes.get((shape, colors))
         if axes is not None:
             return make(operator, axes)
-        made = make(operator, first_guess(shape))
-        return made.checked(operator, made.strengths.tolist())
+        return make(operator, first_guess(shape)).checked(operator)
 
-    def checked(self, operator: Operator, strengths: Sequence[float]) -> Hierarchy:
-        """This hierarchy if it coarsens the axes it should by `strengths`, else one that does."""
-        shape, colors = shape_of(operator)
-        made = self
-        while (axes := strong_axes(shape, made.stages.axes, made.means(strengths))) != made.axes:
+    def checked(self, operator: Operator) -> Hierarchy:
+        """This hierarchy if it coarsens the axes it should, else one that does."""
+        (shape, colors), made = shape_of(operator), self
+        while (axes := strong_axes(shape, made.axes, made.means())) != made.axes:
             made = make(operator, axes)
-            strengths = made.strengths.tolist()
         _last_axes[shape, colors] = axes
         made.is_checked = True
         return made
@@ -81,21 +75,16 @@ class Hierarchy:
 
     def array(self, stage: int, name: str) -> Tensor:
         """What the table calls so, of the cells of a `stage`, [matrices, z, y, x] (a view)."""
-        shape, colors = self.stages.shape(stage), self.stages.colors
-        begin, numbers = self.stages.column(stage, name), self.data
-        if name in MATRIX:
-            assert self.work is not None
-            numbers = self.work
-        return numbers[begin : begin + colors * math.prod(shape)].view(colors, *shape)
+        return self.stages.view(self.data, stage, name, self.stages.shape(stage))
 
     @property
     def axes(self) -> Axes:
         """The axes that each level coarsens."""
         return self.stages.axes
 
-    def means(self, strengths: Sequence[float]) -> list[list[float]]:
+    def means(self) -> list[list[float]]:
         """The mean scaled conductance along each axis, of each level that is coarsened."""
-        found, begin = [], 0
+        strengths, found, begin = self.strengths.tolist(), [], 0
         for number, stage in enumerate(self.stages.levels[: len(self.axes)]):
             shape = self.stages.shape(stage)
             end = begin + 3 * self.stages.colors * (self.shares if number == 0 else 1)
@@ -115,9 +104,9 @@ def shares_of(cells: int, colors: int, like: Tensor) -> tuple[int, int]:
 
 
 @functools.cache
-def table_of(stages: Stages, device: torch.device) -> Tensor:
-    """The table of `stages` for kernels on `device`."""
-    return torch.tensor(stages.table, dtype=torch.int64, device=device)
+def table_of(stages: Stages) -> Tensor:
+    """The table of `stages` for kernels."""
+    return torch.tensor(stages.table, dtype=torch.int64)
 
 
 def shape_of(operator: Operator) -> tuple[Shape, int]:
@@ -128,11 +117,10 @@ def shape_of(operator: Operator) -> tuple[Shape, int]:
 
 def make(operator: Operator, axes: Axes) -> Hierarchy:
     """The grids of `operator` that come about by coarsening these `axes`."""
-    (shape, colors), ghosts = shape_of(operator), operator.ghosts
-    stages, loss = stages_of(shape, colors, axes, ghosts is not None), operator.loss
+    shape, colors = shape_of(operator)
+    stages, loss = stages_of(shape, colors, axes), operator.loss
     shares, threads = shares_of(math.prod(shape), colors, loss)
-    levels, few = len(stages.levels) - 1, math.prod(stages.shape(stages.levels[-1]))
-    is_solved = levels > 0 and ghosts is None
+    levels = len(stages.levels) - 1
     data, work = borrow(stages.data, loss), borrow(stages.work, loss)
     strengths = loss.new_empty(3 * colors * (shares + max(levels - 1, 0)), dtype=torch.float64)
     made = {
@@ -140,31 +128,33 @@ def make(operator: Operator, axes: Axes) -> Hierarchy:
         "work": work,
         "scratch": loss.new_empty(colors * shares * 3 * (shape[2] + 3)),
         "strengths": strengths,
-        "dense": loss.new_empty(2 * colors * few**2 if is_solved else 0, dtype=torch.float64),
     }
-    given: dict[str, Any] = {"table": table_of(stages, loss.device), "colors": colors}
+    given: dict[str, Any] = {"table": table_of(stages), "colors": colors}
     given["finest_parts"] = shares
-    for name, tensor in zip(("z", "y", "x", "loss"), (*operator.conductances, loss), strict=True):
-        given |= {f"given_{name}": tensor, f"shared_{name}": int(len(tensor) < colors)}
+    matrix = *operator.conductances, loss
+    given |= {"matrix": matrix, "is_each": [len(tensor) == colors for tensor in matrix]}
     kernel = prepare_kernel(loss.element_size() * 8).bind(given, made)
 
     def do(step: str, stage: int, parts: int, threads: int) -> None:
-        kernel.launch(colors * parts, threads, step=STEPS[step], stage=stage, parts=parts)
+        kernel.launch(colors * parts, threads, step=MAKING[step], stage=stage, parts=parts)
 
-    hierarchy = Hierarchy(stages, shares, data, strengths, work=None if ghosts is None else work)
-    do("scale cells", 0, shares, threads)
-    if ghosts is not None:
-        # Outermost cells have neighbors that are not here.
-        for name in ("SCALE", "TAKEN"):
-            ghosts.fill(hierarchy.array(0, name))
-    do("scale faces", 0, shares, threads)
+    hierarchy = Hierarchy(stages, shares, data, strengths)
+    do("SCALE_CELLS", 0, shares, threads)
+    do("SCALE_FACES", 0, shares, threads)
     second = stages.levels[1] if levels else 0
     for stage in range(second):
-        do("weights", stage, shares, threads)
-        do("coarse cells", stage, shares, threads)
-    if is_solved:
-        do("all but first", second, 1, min(threads, colors))
-    if ghosts is None:
-        give_back(work)
+        do("WEIGHTS", stage, shares, threads)
+        do("COARSE_CELLS", stage, shares, threads)
+    if levels:
+        do("ALL_BUT_FIRST", second, 1, min(threads, colors))
+        last = stages.levels[-1]
+        cells = stages.shape(last)
+        few = math.prod(cells)
+        # Faces lie at the cell below them.
+        *faces, lost = (stages.view(work, last, name, cells) for name in MATRIX)
+        z, y, x = (lower_cells(c, axis) for axis, c in zip(AXES, faces, strict=True))
+        inverse = Coarsest.of(Operator((z, y, x), lost)).inverse
+        stages.view(data, last, "INVERSE", (few, few)).copy_(inverse)
+    give_back(work)
     weakref.finalize(hierarchy, give_back, data)
     return hierarchy

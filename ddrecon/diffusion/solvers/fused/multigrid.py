@@ -1,4 +1,4 @@
-"""Conjugate gradients preconditioned by multigrid, as launches of fused kernels.
+"""Conjugate gradients preconditioned by multigrid, as launches of fused kernels on processors.
 
 Every launch of an iteration finds out for itself which colors are as exact as asked for, and leaves
 them as they are. So iterations are launched ahead, as many as solves of this size took before, and
@@ -13,11 +13,19 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.operator import Operator
-from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy
-from ddrecon.diffusion.solvers.fused.run import Run
-from ddrecon.diffusion.solvers.fused.slabs import solve_in_slabs
+from ddrecon.diffusion.solvers.fused.hierarchy import Hierarchy, shares_of, table_of
+from ddrecon.diffusion.solvers.fused.kernels import (
+    ACTS,
+    LEGS,
+    SLOTS,
+    SUMS,
+    VECTORS,
+    cycle_kernel,
+    gradient_kernel,
+)
+from ddrecon.diffusion.solvers.fused.stages import margin
 from ddrecon.diffusion.solvers.scaled import Solution
-from ddrecon.kernels.spare import trim_freed_memory
+from ddrecon.kernels.spare import borrow, give_back, trim_freed_memory
 
 MOST_AHEAD = 16
 """So many iterations are launched at most before the residual is looked at."""
@@ -37,9 +45,7 @@ def solve(
     Its residual may be above `tolerance` then.
     """
     made = source.new_empty(source.shape)
-    # The same on all ranks: of the largest slab.
-    layers = 1.0 if (ghosts := operator.ghosts) is None else ghosts.most / source.shape[ghosts.axis]
-    if layers * source[0].numel() < ALONE:
+    if source[0].numel() < ALONE:
         return _solve_checked(operator, source, guess, tolerance, most, made)
     if source.nbytes >= TRIMMED:
         trim_freed_memory()
@@ -69,15 +75,13 @@ def _solve_checked(
     made: Tensor,
 ) -> Solution:
     """The solution, written to `made`, by a hierarchy that coarsens the axes it should."""
-    if operator.ghosts is not None:
-        return solve_in_slabs(operator, operator.ghosts, source, guess, tolerance, most, made)
     hierarchy = operator.once(Hierarchy.of)
-    solution, strengths = _solve(hierarchy, source, guess, tolerance, most, made)
+    solution = _solve(hierarchy, source, guess, tolerance, most, made)
     while not hierarchy.is_checked:
-        found = hierarchy.checked(operator, strengths)
+        found = hierarchy.checked(operator)
         operator.prepared[Hierarchy.of] = found
         if found is not hierarchy:
-            solution, strengths = _solve(found, source, guess, tolerance, most, made)
+            solution = _solve(found, source, guess, tolerance, most, made)
         hierarchy = found
     return solution
 
@@ -89,16 +93,81 @@ def _solve(
     tolerance: float,
     most: int,
     made: Tensor,
-) -> tuple[Solution, list[float]]:
-    """The solution in `made`, and the strengths of a hierarchy that is not checked yet."""
+) -> Solution:
+    """The solution in `made`, by a hierarchy that need not be checked."""
     run, counts = Run(hierarchy, source, guess, tolerance), _counts[source.shape]
     launched = min(max(counts), most)
     run.iterate(0, launched)
-    verdict, strengths = run.verdict(launched)
-    while verdict.is_open(tolerance) and launched < most:
+    count, residual = run.verdict(launched)
+    while residual > tolerance and launched < most:
         more = min(2 * launched + 1, launched + MOST_AHEAD, most)
         run.iterate(launched, more)
         launched = more
-        verdict, strengths = run.verdict(launched)
-    counts.append(verdict.iterations)
-    return Solution(run.value(made), verdict.iterations, verdict.residual), strengths
+        count, residual = run.verdict(launched)
+    counts.append(count)
+    torch.mul(run.vector("Y"), hierarchy.scale, out=made)  # u = S y
+    give_back(run.vectors, run.coarser, run.scratch)
+    return Solution(made, count, residual)
+
+
+class Run:
+    """A solve under way: its vectors, and the launches that change them."""
+
+    def __init__(
+        self, hierarchy: Hierarchy, source: Tensor, guess: Tensor | None, tolerance: float
+    ):
+        self.source, stages, bits = source, hierarchy.stages, source.element_size() * 8
+        self.colors, (_, y, x) = len(source), source.shape[1:]
+        cells, self.edge = source[0].numel(), margin(x)
+        self.shares, self.threads = shares_of(cells, self.colors, source)
+        self.size = -(-self.colors * cells // 16) * 16 + self.edge
+        self.vectors = borrow(VECTORS["VECTORS"] * self.size + self.edge, source)
+        self.coarser = borrow(self.colors * stages.vectors, source).zero_()
+        slots = SLOTS * (-(-y * x // 16) * 16 + 2 * self.edge)
+        self.scratch = borrow(self.colors * self.shares * slots, source)
+        self.sums = source.new_empty(SUMS["SUMS"], self.colors, self.shares, dtype=torch.float64)
+        self.tiny = torch.finfo(source.dtype).tiny
+        given = {
+            "table": table_of(stages), "data": hierarchy.data, "first_vector": self.edge,
+            "vector_size": self.size, "scratch_size": slots, "tolerance": tolerance,
+            "tiny": self.tiny, "matrices": stages.colors, "all_colors": self.colors,
+            "shares": self.shares,
+        }  # fmt: skip
+        made = {"vectors": self.vectors, "scratch": self.scratch, "sums": self.sums}
+        guessed = None if guess is None or guess.shape != source.shape else guess
+        ends = {"source": source, "guess": guessed, "item_parts": self.shares}
+        self.gradient = gradient_kernel(bits).bind(given | ends, made)
+        made, share = made | {"coarser": self.coarser}, {"share": stages.vectors}
+        self.cycle = cycle_kernel(bits).bind(given | share, made)
+
+    def iterate(self, first: int, last: int) -> None:
+        """Launches these iterations."""
+        for act in ("START", "CHOOSE") if first == 0 else ():
+            self._advance(act, 0)
+        for iteration in range(first, last):
+            for leg in LEGS:
+                parts, threads = self.shares, self.threads
+                if leg == "COARSER":
+                    parts, threads = 1, min(threads, self.colors)
+                changed = {"leg": LEGS[leg], "iteration": iteration, "item_parts": parts}
+                self.cycle.launch(self.colors * parts, threads, **changed)
+            for act in ("DIRECT", "ADVANCE"):
+                self._advance(act, iteration)
+
+    def verdict(self, launched: int) -> tuple[int, float]:
+        """How many iterations were needed of those launched, and the relative residual left."""
+        odd = launched % 2
+        left, norm = (
+            self.sums[SUMS[name] + n].sum(-1) for name, n in (("RESIDUAL", odd), ("SOURCE_NORM", 0))
+        )
+        relative = left.sqrt() / norm.sqrt().clamp(min=self.tiny)
+        return int(self.sums[SUMS["COUNT"] + odd].max()), float(relative.max())
+
+    def vector(self, name: str) -> Tensor:
+        """One of the vectors that kernels have, [C, z, y, x] (a view)."""
+        first = self.edge + VECTORS[name] * self.size
+        return self.vectors[first:][: self.source.numel()].view_as(self.source)
+
+    def _advance(self, act: str, iteration: int) -> None:
+        items = self.colors * self.shares
+        self.gradient.launch(items, self.threads, act=ACTS[act], iteration=iteration)

@@ -14,24 +14,17 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from torch import Tensor
+
+from ddrecon.diffusion.solvers.fused.kernels import COLUMNS
 from ddrecon.diffusion.solvers.hierarchy import FEW_CELLS, STRONG
 
 Shape = tuple[int, int, int]
 Axes = tuple[tuple[int, ...], ...]
 """The axes (0 is z) that each level coarsens."""
-COLUMNS = (
-    "NZ", "NY", "NX",
-    "AXIS",  # along which cells become pairs; -1: none, the coarsest
-    "NEXT",  # where a level begins: the stage of the next one; else -1
-    "CZ", "CY", "CX", "LOSS",  # conductances and loss of A, in `work`
-    "BELOW", "ABOVE",  # weights of the coarsening, in `data`
-    "SZ", "SY", "SX", "SCALE", "TAKEN",  # of the scaled matrix, in `data`
-    "INVERSE",  # of the coarsest matrix, in `data`
-    "SOURCE", "U",  # right side and solution of a level, in a color's share of `vectors`
-)  # fmt: skip
-MATRIX = COLUMNS[5:9]
-"""Conductances and loss of a stage that is not the finest."""
-ENUM = f"enum {{{', '.join(COLUMNS)}, COLUMNS}};"
+_NAMES, STAGE = list(COLUMNS), COLUMNS["COLUMNS"]
+MATRIX, COARSENED, SCALED = _NAMES[5:9], _NAMES[9:11], _NAMES[11:16]
+"""Of stages that are not the finest, of those that are coarsened, and of levels (`levels.h`)."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +45,16 @@ class Stages:
 
     def column(self, stage: int, name: str) -> int:
         """An entry of the table."""
-        return self.table[stage * len(COLUMNS) + COLUMNS.index(name)]
+        return self.table[stage * STAGE + COLUMNS[name]]
+
+    def view(self, numbers: Tensor, stage: int, name: str, shape: Sequence[int]) -> Tensor:
+        """An array of a stage in `numbers`, [colors, *shape] (a view)."""
+        begin, count = self.column(stage, name), self.colors * math.prod(shape)
+        return numbers[begin : begin + count].view(self.colors, *shape)
 
     def shape(self, stage: int) -> Shape:
         """How many cells a stage has along z, y and x."""
-        z, y, x = (self.column(stage, name) for name in COLUMNS[:3])
+        z, y, x = (self.column(stage, name) for name in ("NZ", "NY", "NX"))
         return z, y, x
 
 
@@ -91,11 +89,8 @@ def margin(width: int) -> int:
 
 
 @functools.cache
-def stages_of(shape: Shape, colors: int, axes: Axes, is_open: bool = False) -> Stages:
-    """The stages of `shape` cells and matrices of so many `colors`.
-
-    The last one is not solved directly where they are `is_open`.
-    """
+def stages_of(shape: Shape, colors: int, axes: Axes) -> Stages:
+    """The stages of `shape` cells and matrices of so many `colors`."""
     rows, sizes = list(_rows(shape, axes)), {"data": 0, "work": 0, "vectors": 0}
     levels = [i for i, row in enumerate(rows) if row["IS_LEVEL"]]
     following = dict(itertools.pairwise(levels))
@@ -112,25 +107,25 @@ def stages_of(shape: Shape, colors: int, axes: Axes, is_open: bool = False) -> S
             row |= {name: take("work", colors * cells) for name in MATRIX}
         if not is_last:
             coarse = colors * _cells(rows[i + 1])
-            row |= {name: take("data", coarse) for name in COLUMNS[9:11]}
+            row |= {name: take("data", coarse) for name in COARSENED}
         if row["IS_LEVEL"] and not (is_last and i > 0):
-            row |= {name: take("data", colors * cells) for name in COLUMNS[11:16]}
-        if is_last and not is_open:
+            row |= {name: take("data", colors * cells) for name in SCALED}
+        if is_last:
             row["INVERSE"] = take("data", colors * cells**2)
         if row["IS_LEVEL"] and i > 0:
-            row |= {name: take("vectors", cells) for name in COLUMNS[17:19]}
+            row |= {name: take("vectors", cells) for name in ("SOURCE", "U")}
     for kind in sizes:
         take(kind, 0)
-    table = tuple(row.get(name, 0) for row in rows for name in COLUMNS)
+    table = tuple(row.get(name, 0) for row in rows for name in _NAMES[:STAGE])
     return Stages(axes, colors, table, tuple(levels), **sizes)
 
 
 def _rows(shape: Shape, axes: Axes) -> Iterator[dict[str, int]]:
     for level in axes:
         for number, axis in enumerate(level):
-            yield dict(zip(COLUMNS[:4], (*shape, axis), strict=True)) | {"IS_LEVEL": number == 0}
+            yield dict(zip(_NAMES[:4], (*shape, axis), strict=True)) | {"IS_LEVEL": number == 0}
             shape = _halved(shape, (axis,))
-    yield dict(zip(COLUMNS[:4], (*shape, -1), strict=True)) | {"IS_LEVEL": True}
+    yield dict(zip(_NAMES[:4], (*shape, -1), strict=True)) | {"IS_LEVEL": True}
 
 
 def _cells(row: dict[str, int]) -> int:

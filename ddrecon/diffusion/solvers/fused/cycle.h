@@ -1,0 +1,214 @@
+#pragma once
+#include "ddrecon/diffusion/solvers/fused/transfers.h"
+// Multigrid's V-cycle, slice by slice (`solvers/hierarchy.py` has the formulas). A leg of the cycle
+// goes through the slices of a level once. What it computes of a slice is kept for as long as its
+// neighbors need it, so that only right side, matrix and result go through memory. Down: two
+// relaxations from zero, the residual and its restriction. Up: the same two relaxations again, the
+// correction, and two relaxations more.
+
+namespace ddrecon {
+
+// Two relaxations from zero: Chebyshev's polynomial of the right side.
+template <class F>
+INLINE void smooth(const Grids<F>& grids, const Level<F>& l, int z, const F* source, F* out) {
+    const F *u = source + z * l.slice, one = grids.steps[0], two = grids.steps[1];
+    const F *lower = z > 0 ? u - l.slice : u, *upper = z < l.nz - 1 ? u + l.slice : u;
+    stencil(l, z, lower, u, upper, u, one + two - one * two, F(0), one * two, out);
+}
+
+// Restricts T (source - M y), y being two relaxations from zero, to slices `from` to `to`.
+template <class F> APART void go_down(
+    const Grids<F>& grids, int s, int matrix, const F* source, F* out, F* memory, int from,
+    int to) {
+    const Level<F> l = grids.level(s, matrix);
+    const Ways way = grids.ways(s);
+    const Size slice = l.slice;
+    const Slots<F> slot(memory, l);
+    slot.clear(4);
+    F* const zero = slot(12);
+    for (Size i = 0; i < slice; ++i) zero[i] = F(0);
+    int next = way.z < 0 ? from : from > 0 ? 2 * from - 1 : 0, smoothed = next > 0 ? next - 1 : 0;
+    const auto residual = [&](int z) -> const F* {
+        if (z < 0 || z >= l.nz) return zero;
+        for (; next <= z; ++next) {
+            for (; smoothed <= next + 1 && smoothed < l.nz; ++smoothed)
+                smooth(grids, l, smoothed, source, slot.ring(0, smoothed));
+            F* __restrict r = slot.ring(4, next);
+            stencil(l, slot, 0, next, source + next * slice, F(-1), F(1), F(1), r);
+            const F* __restrict taken = l.taken + next * slice;
+            for (Size i = 0; i < slice; ++i) r[i] *= taken[i];
+        }
+        return slot.ring(4, z);
+    };
+    const int cy = way.y >= 0 ? (l.ny + 1) / 2 : l.ny, cx = way.x >= 0 ? (l.nx + 1) / 2 : l.nx;
+    const bool is_level = grids.at(way.next, NEXT) >= 0;
+    const Size coarse = (Size)cy * cx;
+    const F* scale = is_level ? grids.level(way.next, matrix).scale : zero;
+    for (int k = from; k < to; ++k) {
+        const F* r;
+        if (way.z >= 0) {
+            const F *before = residual(2 * k - 1), *one = residual(2 * k);
+            const F *two = residual(2 * k + 1), *after = residual(2 * k + 2);
+            const F* b = grids.weights(way.z, BELOW, matrix) + k * slice;
+            const F* a = grids.weights(way.z, ABOVE, matrix) + k * slice;
+            restrict_pair(
+                before, one, two, after, k > 0 ? b - slice : zero, k > 0 ? a - slice : zero, b, a,
+                slot(8), slice);
+            r = slot(8);
+        } else {
+            r = residual(k);
+        }
+        if (way.y >= 0) {
+            const Size place = (Size)k * cy * l.nx;
+            restrict_y(
+                r, slot(9), grids.weights(way.y, BELOW, matrix) + place,
+                grids.weights(way.y, ABOVE, matrix) + place, zero, l.ny, l.nx);
+            r = slot(9);
+        }
+        if (way.x >= 0) {
+            restrict_x(
+                r, slot(10), grids.weights(way.x, BELOW, matrix) + k * coarse,
+                grids.weights(way.x, ABOVE, matrix) + k * coarse, cy, l.nx);
+            r = slot(10);
+        }
+        F* __restrict o = out + k * coarse;
+        const F* __restrict t = r, * __restrict scales = scale + k * coarse;
+        if (is_level)
+            for (Size i = 0; i < coarse; ++i) o[i] = scales[i] * t[i];
+        else
+            for (Size i = 0; i < coarse; ++i) o[i] = t[i];
+    }
+}
+
+// The cycle's result in slices `from` to `to`, from the solution `u` of the coarser grid; returns
+// its inner product with `source`. Multiplied by S where a finer grid is to be corrected by it.
+template <class F> APART double go_up(
+    const Grids<F>& grids, int s, int matrix, const F* source, const F* u, F* out, F* memory,
+    int from, int to, bool is_finest) {
+    const Level<F> l = grids.level(s, matrix);
+    const Ways way = grids.ways(s);
+    const Size slice = l.slice;
+    const Slots<F> slot(memory, l);
+    slot.clear(8);
+    int corrected = from > 2 ? from - 2 : 0, relaxed = from > 1 ? from - 1 : 0;
+    int spread = way.z < 0 ? corrected : corrected > 3 ? corrected / 2 - 1 : 0;
+    const int cz = way.z >= 0 ? (l.nz + 1) / 2 : l.nz;
+    const int cy = way.y >= 0 ? (l.ny + 1) / 2 : l.ny, cx = way.x >= 0 ? (l.nx + 1) / 2 : l.nx;
+    // slice k of the coarser grid, interpolated along x and y
+    const auto prolonged = [&](int k) -> const F* {
+        for (; spread <= k; ++spread) {
+            const F* in = u + (Size)spread * cy * cx;
+            F* const done = slot.ring(8, spread);
+            if (way.x >= 0) {
+                const Size place = (Size)spread * cy * cx;
+                F* const rows = way.y >= 0 ? slot(12) : done;
+                prolong_x(
+                    in, rows, grids.weights(way.x, BELOW, matrix) + place,
+                    grids.weights(way.x, ABOVE, matrix) + place, cy, l.nx);
+                in = rows;
+            }
+            if (way.y >= 0) {
+                const Size place = (Size)spread * cy * l.nx;
+                prolong_y(
+                    in, done, grids.weights(way.y, BELOW, matrix) + place,
+                    grids.weights(way.y, ABOVE, matrix) + place, l.ny, l.nx);
+                in = done;
+            }
+            if (in != done)
+                for (Size i = 0; i < slice; ++i) done[i] = in[i];
+        }
+        return slot.ring(8, k);
+    };
+    const auto correct = [&](int z) {
+        F* __restrict y = slot.ring(0, z);
+        smooth(grids, l, z, source, y);
+        const F* __restrict taken = l.taken + z * slice;
+        const int k = way.z >= 0 ? z / 2 : z;
+        const int to = way.z < 0 ? k : z & 1 ? (k + 1 < cz ? k + 1 : k) : (k > 0 ? k - 1 : k);
+        // The lower one first: slices are made in their order.
+        const F* const lower = prolonged(to < k ? to : k);
+        const F* const upper = prolonged(to < k ? k : to);
+        const F* __restrict here = to < k ? upper : lower, * __restrict there =
+                                                               to < k ? lower : upper;
+        if (to == k) {
+            for (Size i = 0; i < slice; ++i) y[i] += taken[i] * here[i];
+        } else {
+            const F* __restrict w = to > k ? grids.weights(way.z, BELOW, matrix) + k * slice
+                                           : grids.weights(way.z, ABOVE, matrix) + to * slice;
+            for (Size i = 0; i < slice; ++i)
+                y[i] += taken[i] * (here[i] + w[i] * (there[i] - here[i]));
+        }
+    };
+    const F first = grids.steps[0], second = grids.steps[1];
+    double total = 0.0;
+    for (int z = from; z < to; ++z) {
+        for (; relaxed <= z + 1 && relaxed < l.nz; ++relaxed) {
+            for (; corrected <= relaxed + 1 && corrected < l.nz; ++corrected) correct(corrected);
+            stencil(
+                l, slot, 0, relaxed, source + relaxed * slice, 1 - second, second, second,
+                slot.ring(4, relaxed));
+        }
+        F* __restrict o = out + z * slice;
+        stencil(l, slot, 4, z, source + z * slice, 1 - first, first, first, o);
+        if (is_finest) {
+            total += inner(source + z * slice, o, slice);
+        } else {
+            const F* __restrict scale = l.scale + z * slice;
+            for (Size i = 0; i < slice; ++i) o[i] *= scale[i];
+        }
+    }
+    return total;
+}
+
+// What a launch does: the finest level's way down, all coarser levels, the finest's way up. `mine`:
+// right sides and solutions of coarser levels. `parts`: of the slices of a color.
+enum Leg { DOWN, COARSER, UP };
+template <class F>
+APART void coarser_levels(const Grids<F>& grids, int matrix, F* mine, F* memory) {
+    int levels[64], count = 0, s = (int)grids.at(0, NEXT);
+    for (; grids.at(s, NEXT) >= 0; s = (int)grids.at(s, NEXT)) {
+        const int next = (int)grids.at(s, NEXT);
+        go_down(
+            grids, s, matrix, mine + grids.at(s, SOURCE), mine + grids.at(next, SOURCE), memory, 0,
+            (int)grids.at(next, NZ));
+        levels[count++] = s;
+    }
+    const int n = (int)(grids.at(s, NZ) * grids.at(s, NY) * grids.at(s, NX));
+    const F* inverse = grids.data + grids.at(s, INVERSE) + (Size)matrix * n * n;
+    for (int i = 0; i < n; ++i)
+        mine[grids.at(s, U) + i] = (F)inner(inverse + i * n, mine + grids.at(s, SOURCE), (Size)n);
+    while (count > 0) {
+        const F* coarse = mine + grids.at(s, U);
+        s = levels[--count];
+        go_up(
+            grids, s, matrix, mine + grids.at(s, SOURCE), coarse, mine + grids.at(s, U), memory, 0,
+            (int)grids.at(s, NZ), false);
+    }
+}
+template <class F>
+INLINE void cycle(const Solve<F>& solve, int leg, int parts, F* mine, F* memory) {
+    if (solve.is_done()) return;
+    const Grids<F>& grids = solve.grids;
+    const int matrix = solve.matrix(), after = (int)grids.at(0, NEXT);
+    const F* const residual = solve.vector(R);
+    const auto divide = [&](int stage, int k) { return (int)(grids.at(stage, NZ) * k / parts); };
+    if (leg == DOWN && after >= 0)
+        go_down(
+            grids, 0, matrix, residual, mine + grids.at(after, SOURCE), memory,
+            divide(after, solve.part), divide(after, solve.part + 1));
+    if (leg == COARSER && after >= 0) coarser_levels(grids, matrix, mine, memory);
+    if (leg != UP) return;
+    F* const out = solve.vector(P);
+    double& total = solve.sum(CORRECTED + solve.now);
+    if (after >= 0) {
+        total = go_up(
+            grids, 0, matrix, residual, mine + grids.at(after, U), out, memory,
+            divide(0, solve.part), divide(0, solve.part + 1), true);
+    } else {
+        // A single cell: S A S is 1.
+        out[0] = residual[0];
+        total = (double)out[0] * (double)out[0];
+    }
+}
+
+} // namespace ddrecon
