@@ -43,14 +43,14 @@ class _Cell(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
-        ctx.code, tensors = inputs[:3], inputs[3:]
-        keep(ctx, *tensors)
+        ctx.header, ctx.cell, ctx.outs = inputs[:3]
+        keep(ctx, *inputs[3:])
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         numbers, *fields = ctx.saved_tensors
-        found, sums = _run("cotangents", *ctx.code, numbers, fields, bars=bars)
+        found, sums = _run("cotangents", ctx.header, ctx.cell, ctx.outs, numbers, fields, bars=bars)
         numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
         field_bars = (bar.sum_to_size(one.shape) for bar, one in zip(found, fields, strict=True))
         return None, None, None, numbers_bar, *field_bars
@@ -67,8 +67,8 @@ class _Cell(torch.autograd.Function):
                 ],
             )
             numbers, *fields = values
-            given = {"d_numbers": d_numbers, "d_fields": d_fields}
-            return _run("tangents", *ctx.code, numbers, fields, **given)[0]
+            code = ctx.header, ctx.cell, ctx.outs, numbers, fields
+            return _run("tangents", *code, d_numbers=d_numbers, d_fields=d_fields)[0]
 
         found: Tensors = run_plainly(change, *ctx.saved_tensors, *changes[3:])
         return found
