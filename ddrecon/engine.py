@@ -8,6 +8,7 @@ same formulas, so their numbers agree to rounding. What is torch's with either e
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Collection, Mapping
 from importlib.util import find_spec
@@ -24,7 +25,7 @@ PARTS = "view rays", "light", "diffusion", "transport rounds"
 VARIABLE = "DDRECON_ENGINE"
 """The environment variable that chooses where `use_engine` was not called; `auto` without it."""
 LOG = "ddrecon.engine"
-"""The logger that is told when kernels are compiled, which happens once."""
+"""The logger that is told when kernels are compiled, which happens once, or warp is missing."""
 
 _engine: str | None = None
 """The engine of this process, once it is known."""
@@ -100,4 +101,8 @@ def _resolve(name: str, asked: str) -> str:
     is_installed = find_spec("warp") is not None
     if name == "warp" and not is_installed:
         raise MissingExtraError(f"{asked} {advice('warp')}")
-    return "warp" if is_installed else "torch"
+    if is_installed:
+        return "warp"
+    log = logging.getLogger(LOG)
+    log.info('engine torch: pip install "ddrecon[fast]" brings warp, which is many times as fast')
+    return "torch"

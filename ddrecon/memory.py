@@ -85,7 +85,7 @@ OPTIMIZE = Arrays(
         "moments": 4,
         "limited": 29,
     },
-    node={"color": 12, "varied": 4},
+    node={"color": 24, "varied": 4},
     pixel=18,  # targets, those of a coarser level, what rays meet, renders
 )
 """Fitted to arrays that `benchmarks/memory.py --count` finds alive, but for nodes and pixels."""

@@ -65,14 +65,12 @@ class DiffusionProblem:
                 self.medium, self.diffusion, self.source, self.outside
             )
             return Operator((z, y, x), loss), right
-        flux_along = self._source_flux()
         z, y, x = (recompute(conductance, self.diffusion, self.medium.grid, axis) for axis in AXES)
         loss, right = recompute(
             _loss_and_source, self.medium, self.diffusion, self.source.mean, self.outside
         )
-        for axis, flux in flux_along.items():
-            if flux is not None:
-                right = right - recompute(_divergence, self.medium, self.diffusion, flux, axis)
+        for axis, flux in zip(AXES, self.source.flux or (), strict=self.source.flux is not None):
+            right = right - recompute(_divergence, self.medium, self.diffusion, flux, axis)
         return Operator((z, y, x), loss), right
 
     def flux(
@@ -146,9 +144,6 @@ class DiffusionProblem:
         ghosts = Ghosts.of(slab)
         z, y, x = (_inner(slab, ghosts, faces) for faces in operator.conductances)
         return Operator((z, y, x), _inner(slab, ghosts, operator.loss), ghosts=ghosts)
-
-    def _source_flux(self) -> dict[int, Tensor | None]:
-        return dict(zip(AXES, self.source.flux or (None, None, None), strict=True))
 
 
 def solve_conservative(problem: DiffusionProblem, solve: SolverWithMemory[Operator]) -> Moments:

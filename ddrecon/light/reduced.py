@@ -46,51 +46,34 @@ def reduced_light(
     moments of the scattering that remains (E17), for k up to `degree`: Q0, and Q1 with 3 g'. With
     `has_pairs`, what backward peaks turn back belongs to the beams of directional lights (E20).
     """
-    if degree <= 1 and not has_pairs:
-        return _to_first_order(medium, lights, degree)
-    beams: list[Beam | PointBeam] = []
+    beams: dict[int, Beam | PointBeam] = {}
     sources: list[Moments] = []
     turned: list[TurnedBeam] = []
-    for light in lights:
-        if isinstance(light, DirectionalLight) and has_pairs:
-            beam, pair = follow_pair(medium, light)
-            beams.append(beam)
-            sources.append(pair.source(medium))
-            turned += pair.turned
-        elif isinstance(light, DirectionalLight | PointLight):
-            one, received = _follow(medium, light, degree)
-            beams.append(one)
-            sources.append(received.weighted(remaining_moments(medium)))
-    nothing = Moments(torch.zeros_like(medium.extinction.value))
-    source = reduce(Moments.plus, sources) if sources else nothing
-    return ReducedLight(tuple(beams), source, tuple(turned))
-
-
-def _to_first_order(medium: Medium, lights: Sequence[Source], degree: int) -> ReducedLight:
-    """`reduced_light` with Q0, and Q1 where `degree` is 1."""
-    beams: dict[int, Beam | PointBeam] = {}
-    parts, received = [], []
     directional = {
         i: light for i, light in enumerate(lights) if isinstance(light, DirectionalLight)
     }
-    is_even = directional and not medium.is_cellwise
+    is_even = directional and degree <= 1 and not has_pairs and not medium.is_cellwise
     if is_even and is_fused_whole(
         medium.grid, *(light.direction for light in directional.values())
     ):
         from ddrecon.light.fused.beams import follow_beams
 
-        found, moments = follow_beams(medium, list(directional.values()), degree > 0)
+        found, source = follow_beams(medium, list(directional.values()), degree > 0)
         beams.update(zip(directional, found, strict=True))
-        parts.append(moments)
+        sources.append(source)
     for i, light in enumerate(lights):
-        if i not in beams and isinstance(light, DirectionalLight | PointLight):
-            beams[i], moments = _follow(medium, light, degree)
-            received.append(moments)
-    if received:
-        parts.append(reduce(Moments.plus, received).scaled(1.0, medium.mean_cosine))
-    elif not parts:
-        parts.append(Moments(torch.zeros_like(medium.extinction.value)))
-    return ReducedLight(tuple(beams[i] for i in sorted(beams)), reduce(Moments.plus, parts))
+        if i in beams:
+            continue
+        if isinstance(light, DirectionalLight) and has_pairs:
+            beams[i], pair = follow_pair(medium, light)
+            sources.append(pair.source(medium))
+            turned += pair.turned
+        elif isinstance(light, DirectionalLight | PointLight):
+            beams[i], received = _follow(medium, light, degree)
+            sources.append(received.weighted(remaining_moments(medium)))
+    nothing = Moments(torch.zeros_like(medium.extinction.value))
+    source = reduce(Moments.plus, sources) if sources else nothing
+    return ReducedLight(tuple(beams[i] for i in sorted(beams)), source, tuple(turned))
 
 
 def _follow(

@@ -1,8 +1,7 @@
 """View rays: the integral of what the medium sends towards the camera (docs/theory.md E1-E3).
 
 Between two nodes of a ray density and optical depth are taken as linear, so emission times
-transmittance has a closed form. `ddrecon.march.plain` has the same integral in plain sums: read
-that first.
+transmittance has a closed form. `integrate_segments` is that; all else says where nodes are.
 """
 
 from __future__ import annotations
@@ -15,14 +14,12 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.engine import current_engine
-from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.march.emission import Emission, Sampled, pack_channels
-from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.lattice import Lattice, interpolate_between, is_rough
-from ddrecon.march.samplers import make_sampler
+from ddrecon.march.samplers import Equidistant, make_sampler
 from ddrecon.march.sight import Sight
-from ddrecon.march.slices import Slices
+from ddrecon.march.slices import Slices, Window
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
 from ddrecon.numerics.autodiff import is_varied, recompute
@@ -31,7 +28,7 @@ from ddrecon.numerics.nodes import Nodes
 from ddrecon.settings import RenderSettings
 from ddrecon.slabs.slab import Slab, whole_of
 
-CHUNK_NODES = 1 << 17
+CHUNK_NODES = 1 << 18
 """Nodes marched at a time: few enough that a chunk's tensors stay in a processor's cache, and
 memory does not grow with pixels.
 """
@@ -124,7 +121,7 @@ def _spread(part: Part, sight: Sight) -> Tensor:
 
 def march_rays(
     emission: Emission,
-    sampler: Bands | Equidistant,
+    sampler: Slices | Equidistant,
     rays: Rays,
     crossing: Crossing,
     integrate: Integrate | None = None,
@@ -132,11 +129,9 @@ def march_rays(
     """Those of `rays` that are in `crossing`, in some order, by `integrate` or as E1 to E3 say."""
     hitting = rays.select(crossing.hit)
 
-    def run(chunk: Tensor, part: Slices | Equidistant) -> Tensor:
+    def run(chunk: Tensor, part: Window | Equidistant) -> Tensor:
         chosen = hitting.select(chunk)
-        values, distance = part.sample(
-            chosen.origin, chosen.direction, crossing.near[chunk], crossing.far[chunk]
-        )
+        values, distance = part.sample(chosen, crossing.near[chunk], crossing.far[chunk])
         nodes = Nodes(chosen.origin, chosen.direction, distance)
         return integrate(values, nodes, chunk) if integrate else _integrate(emission, values, nodes)
 
@@ -147,7 +142,7 @@ def march_rays(
 
 def march_lattice(
     emission: Emission,
-    bands: Bands,
+    slices: Slices,
     lattice: Lattice,
     intersect: Callable[[Rays], tuple[Tensor, Tensor]] | None = None,
     integrate: Integrate | None = None,
@@ -156,10 +151,10 @@ def march_lattice(
 
     By `integrate`, or as E1 to E3 say, where `intersect` says, or within the box.
     """
-    grid, columns = emission.grid, bands.slices.lattice_columns(lattice)
+    grid, columns = emission.grid, slices.lattice_columns(lattice)
     box = whole_of(grid)
 
-    def run(chunk: Tensor, part: Slices) -> Tensor:
+    def run(chunk: Tensor, part: Window) -> Tensor:
         rows = lattice.rows[chunk]
         rays = lattice.rays(rows, 2 * math.hypot(*box.extent))
         near, far = intersect(rays) if intersect else intersect_box(box, rays)
@@ -172,7 +167,7 @@ def march_lattice(
         index = width * chunk[:, None] + torch.arange(width, device=chunk.device)
         return integrate(values, nodes, index.flatten())
 
-    parts = bands.lattice_parts(lattice, max(1, CHUNK_NODES // (bands.nodes * lattice.shape[1])))
+    parts = slices.lattice_parts(lattice, max(1, CHUNK_NODES // (slices.nodes * lattice.shape[1])))
     return torch.cat([recompute(run, *part) for part in parts], 1).unflatten(1, lattice.shape)
 
 

@@ -14,18 +14,18 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.march import integral
-from ddrecon.march.bands import Bands, planes_across
 from ddrecon.march.box import Crossing, intersect_box
 from ddrecon.march.emission import Channels, Emission
-from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.integral import Integrate, Part, integrate_segments, opacity_of
 from ddrecon.march.lattice import Lattice
+from ddrecon.march.samplers import Equidistant
+from ddrecon.march.slices import Slices, planes_across
 from ddrecon.numerics.autodiff import is_fused
 from ddrecon.numerics.nodes import Nodes
 from ddrecon.slabs.exchange import sum_before, sum_slabs
 from ddrecon.slabs.slab import Slab
 
-Sampler = Bands | Equidistant
+Sampler = Slices | Equidistant
 Find = Callable[[Emission, Sampler, Integrate], Tensor]
 """What is found along all rays, [*, R], by an integral of values that are sampled."""
 Look = Callable[[Emission, Sampler, Tensor | None], Tensor]
@@ -61,13 +61,13 @@ def march_rays(emission: Emission, sampler: Sampler, rays: Rays, crossing: Cross
     return crossing.hit, _compose(emission, sampler, hitting, find, look)
 
 
-def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
+def march_lattice(emission: Emission, slices: Slices, lattice: Lattice) -> Tensor:
     """Radiance and opacity [2 C, r, c] along the rays of `lattice`, through all slabs."""
     slab = _slab_of(emission)
 
     def intersect(rays: Rays) -> tuple[Tensor, Tensor]:
         near, far = intersect_box(slab.whole, rays)
-        return clip_to_slab(slab, rays, near, torch.maximum(near, far), bands)
+        return clip_to_slab(slab, rays, near, torch.maximum(near, far), slices)
 
     rays = lattice.rays(lattice.rows, 2 * max(slab.whole.extent))
     with torch.no_grad():
@@ -87,7 +87,7 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
         def of_some(values: Tensor, nodes: Nodes, index: Tensor) -> Tensor:
             return integrate(values, nodes, numbers[index])
 
-        assert isinstance(sampler, Bands)
+        assert isinstance(sampler, Slices)
         found = integral.march_lattice(emission, sampler, own, intersect, of_some).flatten(1)
         return found.new_zeros(len(found), len(near)).index_copy(1, numbers, found)
 
@@ -101,7 +101,7 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
         found = integrate_rays(emission, sampler, some, Crossing(inside, near, far), fronts)
         return found.new_zeros(len(found), len(rays.origin)).index_copy(1, numbers, found)
 
-    return _compose(emission, bands, rays, find, look).unflatten(1, lattice.shape)
+    return _compose(emission, slices, rays, find, look).unflatten(1, lattice.shape)
 
 
 def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look: Look) -> Tensor:
@@ -143,9 +143,7 @@ def _compose(emission: Emission, sampler: Sampler, rays: Rays, find: Find, look:
 def _of_mass(emission: Emission, sampler: Sampler) -> Sampler:
     """`sampler` of the extinction's field alone."""
     channels = Channels([emission.extinction.field], None, sampler.channels.matter)
-    if isinstance(sampler, Bands):
-        return replace(sampler, channels=channels)
-    return sampler.of(channels)
+    return replace(sampler, channels=channels)
 
 
 def clip_to_slab(

@@ -4,8 +4,8 @@ Over depths from a to b >= a the mean of exp(-depth) is exp(-a) phi(b - a), with
 
     phi(d) = (1 - exp(-d)) / d,    psi(d) = phi + phi' = (1 - phi) / d.
 
-Where d is small they are their series: the derivatives of the closed forms are differences of
-nearly equal numbers there.
+Where d is small the closed forms, and their derivatives, are differences of nearly equal numbers:
+there psi is its series.
 """
 
 from __future__ import annotations
@@ -16,15 +16,17 @@ import torch
 from torch import Tensor
 
 SERIES_BELOW = 1e-2
-"""Below this depth phi and psi are their series."""
+"""Below this depth psi is its series."""
 TERMS = 6
 """Of the series: the next one, and its slope, are below rounding."""
 
 
 def decay_mean(depth: Tensor) -> Tensor:
     """phi(`depth`): the mean of exp(-depth s) over s in [0, 1]; `depth` >= 0, of any shape."""
-    thick = depth.clamp(min=SERIES_BELOW)
-    return torch.where(depth < SERIES_BELOW, _series(depth, 1), -torch.expm1(-thick) / thick)
+    at = depth.detach()
+    phi, psi = _phi_and_psi(at, -torch.expm1(-at))
+    # The second term is 0 and has the slope: so one array is kept, where autograd would keep ten.
+    return phi + (psi - phi) * (depth - at)
 
 
 def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Tensor:
@@ -44,16 +46,21 @@ def decayed_line(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tens
     phi + (near - far) psi; the second, the part of what enters at the far end, is 1 - exp(-depth).
     `depth` [N, C, ...] >= 0; `near` and `far` have its shape, or one of them has one channel.
     """
-    lost, thick = -torch.expm1(-depth), depth.clamp(min=SERIES_BELOW)
-    is_thin = depth < SERIES_BELOW
-    psi = torch.where(is_thin, _series(depth, 2), (1 - lost / thick) / thick)
-    phi = torch.where(is_thin, 1 - depth * psi, lost / thick)
+    lost = -torch.expm1(-depth)
+    phi, psi = _phi_and_psi(depth, lost)
     return far * phi + (near - far) * psi, lost
 
 
-def _series(depth: Tensor, first: int) -> Tensor:
-    """The sum over k of (-`depth`)^k / (k + `first`)!: phi for 1, and psi for 2."""
-    *others, last = (depth.new_tensor(1 / math.factorial(first + k)) for k in range(TERMS))
+def _phi_and_psi(depth: Tensor, lost: Tensor) -> tuple[Tensor, Tensor]:
+    """Both, given what is `lost`, 1 - exp(-depth)."""
+    is_thin, thick = depth < SERIES_BELOW, depth.clamp(min=SERIES_BELOW)
+    psi = torch.where(is_thin, _series(depth), (1 - lost / thick) / thick)
+    return torch.where(is_thin, 1 - depth * psi, lost / thick), psi
+
+
+def _series(depth: Tensor) -> Tensor:
+    """psi as the sum over k of (-`depth`)^k / (k + 2)!."""
+    *others, last = (depth.new_tensor(1 / math.factorial(k + 2)) for k in range(TERMS))
     total = last.expand_as(depth)
     for factor in reversed(others):
         total = torch.addcmul(factor, depth, total, value=-1)

@@ -38,10 +38,10 @@ class Slab(Grid):
     first: int
 
     @staticmethod
-    def of(whole: Grid, axis: int, cuts: tuple[int, ...], rank: int, halo: int = HALO) -> Slab:
+    def of(whole: Grid, axis: int, cuts: tuple[int, ...], rank: int) -> Slab:
         """The slab of `rank` where `whole` is cut along `axis` at `cuts`."""
-        first = max(cuts[rank] - halo, 0)
-        last = min(cuts[rank + 1] + halo, whole.shape[axis])
+        first = max(cuts[rank] - HALO, 0)
+        last = min(cuts[rank + 1] + HALO, whole.shape[axis])
 
         def with_entry(triple: Triple, value: float) -> Triple:
             z, y, x = (value if a == axis else entry for a, entry in enumerate(triple))
@@ -87,10 +87,6 @@ class Slab(Grid):
             plane(self.whole, self.axis, begin) if begin > 0 else None,
             plane(self.whole, self.axis, end) if end < self.whole.shape[self.axis] else None,
         )
-
-    def narrowed(self, halo: int) -> Slab:
-        """The same own cells with no more than `halo` layers of other ranks on either side."""
-        return Slab.of(self.whole, self.axis, self.cuts, self.rank, halo)
 
     def cut(self, field: Tensor) -> Tensor:
         """The part of `field` [..., z, y, x] of the whole that lies in this slab (a view)."""

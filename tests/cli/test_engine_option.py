@@ -130,6 +130,14 @@ def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.Mo
         assert refuse(2, *command[:-1]) == [f"DDRECON_ENGINE={name}: {answer}"]
 
 
+def test_one_line_says_what_is_missing(succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "find_spec", {}.get)
+    line = 'engine torch: pip install "ddrecon[fast]" brings warp, which is many times as fast'
+    command = "check", "scene.yaml", "--engine"
+    assert line in succeed(*command, "auto").stderr.splitlines()
+    assert line not in succeed(*command, "torch").stderr.splitlines()
+
+
 @pytest.mark.parametrize(("quiet", "expected"), [((), [COMPILING]), (("-q",), [])])
 def test_a_compilation_is_announced_once(
     succeed: Run, monkeypatch: pytest.MonkeyPatch, quiet: tuple[str, ...], expected: list[str]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -15,7 +14,7 @@ from ddrecon.diffusion.operator import AXES, Operator, boundary_loss, conductanc
 from ddrecon.diffusion.solvers.coarsening import coarsen
 from ddrecon.diffusion.solvers.conjugate_gradient import conjugate_gradient
 from ddrecon.diffusion.solvers.hierarchy import Coarsest, Level
-from ddrecon.diffusion.solvers.multigrid import multigrid, solve_by_torch
+from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.diffusion.solvers.scaled import ScaledMatrix
 from ddrecon.grid import Grid
 
@@ -255,15 +254,3 @@ def test_what_is_made_of_an_operator_is_made_once(monkeypatch: pytest.MonkeyPatc
     assert made.matrix is operator.once(ScaledMatrix.of)
     multigrid(operator, 2 * source, None, 1e-6)
     assert operator.once(Level.of) is made
-
-
-def test_a_solve_ahead_ends_as_one_that_is_looked_at():
-    """Also where the last operator of its shape coarsened other axes, and took fewer iterations."""
-    for sides in ((1, 1, 1), (1, 1, 10), (1, 10, 10)):
-        operator, source = uneven((12, 12, 12), sides), random_values(2, 12, 12, 12)
-        looked, ahead = (
-            solve_by_torch(replace(operator, prepared={}), source, None, 1e-8, is_ahead)
-            for is_ahead in (False, True)
-        )
-        assert torch.equal(ahead.value, looked.value)
-        assert (ahead.iterations, ahead.residual) == (looked.iterations, looked.residual)

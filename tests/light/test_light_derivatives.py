@@ -1,5 +1,5 @@
-"""Every number of every light can be optimized: derivatives of whole images in both modes, through
-torch.func, and by differences.
+"""Every number of every light can be optimized: derivatives of whole images in both modes, and by
+differences.
 """
 
 from __future__ import annotations
@@ -104,21 +104,6 @@ def test_tangent_adjoint_and_differences_agree(name: str, number: str, way: dict
     size = float(terms.abs().sum())
     assert abs(float(tangent - terms.sum())) < 1e-10 * size
     assert abs(float(difference - terms.sum())) < 1e-6 * size
-
-
-@pytest.mark.parametrize(
-    ("name", "number"),
-    [("sky with a sun", "rotation"), ("point inside", "position"), ("directional", "direction")],
-)
-def test_torch_func_gives_the_same_tangent(name: str, number: str, build):
-    loss, value = image_loss(build(WAYS["forward"]), name, number), getattr(LIGHTS[name], number)
-    with forward_ad.dual_level():
-        tangent = forward_ad.unpack_dual(
-            loss(forward_ad.make_dual(value.clone(), shift_of(value)))
-        ).tangent
-    torch.testing.assert_close(
-        torch.func.jvp(loss, (value,), (shift_of(value),))[1], tangent, rtol=1e-12, atol=0
-    )
 
 
 @pytest.mark.parametrize("field", ["density", "g"])

@@ -14,14 +14,13 @@ from media import half_empty, make_scene, random_values
 from torch import Tensor
 
 from ddrecon.cameras import Camera, look_at
-from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.grid import Grid, array_order
 from ddrecon.light.environment import pixel_moments
 from ddrecon.light.lights import DirectionalLight, EnvironmentLight
 from ddrecon.light.sky import MAX_SUNS, Sky, count_suns, decompose_map, fibonacci_sphere
 from ddrecon.light.skylight import sum_unscattered_sky
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.renderer import render, solve_light, view_components
+from ddrecon.renderer import render
 from ddrecon.scene import Scene
 
 SHAPE = (5, 4, 6)
@@ -134,18 +133,6 @@ def test_a_constant_map_is_ambient_light_whatever_the_directions(directions: int
     assert torch.equal(ambient.radiance, color) and not sky.irradiance.any()
 
 
-@pytest.mark.parametrize("model", ["p1", "none"])
-@pytest.mark.parametrize("g", [0.0, 0.6])
-def test_a_constant_map_looks_as_ambient_light_does(g: float, model: str):
-    scene = make_scene(half_empty(*SHAPE), g=g, model=model, ambient=(0.7, 0.2, 0.4))
-    constant = light_of(
-        torch.tensor([0.7, 0.2, 0.4], dtype=torch.float64).view(3, 1, 1).expand(3, 6, 8),
-        rotation=20.0,
-    )
-    found = render(replace(scene, lights=[scene.lights[0], constant]))
-    torch.testing.assert_close(found, render(scene), rtol=1e-10, atol=0)
-
-
 @pytest.mark.parametrize(
     "place", [(32, 64, 9, 40), (32, 64, 16, 0), (16, 32, 8, 19), (16, 32, 12, 31)], ids=str
 )
@@ -198,20 +185,6 @@ def test_a_turned_world_looks_the_same():
         torch.testing.assert_close(turned, images[0], rtol=1e-9, atol=0)
 
 
-@pytest.mark.parametrize("quarter", [1, 3])
-def test_a_quarter_turn_rolls_the_map(quarter: int):
-    """Up to how the regions lie, which turn with the map."""
-    scene, radiance = make_scene(half_empty(*SHAPE), g=0.3), banded(24, 48)
-    turned, rolled = (
-        light_of(radiance, rotation=90.0 * quarter),
-        light_of(radiance.roll(-12 * quarter, 2)),
-    )
-    assert (
-        relative_error(*(render(replace(scene, lights=[light])) for light in (turned, rolled)))
-        < 0.005
-    )
-
-
 def test_more_directions_change_little():
     scene, radiance = make_scene(half_empty(*SHAPE), g=0.3), banded(24, 48)
     images = [
@@ -220,15 +193,6 @@ def test_more_directions_change_little():
     ]
     coarse, middle, fine = (relative_error(image, images[-1]) for image in images[:-1])
     assert fine < middle / 2 < coarse / 4 and middle < 2e-3
-
-
-def test_components_sum_to_the_image_and_the_background_is_the_map():
-    scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light_of(uneven(6, 8))])
-    parts = view_components(solve_light(scene, SolveMemory()), scene, scene.views[0].camera)
-    torch.testing.assert_close(
-        parts.reduced + parts.single + parts.multiple, render(scene)[0], rtol=1e-13, atol=0
-    )
-    assert bool((parts.reduced > 0).all()) and bool((parts.single > 0).any())
 
 
 def saved_bytes(scene: Scene, directions: int) -> int:
@@ -271,17 +235,6 @@ def test_images_have_finite_derivatives_by_every_number(case: str):
     scene = replace(make_scene(half_empty(*SHAPE), g=0.4), lights=[light])
     slopes = torch.autograd.grad(render(scene).sum(), numbers)
     assert all(bool(torch.isfinite(slope).all()) for slope in slopes) and bool(slopes[0].any())
-
-
-def test_single_precision_follows_double():
-    images = []
-    for dtype in (torch.float32, torch.float64):
-        scene, light = (
-            make_scene(half_empty(*SHAPE, dtype=dtype), g=0.4),
-            light_of(uneven(6, 8).to(dtype), 1.3, 20.0),
-        )
-        images.append(render(replace(scene, lights=[light])).double())
-    assert relative_error(*images) < 1e-5
 
 
 def test_the_sky_is_in_array_order():

@@ -60,7 +60,7 @@ def lattice_of(scene: Scene) -> tuple[Lattice, Slices]:
     bundle, grid = cast_rays(scene.views[0].camera), scene.volume.grid
     crossing = cross_box(grid, bundle)
     way = choose_way(grid, bundle, crossing)
-    slices = make_sampler(Channels([scene.volume.density[None]]), grid, way, 1).slices
+    slices = make_sampler(Channels([scene.volume.density[None]]), grid, way, 1)
     return choose_lattice(grid, slices.axis, bundle.select(crossing.hit)), slices
 
 

@@ -18,12 +18,12 @@ from media import (
 )
 from torch import Tensor
 
-from ddrecon.cameras import Camera, Rays, cast_rays
+from ddrecon.cameras import Rays, cast_rays
 from ddrecon.grid import Grid
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.reduced import reduced_light
-from ddrecon.march import bands, samplers
 from ddrecon.march import integral as march_module
+from ddrecon.march import slices
 from ddrecon.march.emission import Emission
 from ddrecon.medium.coefficients import Volume, scale_medium
 from ddrecon.medium.phase import henyey_greenstein
@@ -146,7 +146,7 @@ def test_chunks_do_not_matter(view: dict, monkeypatch):
 
     whole = marched()
     monkeypatch.setattr(march_module, "CHUNK_NODES", 40)
-    monkeypatch.setattr(bands, "BAND", 1)
+    monkeypatch.setattr(slices, "BAND", 1)
     for one, other in zip(whole, marched(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-14)
 
@@ -185,24 +185,6 @@ def test_what_is_empty_is_left_out_and_makes_no_difference(view: dict, monkeypat
         assert counts[0] < 0.6 * counts[1]
 
 
-@pytest.mark.parametrize("view", ["perspective", "oblique", "orthographic"])
-def test_slices_and_equal_steps_agree_in_the_limit(view: str, monkeypatch):
-    """Both interpolate the same fields, at other nodes: with steps their difference vanishes."""
-    emission, bundle = (
-        emission_of(box_grid((3, 5, 4)), random_values(3, 5, 4)),
-        cast_rays(make_camera(size=(7, 6), **CAMERAS[view])),
-    )
-    sliced = [march_rays(emission, bundle, every_ray(steps)) for steps in (1, 16)]
-    monkeypatch.setattr(samplers, "STEEPEST", 1.0)
-    equal = [march_rays(emission, bundle, every_ray(steps)) for steps in (1, 16)]
-    for field in (0, 1):
-        coarse, fine = (
-            float((a[field] - b[field]).norm() / a[field].norm())
-            for a, b in zip(sliced, equal, strict=True)
-        )
-        assert 0 < fine < 2e-3 and fine < coarse / 8, (coarse, fine)
-
-
 @each_camera
 def test_radiance_and_transmittance_have_both_derivatives(view: dict):
     grid, bundle = box_grid((2, 3, 2)), cast_rays(make_camera(size=(2, 2), **view))
@@ -213,38 +195,6 @@ def test_radiance_and_transmittance_have_both_derivatives(view: dict):
         atol=1e-8,
         check_forward_ad=True,
     )
-
-
-@pytest.mark.parametrize("g", [0.0, 0.6])
-@pytest.mark.parametrize("has_fields", ["absorption", "scattering"])
-def test_a_cross_section_may_be_a_field(has_fields: str, g: float):
-    """The same numbers in every cell give the same image, but for bounds of third-order
-    corrections, which colors share or do not.
-    """
-    grid, density, camera = box_grid((3, 5, 4)), random_values(3, 5, 4), make_camera()
-    constant = Volume(
-        grid, density, random_values(3, seed=1), random_values(3, seed=2), density.new_tensor(g)
-    )
-    field = {"absorption": "sigma_a", "scattering": "sigma_s"}[has_fields]
-    varying = replace(
-        constant, **{field: getattr(constant, field).view(3, 1, 1, 1).expand(3, *grid.shape)}
-    )
-    light = DirectionalLight(density.new_tensor([0.3, -1.0, -0.5]), density.new_tensor([2.0]))
-    results = []
-    for volume in (constant, varying):
-        medium = scale_medium(volume)
-        beams = reduced_light(medium, [light], False).beams
-        emission = Emission(
-            grid,
-            medium.extinction,
-            medium.scattering,
-            beams,
-            random_values(3, *grid.shape, seed=4),
-            medium.seen,
-            medium.peak,
-        )
-        results.append(torch.cat(march_rays(emission, cast_rays(camera), every_ray(1))))
-    torch.testing.assert_close(results[0], results[1], rtol=1e-4, atol=0)
 
 
 THICKNESS, SIGMA_S, SIGMA_A = 1.5, 2.0, 0.5
@@ -291,80 +241,7 @@ def test_single_scattering_of_a_slab_is_its_closed_form(g: float, is_behind: boo
     assert errors[-1] < 5e-3 and convergence_order([1 / n for n in cells], errors) >= 1.8, errors
 
 
-def test_forward_scattering_is_brightest_against_the_light():
-    """p(1) / p(-1) = ((1 + g) / (1 - g))^3 of a thin slab, where attenuation hardly matters."""
-    against, along = (
-        float(render(with_density(slab(8, 0.8, (0.0, 0.0, z)), 1e-6)).mean()) for z in (1.0, -1.0)
-    )
-    assert against / along == pytest.approx(((1 + 0.8) / (1 - 0.8)) ** 3, rel=1e-4)
-
-
-def with_density(scene: Scene, factor: float) -> Scene:
-    return replace(scene, volume=replace(scene.volume, density=factor * scene.volume.density))
-
-
-WIDTH, DENSITY, LIGHT = 0.1, 12.0, (1.0, -0.8, -0.5)
-
-
-def slow_single_scattering(camera: Camera, steps: int = 600) -> Tensor:
-    """Single scattering of a Gaussian ball in the origin, radiance of every pixel, by plain sums
-    along each ray.
-
-    The depth towards the light is the integral of a Gaussian along a line: an error function.
-    """
-    bundle = cast_rays(camera)
-    distance = torch.linspace(1.0, 4.0, steps, dtype=torch.float64)
-    travel = torch.nn.functional.normalize(torch.tensor(LIGHT, dtype=torch.float64), dim=0)
-    pixels = []
-    for origin, direction in zip(bundle.origin.flip(-1), bundle.direction.flip(-1), strict=True):
-        point = origin + distance[:, None] * direction
-        density = DENSITY * torch.exp(-(point**2).sum(1) / (2 * WIDTH**2))
-        along = point @ travel
-        across = torch.exp(-((point**2).sum(1) - along**2) / (2 * WIDTH**2))
-        to_light = (
-            DENSITY
-            * across
-            * WIDTH
-            * math.sqrt(math.pi / 2)
-            * (1 + torch.erf(along / WIDTH / math.sqrt(2)))
-        )
-        to_camera = torch.cat(
-            [torch.zeros(1, dtype=torch.float64), torch.cumulative_trapezoid(density, distance)]
-        )
-        phase = henyey_greenstein(-(direction @ travel), torch.tensor(-0.3, dtype=torch.float64))
-        emitted = (
-            SIGMA_S
-            * density
-            * phase
-            * 3.0
-            / (4 * math.pi)
-            * torch.exp(-(SIGMA_A + SIGMA_S) * (to_camera + to_light))
-        )
-        pixels.append(torch.trapezoid(emitted, distance))
-    return torch.stack(pixels).view(camera.size)
-
-
-@pytest.mark.parametrize("eye", [(0.3, 0.4, 2.5), (1.6, -1.2, 1.5)], ids=str)
-def test_single_scattering_of_a_blob_converges_at_second_order(eye: tuple[float, float, float]):
-    camera, counts, errors = make_camera(eye=eye, size=(9, 9), half_width=0.1), [12, 18, 27, 40], []
-    expected = slow_single_scattering(camera)
-    for n in counts:
-        grid = Grid((n, n + n // 3, n), (-0.5, -0.6, -0.45), (0.5, 0.6, 0.45))
-        density = DENSITY * torch.exp(
-            -sum(axis**2 for axis in grid.centers(expected)) / (2 * WIDTH**2)
-        )
-        scene = make_scene(
-            density,
-            grid=grid,
-            sigma_a=(SIGMA_A,),
-            sigma_s=(SIGMA_S,),
-            g=-0.3,
-            travel=LIGHT,
-            camera=camera,
-            model="none",
-        )
-        errors.append(float((render(scene)[0, 0] - expected).norm() / expected.norm()))
-    assert convergence_order([1 / n for n in counts], errors) >= 1.8, errors
+WIDTH, DENSITY = 0.1, 12.0
 
 
 def test_more_steps_and_samples_keep_a_homogeneous_transmittance():

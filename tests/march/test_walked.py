@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
-from ddrecon.march.bands import Bands
 from ddrecon.march.emission import Channels
 from ddrecon.march.sight import look_through
+from ddrecon.march.slices import Slices
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.settings import RenderSettings
@@ -127,11 +127,11 @@ def test_segments_walked_are_those_whose_cells_it_touches(steps: int):
     sight = look_through(scene.views[0].camera, scene.volume.grid, scene.render)
     rays, crossing, axis = sight.rays, sight.crossing, sight.way.axis
     channels = Channels([scene.volume.density[None]], support=scene.volume.support)
-    bands = Bands(channels, scene.volume.grid, axis, sight.way.is_reversed, steps)
+    slices = Slices(channels, scene.volume.grid, axis, sight.way.is_reversed, steps)
     packed = pack_rays(
         scene.volume.grid, axis, rays.origin, rays.direction, *vars(crossing).values()
     )
-    support, planes = bands.support, bands.planes
+    support, planes = slices.support, slices.planes
     bits = find_walked(support, planes, packed.bundle)
     walked = [
         [bool(bits[p, n // 32] >> (n % 32) & 1) for n in range(len(planes))]

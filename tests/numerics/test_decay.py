@@ -42,13 +42,6 @@ def test_the_mean_decay_of_an_opaque_step_is_one_over_its_depth():
     )
 
 
-def test_derivatives_agree_where_the_series_begins():
-    below, above = (SERIES_BELOW * (1 + sign * 1e-9) for sign in (-1, 1))
-    depth = torch.tensor([below, above], dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(decay_mean(depth).sum(), depth)
-    assert slope[0].item() == pytest.approx(slope[1].item(), rel=1e-9)
-
-
 def test_decayed_sums_against_quadrature():
     weight, begin, end, scale = segments()
     total = decayed_sum(weight, begin, end, scale)
@@ -64,21 +57,18 @@ def test_decayed_sums_against_quadrature():
             assert total[c, r].item() == pytest.approx(sum(parts), rel=1e-13)
 
 
-def test_a_segment_may_be_walked_either_way():
-    weight, begin, end, scale = segments()
-    assert torch.equal(
-        decayed_sum(weight, begin, end, scale), decayed_sum(weight, end, begin, scale)
+def test_both_modes_have_derivatives():
+    """Of thick, thin and empty steps, and where nodes share the same depth."""
+    weight, begin, end, scale = (one.requires_grad_() for one in segments())
+    assert torch.autograd.gradcheck(
+        lambda w, b, e, s: decayed_sum(w, b, e + 0.1, s),
+        (weight, begin, end, scale),
+        check_forward_ad=True,
     )
-
-
-def test_a_segment_without_depth_is_a_plain_exponential():
-    weight, begin, _, scale = segments()
-    torch.testing.assert_close(
-        decayed_sum(weight, begin, begin, scale),
-        (weight * torch.exp(-scale * begin)).sum(0),
-        rtol=1e-15,
-        atol=0,
-    )
+    near, far = (random_values(len(DEPTHS) - 1, 1, 3, seed=seed) for seed in (4, 5))
+    depth = (1e-5 + torch.tensor(DEPTHS[:-1], dtype=torch.float64)).view(-1, 1, 1)
+    inputs = [one.clone().requires_grad_() for one in (near, far, depth)]
+    assert torch.autograd.gradcheck(decayed_line, inputs, check_forward_ad=True)
 
 
 @pytest.mark.parametrize("depth", DEPTHS)

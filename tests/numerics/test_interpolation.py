@@ -1,34 +1,19 @@
-"""Interpolation: linear fields exactly, the same as explicit index arithmetic, and both
-derivatives.
-"""
+"""Interpolation: the same as explicit index arithmetic, its order, and both derivatives."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from contextlib import nullcontext
 
 import pytest
 import torch
 from media import convergence_order, random_values
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ddrecon.numerics.interpolation import sample_slices, sample_volume
 from ddrecon.numerics.third_order import ThirdOrder, subdivide
-
-
-def interior_points(count: int, shape: tuple[int, ...]) -> Tensor:
-    """Points between the first and the last cell center, last array axis first."""
-    reach = torch.tensor([1 - 1 / cells for cells in reversed(shape)], dtype=torch.float64)
-    return (2 * random_values(count, len(shape), seed=5) - 1) * reach
-
-
-def linear_field(shape: tuple[int, ...], slope: Tensor) -> Tensor:
-    """slope . position on cell centers, position in [-1, 1], last array axis first in `slope`."""
-    axes = [(2 * torch.arange(cells, dtype=torch.float64) + 1) / cells - 1 for cells in shape]
-    return sum(
-        s * axis
-        for s, axis in zip(slope.flip(0), torch.meshgrid(*axes, indexing="ij"), strict=True)
-    )
 
 
 def interpolated(values: Tensor, point: Tensor) -> Tensor:
@@ -48,56 +33,51 @@ def interpolated(values: Tensor, point: Tensor) -> Tensor:
     return total
 
 
-def test_slices_against_explicit_corners():
-    slices, points = random_values(2, 3, 4, 5), 2.6 * random_values(2, 9, 2, seed=1) - 1.3
-    sampled = sample_slices(slices, points)
+def sample(values: Tensor, points: Tensor, smooth: ThirdOrder | None = None) -> Tensor:
+    """Values [N, K, P] of slices, or of volumes one by one."""
+    if values.ndim == 4:
+        return sample_slices(values, points, smooth)
+    pairs = zip(values, points, strict=True)
+    return torch.stack([sample_volume(one, p[None], smooth)[:, 0] for one, p in pairs])
+
+
+SIZES = [(4, 5), (1, 3), (3, 4, 5), (2, 1, 3)]
+each_size = pytest.mark.parametrize("sizes", SIZES, ids=str)
+
+
+@each_size
+@pytest.mark.parametrize("is_forward", [False, True])
+def test_values_are_those_of_explicit_corners(sizes: tuple[int, ...], is_forward: bool):
+    """Also where forward mode is on, and cells are gathered."""
+    values, points = (
+        random_values(2, 3, *sizes),
+        2.6 * random_values(2, 9, len(sizes), seed=1) - 1.3,
+    )
+    with forward_ad.dual_level() if is_forward else nullcontext():
+        sampled = sample(values, points)
     for n, p in itertools.product(range(2), range(9)):
         torch.testing.assert_close(
-            sampled[n, :, p], interpolated(slices[n], points[n, p]), rtol=1e-13, atol=1e-14
+            sampled[n, :, p], interpolated(values[n], points[n, p]), rtol=1e-13, atol=1e-14
         )
 
 
-def test_volumes_against_explicit_corners():
-    volume, points = random_values(2, 3, 4, 5), 2.6 * random_values(1, 9, 3, seed=1) - 1.3
-    sampled = sample_volume(volume, points)
-    for p in range(9):
-        torch.testing.assert_close(
-            sampled[:, 0, p], interpolated(volume, points[0, p]), rtol=1e-13, atol=1e-14
-        )
-
-
-def test_linear_fields_are_exact_in_slices():
-    slope, shape = random_values(2), (4, 6)
-    points = interior_points(20, shape)
-    sampled = sample_slices(linear_field(shape, slope)[None, None], points[None])[0, 0]
-    torch.testing.assert_close(sampled, points @ slope, rtol=0, atol=1e-14)
-
-
-def test_linear_fields_are_exact_in_volumes():
-    slope, shape = random_values(3), (4, 6, 3)
-    points = interior_points(20, shape)
-    sampled = sample_volume(linear_field(shape, slope)[None], points[None])[0, 0]
-    torch.testing.assert_close(sampled, points @ slope, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
-def test_slices_have_both_derivatives(wanted: tuple[bool, bool]):
-    slices, points = random_values(2, 2, 3, 4), 2.4 * random_values(2, 5, 2, seed=1) - 1.2
+@each_size
+@pytest.mark.parametrize("smooth", [None, ThirdOrder(1, 3, 0.5)], ids=["linear", "third order"])
+@pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)], ids=str)
+def test_both_modes_have_derivatives(
+    sizes: tuple[int, ...], smooth: ThirdOrder | None, wanted: tuple[bool, bool]
+):
+    values, points = (
+        random_values(2, 3, *sizes),
+        2.4 * random_values(2, 5, len(sizes), seed=1) - 1.2,
+    )
     inputs = [
         tensor.requires_grad_(is_wanted)
-        for tensor, is_wanted in zip((slices, points), wanted, strict=True)
+        for tensor, is_wanted in zip((values, points), wanted, strict=True)
     ]
-    assert torch.autograd.gradcheck(lambda s, p: sample_slices(s, p), inputs, check_forward_ad=True)
-
-
-@pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)])
-def test_volumes_have_both_derivatives(wanted: tuple[bool, bool]):
-    volume, points = random_values(2, 3, 2, 4), 2.4 * random_values(2, 3, 3, seed=1) - 1.2
-    inputs = [
-        tensor.requires_grad_(is_wanted)
-        for tensor, is_wanted in zip((volume, points), wanted, strict=True)
-    ]
-    assert torch.autograd.gradcheck(sample_volume, inputs, check_forward_ad=True)
+    assert torch.autograd.gradcheck(
+        lambda v, p: sample(v, p, smooth), inputs, check_forward_ad=True, fast_mode=True
+    )
 
 
 # --- kinks ---------------------------------------------------------------------------------------
@@ -174,15 +154,3 @@ def test_subdivided_squares_are_exact_in_smooth_channels():
     fine = torch.arange(19, dtype=torch.float64) / 3
     torch.testing.assert_close(found[3:-3, 1], (fine * fine)[3:-3], rtol=0, atol=1e-13)
     assert torch.equal(found[::3], values) and float((found[:, 0] - fine * fine).abs().max()) > 0.1
-
-
-@pytest.mark.parametrize("wanted", [(True, False), (False, True), (True, True)], ids=str)
-def test_smooth_channels_have_both_derivatives(wanted: tuple[bool, bool]):
-    slices, points = random_values(2, 3, 4, 5), 1.6 * random_values(2, 7, 2, seed=1) - 0.8
-    inputs = tuple(
-        item.clone().requires_grad_(is_wanted)
-        for item, is_wanted in zip((slices, points), wanted, strict=True)
-    )
-    assert torch.autograd.gradcheck(
-        lambda s, p: sample_slices(s, p, ThirdOrder(1, 3, 0.5)), inputs, check_forward_ad=True
-    )

@@ -13,18 +13,16 @@ from torch import Tensor
 from ddrecon.ranks import own_rank, rank_count
 from ddrecon.slabs.exchange import swap_layers
 
-REACH = 1
-"""Layers of a neighbor from which a step may begin."""
 Work = Callable[[int, Tensor], Tensor]
 """What is done for directions, by their number and what enters the slab; it returns what leaves."""
 
 
-def pass_on(ways: Sequence[int], nothing: Tensor, work: Work, is_backward: bool = False) -> Tensor:
+def pass_on(ways: Sequence[int], nothing: Tensor, work: Work) -> Tensor:
     """Does the `work` of what goes through slabs, as what leaves one has entered the next.
 
     `ways`: 1 for what goes from a slab to the next, -1 to the last, 0 to none; `nothing` enters the
-    first; with `is_backward`, all goes the other way. Returns what nobody took up at the end:
-    derivatives that go through it meet all exchanges, on all ranks in the same order.
+    first. Returns what nobody took up at the end: derivatives that go through it meet all
+    exchanges, on all ranks in the same order.
     """
     for number, way in enumerate(ways):
         if way == 0:
@@ -32,8 +30,7 @@ def pass_on(ways: Sequence[int], nothing: Tensor, work: Work, is_backward: bool 
     if not any(ways):
         return nothing
     upwards, downwards = (
-        [number for number, way in enumerate(ways) if way == wanted]
-        for wanted in ((-1, 1) if is_backward else (1, -1))
+        [number for number, way in enumerate(ways) if way == wanted] for wanted in (1, -1)
     )
     to_below = to_above = below = above = nothing
     rank, last = own_rank(), rank_count() - 1

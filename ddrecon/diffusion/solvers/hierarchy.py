@@ -9,7 +9,6 @@ error smaller.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -88,40 +87,14 @@ class Level:
     coarser: Level | Coarsest | Gathered
 
     @staticmethod
-    def of(operator: Operator, axes: Sequence[Sequence[int]] = ()) -> Level:
-        """The grid of `operator` and all coarser ones.
-
-        Which `axes` each level coarsens may be given; else it is read off their strengths.
-        """
+    def of(operator: Operator) -> Level:
+        """The grid of `operator` and all coarser ones."""
         matrix, ways = operator.once(ScaledMatrix.of), []
         taken = matrix.scale * (operator.diagonal - operator.loss)
-        for axis in axes[0] if axes else _strong_axes(matrix):
+        for axis in _strong_axes(matrix):
             way, operator = coarsen(operator, axis)
             ways.append(way)
-        return Level(matrix, taken, tuple(ways), _coarser(operator, axes[1:]))
-
-    @property
-    def levels(self) -> Iterator[Level]:
-        """This level and all coarser ones that are not solved directly."""
-        level: Level | Coarsest | Gathered = self
-        while isinstance(level, Level):
-            yield level
-            level = level.coarser
-
-    @property
-    def axes(self) -> tuple[tuple[int, ...], ...]:
-        """The axes that each level coarsens."""
-        return tuple(tuple(way.axis for way in level.ways) for level in self.levels)
-
-    def has_strong_axes(self) -> Tensor:
-        """Whether each level coarsens the axes that it would by their strengths: a bool, unread."""
-        found = [torch.ones_like(self.taken[0, 0, 0, 0], dtype=torch.bool)]
-        for level, coarsened in zip(self.levels, self.axes, strict=True):
-            axes, means = _strengths(level.matrix)
-            for axis, mean in zip(axes, means, strict=True):
-                is_weak = mean < STRONG * torch.stack(means).amax()
-                found.append(~is_weak if axis in coarsened else is_weak)
-        return torch.stack(found).all()
+        return Level(matrix, taken, tuple(ways), _coarser(operator))
 
     def cycle(self, source: Tensor) -> Tensor:
         """Roughly y with S A S y = `source` [C, z, y, x].
@@ -171,23 +144,18 @@ class Gathered:
         return self.ghosts.cut(self.whole.correction(whole))
 
 
-def _coarser(operator: Operator, axes: Sequence[Sequence[int]] = ()) -> Level | Coarsest | Gathered:
+def _coarser(operator: Operator) -> Level | Coarsest | Gathered:
     """The grid of `operator`, coarsened from a finer one, and all coarser ones."""
     if operator.ghosts is not None:
         return Gathered.of(operator, operator.ghosts)
     has_few = operator.loss[0].numel() <= FEW_CELLS
-    return Coarsest.of(operator) if has_few else Level.of(operator, axes)
-
-
-def _strengths(matrix: ScaledMatrix) -> tuple[list[int], list[Tensor]]:
-    """The axes that have more than one cell, and the mean conductance along each."""
-    axes = [axis for axis in AXES if matrix.scale.shape[axis] > 1]
-    return axes, [matrix.conductances[axis - 1].mean() for axis in axes]
+    return Coarsest.of(operator) if has_few else Level.of(operator)
 
 
 def _strong_axes(matrix: ScaledMatrix) -> list[int]:
     """The axes to coarsen, all that have more than one cell and are not weak."""
-    axes, means = _strengths(matrix)
+    axes = [axis for axis in AXES if matrix.scale.shape[axis] > 1]
+    means = [matrix.conductances[axis - 1].mean() for axis in axes]
     if matrix.ghosts is not None:
         # All ranks coarsen the same axes.
         means = sum_over_ranks(means)

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.kernels.launch import MOST, too_many
-from ddrecon.march.bands import Bands
-from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.fused.stretches import find_walked
+from ddrecon.march.samplers import Equidistant
+from ddrecon.march.slices import Slices
 from ddrecon.numerics.remember import remember
 from ddrecon.numerics.slicing import across
 
@@ -66,10 +66,10 @@ def _short(order: Tensor) -> Tensor:
     return order.int()
 
 
-def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
+def cells_of(sampler: Slices | Equidistant) -> tuple[Cells, list[Tensor]]:
     """Where nodes lie for `sampler`, and the fields among whose cells that is."""
     fields = list(sampler.channels.fields)
-    if not isinstance(sampler, Bands):
+    if not isinstance(sampler, Slices):
         like = fields[0]
         planes = torch.linspace(0, 1, sampler.nodes, dtype=like.dtype, device=like.device)
         return Cells(planes), fields
@@ -77,6 +77,5 @@ def cells_of(sampler: Bands | Equidistant) -> tuple[Cells, list[Tensor]]:
     if sampler.steps == 1:
         return Cells(planes, sampler.axis, _short(sampler.order), support), fields
     # Slices between those of cells are interpolated beforehand.
-    bands = torch.cat(sampler.slices.bands, 2).transpose(0, 1)
     order = torch.arange(sampler.nodes, dtype=torch.int32, device=planes.device)
-    return Cells(planes, 0, order, support), [bands]
+    return Cells(planes, 0, order, support), [sampler.values.transpose(0, 1)]

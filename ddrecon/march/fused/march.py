@@ -9,10 +9,8 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.light.point_light import PointBeam
-from ddrecon.march.bands import Bands
 from ddrecon.march.box import Crossing
 from ddrecon.march.emission import Emission, is_field
-from ddrecon.march.equidistant import Equidistant
 from ddrecon.march.fused.bundle import (
     Packed,
     numbers_of,
@@ -27,16 +25,18 @@ from ddrecon.march.fused.integrate import Integrate
 from ddrecon.march.fused.layout import Layout
 from ddrecon.march.integral import opacity_of
 from ddrecon.march.lattice import Lattice
+from ddrecon.march.samplers import Equidistant
+from ddrecon.march.slices import Slices
 from ddrecon.medium.phase_cells import count_tables
 
 
 def march_rays(
-    emission: Emission, sampler: Bands | Equidistant, rays: Rays, crossing: Crossing
+    emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing
 ) -> tuple[Tensor, Tensor]:
     """Those of `rays` that are in `crossing`: indices [P], radiance and opacity [2 C, P]."""
     packed = pack_rays(
         emission.grid,
-        sampler.axis if isinstance(sampler, Bands) else None,
+        sampler.axis if isinstance(sampler, Slices) else None,
         rays.origin,
         rays.direction,
         crossing.hit,
@@ -48,7 +48,7 @@ def march_rays(
 
 def integrate_rays(
     emission: Emission,
-    sampler: Bands | Equidistant,
+    sampler: Slices | Equidistant,
     rays: Rays,
     crossing: Crossing,
     fronts: Tensor | None = None,
@@ -57,14 +57,14 @@ def integrate_rays(
 
     Behind the mass `fronts` [K, P], which counts as mass along them.
     """
-    axis = sampler.axis if isinstance(sampler, Bands) else None
+    axis = sampler.axis if isinstance(sampler, Slices) else None
     ends = crossing.hit, crossing.near, crossing.far
     packed = pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
     composed, masses = _integrate(emission, sampler, packed, fronts)
     return torch.cat([composed[: emission.colors], masses])
 
 
-def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
+def march_lattice(emission: Emission, bands: Slices, lattice: Lattice) -> Tensor:
     """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
     packed = pack_lattice(emission.grid, bands.axis, lattice)
     return _integrate(emission, bands, packed)[0].unflatten(1, lattice.shape)
@@ -72,7 +72,7 @@ def march_lattice(emission: Emission, bands: Bands, lattice: Lattice) -> Tensor:
 
 def _integrate(
     emission: Emission,
-    sampler: Bands | Equidistant,
+    sampler: Slices | Equidistant,
     packed: Packed,
     fronts: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
