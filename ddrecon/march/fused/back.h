@@ -270,7 +270,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 bent_bar[k] = layers.linear[i] * bend_bar[k];
             }
             Spot<F, false, V> spot = node;
-            spot.y = node.y.behind(layers.at[i] * lines.rows);
+            spot.y = node.y.behind(node.z.cells[i] * lines.rows);
             spread_to_cells(spot, Runs<F>(spot.y, spot.x, lines), 0, value_bar, bent_bar);
         }
     }

@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/march/fused/cells.h"
+#include "ddrecon/march/fused/runs.h"
 #include "ddrecon/march/fused/layout.h"
 // A packet of rays: where its nodes lie, and what they emit.
 
@@ -197,7 +197,6 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         node.y = Place<F, V>::at(value_of(o1) + s * value_of(d1), lines.rows);
         node.x = Place<F, V>::at(value_of(o2) + s * value_of(d2), lines.columns);
         if (!IS_SLICED) node.z = Place<F, V>::at(value_of(o0) + s * value_of(d0), given.depth);
-        node.find_corners(lines);
         if (IS_SLICED) node.runs = Runs<F>(node.y, node.x, lines);
         sample(node, n, 0, EXTINCTION);
         if (SCATTERING) sample(node, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
@@ -224,8 +223,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
                     const Window<F> w(node.runs.run[r], node.y, node.x, lines);
                     for (int c = from; c < to; ++c) {
                         V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
-                        const V v = is_bent(c) ? w.curved(fields[c] + offset, node.y, node.x, bend)
-                                               : w.linear(fields[c] + offset);
+                        const V v = w.value(fields[c] + offset, is_bent(c), bend);
                         known = P::pick(w.is_in, v, known);
                         if (!is_bent(c)) continue;
                         V& known_bend = P::template part<PART>(node.bend[c - FIRST_MASS]);
@@ -257,7 +255,6 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
             sides[i].x = Kink<F>::template place<Slope>(x, lines.columns, side, 1);
             if constexpr (!IS_SLICED)
                 sides[i].z = Kink<F>::template place<Slope>(z, given.depth, side, 2);
-            sides[i].find_corners(lines);
         }
         for (int c = from; c < to; ++c) {
             const F* field = given.fields[c] + slice(n);
