@@ -31,14 +31,13 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     typedef typename Rays::Point Point;
     using Rays::begin, Rays::last, Rays::given, Rays::foot, Rays::across, Rays::row_of;
     using Rays::DEPTH, Rays::HAS_VIEW, Rays::NUMBER, Rays::VIEW, Rays::lines;
-    using Rays::o0, Rays::o1, Rays::o2, Rays::d0, Rays::d1, Rays::d2, Rays::near, Rays::far;
     using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_CURVES, Which::VARIES_RAYS;
 
     const Bars<F>& bars;
     const V none = P::all(F(0));
     V m_bar[L::EXTINCTION], number_bar[2 * L::C + 1], coefficient_bar[L::BEAMS * L::RAY_TERMS + 1];
     V foot_bar[L::BEAMS + 1], across_bar[L::BEAMS + 1];
-    V o_bar[3] = {none, none, none}, d_bar[3] = {none, none, none}, near_bar = none, far_bar = none;
+    V ray_bar[8] = {none, none, none, none, none, none, none, none};
 
     Back(int item, const Given<F>& given, const Bars<F>& bars)
         : Rays(item, given, {}), bars(bars) {}
@@ -279,26 +278,18 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 if (L::is_bent(c)) at_bar[k] += bend_bar[c - L::FIRST_MASS] * bend.by[k];
             }
         });
-        const V y_bar = at_bar[0], x_bar = at_bar[1], z_bar = at_bar[2];
-        if (IS_SLICED) {
-            // A node held at a face of the box moves with the face.
-            const M is_near = node.s <= near, is_far = node.s >= far;
-            near_bar += P::pick(is_near, t_bar, none);
-            far_bar += P::pick(is_near, none, P::pick(is_far, t_bar, none));
-            const V s_bar = P::pick(is_near | is_far, none, t_bar) + y_bar * d1 + x_bar * d2;
-            o_bar[0] -= s_bar / d0;
-            d_bar[0] -= s_bar * node.s / d0;
-        } else {
-            const V s_bar = t_bar + z_bar * d0 + y_bar * d1 + x_bar * d2;
-            near_bar += s_bar * (F(1) - given.planes[n]);
-            far_bar += s_bar * given.planes[n];
-            o_bar[0] += z_bar;
-            d_bar[0] += z_bar * node.s;
+        Dual<V, 8> ray[8];
+        for (int k = 0; k < 8; ++k) {
+            ray[k] = this->ray[k];
+            ray[k].by[k] = P::all(F(1));
         }
-        o_bar[1] += y_bar;
-        d_bar[1] += y_bar * node.s;
-        o_bar[2] += x_bar;
-        d_bar[2] += x_bar * node.s;
+        const int axes[] = {1, 2, 0};
+        const auto s = this->distance(ray, n), t = this->hold(ray, s);
+        for (int k = 0; k < 8; ++k) ray_bar[k] += t_bar * t.by[k];
+        for (int i = 0; i < (IS_SLICED ? 2 : 3); ++i) {
+            const auto place = this->place(ray, s, axes[i]);
+            for (int k = 0; k < 8; ++k) ray_bar[k] += at_bar[i] * place.by[k];
+        }
     }
 
     // To row k of an array that has a number of each ray.
@@ -310,11 +301,11 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         for (int k = 0; k <= 2 * L::C; ++k)
             bars.numbers[k * bars.packets + this->item] = P::sum(number_bar[k]);
         if (VARIES_RAYS && bars.rays) {
-            const int y = this->is_turned ? 2 : 1, x = 3 - y;
-            const V found[] = {o_bar[0], o_bar[y], o_bar[x], d_bar[0],
-                               d_bar[y], d_bar[x], near_bar, far_bar};
+            const int y = this->is_turned ? 2 : 1, x = 3 - y,
+                      order[] = {0, y, x, 3, 3 + y, 3 + x, 6, 7};
             for (int l = 0; l < LANES && begin + l <= last; ++l)
-                for (int k = 0; k < 8; ++k) bars.rays[8LL * (begin + l) + k] = P::lane(found[k], l);
+                for (int k = 0; k < 8; ++k)
+                    bars.rays[8LL * (begin + l) + k] = P::lane(ray_bar[order[k]], l);
         }
         for (int b = 0; b < L::BEAMS && bars.angles; ++b) {
             put(bars.angles, b, foot_bar[b]);

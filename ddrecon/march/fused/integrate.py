@@ -138,7 +138,7 @@ def _transpose(
     kernel.launch(packets, given | ends | {"packets": packets}, made, shares=own)
     for share in shares[1:]:
         for total, part in zip(shares[0], share, strict=True):
-            if total is not None:
+            if total is not None and part is not None:
                 total += part
     table_bar, *field_bars = shares[0]
     rays_bar, angles_bar, coefficients_bar, fronts_bar = bars.values()

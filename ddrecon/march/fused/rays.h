@@ -88,7 +88,8 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     const Given<F>& given;
     const Changes<F> changes;
     int item, last, begin, first_node = 0, last_node;
-    Distance o0, o1, o2, d0, d1, d2, near, far;
+    // Origin, direction, near and far.
+    Distance ray[8];
     Foot foot[L::BEAMS + 1], across[L::BEAMS + 1];
     Coefficient coefficients[L::BEAMS * L::RAY_TERMS + 1];
     // Along y the packet's rays are closer together than along x; it `is_turned` where y are
@@ -104,9 +105,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
           begin(item * LANES),
           last_node(given.node_count - 1),
           lines{given.rows, given.columns, given.row_stride, given.column_stride} {
-        Distance* const parts[] = {&o0, &o1, &o2, &d0, &d1, &d2, &near, &far};
-        UNROLLED
-        for (int k = 0; k < 8; ++k) *parts[k] = load<Distance>(given.rays, changes.rays, k, 8);
+        for (int k = 0; k < 8; ++k) ray[k] = load<Distance>(given.rays, changes.rays, k, 8);
         for (int b = 0; b < L::BEAMS; ++b) {
             foot[b] = load<Foot>(given.angles, changes.angles, row_of(b));
             across[b] = load<Foot>(given.angles, changes.angles, row_of(L::BEAMS + b));
@@ -116,25 +115,27 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
                 coefficients[k] =
                     load<Coefficient>(given.coefficients, changes.coefficients, row_of(k));
         // Nodes before the box and behind it are held at its faces: between them nothing is added.
-        const V near = value_of(this->near), far = value_of(this->far);
-        while (first_node < last_node && P::every(value_of(distance(first_node + 1)) <= near))
+        const V near = value_of(ray[6]), far = value_of(ray[7]);
+        while (first_node < last_node && P::every(value_of(distance(ray, first_node + 1)) <= near))
             ++first_node;
-        while (last_node > first_node && P::every(value_of(distance(last_node - 1)) >= far))
+        while (last_node > first_node && P::every(value_of(distance(ray, last_node - 1)) >= far))
             --last_node;
         if (P::every(near >= far)) last_node = first_node;
         if (LANES > 1 && IS_SLICED) turn();
     }
     void turn() {
-        const V s = value_of(distance((first_node + last_node) / 2));
-        const V y = value_of(o1) + s * value_of(d1), x = value_of(o2) + s * value_of(d2);
+        const Distance s = distance(ray, (first_node + last_node) / 2);
+        const V y = value_of(place(ray, s, 1)), x = value_of(place(ray, s, 2));
         const int end = begin + LANES <= last ? LANES - 1 : last - begin;
         const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
         if (high * high <= wide * wide) return;
         is_turned = true;
         lines = {lines.columns, lines.rows, lines.column, lines.row};
-        const Distance o = o1, d = d1;
-        o1 = o2, d1 = d2;
-        o2 = o, d2 = d;
+        for (int k = 1; k <= 4; k += 3) {
+            const Distance y = ray[k];
+            ray[k] = ray[k + 1];
+            ray[k + 1] = y;
+        }
     }
     long long row_of(int k) const { return given.row_of(k); }
     // What the rays have at `at` of an array, and its change.
@@ -175,21 +176,31 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
         return from < to;
     }
 
-    Distance distance(int n) const {
-        if (IS_SLICED) return (given.planes[n] - o0) / d0;
-        return near + given.planes[n] * (far - near);
+    // Of any kind of numbers that a ray has: the distance of node n; the same held in the box; and
+    // where it is then across slices, along y, and along x.
+    template <class X> X distance(const X* ray, int n) const {
+        if (IS_SLICED) return (given.planes[n] - ray[0]) / ray[3];
+        return ray[6] + given.planes[n] * (ray[7] - ray[6]);
+    }
+    template <class X> static X hold(const X* ray, const X& s) {
+        return P::least(P::most(s, ray[6]), ray[7]);
+    }
+    template <class X> static X place(const X* ray, const X& s, int axis) {
+        return ray[axis] + s * ray[3 + axis];
     }
     long long slice(int n) const {
         return IS_SLICED ? (long long)given.slices[n] * given.plane_stride : 0;
     }
     // Where node n lies, and the matter there.
     void locate(int n, Node& node) const {
-        node.s = distance(n);
-        node.t = P::least(P::most(node.s, near), far);
-        const V s = value_of(node.s);
-        node.y = Place<F, V>::at(value_of(o1) + s * value_of(d1), lines.rows);
-        node.x = Place<F, V>::at(value_of(o2) + s * value_of(d2), lines.columns);
-        if (!IS_SLICED) node.z = Place<F, V>::at(value_of(o0) + s * value_of(d0), given.depth);
+        node.s = distance(ray, n);
+        node.t = hold(ray, node.s);
+        auto at = [&](int axis, int size) {
+            return Place<F, V>::at(value_of(place(ray, node.s, axis)), size);
+        };
+        node.y = at(1, lines.rows);
+        node.x = at(2, lines.columns);
+        if (!IS_SLICED) node.z = at(0, given.depth);
         if (IS_SLICED) node.runs = Runs<F>(node.y, node.x, lines);
         sample(node, n, 0, L::EXTINCTION);
         if (L::SCATTERING) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
@@ -235,9 +246,10 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     }
     // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
     // bend of that each is handed to `take`.
-    template <class Take> void take_slopes(int n, V s, int from, int to, Take take) const {
-        const V y = value_of(o1) + s * value_of(d1), x = value_of(o2) + s * value_of(d2);
-        const V z = value_of(o0) + s * value_of(d0), none = P::all(F(0));
+    template <class Take>
+    void take_slopes(int n, const Distance& s, int from, int to, Take take) const {
+        const V none = P::all(F(0)), z = value_of(place(ray, s, 0));
+        const V y = value_of(place(ray, s, 1)), x = value_of(place(ray, s, 2));
         M is_kink = Kink<F>::is_at(y, lines.rows) | Kink<F>::is_at(x, lines.columns);
         if (!IS_SLICED) is_kink = is_kink | Kink<F>::is_at(z, given.depth);
         const bool has_kink = !P::every(P::pick(is_kink, P::all(F(1)), none) == none);
@@ -262,13 +274,14 @@ template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     }
     // What values change by, as node n moves.
     void move(Node& node, int n, int from, int to) const {
-        const Distance places[] = {o1 + node.s * d1, o2 + node.s * d2, o0 + node.s * d0};
+        const int axes[] = {1, 2, 0};
         auto along = [&](const Slope& slope) -> V {
             V change = P::all(F(0));
-            for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k) change += slope.by[k] * places[k].by[0];
+            for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k)
+                change += slope.by[k] * place(ray, node.s, axes[k]).by[0];
             return change;
         };
-        take_slopes(n, value_of(node.s), from, to, [&](int c, const Slope& v, const Slope& bend) {
+        take_slopes(n, node.s, from, to, [&](int c, const Slope& v, const Slope& bend) {
             node.v[c].by[0] += along(v);
             if (L::is_bent(c)) node.bend[c - L::FIRST_MASS].by[0] += along(bend);
         });
