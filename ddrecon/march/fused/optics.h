@@ -160,7 +160,7 @@ template <class F, int TERMS, bool IS_STEEP> struct Rungs {
 #if defined(__CUDA_ARCH__)
         for (int k = 0; k < TERMS; ++k) {
             const auto found =
-                add<HAS_SLOPES, TURNS, F>(table + row(rung, angle, 0) * TERMS + k, weights, 0);
+                add<HAS_SLOPES, TURNS>(table + row(rung, angle, 0) * TERMS + k, weights, 0);
             out[k] = found.value;
             if (HAS_SLOPES) by_rung[k] = found.by[0];
             if (TURNS) by_angle[k] = found.by[1];
@@ -169,7 +169,7 @@ template <class F, int TERMS, bool IS_STEEP> struct Rungs {
         static_assert(TERMS <= LANES && LANES <= 2 * TERMS, "terms of a row, by lanes");
         Dual<V, 2> lines[LANES];
         for (int l = 0; l < LANES; ++l)
-            lines[l] = add<HAS_SLOPES, TURNS, V>(table + row(rung, angle, l) * TERMS, weights, l);
+            lines[l] = add<HAS_SLOPES, TURNS>(table + row(rung, angle, l) * TERMS, weights, l);
         // Each lane's terms to each term's lanes.
         for (int k = 0; k < TERMS; ++k)
             for (int l = 0; l < LANES; ++l) {
@@ -180,13 +180,13 @@ template <class F, int TERMS, bool IS_STEEP> struct Rungs {
 #endif
     }
     // Terms of lane l, one or LANES from `table` on.
-    template <bool HAS_SLOPES, bool TURNS, class Terms>
-    static INLINE Dual<Terms, 2> add(const F* table, const V (*weights)[4], int l) {
-        Dual<Terms, 2> sum(Terms{});
+    template <bool HAS_SLOPES, bool TURNS>
+    static INLINE Dual<V, 2> add(const F* table, const V (*weights)[4], int l) {
+        Dual<V, 2> sum(V{});
         for (int j = 0; j < 4; ++j) {
-            Terms here{}, turning{}, terms;
+            V here{}, turning{};
             for (int i = 0; i < 4; ++i) {
-                __builtin_memcpy(&terms, table + (j * ROWS + i) * TERMS, sizeof(Terms));
+                const V terms = P::read(table + (j * ROWS + i) * TERMS);
                 here += P::own(weights[1][i], l) * terms;
                 if (TURNS) turning += P::own(weights[3][i], l) * terms;
             }
