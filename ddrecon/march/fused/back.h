@@ -178,7 +178,7 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 foot_bar[b] += one;
                 across_bar[b] += other;
                 t_bar += one;
-            } else if (L::HAS_NUMBERS) {
+            } else if (L::HAS_RUNGS || L::IS_STEEP) {
                 coefficient_bar[b * L::RAY_TERMS + 2] += one;
                 coefficient_bar[b * L::RAY_TERMS] += other;
             }
