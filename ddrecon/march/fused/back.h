@@ -29,42 +29,35 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     typedef typename Rays::Node Node;
     typedef typename Rays::Rungs Rungs;
     typedef typename Rays::Point Point;
-    using L::BEAMS, L::C, L::CHANNELS, L::COLOR_STEP, L::CURVE_STEP, L::DIFFUSE_STEP;
-    using L::DIFFUSING_STEP, L::EXTINCTION, L::FIRST_DIFFUSE, L::FIRST_DIFFUSING, L::FIRST_MASS;
-    using L::FIRST_NUMBER, L::FIRST_PEAK, L::FIRST_SCATTERING, L::HAS_NUMBERS, L::HAS_PEAK;
-    using L::HAS_RUNGS, L::IS_PEAK_FIELD, L::IS_STEEP, L::is_point, L::MASS_STEP, L::MASSES;
-    using L::NUMBER_STEP, L::OUT, L::PEAK_STEP, L::PHASE_STEP, L::RAY_TERMS, L::SCATTERING_STEP;
-    using L::TABLE_STEP, L::TERMS;
     using Rays::begin, Rays::last, Rays::given, Rays::foot, Rays::across, Rays::row_of;
-    using Rays::DEPTH, Rays::HAS_VIEW, Rays::is_bent, Rays::NUMBER, Rays::VIEW, Rays::lines;
-    using Rays::o0, Rays::o1, Rays::o2, Rays::d0, Rays::d1, Rays::d2, Rays::near, Rays::far;
+    using Rays::DEPTH, Rays::HAS_VIEW, Rays::NUMBER, Rays::VIEW, Rays::lines;
     using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_CURVES, Which::VARIES_RAYS;
 
     const Bars<F>& bars;
     const V none = P::all(F(0));
-    V m_bar[EXTINCTION], number_bar[2 * C + 1], coefficient_bar[BEAMS * RAY_TERMS + 1];
-    V foot_bar[BEAMS + 1], across_bar[BEAMS + 1];
-    V o_bar[3] = {none, none, none}, d_bar[3] = {none, none, none}, near_bar = none, far_bar = none;
+    V m_bar[L::EXTINCTION], number_bar[2 * L::C + 1], coefficient_bar[L::BEAMS * L::RAY_TERMS + 1];
+    V foot_bar[L::BEAMS + 1], across_bar[L::BEAMS + 1];
+    V ray_bar[8] = {none, none, none, none, none, none, none, none};
 
     Back(int item, const Given<F>& given, const Bars<F>& bars)
         : Rays(item, given, {}), bars(bars) {}
     void run() {
-        V bar[OUT], inside = none;
-        W m[EXTINCTION];
+        V bar[L::OUT], inside = none;
+        W m[L::EXTINCTION];
         for (int l = 0; l < LANES && begin + l <= last; ++l) P::put(inside, l, F(1));
         bool is_asked = false;
-        for (int i = 0; i < OUT; ++i) {
+        for (int i = 0; i < L::OUT; ++i) {
             bar[i] = inside * P::load(bars.out + row_of(i), begin, 1, last);
             is_asked = is_asked || !this->is_nothing(bar[i]);
         }
-        for (int k = 0; k < EXTINCTION; ++k) {
+        for (int k = 0; k < L::EXTINCTION; ++k) {
             m_bar[k] = inside * P::load(bars.masses + row_of(k), begin, 1, last);
             m[k] = P::load_wide(bars.mass + row_of(k), begin, last);
             is_asked = is_asked || !this->is_nothing(m_bar[k]);
         }
         for (V& each : number_bar) each = none;
         for (V& each : coefficient_bar) each = none;
-        for (int b = 0; b < BEAMS; ++b) foot_bar[b] = across_bar[b] = none;
+        for (int b = 0; b < L::BEAMS; ++b) foot_bar[b] = across_bar[b] = none;
         // Pixels that nothing is asked of, masked ones for instance, need no walk.
         if (is_asked) walk(bar, m);
         store();
@@ -72,25 +65,26 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
 
     void walk(const V* bar, W* m) {
         Node nodes[2], *a = nodes, *b = nodes + 1;
-        V a_bar[CHANNELS], b_bar[CHANNELS], wa_bar[OUT], wb_bar[OUT], ua_bar[OUT], ub_bar[OUT];
+        V a_bar[L::CHANNELS], b_bar[L::CHANNELS], wa_bar[L::OUT], wb_bar[L::OUT], ua_bar[L::OUT],
+            ub_bar[L::OUT];
         for (int from = this->last_node, to; this->stretch_before(from, to);) {
-            for (int c = 0; c < CHANNELS; ++c) b_bar[c] = none;
-            for (int i = 0; i < OUT; ++i) wb_bar[i] = ub_bar[i] = none;
+            for (int c = 0; c < L::CHANNELS; ++c) b_bar[c] = none;
+            for (int i = 0; i < L::OUT; ++i) wb_bar[i] = ub_bar[i] = none;
             V ta_bar, tb_bar = none;
             this->locate(to, *b);
             this->emit(to, *b, m);
             // Node b lies behind node a. Its bars grow by the segments on both sides, then it is
             // done.
             for (int n = to - 1; n >= from; --n) {
-                W m_b[EXTINCTION];
+                W m_b[L::EXTINCTION];
                 this->locate(n, *a);
-                for (int k = 0; k < EXTINCTION; ++k) {
+                for (int k = 0; k < L::EXTINCTION; ++k) {
                     m_b[k] = m[k];
                     m[k] -= this->mass_between(*a, *b, k);
                 }
                 this->emit(n, *a, m);
                 V length_bar = none, begin_bar = none, end_bar = none;
-                for (int i = 0; i < OUT; ++i) {
+                for (int i = 0; i < L::OUT; ++i) {
                     const Decay<F> decay(a->u[i], b->u[i], a->decay[i], b->decay[i]);
                     const V half = F(0.5) * bar[i] * this->measure(*a, *b, i);
                     const V both = half * (a->w[i] + b->w[i]);
@@ -98,9 +92,9 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                     wb_bar[i] += wa_bar[i];
                     ua_bar[i] = both * decay.by0;
                     ub_bar[i] += both * decay.by1;
-                    const int beam = i / C - 1;
+                    const int beam = i / L::C - 1;
                     const V by = F(0.5) * bar[i] * (a->w[i] + b->w[i]) * decay.mean;
-                    if (VARIES_ANGLES && i >= C && is_point(beam)) {
+                    if (VARIES_ANGLES && i >= L::C && L::is_point(beam)) {
                         Dual<V, 4> x[] = {foot[beam], across[beam], a->t, b->t};
                         for (int k = 0; k < 4; ++k) x[k].by[k] = P::all(F(1));
                         const auto slopes = Point::subtended(x[0], x[1], x[2], x[3]);
@@ -115,8 +109,8 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 if (VARIES_ANGLES) tb_bar += end_bar;
                 finish(*b, m_b, b_bar, wb_bar, ub_bar, tb_bar);
                 // Its mass is that of node a and half the sum of extinctions, by the length.
-                for (int c = 0; c < CHANNELS; ++c) a_bar[c] = none;
-                for (int k = 0; k < EXTINCTION; ++k) {
+                for (int c = 0; c < L::CHANNELS; ++c) a_bar[c] = none;
+                for (int k = 0; k < L::EXTINCTION; ++k) {
                     a_bar[k] = F(0.5) * m_bar[k] * (b->t - a->t);
                     b_bar[k] += a_bar[k];
                     if (VARIES_RAYS) length_bar += F(0.5) * m_bar[k] * (a->v[k] + b->v[k]);
@@ -125,8 +119,8 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
                 if (VARIES_ANGLES) ta_bar += begin_bar;
                 spread(n + 1, *b, b_bar, tb_bar + length_bar);
                 tb_bar = ta_bar;
-                for (int c = 0; c < CHANNELS; ++c) b_bar[c] = a_bar[c];
-                for (int i = 0; i < OUT; ++i) {
+                for (int c = 0; c < L::CHANNELS; ++c) b_bar[c] = a_bar[c];
+                for (int i = 0; i < L::OUT; ++i) {
                     wb_bar[i] = wa_bar[i];
                     ub_bar[i] = ua_bar[i];
                 }
@@ -141,19 +135,19 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
 
     // What node b emits, and its values go back to the cells. Its mass is that behind it, `m`.
     void finish(const Node& node, const W* m, V* v_bar, const V* w_bar, const V* u_bar, V& t_bar) {
-        for (int c = 0; c < C; ++c) {
-            const int k = c * MASS_STEP, s = FIRST_DIFFUSING + c * DIFFUSING_STEP;
-            const int d = FIRST_DIFFUSE + c * DIFFUSE_STEP;
+        for (int c = 0; c < L::C; ++c) {
+            const int k = L::extinction(c), s = L::diffusing(c);
+            const int d = L::diffuse(c);
             const V scattering = node.v[s];
             v_bar[s] += w_bar[c] * node.v[d];
             v_bar[d] += w_bar[c] * scattering;
             m_bar[k] += u_bar[c] * this->number(c);
             number_bar[c] += u_bar[c] * P::narrow(m[k]);
         }
-        for (int b = 0; b < BEAMS; ++b)
-            for (int c = 0; c < C; ++c) {
-                const int k = c * MASS_STEP, s = FIRST_SCATTERING + c * SCATTERING_STEP;
-                const int i = C + b * C + c, j = FIRST_MASS + b * EXTINCTION + k;
+        for (int b = 0; b < L::BEAMS; ++b)
+            for (int c = 0; c < L::C; ++c) {
+                const int k = L::extinction(c), s = L::scattering(c);
+                const int i = L::C + b * L::C + c, j = L::mass(b, c);
                 const V way = P::narrow(m[k]) + node.v[j], scattering = node.v[s];
                 V way_bar = u_bar[i] * this->number(c);
                 number_bar[c] += u_bar[i] * way;
@@ -168,52 +162,52 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     // What p of beam b in color c had of mass on the `way`, of the number there, and of angles.
     void finish_phase(
         const Node& node, int b, int c, V way, V p_bar, V* v_bar, V& way_bar, V& t_bar) {
-        const E& p = node.p[C + b * C + c];
-        if constexpr (HAS_PEAK) {
+        const E& p = node.p[L::C + b * L::C + c];
+        if constexpr (L::HAS_PEAK) {
             const V depth_bar = p_bar * p.by[DEPTH];
             way_bar += depth_bar * this->peak_of(node, c);
-            if (IS_PEAK_FIELD)
-                v_bar[FIRST_PEAK + c * PEAK_STEP] += depth_bar * way;
+            if (L::IS_PEAK_FIELD)
+                v_bar[L::peak(c)] += depth_bar * way;
             else
-                number_bar[C + c] += depth_bar * way;
+                number_bar[L::C + c] += depth_bar * way;
         }
-        if constexpr (HAS_NUMBERS) v_bar[FIRST_NUMBER + c * NUMBER_STEP] += p_bar * p.by[NUMBER];
+        if constexpr (L::HAS_NUMBERS) v_bar[L::number(c)] += p_bar * p.by[NUMBER];
         if constexpr (HAS_VIEW) {
             const V one = p_bar * p.by[VIEW], other = p_bar * p.by[VIEW + 1];
-            if (is_point(b)) {
+            if (L::is_point(b)) {
                 foot_bar[b] += one;
                 across_bar[b] += other;
                 t_bar += one;
-            } else if (HAS_NUMBERS) {
-                coefficient_bar[b * RAY_TERMS + 2] += one;
-                coefficient_bar[b * RAY_TERMS] += other;
+            } else if (L::HAS_RUNGS || L::IS_STEEP) {
+                coefficient_bar[b * L::RAY_TERMS + 2] += one;
+                coefficient_bar[b * L::RAY_TERMS] += other;
             }
         }
         if (!VARIES_CURVES || !this->has_curve(b)) return;
         const M counts = (p.value > none) & this->is_peaked(node, c);
-        V powers[TERMS], power = HAS_PEAK ? P::pick(counts, p_bar, none) : p_bar;
+        V powers[L::TERMS], power = L::HAS_PEAK ? P::pick(counts, p_bar, none) : p_bar;
         const V place = value_of(this->place_of(node, c, way));
-        for (int k = 0; k < TERMS; ++k) {
+        for (int k = 0; k < L::TERMS; ++k) {
             powers[k] = power;
             power *= place;
         }
-        F* const table_bar = bars.table ? bars.table + c * PHASE_STEP * TABLE_STEP : nullptr;
-        if constexpr (HAS_RUNGS) {
-            const auto rung = Rungs::rung(this->number_of(node, c * PHASE_STEP));
+        F* const table_bar = bars.table ? bars.table + L::table(c) : nullptr;
+        if constexpr (L::HAS_RUNGS) {
+            const auto rung = Rungs::rung(this->number_of(node, L::phase(c)));
             if (table_bar) Rungs::spread(table_bar, rung, node.angle[b], powers);
-        } else if (!is_point(b)) {
-            for (int k = 0; k < TERMS; ++k) coefficient_bar[this->first_of(b, c) + k] += powers[k];
+        } else if (!L::is_point(b)) {
+            for (int k = 0; k < L::TERMS; ++k) coefficient_bar[L::curve(b, c) + k] += powers[k];
         } else if (table_bar) {
             Point::spread(node.angle[b], table_bar, powers);
         }
     }
 
     void spread(int n, const Node& node, const V* v_bar, V t_bar) {
-        V bend_bar[MASSES + 1];
-        for (int k = 0; k < MASSES; ++k) {
-            const V bent = this->number(2 * C) * node.bend[k], inverse = node.held[k];
-            bend_bar[k] = -v_bar[FIRST_MASS + k] * inverse * inverse * inverse;
-            number_bar[2 * C] -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
+        V bend_bar[L::MASSES + 1];
+        for (int k = 0; k < L::MASSES; ++k) {
+            const V bent = this->number(2 * L::C) * node.bend[k], inverse = node.held[k];
+            bend_bar[k] = -v_bar[L::FIRST_MASS + k] * inverse * inverse * inverse;
+            number_bar[2 * L::C] -= bend_bar[k] * bent * node.bend[k] * node.bend[k];
         }
         if constexpr (IS_SLICED)
             spread_to_cells(node, node.runs, this->slice(n), v_bar, bend_bar);
@@ -225,19 +219,19 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
         const Spot& spot, const Runs<F>& runs, long long offset, const V* v_bar,
         const V* bend_bar) const {
 #if defined(__CUDA_ARCH__)
-        for (int c = 0; c < CHANNELS; ++c)
+        for (int c = 0; c < L::CHANNELS; ++c)
             if (bars.fields[c])
                 spread_place(
                     bars.fields[c] + offset, spot.y, spot.x, lines, v_bar[c],
-                    is_bent(c) ? bend_bar[c - FIRST_MASS] : F(0));
+                    L::is_bent(c) ? bend_bar[c - L::FIRST_MASS] : F(0));
 #else
-        bool is_wanted[CHANNELS], has_bent = false;
+        bool is_wanted[L::CHANNELS], has_bent = false;
         M is_zero = none == none;
-        for (int c = 0; c < CHANNELS; ++c) {
+        for (int c = 0; c < L::CHANNELS; ++c) {
             const M is = v_bar[c] == none;
             is_wanted[c] = bars.fields[c] && !P::every(is);
             if (is_wanted[c]) is_zero = is_zero & is;
-            has_bent = has_bent || (is_wanted[c] && is_bent(c));
+            has_bent = has_bent || (is_wanted[c] && L::is_bent(c));
         }
         // Lanes outside of the box count for nothing.
         const unsigned counting = ~P::bits_of(__builtin_convertvector(is_zero, typename P::I));
@@ -248,11 +242,11 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             run.lane = __builtin_ctz(run.lanes);
             const Shares<F> shares(run, spot.y, spot.x, lines, has_bent);
 #pragma clang loop unroll(disable)
-            for (int c = 0; c < CHANNELS; ++c) {
+            for (int c = 0; c < L::CHANNELS; ++c) {
                 if (!is_wanted[c]) continue;
                 F* const field = bars.fields[c] + offset;
-                if (is_bent(c))
-                    shares.add_bent(field, v_bar[c], bend_bar[c - FIRST_MASS]);
+                if (L::is_bent(c))
+                    shares.add_bent(field, v_bar[c], bend_bar[c - L::FIRST_MASS]);
                 else
                     shares.add(field, v_bar[c]);
             }
@@ -262,15 +256,15 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     void spread_between(const Node& node, const V* v_bar, const V* bend_bar) const {
         const Layers<F, V> layers(node.z);
         for (int i = 0; i < 4; ++i) {
-            if (layers.is_outer(i) && !MASSES) continue;
-            V value_bar[CHANNELS], bent_bar[MASSES + 1];
-            for (int c = 0; c < CHANNELS; ++c) value_bar[c] = layers.linear[i] * v_bar[c];
-            for (int k = 0; k < MASSES; ++k) {
-                value_bar[FIRST_MASS + k] += layers.across[i] * bend_bar[k];
+            if (layers.is_outer(i) && !L::MASSES) continue;
+            V value_bar[L::CHANNELS], bent_bar[L::MASSES + 1];
+            for (int c = 0; c < L::CHANNELS; ++c) value_bar[c] = layers.linear[i] * v_bar[c];
+            for (int k = 0; k < L::MASSES; ++k) {
+                value_bar[L::FIRST_MASS + k] += layers.across[i] * bend_bar[k];
                 bent_bar[k] = layers.linear[i] * bend_bar[k];
             }
             Spot<F, false, V> spot = node;
-            spot.y = node.y.behind(layers.at[i] * lines.rows);
+            spot.y = node.y.behind(node.z.cells[i] * lines.rows);
             spread_to_cells(spot, Runs<F>(spot.y, spot.x, lines), 0, value_bar, bent_bar);
         }
     }
@@ -278,32 +272,24 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
     // What the bars of node n are for its ray: of its values and their bends, and of its distance.
     void move(int n, const Node& node, const V* v_bar, const V* bend_bar, V t_bar) {
         V at_bar[3] = {none, none, none};
-        this->take_slopes(n, node.s, 0, CHANNELS, [&](int c, const auto& v, const auto& bend) {
+        this->take_slopes(n, node.s, 0, L::CHANNELS, [&](int c, const auto& v, const auto& bend) {
             for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k) {
                 at_bar[k] += v_bar[c] * v.by[k];
-                if (is_bent(c)) at_bar[k] += bend_bar[c - FIRST_MASS] * bend.by[k];
+                if (L::is_bent(c)) at_bar[k] += bend_bar[c - L::FIRST_MASS] * bend.by[k];
             }
         });
-        const V y_bar = at_bar[0], x_bar = at_bar[1], z_bar = at_bar[2];
-        if (IS_SLICED) {
-            // A node held at a face of the box moves with the face.
-            const M is_near = node.s <= near, is_far = node.s >= far;
-            near_bar += P::pick(is_near, t_bar, none);
-            far_bar += P::pick(is_near, none, P::pick(is_far, t_bar, none));
-            const V s_bar = P::pick(is_near | is_far, none, t_bar) + y_bar * d1 + x_bar * d2;
-            o_bar[0] -= s_bar / d0;
-            d_bar[0] -= s_bar * node.s / d0;
-        } else {
-            const V s_bar = t_bar + z_bar * d0 + y_bar * d1 + x_bar * d2;
-            near_bar += s_bar * (F(1) - given.planes[n]);
-            far_bar += s_bar * given.planes[n];
-            o_bar[0] += z_bar;
-            d_bar[0] += z_bar * node.s;
+        Dual<V, 8> ray[8];
+        for (int k = 0; k < 8; ++k) {
+            ray[k] = this->ray[k];
+            ray[k].by[k] = P::all(F(1));
         }
-        o_bar[1] += y_bar;
-        d_bar[1] += y_bar * node.s;
-        o_bar[2] += x_bar;
-        d_bar[2] += x_bar * node.s;
+        const int axes[] = {1, 2, 0};
+        const auto s = this->distance(ray, n), t = this->hold(ray, s);
+        for (int k = 0; k < 8; ++k) ray_bar[k] += t_bar * t.by[k];
+        for (int i = 0; i < (IS_SLICED ? 2 : 3); ++i) {
+            const auto place = this->place(ray, s, axes[i]);
+            for (int k = 0; k < 8; ++k) ray_bar[k] += at_bar[i] * place.by[k];
+        }
     }
 
     // To row k of an array that has a number of each ray.
@@ -312,21 +298,21 @@ template <class F, class L, class Which> struct Back : Rays<F, L, Which, ADJOINT
             array[row_of(k) + begin + l] = P::lane(bar, l);
     }
     void store() const {
-        for (int k = 0; k <= 2 * C; ++k)
+        for (int k = 0; k <= 2 * L::C; ++k)
             bars.numbers[k * bars.packets + this->item] = P::sum(number_bar[k]);
         if (VARIES_RAYS && bars.rays) {
-            const int y = this->is_turned ? 2 : 1, x = 3 - y;
-            const V found[] = {o_bar[0], o_bar[y], o_bar[x], d_bar[0],
-                               d_bar[y], d_bar[x], near_bar, far_bar};
+            const int y = this->is_turned ? 2 : 1, x = 3 - y,
+                      order[] = {0, y, x, 3, 3 + y, 3 + x, 6, 7};
             for (int l = 0; l < LANES && begin + l <= last; ++l)
-                for (int k = 0; k < 8; ++k) bars.rays[8LL * (begin + l) + k] = P::lane(found[k], l);
+                for (int k = 0; k < 8; ++k)
+                    bars.rays[8LL * (begin + l) + k] = P::lane(ray_bar[order[k]], l);
         }
-        for (int b = 0; b < BEAMS && bars.angles; ++b) {
+        for (int b = 0; b < L::BEAMS && bars.angles; ++b) {
             put(bars.angles, b, foot_bar[b]);
-            put(bars.angles, BEAMS + b, across_bar[b]);
+            put(bars.angles, L::BEAMS + b, across_bar[b]);
         }
-        for (int k = 0; k < EXTINCTION && bars.fronts; ++k) put(bars.fronts, k, m_bar[k]);
-        for (int k = 0; k < BEAMS * RAY_TERMS && bars.coefficients; ++k)
+        for (int k = 0; k < L::EXTINCTION && bars.fronts; ++k) put(bars.fronts, k, m_bar[k]);
+        for (int k = 0; k < L::BEAMS * L::RAY_TERMS && bars.coefficients; ++k)
             put(bars.coefficients, k, coefficient_bar[k]);
     }
 };

@@ -1,58 +1,77 @@
 #pragma once
-#include "ddrecon/march/fused/runs.h"
+#include "ddrecon/kernels/dual.h"
+#include "ddrecon/kernels/packets.h"
 // Packets of places among cells: where they lie, and values there. Linear interpolation in a slice,
 // or between slices; beams' masses to third order. Fields are read in place, by strides. Places are
 // vectors, or dual numbers of these: then values have their slopes.
 
 namespace ddrecon {
 
-// The four cells around a place in a slice, and their weights.
-template <class F, class N> struct Corners {
+// Lines of cells across the packet, along which its rays are close to each other (y), and along it
+// (x): sizes, and strides in memory.
+struct Lines {
+    int rows, columns, row, column;
+};
+
+// The four cells around a place on a line, which lies a part `a` of the way from the second to the
+// third; and a (1 - a) / 2, the `excess` of second differences that linear values have.
+template <class F, class N> struct Place {
     typedef Packets<F> P;
     typedef typename P::V V;
-    typename P::I at00, at01, at10, at11;
-    N w00, w01, w10, w11;
-    INLINE Corners() {}
-    INLINE Corners(const Place<F, N>& y, const Place<F, N>& x, const Lines& lines) {
-        const auto yi = y.i * lines.row, yj = y.j * lines.row;
-        const auto xi = x.i * lines.column, xj = x.j * lines.column;
-        at00 = yi + xi, at01 = yi + xj, at10 = yj + xi, at11 = yj + xj;
-        w11 = y.a * x.a;
-        w10 = y.a - w11;
-        w01 = x.a - w11;
-        w00 = (F(1) - y.a) - w01;
+    typedef typename P::I I;
+    I cells[4];
+    N a, excess;
+    static INLINE Place at(V y, int size) {
+        const V none = P::all(F(0)), end = P::all(F(size - 1));
+        // Also where y is not a number.
+        const V held = P::least(P::pick(y > none, y, none), end);
+        const I zero = P::whole(none), top = zero + (size - 1);
+        const I last = zero + (size > 1 ? size - 2 : 0), cell = P::whole(held);
+        Place q;
+        const I i = P::pick(cell > last, last, cell), j = P::pick(i + 1 > top, top, i + 1);
+        q.cells[0] = P::pick(i > zero, i - 1, zero);
+        q.cells[1] = i;
+        q.cells[2] = j;
+        q.cells[3] = P::pick(j + 1 > top, top, j + 1);
+        q.a = held - P::real(i);
+        q.excess = P::pick((y > none) & (y < end), F(0.5) * q.a * (F(1) - q.a), none);
+        return q;
     }
-    INLINE N linear(const F* f) const {
-        return w00 * P::gather(f, at00) + w01 * P::gather(f, at01) + w10 * P::gather(f, at10) +
-               w11 * P::gather(f, at11);
-    }
-    // The linear value, and in `bend` what it is off by: a (1 - a) / 2 second differences an axis.
-    INLINE N curved(
-        const F* f, const Place<F, N>& y, const Place<F, N>& x, const Lines& lines, N& bend) const {
-        const auto ym = y.m * lines.row, yi = y.i * lines.row, yj = y.j * lines.row;
-        const auto yp = y.p * lines.row, xm = x.m * lines.column, xi = x.i * lines.column;
-        const auto xj = x.j * lines.column, xp = x.p * lines.column;
-        const V f00 = P::gather(f, at00), f01 = P::gather(f, at01);
-        const V f10 = P::gather(f, at10), f11 = P::gather(f, at11);
-        const N along_y = w00 * (P::gather(f, ym + xi) - F(2) * f00 + f10) +
-                          w01 * (P::gather(f, ym + xj) - F(2) * f01 + f11) +
-                          w10 * (f00 - F(2) * f10 + P::gather(f, yp + xi)) +
-                          w11 * (f01 - F(2) * f11 + P::gather(f, yp + xj));
-        const N along_x = w00 * (P::gather(f, yi + xm) - F(2) * f00 + f01) +
-                          w10 * (P::gather(f, yj + xm) - F(2) * f10 + f11) +
-                          w01 * (f00 - F(2) * f01 + P::gather(f, yi + xp)) +
-                          w11 * (f10 - F(2) * f11 + P::gather(f, yj + xp));
-        bend = y.excess * along_y + x.excess * along_x;
-        return w00 * f00 + w01 * f01 + w10 * f10 + w11 * f11;
+    // The same place of lines that begin `by` cells on.
+    INLINE Place behind(I by) const {
+        return {{cells[0] + by, cells[1] + by, cells[2] + by, cells[3] + by}, a, excess};
     }
 };
+
+// A part of the way from one number to another.
+template <class N, class A, class B>
+INLINE auto between(const N& part, const A& one, const B& other) {
+    return one + part * (other - one);
+}
+// The value at y and x, of which `cell(r, c)` is that in one of four rows and one of four columns.
+template <class F, class N, class Cell>
+INLINE N linear(const Place<F, N>& y, const Place<F, N>& x, Cell cell) {
+    return between(y.a, between(x.a, cell(1, 1), cell(1, 2)), between(x.a, cell(2, 1), cell(2, 2)));
+}
+// The same, and in `bend` what it is off by: a (1 - a) / 2 second differences an axis.
+template <class F, class N, class Cell>
+INLINE N curved(const Place<F, N>& y, const Place<F, N>& x, Cell cell, N& bend) {
+    const auto i0 = cell(1, 1), i1 = cell(1, 2), j0 = cell(2, 1), j1 = cell(2, 2);
+    const N top = between(x.a, i0, i1), low = between(x.a, j0, j1);
+    const N over = between(x.a, cell(0, 1), cell(0, 2)),
+            under = between(x.a, cell(3, 1), cell(3, 2));
+    const N along_y = between(y.a, over - F(2) * top + low, top - F(2) * low + under);
+    const N in_i = between(x.a, cell(1, 0) - F(2) * i0 + i1, i0 - F(2) * i1 + cell(1, 3));
+    const N in_j = between(x.a, cell(2, 0) - F(2) * j0 + j1, j0 - F(2) * j1 + cell(2, 3));
+    bend = y.excess * along_y + x.excess * between(y.a, in_i, in_j);
+    return between(y.a, top, low);
+}
 
 // A place between slices as places in the four around: what a value in each counts for linear ones
 // (all but the outer ones, 0 and 3), and for what these are off by.
 template <class F, class N> struct Layers {
-    typename Packets<F>::I at[4];
     N linear[4], across[4];
-    INLINE Layers(const Place<F, N>& z) : at{z.m, z.i, z.j, z.p} {
+    INLINE Layers(const Place<F, N>& z) {
         const N none(Packets<F>::all(F(0))), w1 = z.a, w0 = F(1) - w1, e = z.excess;
         linear[0] = linear[3] = none, linear[1] = w0, linear[2] = w1;
         across[0] = e * w0, across[1] = e * (w1 - F(2) * w0);
@@ -64,27 +83,28 @@ template <class F, class N> struct Layers {
 // Where a node lies among cells: in a slice, or anywhere.
 template <class F, bool IS_SLICED, class N> struct Spot {
     Place<F, N> z, y, x;
-    Corners<F, N> corners;
-    INLINE void find_corners(const Lines& lines) {
-        if (IS_SLICED) corners = Corners<F, N>(y, x, lines);
-    }
     // The linear value of field f there; if it `is_bent`, in `bend` what that is off by.
     INLINE N value(const F* f, const Lines& lines, bool is_bent, N& bend) const {
-        if (IS_SLICED) return is_bent ? corners.curved(f, y, x, lines, bend) : corners.linear(f);
+        if (IS_SLICED) return in_slice(f, y, lines, is_bent, bend);
         const Layers<F, N> layers(z);
         N total(Packets<F>::all(F(0)));
         bend = total;
         for (int i = 0; i < 4; ++i) {
             if (layers.is_outer(i) && !is_bent) continue;
-            const Place<F, N> row = y.behind(layers.at[i] * lines.rows);
-            const Corners<F, N> q(row, x, lines);
             N own(Packets<F>::all(F(0)));
-            const N v =
-                is_bent && !layers.is_outer(i) ? q.curved(f, row, x, lines, own) : q.linear(f);
+            const Place<F, N> row = y.behind(z.cells[i] * lines.rows);
+            const N v = in_slice(f, row, lines, is_bent && !layers.is_outer(i), own);
             total += layers.linear[i] * v;
             if (is_bent) bend += layers.linear[i] * own + layers.across[i] * v;
         }
         return total;
+    }
+    INLINE N
+    in_slice(const F* f, const Place<F, N>& y, const Lines& lines, bool is_bent, N& bend) const {
+        auto cell = [&](int r, int c) HERE {
+            return Packets<F>::gather(f, y.cells[r] * lines.row + x.cells[c] * lines.column);
+        };
+        return is_bent ? curved(y, x, cell, bend) : linear(y, x, cell);
     }
 };
 
@@ -106,9 +126,12 @@ template <class F> struct Kink {
         const V none = P::all(F(0)), end = P::all(F(size - 1));
         const V seen = P::pick(is_at(y, size), y + side * SIDE * F(size), y);
         const Place<F, V> at = Place<F, V>::at(seen, size);
-        const V a = P::least(P::most(y, none), end) - P::real(at.i);
+        const V a = P::least(P::most(y, none), end) - P::real(at.cells[1]);
         const V live = P::pick((seen > none) & (seen < end), P::all(F(1)), none);
-        Place<F, N> q = {at.m, at.i, at.j, at.p, N(a), N(live * (F(0.5) * a * (F(1) - a)))};
+        Place<F, N> q = {
+            {at.cells[0], at.cells[1], at.cells[2], at.cells[3]},
+            N(a),
+            N(live * (F(0.5) * a * (F(1) - a)))};
         q.a.by[direction] = live;
         q.excess.by[direction] = live * (F(0.5) - a);
         return q;

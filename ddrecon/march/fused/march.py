@@ -34,16 +34,7 @@ def march_rays(
     emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing
 ) -> tuple[Tensor, Tensor]:
     """Those of `rays` that are in `crossing`: indices [P], radiance and opacity [2 C, P]."""
-    packed = pack_rays(
-        emission.grid,
-        sampler.axis if isinstance(sampler, Slices) else None,
-        rays.origin,
-        rays.direction,
-        crossing.hit,
-        crossing.near,
-        crossing.far,
-    )
-    return crossing.hit, _integrate(emission, sampler, packed)[0]
+    return crossing.hit, _integrate(emission, sampler, _pack(emission, sampler, rays, crossing))[0]
 
 
 def integrate_rays(
@@ -57,9 +48,7 @@ def integrate_rays(
 
     Behind the mass `fronts` [K, P], which counts as mass along them.
     """
-    axis = sampler.axis if isinstance(sampler, Slices) else None
-    ends = crossing.hit, crossing.near, crossing.far
-    packed = pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
+    packed = _pack(emission, sampler, rays, crossing)
     composed, masses = _integrate(emission, sampler, packed, fronts)
     return torch.cat([composed[: emission.colors], masses])
 
@@ -68,6 +57,14 @@ def march_lattice(emission: Emission, bands: Slices, lattice: Lattice) -> Tensor
     """Radiance and opacity [2 C, r, c] along the rays of `lattice`."""
     packed = pack_lattice(emission.grid, bands.axis, lattice)
     return _integrate(emission, bands, packed)[0].unflatten(1, lattice.shape)
+
+
+def _pack(
+    emission: Emission, sampler: Slices | Equidistant, rays: Rays, crossing: Crossing
+) -> Packed:
+    axis = sampler.axis if isinstance(sampler, Slices) else None
+    ends = crossing.hit, crossing.near, crossing.far
+    return pack_rays(emission.grid, axis, rays.origin, rays.direction, *ends)
 
 
 def _integrate(

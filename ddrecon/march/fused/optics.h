@@ -152,57 +152,49 @@ template <class F, int TERMS, bool IS_STEEP> struct Rungs {
     // A lane's terms stand beside each other: it reads them as a vector of its own.
     template <bool HAS_SLOPES, bool TURNS> static INLINE void read(
         const F* table, const Place& rung, const Place& angle, V* out, V* by_rung, V* by_angle) {
-        V rungs[4], angles[4], rung_slopes[4], angle_slopes[4];
-        rung.weigh(F(1), rungs);
-        angle.weigh(STEP, angles);
-        if (HAS_SLOPES) rung.weigh_slopes(F(1), rung_slopes);
-        if (TURNS) angle.weigh_slopes(STEP, angle_slopes);
+        V weights[4][4];
+        rung.weigh(F(1), weights[0]);
+        angle.weigh(STEP, weights[1]);
+        if (HAS_SLOPES) rung.weigh_slopes(F(1), weights[2]);
+        if (TURNS) angle.weigh_slopes(STEP, weights[3]);
 #if defined(__CUDA_ARCH__)
         for (int k = 0; k < TERMS; ++k) {
-            const F* at = table + row(rung, angle, 0) * TERMS + k;
-            F sum = 0, more = 0, turned = 0;
-            for (int j = 0; j < 4; ++j) {
-                const F* line = at + j * ROWS * TERMS;
-                F here = 0, turning = 0;
-                for (int i = 0; i < 4; ++i) here += angles[i] * line[i * TERMS];
-                if (TURNS)
-                    for (int i = 0; i < 4; ++i) turning += angle_slopes[i] * line[i * TERMS];
-                sum += rungs[j] * here;
-                if (HAS_SLOPES) more += rung_slopes[j] * here;
-                if (TURNS) turned += rungs[j] * turning;
-            }
-            out[k] = sum;
-            if (HAS_SLOPES) by_rung[k] = more;
-            if (TURNS) by_angle[k] = turned;
+            const auto found =
+                add<HAS_SLOPES, TURNS>(table + row(rung, angle, 0) * TERMS + k, weights, 0);
+            out[k] = found.value;
+            if (HAS_SLOPES) by_rung[k] = found.by[0];
+            if (TURNS) by_angle[k] = found.by[1];
         }
 #else
         static_assert(TERMS <= LANES && LANES <= 2 * TERMS, "terms of a row, by lanes");
-        V lines[3][LANES];
-        for (int l = 0; l < LANES; ++l) {
-            const F* at = table + row(rung, angle, l) * TERMS;
-            V sum = P::all(F(0)), more = sum, turned = sum;
-            for (int j = 0; j < 4; ++j) {
-                const F* line = at + j * ROWS * TERMS;
-                V here = P::all(F(0)), turning = here;
-                for (int i = 0; i < 4; ++i) {
-                    const V terms = P::read(line + i * TERMS);
-                    here += P::own(angles[i], l) * terms;
-                    if (TURNS) turning += P::own(angle_slopes[i], l) * terms;
-                }
-                sum += P::own(rungs[j], l) * here;
-                if (HAS_SLOPES) more += P::own(rung_slopes[j], l) * here;
-                if (TURNS) turned += P::own(rungs[j], l) * turning;
-            }
-            lines[0][l] = sum, lines[1][l] = more, lines[2][l] = turned;
-        }
+        Dual<V, 2> lines[LANES];
+        for (int l = 0; l < LANES; ++l)
+            lines[l] = add<HAS_SLOPES, TURNS>(table + row(rung, angle, l) * TERMS, weights, l);
         // Each lane's terms to each term's lanes.
         for (int k = 0; k < TERMS; ++k)
             for (int l = 0; l < LANES; ++l) {
-                out[k][l] = P::own(lines[0][l], k);
-                if (HAS_SLOPES) by_rung[k][l] = P::own(lines[1][l], k);
-                if (TURNS) by_angle[k][l] = P::own(lines[2][l], k);
+                out[k][l] = P::own(lines[l].value, k);
+                if (HAS_SLOPES) by_rung[k][l] = P::own(lines[l].by[0], k);
+                if (TURNS) by_angle[k][l] = P::own(lines[l].by[1], k);
             }
 #endif
+    }
+    // Terms of lane l, one or LANES from `table` on.
+    template <bool HAS_SLOPES, bool TURNS>
+    static INLINE Dual<V, 2> add(const F* table, const V (*weights)[4], int l) {
+        Dual<V, 2> sum(V{});
+        for (int j = 0; j < 4; ++j) {
+            V here{}, turning{};
+            for (int i = 0; i < 4; ++i) {
+                const V terms = P::read(table + (j * ROWS + i) * TERMS);
+                here += P::own(weights[1][i], l) * terms;
+                if (TURNS) turning += P::own(weights[3][i], l) * terms;
+            }
+            sum.value += P::own(weights[0][j], l) * here;
+            if (HAS_SLOPES) sum.by[0] += P::own(weights[2][j], l) * here;
+            if (TURNS) sum.by[1] += P::own(weights[0][j], l) * turning;
+        }
+        return sum;
     }
     // What bars of the coefficients are for the table.
     static INLINE void spread(F* table_bar, const Place& rung, const Place& angle, const V* bar) {

@@ -28,7 +28,6 @@ template <class F> struct Pixels {
         Packet packet;
         packet.y = Place<F, V>::at(P::load(places, n, 2, total - 1), rows);
         packet.x = Place<F, V>::at(P::load(places + 1, n, 2, total - 1), columns);
-        packet.find_corners(lines());
         packet.runs = Runs<F>(packet.y, packet.x, lines());
         return packet;
     }
@@ -39,7 +38,7 @@ template <class F> struct Pixels {
             if (packet.runs.count <= MOST_RUNS && columns >= LANES) {
                 for (int r = 0; r < packet.runs.count; ++r) {
                     const Window<F> w(packet.runs.run[r], packet.y, packet.x, lines());
-                    const V found = w.curved(v, packet.y, packet.x, bend);
+                    const V found = w.value(v, true, bend);
                     value = P::pick(w.is_in, found - bend, value);
                 }
                 return value;
@@ -70,13 +69,14 @@ template <class F> struct Pixels {
                     for (int l = 0; l < LANES && n + l < end; ++l)
                         row[hit[n + l]] = P::lane(value, l);
             }
-            const auto& q = packet.corners;
-            const V most = P::most(
-                P::most(P::gather(uneven, q.at00), P::gather(uneven, q.at01)),
-                P::most(P::gather(uneven, q.at10), P::gather(uneven, q.at11)));
+            auto around = [&](int r, int c) -> V {
+                return P::gather(uneven, packet.y.cells[r] * columns + packet.x.cells[c]);
+            };
+            const V most =
+                P::most(P::most(around(1, 1), around(1, 2)), P::most(around(2, 1), around(2, 2)));
             for (int l = 0; l < LANES && n + l < end; ++l) {
-                const int row = P::lane_of(packet.y.i, l) / TILE;
-                const F column = F(P::lane_of(packet.x.i, l)) + P::lane(packet.x.a, l);
+                const int row = P::lane_of(packet.y.cells[1], l) / TILE;
+                const F column = F(P::lane_of(packet.x.cells[1], l)) + P::lane(packet.x.a, l);
                 const int place = 1 + 16 * row * columns + (int)(F(16) * column);
                 rough[n + l] = P::lane(most, l) > bound[0] ? place : 0;
             }

@@ -1,6 +1,6 @@
 #pragma once
-#include "ddrecon/march/fused/cells.h"
 #include "ddrecon/march/fused/layout.h"
+#include "ddrecon/march/fused/runs.h"
 // A packet of rays: where its nodes lie, and what they emit.
 
 namespace ddrecon {
@@ -39,28 +39,22 @@ template <bool SLICED, bool RAYS, bool ANGLES, bool CURVES> struct Case {
 // values, and p with its derivatives, a dual number E.
 enum Mode { VALUES, TANGENT, ADJOINT };
 
-template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
+template <class F, class L, class Which, Mode MODE> struct Rays : Which {
     typedef Numbers<F> P;
     typedef typename P::V V;
     typedef typename P::W W;
     typedef typename P::M M;
-    using L::BEAMS, L::C, L::CHANNELS, L::COLOR_STEP, L::CURVE_STEP, L::DIFFUSE_STEP;
-    using L::DIFFUSING_STEP, L::EXTINCTION, L::FIRST_DIFFUSE, L::FIRST_DIFFUSING, L::FIRST_MASS;
-    using L::FIRST_NUMBER, L::FIRST_OWN_SCATTERING, L::FIRST_PEAK, L::FIRST_SCATTERING;
-    using L::HAS_NUMBERS, L::HAS_PEAK, L::HAS_RUNGS, L::IS_LINEAR, L::IS_PEAK_FIELD, L::IS_STEEP;
-    using L::is_point, L::MASS_STEP, L::MASSES, L::NUMBER_STEP, L::OUT, L::PEAK_STEP, L::PHASE_STEP;
-    using L::PHASES, L::RAY_TERMS, L::SCATTERING, L::SCATTERING_STEP, L::TABLE_STEP, L::TERMS;
     using Which::IS_SLICED, Which::VARIES_ANGLES, Which::VARIES_CURVES, Which::VARIES_RAYS;
-    typedef ddrecon::Polynomial<F, TERMS> Polynomial;
-    typedef ddrecon::Point<F, TERMS> Point;
-    typedef ddrecon::Rungs<F, TERMS, IS_STEEP> Rungs;
+    typedef ddrecon::Polynomial<F, L::TERMS> Polynomial;
+    typedef ddrecon::Point<F, L::TERMS> Point;
+    typedef ddrecon::Rungs<F, L::TERMS, L::IS_STEEP> Rungs;
 
     // In an adjoint p has derivatives by the depth of the peak, by the number of the cell, and by
     // two numbers of the angle: foot and square distance of a point light, part and cosine else.
     static constexpr bool IS_TANGENT = MODE == TANGENT;
     static constexpr bool HAS_VIEW =
-        MODE == ADJOINT && (VARIES_ANGLES || (VARIES_CURVES && HAS_NUMBERS && !IS_LINEAR));
-    static constexpr int DEPTH = 0, NUMBER = HAS_PEAK, VIEW = NUMBER + HAS_NUMBERS;
+        MODE == ADJOINT && (VARIES_ANGLES || (VARIES_CURVES && L::HAS_NUMBERS && !L::IS_LINEAR));
+    static constexpr int DEPTH = 0, NUMBER = L::HAS_PEAK, VIEW = NUMBER + L::HAS_NUMBERS;
     static constexpr int DIRECTIONS = VIEW + 2 * HAS_VIEW;
     typedef Dual<V> D;
     typedef Dual<V, DIRECTIONS ? DIRECTIONS : 1> Slopes;
@@ -75,7 +69,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
     typedef typename Either<
         HAS_VIEW, E,
         typename Either<VARIES_RAYS || VARIES_ANGLES || VARIES_CURVES, N, V>::type>::type Angle;
-    typedef typename Either<HAS_RUNGS, E, Angle>::type Curve;
+    typedef typename Either<L::HAS_RUNGS, E, Angle>::type Curve;
     typedef typename Either<IS_TANGENT, Dual<W>, W>::type Mass;
     typedef Dual<V, IS_SLICED ? 2 : 3> Slope;
 
@@ -85,18 +79,19 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         Runs<F> runs;
         bool is_empty, is_lit;
         Distance s, t;
-        N v[CHANNELS], bend[MASSES + 1], w[OUT], u[OUT];
-        V held[MASSES + 1], decay[OUT];
-        E p[OUT];
-        Cubic<F, V> angle[BEAMS + 1];
+        N v[L::CHANNELS], bend[L::MASSES + 1], w[L::OUT], u[L::OUT];
+        V held[L::MASSES + 1], decay[L::OUT];
+        E p[L::OUT];
+        Cubic<F, V> angle[L::BEAMS + 1];
     };
 
     const Given<F>& given;
     const Changes<F> changes;
     int item, last, begin, first_node = 0, last_node;
-    Distance o0, o1, o2, d0, d1, d2, near, far;
-    Foot foot[BEAMS + 1], across[BEAMS + 1];
-    Coefficient coefficients[BEAMS * RAY_TERMS + 1];
+    // Origin, direction, near and far.
+    Distance ray[8];
+    Foot foot[L::BEAMS + 1], across[L::BEAMS + 1];
+    Coefficient coefficients[L::BEAMS * L::RAY_TERMS + 1];
     // Along y the packet's rays are closer together than along x; it `is_turned` where y are
     // columns.
     bool is_turned = false;
@@ -110,37 +105,37 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
           begin(item * LANES),
           last_node(given.node_count - 1),
           lines{given.rows, given.columns, given.row_stride, given.column_stride} {
-        Distance* const parts[] = {&o0, &o1, &o2, &d0, &d1, &d2, &near, &far};
-        UNROLLED
-        for (int k = 0; k < 8; ++k) *parts[k] = load<Distance>(given.rays, changes.rays, k, 8);
-        for (int b = 0; b < BEAMS; ++b) {
+        for (int k = 0; k < 8; ++k) ray[k] = load<Distance>(given.rays, changes.rays, k, 8);
+        for (int b = 0; b < L::BEAMS; ++b) {
             foot[b] = load<Foot>(given.angles, changes.angles, row_of(b));
-            across[b] = load<Foot>(given.angles, changes.angles, row_of(BEAMS + b));
+            across[b] = load<Foot>(given.angles, changes.angles, row_of(L::BEAMS + b));
         }
-        if (HAS_PEAK || HAS_NUMBERS)
-            for (int k = 0; k < BEAMS * RAY_TERMS; ++k)
+        if (L::HAS_PEAK || L::HAS_NUMBERS)
+            for (int k = 0; k < L::BEAMS * L::RAY_TERMS; ++k)
                 coefficients[k] =
                     load<Coefficient>(given.coefficients, changes.coefficients, row_of(k));
         // Nodes before the box and behind it are held at its faces: between them nothing is added.
-        const V near = value_of(this->near), far = value_of(this->far);
-        while (first_node < last_node && P::every(value_of(distance(first_node + 1)) <= near))
+        const V near = value_of(ray[6]), far = value_of(ray[7]);
+        while (first_node < last_node && P::every(value_of(distance(ray, first_node + 1)) <= near))
             ++first_node;
-        while (last_node > first_node && P::every(value_of(distance(last_node - 1)) >= far))
+        while (last_node > first_node && P::every(value_of(distance(ray, last_node - 1)) >= far))
             --last_node;
         if (P::every(near >= far)) last_node = first_node;
         if (LANES > 1 && IS_SLICED) turn();
     }
     void turn() {
-        const V s = value_of(distance((first_node + last_node) / 2));
-        const V y = value_of(o1) + s * value_of(d1), x = value_of(o2) + s * value_of(d2);
+        const Distance s = distance(ray, (first_node + last_node) / 2);
+        const V y = value_of(place(ray, s, 1)), x = value_of(place(ray, s, 2));
         const int end = begin + LANES <= last ? LANES - 1 : last - begin;
         const F high = P::lane(y, end) - P::lane(y, 0), wide = P::lane(x, end) - P::lane(x, 0);
         if (high * high <= wide * wide) return;
         is_turned = true;
         lines = {lines.columns, lines.rows, lines.column, lines.row};
-        const Distance o = o1, d = d1;
-        o1 = o2, d1 = d2;
-        o2 = o, d2 = d;
+        for (int k = 1; k <= 4; k += 3) {
+            const Distance y = ray[k];
+            ray[k] = ray[k + 1];
+            ray[k + 1] = y;
+        }
     }
     long long row_of(int k) const { return given.row_of(k); }
     // What the rays have at `at` of an array, and its change.
@@ -181,29 +176,37 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         return from < to;
     }
 
-    Distance distance(int n) const {
-        if (IS_SLICED) return (given.planes[n] - o0) / d0;
-        return near + given.planes[n] * (far - near);
+    // Of any kind of numbers that a ray has: the distance of node n; the same held in the box; and
+    // where it is then across slices, along y, and along x.
+    template <class X> X distance(const X* ray, int n) const {
+        if (IS_SLICED) return (given.planes[n] - ray[0]) / ray[3];
+        return ray[6] + given.planes[n] * (ray[7] - ray[6]);
+    }
+    template <class X> static X hold(const X* ray, const X& s) {
+        return P::least(P::most(s, ray[6]), ray[7]);
+    }
+    template <class X> static X place(const X* ray, const X& s, int axis) {
+        return ray[axis] + s * ray[3 + axis];
     }
     long long slice(int n) const {
         return IS_SLICED ? (long long)given.slices[n] * given.plane_stride : 0;
     }
-    static bool is_bent(int c) { return c >= FIRST_MASS && c < FIRST_MASS + MASSES; }
     // Where node n lies, and the matter there.
     void locate(int n, Node& node) const {
-        node.s = distance(n);
-        node.t = P::least(P::most(node.s, near), far);
-        const V s = value_of(node.s);
-        node.y = Place<F, V>::at(value_of(o1) + s * value_of(d1), lines.rows);
-        node.x = Place<F, V>::at(value_of(o2) + s * value_of(d2), lines.columns);
-        if (!IS_SLICED) node.z = Place<F, V>::at(value_of(o0) + s * value_of(d0), given.depth);
-        node.find_corners(lines);
+        node.s = distance(ray, n);
+        node.t = hold(ray, node.s);
+        auto at = [&](int axis, int size) {
+            return Place<F, V>::at(value_of(place(ray, node.s, axis)), size);
+        };
+        node.y = at(1, lines.rows);
+        node.x = at(2, lines.columns);
+        if (!IS_SLICED) node.z = at(0, given.depth);
         if (IS_SLICED) node.runs = Runs<F>(node.y, node.x, lines);
-        sample(node, n, 0, EXTINCTION);
-        if (SCATTERING) sample(node, n, FIRST_OWN_SCATTERING, FIRST_PEAK);
+        sample(node, n, 0, L::EXTINCTION);
+        if (L::SCATTERING) sample(node, n, L::AFTER_MASSES, L::FIRST_PEAK);
         node.is_empty = true;
-        for (int c = 0; c < FIRST_PEAK; ++c)
-            if (c < EXTINCTION || c >= FIRST_OWN_SCATTERING)
+        for (int c = 0; c < L::FIRST_PEAK; ++c)
+            if (c < L::EXTINCTION || c >= L::AFTER_MASSES)
                 node.is_empty = node.is_empty && is_nothing(node.v[c]);
     }
     static bool is_nothing(const V& x) { return P::every(x == P::all(F(0))); }
@@ -215,7 +218,7 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         if constexpr (IS_TANGENT && VARIES_RAYS) move(node, n, from, to);
     }
     template <int PART> INLINE void sample_part(Node& node, int n, int from, int to) const {
-        const F* const* fields = given.fields + PART * CHANNELS;
+        const F* const* fields = given.fields + PART * L::CHANNELS;
         const long long offset = slice(n);
 #if !defined(__CUDA_ARCH__)
         if constexpr (IS_SLICED && HAS_PERMUTATION<F>)
@@ -224,11 +227,10 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
                     const Window<F> w(node.runs.run[r], node.y, node.x, lines);
                     for (int c = from; c < to; ++c) {
                         V bend = P::all(F(0)), &known = P::template part<PART>(node.v[c]);
-                        const V v = is_bent(c) ? w.curved(fields[c] + offset, node.y, node.x, bend)
-                                               : w.linear(fields[c] + offset);
+                        const V v = w.value(fields[c] + offset, L::is_bent(c), bend);
                         known = P::pick(w.is_in, v, known);
-                        if (!is_bent(c)) continue;
-                        V& known_bend = P::template part<PART>(node.bend[c - FIRST_MASS]);
+                        if (!L::is_bent(c)) continue;
+                        V& known_bend = P::template part<PART>(node.bend[c - L::FIRST_MASS]);
                         known_bend = P::pick(w.is_in, bend, known_bend);
                     }
                 }
@@ -238,15 +240,16 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         for (int c = from; c < to; ++c) {
             V bend = P::all(F(0));
             P::template part<PART>(node.v[c]) =
-                node.value(fields[c] + offset, lines, is_bent(c), bend);
-            if (is_bent(c)) P::template part<PART>(node.bend[c - FIRST_MASS]) = bend;
+                node.value(fields[c] + offset, lines, L::is_bent(c), bend);
+            if (L::is_bent(c)) P::template part<PART>(node.bend[c - L::FIRST_MASS]) = bend;
         }
     }
     // Slopes at node n of channels `from` to before `to`, along y, x and z: of its value and of the
     // bend of that each is handed to `take`.
-    template <class Take> void take_slopes(int n, V s, int from, int to, Take take) const {
-        const V y = value_of(o1) + s * value_of(d1), x = value_of(o2) + s * value_of(d2);
-        const V z = value_of(o0) + s * value_of(d0), none = P::all(F(0));
+    template <class Take>
+    void take_slopes(int n, const Distance& s, int from, int to, Take take) const {
+        const V none = P::all(F(0)), z = value_of(place(ray, s, 0));
+        const V y = value_of(place(ray, s, 1)), x = value_of(place(ray, s, 2));
         M is_kink = Kink<F>::is_at(y, lines.rows) | Kink<F>::is_at(x, lines.columns);
         if (!IS_SLICED) is_kink = is_kink | Kink<F>::is_at(z, given.depth);
         const bool has_kink = !P::every(P::pick(is_kink, P::all(F(1)), none) == none);
@@ -257,14 +260,13 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
             sides[i].x = Kink<F>::template place<Slope>(x, lines.columns, side, 1);
             if constexpr (!IS_SLICED)
                 sides[i].z = Kink<F>::template place<Slope>(z, given.depth, side, 2);
-            sides[i].find_corners(lines);
         }
         for (int c = from; c < to; ++c) {
             const F* field = given.fields[c] + slice(n);
             Slope bend(none), other(none);
-            Slope v = sides[0].value(field, lines, is_bent(c), bend);
+            Slope v = sides[0].value(field, lines, L::is_bent(c), bend);
             if (has_kink) {
-                v = F(0.5) * (v + sides[1].value(field, lines, is_bent(c), other));
+                v = F(0.5) * (v + sides[1].value(field, lines, L::is_bent(c), other));
                 bend = F(0.5) * (bend + other);
             }
             take(c, v, bend);
@@ -272,28 +274,30 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
     }
     // What values change by, as node n moves.
     void move(Node& node, int n, int from, int to) const {
-        const Distance places[] = {o1 + node.s * d1, o2 + node.s * d2, o0 + node.s * d0};
+        const int axes[] = {1, 2, 0};
         auto along = [&](const Slope& slope) -> V {
             V change = P::all(F(0));
-            for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k) change += slope.by[k] * places[k].by[0];
+            for (int k = 0; k < (IS_SLICED ? 2 : 3); ++k)
+                change += slope.by[k] * place(ray, node.s, axes[k]).by[0];
             return change;
         };
-        take_slopes(n, value_of(node.s), from, to, [&](int c, const Slope& v, const Slope& bend) {
+        take_slopes(n, node.s, from, to, [&](int c, const Slope& v, const Slope& bend) {
             node.v[c].by[0] += along(v);
-            if (is_bent(c)) node.bend[c - FIRST_MASS].by[0] += along(bend);
+            if (L::is_bent(c)) node.bend[c - L::FIRST_MASS].by[0] += along(bend);
         });
     }
 
     N peak_of(const Node& node, int c) const {
-        return IS_PEAK_FIELD ? node.v[FIRST_PEAK + c * PEAK_STEP] : number(C + c);
+        return L::IS_PEAK_FIELD ? node.v[L::peak(c)] : number(L::C + c);
     }
-    N number_of(const Node& node, int h) const { return node.v[FIRST_NUMBER + h * NUMBER_STEP]; }
-    int first_of(int b, int c) const { return b * RAY_TERMS + c * CURVE_STEP; }
+    N number_of(const Node& node, int h) const { return node.v[L::number(h)]; }
     // Whether p of a beam is by coefficients at all, and in which lanes it is.
-    bool has_curve(int b) const { return HAS_PEAK || IS_LINEAR || (is_point(b) && !IS_STEEP); }
+    bool has_curve(int b) const {
+        return L::HAS_PEAK || L::IS_LINEAR || (L::is_point(b) && !L::IS_STEEP);
+    }
     M is_peaked(const Node& node, int c) const {
         const V none = P::all(F(0));
-        return (IS_STEEP ? value_of(number_of(node, c * PHASE_STEP)) : F(1) + none) > none;
+        return (L::IS_STEEP ? value_of(number_of(node, L::phase(c))) : F(1) + none) > none;
     }
     // In an adjoint, a number by which p has derivatives.
     template <int DIRECTION, class X> static E seed(const X& x) {
@@ -303,9 +307,9 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
     }
     // Where on its curve p is behind mass on both ways: by the depth of the peak, or by the number.
     auto place_of(const Node& node, int c, const N& way) const {
-        if constexpr (HAS_PEAK)
+        if constexpr (L::HAS_PEAK)
             return Polynomial::place(seed<DEPTH>(peak_of(node, c) * way));
-        else if constexpr (IS_LINEAR)
+        else if constexpr (L::IS_LINEAR)
             return seed<NUMBER>(number_of(node, c));
         else
             return P::all(F(0));
@@ -313,15 +317,15 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
     // Where beam b is in tables by angle at a node, and the cosine of that.
     Cubic<F, Angle> see(const Node& node, int b, Angle& cosine) const {
         Cubic<F, Angle> angle;
-        const Coefficient* given = coefficients + b * RAY_TERMS;
+        const Coefficient* given = coefficients + b * L::RAY_TERMS;
         if constexpr (HAS_VIEW) {
-            if (is_point(b))
+            if (L::is_point(b))
                 return Point::angle(
                     seed<VIEW>(foot[b]), seed<VIEW + 1>(across[b]), E(node.t), cosine);
             cosine = seed<VIEW + 1>(given[0]);
             angle.part = seed<VIEW>(given[2]);
         } else {
-            if (is_point(b))
+            if (L::is_point(b))
                 return Point::angle(Angle(foot[b]), Angle(across[b]), Angle(node.t), cosine);
             cosine = given[0], angle.part = given[2];
         }
@@ -333,61 +337,61 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
         Angle cosine;
         const Cubic<F, Angle> angle = see(node, b, cosine);
         node.angle[b] = angle.value();
-        for (int h = 0; h < PHASES; ++h) {
-            const F* const table = given.table + h * TABLE_STEP;
-            Curve* const curve = curves + h * TERMS;
-            V change[TERMS];
+        for (int h = 0; h < L::PHASES; ++h) {
+            const F* const table = given.table + L::table(h);
+            Curve* const curve = curves + h * L::TERMS;
+            V change[L::TERMS];
             const bool changes_itself = IS_TANGENT && VARIES_CURVES && changes.table;
-            if constexpr (HAS_RUNGS) {
+            if constexpr (L::HAS_RUNGS) {
                 const auto rung = Rungs::rung(seed<NUMBER>(number_of(node, h)));
                 Rungs::curve(table, rung, angle, curve);
                 if (changes_itself)
-                    Rungs::curve(
-                        changes.table + h * TABLE_STEP, rung.value(), node.angle[b], change);
-            } else if (!IS_STEEP) {
+                    Rungs::curve(changes.table + L::table(h), rung.value(), node.angle[b], change);
+            } else if (!L::IS_STEEP) {
                 Point::curve(angle, table, curve);
                 if (changes_itself)
-                    Point::curve(node.angle[b], changes.table + h * TABLE_STEP, change);
+                    Point::curve(node.angle[b], changes.table + L::table(h), change);
             }
             if constexpr (IS_TANGENT && VARIES_CURVES)
-                for (int k = 0; k < TERMS && changes_itself; ++k) curve[k].by[0] += change[k];
-            if constexpr (IS_STEEP)
+                for (int k = 0; k < L::TERMS && changes_itself; ++k) curve[k].by[0] += change[k];
+            if constexpr (L::IS_STEEP)
                 plain[h] = henyey_greenstein<F>(seed<NUMBER>(number_of(node, h)), E(cosine));
         }
     }
     // All else at node n: all outputs' emission, depth and p behind the mass `m`.
     void emit(int n, Node& node, const Mass* m) const {
-        sample(node, n, EXTINCTION, FIRST_OWN_SCATTERING);
-        if (FIRST_PEAK < CHANNELS) sample(node, n, FIRST_PEAK, CHANNELS);
-        for (int k = 0; k < MASSES; ++k) {
-            const N bent = number(2 * C) * node.bend[k], held = F(1) / P::root(F(1) + bent * bent);
-            node.v[FIRST_MASS + k] -= node.bend[k] * held;
+        sample(node, n, L::EXTINCTION, L::AFTER_MASSES);
+        if (L::FIRST_PEAK < L::CHANNELS) sample(node, n, L::FIRST_PEAK, L::CHANNELS);
+        for (int k = 0; k < L::MASSES; ++k) {
+            const N bent = number(2 * L::C) * node.bend[k],
+                    held = F(1) / P::root(F(1) + bent * bent);
+            node.v[L::FIRST_MASS + k] -= node.bend[k] * held;
             node.held[k] = value_of(held);
         }
-        for (int c = 0; c < C; ++c) {
-            const N scattering = node.v[FIRST_DIFFUSING + c * DIFFUSING_STEP];
-            node.w[c] = scattering * node.v[FIRST_DIFFUSE + c * DIFFUSE_STEP];
-            node.u[c] = number(c) * P::narrow(m[c * MASS_STEP]);
+        for (int c = 0; c < L::C; ++c) {
+            const N scattering = node.v[L::diffusing(c)];
+            node.w[c] = scattering * node.v[L::diffuse(c)];
+            node.u[c] = number(c) * P::narrow(m[L::extinction(c)]);
         }
-        for (int b = 0; b < BEAMS; ++b) {
-            const bool has_tables = is_point(b) || HAS_RUNGS;
-            Curve curves[PHASES * TERMS];
-            E plain[PHASES];
-            if (has_tables || IS_STEEP) read_tables(node, b, curves, plain);
-            for (int c = 0; c < C; ++c) {
-                const int i = C + b * C + c, h = c * PHASE_STEP;
-                const N scattering = node.v[FIRST_SCATTERING + c * SCATTERING_STEP];
-                const N way = P::narrow(m[c * MASS_STEP]) +
-                              node.v[FIRST_MASS + b * EXTINCTION + c * MASS_STEP];
+        for (int b = 0; b < L::BEAMS; ++b) {
+            const bool has_tables = L::is_point(b) || L::HAS_RUNGS;
+            Curve curves[L::PHASES * L::TERMS];
+            E plain[L::PHASES];
+            if (has_tables || L::IS_STEEP) read_tables(node, b, curves, plain);
+            for (int c = 0; c < L::C; ++c) {
+                const int i = L::C + b * L::C + c, h = L::phase(c);
+                const N scattering = node.v[L::scattering(c)];
+                const N way = P::narrow(m[L::extinction(c)]) + node.v[L::mass(b, c)];
                 E p(P::all(F(1)));
                 if (has_curve(b)) {
                     const auto place = place_of(node, c, way);
                     p = has_tables
-                            ? Polynomial::template at<E>(curves + h * TERMS, place)
-                            : Polynomial::template at<E>(coefficients + first_of(b, c), place);
+                            ? Polynomial::template at<E>(curves + h * L::TERMS, place)
+                            : Polynomial::template at<E>(coefficients + L::curve(b, c), place);
                 }
-                if (HAS_PEAK) p = P::most(p, E(P::all(F(0))));
-                if (IS_STEEP) p = HAS_PEAK ? P::pick(is_peaked(node, c), p, plain[h]) : plain[h];
+                if (L::HAS_PEAK) p = P::most(p, E(P::all(F(0))));
+                if (L::IS_STEEP)
+                    p = L::HAS_PEAK ? P::pick(is_peaked(node, c), p, plain[h]) : plain[h];
                 node.p[i] = p;
                 if constexpr (MODE == ADJOINT)
                     node.w[i] = scattering * p.value;
@@ -396,15 +400,15 @@ template <class F, class L, class Which, Mode MODE> struct Rays : L, Which {
                 node.u[i] = number(c) * way;
             }
         }
-        for (int i = 0; i < OUT; ++i) node.decay[i] = P::decay(value_of(node.u[i]));
+        for (int i = 0; i < L::OUT; ++i) node.decay[i] = P::decay(value_of(node.u[i]));
     }
     Mass mass_between(const Node& a, const Node& b, int k) const {
         return P::wide(F(0.5) * (a.v[k] + b.v[k]) * (b.t - a.t));
     }
     // What output i is integrated by: length, or for a point light the integral of 1 / r^2.
     Length measure(const Node& a, const Node& b, int i) const {
-        const int beam = i / C - 1;
-        if (i < C || !is_point(beam)) return b.t - a.t;
+        const int beam = i / L::C - 1;
+        if (i < L::C || !L::is_point(beam)) return b.t - a.t;
         return Point::subtended(Length(foot[beam]), Length(across[beam]), Length(a.t), Length(b.t));
     }
 };

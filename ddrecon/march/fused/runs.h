@@ -1,44 +1,10 @@
 #pragma once
-#include "ddrecon/kernels/dual.h"
-#include "ddrecon/kernels/packets.h"
+#include "ddrecon/march/fused/cells.h"
 // Packets of places that are close to each other: their values, in vectors of cells. Some lanes, a
 // run, lie between the same two rows and within LANES columns. Columns of a row are read in one
 // piece, and lanes pick theirs by a permutation: 1.4 times as fast as lane by lane.
 
 namespace ddrecon {
-
-// Lines of cells across the packet, along which its rays are close to each other (y), and along it
-// (x): sizes, and strides in memory.
-struct Lines {
-    int rows, columns, row, column;
-};
-
-// The cells m, i, j, p around a place on a line, which lies a part a of the way from i to j; and
-// a (1 - a) / 2, in `excess` of which values are off.
-template <class F, class N> struct Place {
-    typedef Packets<F> P;
-    typedef typename P::V V;
-    typedef typename P::I I;
-    I m, i, j, p;
-    N a, excess;
-    static INLINE Place at(V y, int size) {
-        const V none = P::all(F(0)), end = P::all(F(size - 1));
-        // Also where y is not a number.
-        const V held = P::least(P::pick(y > none, y, none), end);
-        const I zero = P::whole(none), top = zero + (size - 1);
-        const I last = zero + (size > 1 ? size - 2 : 0), cell = P::whole(held);
-        Place q;
-        q.i = P::pick(cell > last, last, cell);
-        q.j = P::pick(q.i + 1 > top, top, q.i + 1);
-        q.m = P::pick(q.i > zero, q.i - 1, zero);
-        q.p = P::pick(q.j + 1 > top, top, q.j + 1);
-        q.a = held - P::real(q.i);
-        q.excess = P::pick((y > none) & (y < end), F(0.5) * q.a * (F(1) - q.a), none);
-        return q;
-    }
-    // The same place of lines that begin `by` cells on.
-    INLINE Place behind(I by) const { return {m + by, i + by, j + by, p + by, a, excess}; }
-};
 
 // Of more runs each lane finds its values itself.
 constexpr int MOST_RUNS = 5;
@@ -67,18 +33,18 @@ template <class F> struct Runs {
         typedef Packets<F> P;
         typedef typename P::I I;
         const int most = lines.columns > LANES ? lines.columns - LANES : 0;
-        const int low = __builtin_reduce_min(x.m), high = __builtin_reduce_max(x.p);
+        const int low = __builtin_reduce_min(x.cells[0]), high = __builtin_reduce_max(x.cells[3]);
         count = 0;
-        if (high - low < LANES && __builtin_reduce_and(y.i == y.i[0])) {
+        if (high - low < LANES && __builtin_reduce_and(y.cells[1] == y.cells[1][0])) {
             run[count++] = {ALL_LANES, 0, low, high, low < most ? low : most};
             return;
         }
         for (unsigned rest = ALL_LANES; rest; rest &= ~run[count++].lanes) {
             const int lane = __builtin_ctz(rest);
-            const I in_row = (y.i == P::lane_of(y.i, lane)) & P::lanes_of(rest);
-            const int low = __builtin_reduce_min(P::pick(in_row, x.m, I{} + lines.columns));
-            const I in_run = in_row & (x.p < low + LANES);
-            const int high = __builtin_reduce_max(P::pick(in_run, x.p, I{}));
+            const I in_row = (y.cells[1] == P::lane_of(y.cells[1], lane)) & P::lanes_of(rest);
+            const int low = __builtin_reduce_min(P::pick(in_row, x.cells[0], I{} + lines.columns));
+            const I in_run = in_row & (x.cells[3] < low + LANES);
+            const int high = __builtin_reduce_max(P::pick(in_run, x.cells[3], I{}));
             const unsigned lanes = P::bits_of(in_run);
             run[count] = {lanes, __builtin_ctz(lanes), low, high, low < most ? low : most};
         }
@@ -110,57 +76,34 @@ template <class F> constexpr bool HAS_PERMUTATION = false;
 // What a run sees of fields: its rows, and lanes' columns within its own.
 template <class F> struct Window {
     typedef Packets<F> P;
-    typedef Permute<F> Lanes;
     typedef typename P::V V;
-    typedef typename P::I I;
     typename P::M is_in;
-    I m, i, j, p;
-    V a, b;
-    long long at_m, at_i, at_j, at_p;
+    Place<F, V> y, x;
+    long long rows[4];
     int first, stride;
     Window(const Run& run, const Place<F, V>& y, const Place<F, V>& x, const Lines& lines)
         : is_in(__builtin_convertvector(P::lanes_of(run.lanes), typename P::M)),
-          m(x.m - run.first),
-          i(x.i - run.first),
-          j(x.j - run.first),
-          p(x.p - run.first),
-          a(y.a),
-          b(x.a),
-          at_m((long long)P::lane_of(y.m, run.lane) * lines.row),
-          at_i((long long)P::lane_of(y.i, run.lane) * lines.row),
-          at_j((long long)P::lane_of(y.j, run.lane) * lines.row),
-          at_p((long long)P::lane_of(y.p, run.lane) * lines.row),
+          y(y),
+          x(x.behind(typename P::I{} - run.first)),
           first(run.first),
-          stride(lines.column) {}
-    INLINE V row(const F* f, long long at) const {
-        if (stride == 1) return P::read(f + at + first);
-        V x;
-        for (int l = 0; l < LANES; ++l) x[l] = f[at + (long long)(first + l) * stride];
-        return x;
+          stride(lines.column) {
+        for (int r = 0; r < 4; ++r)
+            rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
     }
-    INLINE V along(V row) const {
-        const V one = Lanes::pick(row, i);
-        return one + b * (Lanes::pick(row, j) - one);
-    }
-    INLINE V linear(const F* f) const {
-        const V top = along(row(f, at_i));
-        return top + a * (along(row(f, at_j)) - top);
-    }
-    // As `Corners::curved`.
-    INLINE V curved(const F* f, const Place<F, V>& y, const Place<F, V>& x, V& bend) const {
-        const V row_i = row(f, at_i), row_j = row(f, at_j);
-        const V i0 = Lanes::pick(row_i, i), i1 = Lanes::pick(row_i, j);
-        const V j0 = Lanes::pick(row_j, i), j1 = Lanes::pick(row_j, j);
-        const V top = i0 + b * (i1 - i0), low = j0 + b * (j1 - j0);
-        const V over = along(row(f, at_m)), under = along(row(f, at_p));
-        // Second differences along y, and along x in both rows.
-        const V along_y = (F(1) - a) * (over - F(2) * top + low) + a * (top - F(2) * low + under);
-        const V in_i = (F(1) - b) * (Lanes::pick(row_i, m) - F(2) * i0 + i1) +
-                       b * (i0 - F(2) * i1 + Lanes::pick(row_i, p));
-        const V in_j = (F(1) - b) * (Lanes::pick(row_j, m) - F(2) * j0 + j1) +
-                       b * (j0 - F(2) * j1 + Lanes::pick(row_j, p));
-        bend = y.excess * along_y + x.excess * (in_i + a * (in_j - in_i));
-        return top + a * (low - top);
+    // As `Spot::value`.
+    INLINE V value(const F* f, bool is_bent, V& bend) const {
+        V row[4];
+        UNROLLED
+        for (int r = 0; r < 4; ++r) {
+            if (!is_bent && (r == 0 || r == 3)) continue;
+            if (stride == 1)
+                row[r] = P::read(f + rows[r] + first);
+            else
+                for (int l = 0; l < LANES; ++l)
+                    row[r][l] = f[rows[r] + (long long)(first + l) * stride];
+        }
+        auto cell = [&](int r, int c) HERE { return Permute<F>::pick(row[r], x.cells[c]); };
+        return is_bent ? curved(y, x, cell, bend) : linear(y, x, cell);
     }
 };
 

@@ -1,5 +1,5 @@
 #pragma once
-#include "ddrecon/march/fused/cells.h"
+#include "ddrecon/march/fused/runs.h"
 // Cotangents of values at packets of places in a slice go back to the cells. Neighboring rays meet
 // the same cells. Of a run, cells of its columns add up all shares in vectors, and are written
 // once:
@@ -19,7 +19,6 @@ namespace ddrecon {
 #if defined(__CUDA_ARCH__)
 template <class F> INLINE void spread_place(
     F* field, const Place<F, F>& y, const Place<F, F>& x, const Lines& lines, F bar, F bend_bar) {
-    const int ys[4] = {y.m, y.i, y.j, y.p}, xs[4] = {x.m, x.i, x.j, x.p};
     const F ya = y.a, xa = x.a;
     // Linear weights, and those of a (1 - a) / 2 second differences.
     const F y_linear[4] = {0, 1 - ya, ya, 0}, x_linear[4] = {0, 1 - xa, xa, 0};
@@ -31,7 +30,7 @@ template <class F> INLINE void spread_place(
                 bar * y_linear[j] * x_linear[i] + bend_bar * (y.excess * y_bend[j] * x_linear[i] +
                                                               x.excess * y_linear[j] * x_bend[i]);
             if (weight != F(0))
-                Packets<F>::add(field, ys[j] * lines.row + xs[i] * lines.column, weight);
+                Packets<F>::add(field, y.cells[j] * lines.row + x.cells[i] * lines.column, weight);
         }
 }
 #else
@@ -45,12 +44,12 @@ template <class F> struct Shares {
     Run run;
     Lines lines;
     int first, alike = 0;
-    long long at_m, at_i, at_j, at_p;
+    long long rows[4];
     V ya, y_excess, xa, x_excess, at_low, at_high;
     // If up to so many lanes lie `alike` right of the same column: for each column the lanes whose
-    // m, i, j or p it is. Else each lane's weights of columns, and those of a (1 - a) / 2 second
+    // first to fourth it is. Else each lane's weights of columns, and those of a (1 - a) / 2 second
     // differences.
-    I m[MOST_ALIKE], i[MOST_ALIKE], j[MOST_ALIKE], p[MOST_ALIKE];
+    I lanes_of[MOST_ALIKE][4];
     V linear[LANES], bent[LANES];
 
     Shares(
@@ -59,14 +58,12 @@ template <class F> struct Shares {
         : run(run),
           lines(lines),
           first(run.first),
-          at_m((long long)P::lane_of(y.m, run.lane) * lines.row),
-          at_i((long long)P::lane_of(y.i, run.lane) * lines.row),
-          at_j((long long)P::lane_of(y.j, run.lane) * lines.row),
-          at_p((long long)P::lane_of(y.p, run.lane) * lines.row),
           ya(y.a),
           y_excess(y.excess),
           xa(x.a),
           x_excess(x.excess) {
+        for (int r = 0; r < 4; ++r)
+            rows[r] = (long long)P::lane_of(y.cells[r], run.lane) * lines.row;
         if constexpr (HAS_PERMUTATION<F>)
             if (lines.columns >= LANES) pick_lanes(x);
         if (alike) return;
@@ -74,26 +71,24 @@ template <class F> struct Shares {
         F ones[2 * LANES - 1] = {};
         ones[LANES - 1] = F(1);
         auto column = [&](int k) -> V { return P::read(ones + LANES - 1 - (k - first)); };
-        const int *xm = (const int*)&x.m, *xi = (const int*)&x.i, *xj = (const int*)&x.j;
-        const int* xp = (const int*)&x.p;
         const F *xa = (const F*)&x.a, *excess = (const F*)&x.excess;
         for (unsigned rest = run.lanes; rest; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
-            const V at_i = column(xi[l]), at_j = column(xj[l]);
+            V at[4];
+            for (int c = 0; c < 4; ++c) at[c] = column(((const int*)&x.cells[c])[l]);
             const F w1 = xa[l], w0 = F(1) - w1;
-            linear[l] = w0 * at_i + w1 * at_j;
+            linear[l] = w0 * at[1] + w1 * at[2];
             if (is_bent)
-                bent[l] = (excess[l] * (w1 - F(2) * w0)) * at_i +
-                          (excess[l] * (w0 - F(2) * w1)) * at_j + (excess[l] * w0) * column(xm[l]) +
-                          (excess[l] * w1) * column(xp[l]);
+                bent[l] = excess[l] * ((w1 - F(2) * w0) * at[1] + (w0 - F(2) * w1) * at[2] +
+                                       w0 * at[0] + w1 * at[3]);
         }
     }
     void pick_lanes(const Place<F, V>& x) {
         const I numbers = P::numbers(), none = I{} + LANES;
-        const int count = __builtin_popcount(run.lanes), begin = P::lane_of(x.i, run.lane);
+        const int count = __builtin_popcount(run.lanes), begin = P::lane_of(x.cells[1], run.lane);
         // The run's lanes first, the columns right of which they lie, and those after new ones.
         const I lanes = Lanes::gather_lanes(numbers, run.lanes, none);
-        const I column = Lanes::pick_any(x.i, lanes, none), is_lane = numbers < count;
+        const I column = Lanes::pick_any(x.cells[1], lanes, none), is_lane = numbers < count;
         const I before = Lanes::pick_any(column, (numbers - 1) & (LANES - 1), none);
         const I step = P::pick(is_lane & (numbers > 0), column - before, I{});
         if (!__builtin_reduce_and((step == 0) | (step == 1))) return;
@@ -111,14 +106,12 @@ template <class F> struct Shares {
         for (int k = 0; k < most; ++k) {
             const I which = P::pick(start + k < next, start + k, none);
             const I lane = Lanes::pick_any(lanes, which, none), at = numbers - shift;
-            m[k] = Lanes::pick_any(lane, at & (2 * LANES - 1), none);
-            i[k] = Lanes::pick_any(lane, (at - 1) & (2 * LANES - 1), none);
-            j[k] = Lanes::pick_any(lane, (at - 2) & (2 * LANES - 1), none);
-            p[k] = Lanes::pick_any(lane, (at - 3) & (2 * LANES - 1), none);
+            for (int c = 0; c < 4; ++c)
+                lanes_of[k][c] = Lanes::pick_any(lane, (at - c) & (2 * LANES - 1), none);
         }
         // Beyond the ends of the row the columns at its ends count once more.
-        at_low = __builtin_convertvector(-(x.m == x.i), V);
-        at_high = __builtin_convertvector(-(x.p == x.j), V);
+        at_low = __builtin_convertvector(-(x.cells[0] == x.cells[1]), V);
+        at_high = __builtin_convertvector(-(x.cells[3] == x.cells[2]), V);
         alike = most;
     }
     // To a row of cells what linear values there have as bars, and corrections along the row.
@@ -140,8 +133,11 @@ template <class F> struct Shares {
                 by_i += (by_p - F(2) * by_m) + at_low * by_m;
             }
             for (int k = 0; k < alike; ++k) {
-                sum += Lanes::pick_any(by_i, i[k]) + Lanes::pick_any(by_j, j[k]);
-                if (IS_BENT) sum += Lanes::pick_any(by_m, m[k]) + Lanes::pick_any(by_p, p[k]);
+                sum +=
+                    Lanes::pick_any(by_i, lanes_of[k][1]) + Lanes::pick_any(by_j, lanes_of[k][2]);
+                if (IS_BENT)
+                    sum += Lanes::pick_any(by_m, lanes_of[k][0]) +
+                           Lanes::pick_any(by_p, lanes_of[k][3]);
             }
         }
         if (lines.column == 1 && lines.columns >= LANES) {
@@ -154,16 +150,16 @@ template <class F> struct Shares {
     }
     void add(F* field, V bar) const {
         const V in_j = bar * ya;
-        add_row<false>(field + at_i, bar - in_j);
-        add_row<false>(field + at_j, in_j);
+        add_row<false>(field + rows[1], bar - in_j);
+        add_row<false>(field + rows[2], in_j);
     }
     void add_bent(F* field, V bar, V bend_bar) const {
         const V bend_j = bend_bar * ya, bend_i = bend_bar - bend_j;
         const V in_m = y_excess * bend_i, in_p = y_excess * bend_j, in_j = bar * ya;
-        add_row<false>(field + at_m, in_m);
-        add_row<false>(field + at_p, in_p);
-        add_row<true>(field + at_i, (bar - in_j) + (in_p - F(2) * in_m), bend_i);
-        add_row<true>(field + at_j, in_j + (in_m - F(2) * in_p), bend_j);
+        add_row<false>(field + rows[0], in_m);
+        add_row<false>(field + rows[3], in_p);
+        add_row<true>(field + rows[1], (bar - in_j) + (in_p - F(2) * in_m), bend_i);
+        add_row<true>(field + rows[2], in_j + (in_m - F(2) * in_p), bend_j);
     }
 };
 #endif

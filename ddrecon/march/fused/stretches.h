@@ -21,7 +21,7 @@ template <class F> INLINE void mark(
         const V s = (planes[n] - ray[0]) / ray[3];
         const auto y = Place<F, V>::at(ray[1] + s * ray[4], rows);
         const auto x = Place<F, V>::at(ray[2] + s * ray[5], columns);
-        const auto cell = y.i * columns + x.i;
+        const auto cell = y.cells[1] * columns + x.cells[1];
         const bool* slice = touched + (long long)n * rows * columns;
         V touches = none;
         for (int l = 0; l < LANES; ++l) P::put(touches, l, F(slice[P::lane_of(cell, l)]));
