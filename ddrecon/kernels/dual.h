@@ -87,6 +87,16 @@ INLINE Dual<F, COUNT> pick(bool is, const Dual<F, COUNT>& one, const Dual<F, COU
     return r;
 }
 
+// Arrays of values and of their changes, which are read as dual numbers.
+template <class F> struct Changing {
+    const F *value, *change;
+    INLINE Dual<F> operator[](long long i) const { return {value[i], change[i]}; }
+    INLINE Changing operator+(long long i) const { return {value + i, change + i}; }
+};
+// What is written of a number found: itself, or of a dual number its change.
+template <class F> INLINE F change_of(F x) { return x; }
+template <class F> INLINE F change_of(const Dual<F>& x) { return x.by[0]; }
+
 // Whether numbers N have derivatives.
 template <class N> constexpr bool IS_DUAL = false;
 template <class F, int COUNT> constexpr bool IS_DUAL<Dual<F, COUNT>> = true;

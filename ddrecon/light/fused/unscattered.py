@@ -11,7 +11,6 @@ from torch import Tensor
 from ddrecon.kernels.dual import split
 from ddrecon.light.fused.receive import MOST_BEAMS, Receiver
 from ddrecon.light.fused.shear import Shear, change_sum
-from ddrecon.light.fused.tangents import change_received
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 MOST_NUMBERS = 1 << 22
@@ -46,7 +45,7 @@ class Unscattered(torch.autograd.Function):
         for lights in _batches(shears, field, receiver):
             beams = [(i, shears[i]) for i in lights]
             entered = _stack([s.lift(s.sum(laid.of(s), numbers, i).entered) for i, s in beams])
-            receiver.receive(lights[0], entered, moments, adds=lights[0] > 0)
+            receiver.receive(lights[0], entered, moments)
             if has_mass:
                 masses += [
                     torch.addcmul(one, field, 0.5 * numbers[light, 2])
@@ -112,7 +111,7 @@ class Unscattered(torch.autograd.Function):
             (field, scale, numbers, weights), d_tensors = split(tensors)
             d_field, d_scale, d_numbers, d_weights = d_tensors
             receiver = Receiver(field, scale, numbers, weights)
-            d_given = {"field": d_field, "scale": d_scale, "all_weights": d_weights}
+            d_given = {"d_field": d_field, "d_scale": d_scale, "d_weights": d_weights}
             d_moments, d_masses = receiver.new_moments(), []
             for lights in _batches(ctx.shears, field, receiver):
                 followed = [
@@ -120,8 +119,7 @@ class Unscattered(torch.autograd.Function):
                     for light in lights
                 ]
                 entered, d_entered = (_stack(list(each)) for each in zip(*followed, strict=True))
-                d_given["entered"] = d_entered
-                change_received(receiver, lights[0], entered, d_given, d_moments)
+                receiver.receive(lights[0], entered, d_moments, d_entered=d_entered, **d_given)
                 for light, d_mass in zip(lights if ctx.has_mass else (), d_entered, strict=False):
                     if d_field is not None:
                         d_mass = torch.addcmul(d_mass, d_field, 0.5 * numbers[light, 2])
