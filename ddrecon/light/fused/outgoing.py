@@ -1,9 +1,10 @@
-"""E3 towards a camera as one function of tensors, with its derivatives."""
+"""E3 towards a camera as one function of tensors, by the kernels of `outgoing.h`."""
 
 from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,14 +12,12 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
-from ddrecon.kernels.dual import launch_row_tangents, split
-from ddrecon.kernels.rows import launch_rows
-from ddrecon.light.fused.outgoing_kernels import scatter_adjoint_kernel, scatter_kernel
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.kernels.text import TextKernel
+from ddrecon.light.moments import MARGIN, Moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
-_FLUX = "flux_z", "flux_y", "flux_x"
-_TENSORS = "point", "factors", "more", "mean", "higher", *_FLUX
+_LIGHT = "mean", "flux_z", "flux_y", "flux_x", "higher", "more"
+_TENSORS = "point", "factors", *_LIGHT
 
 
 def scatter_fused(
@@ -28,21 +27,21 @@ def scatter_fused(
 
     `factors`: as of `Moments.weighted`, [L + 1, C or 1, 1, 1, 1].
     """
-    flux = light.flux or ()
-    colors = max(map(len, (light.mean, factors[0], *flux, *([] if more is None else [more]))))
+    flux = light.flux or (None, None, None)
+    given = (light.mean, factors[0], *flux, more)
+    colors = max(len(one) for one in given if one is not None)
     degree = 0 if light.flux is None else 1
     if light.higher is not None:
         degree = math.isqrt(len(light.higher) + 4) - 1
-    by_color = factors[: degree + 1].reshape(degree + 1, -1).expand(-1, colors)
     radiance: Tensor = _Scatter.apply(
         grid,
         rays.eye is not None,
         -rays.direction[0] if rays.eye is None else rays.eye,
-        by_color,
-        more if light.flux is None or more is None else more.expand(colors, *grid.shape),
+        factors[: degree + 1].reshape(degree + 1, -1).expand(-1, colors),
         light.mean,
-        light.higher,
         *flux,
+        light.higher,
+        None if more is None or degree == 0 else more.expand(colors, *grid.shape),
     )
     return radiance
 
@@ -54,12 +53,8 @@ class _Scatter(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(grid: Grid, is_eye: bool, *tensors: Any) -> Tensor:
-        given, is_so = _given(is_eye, *tensors)
-        radiance = given["mean"].new_empty(given["colors"], *grid.shape)
-        kernel = functools.partial(scatter_kernel, *is_so)
-        launch_rows(kernel, grid, len(radiance), given, {"radiance": radiance})
-        return radiance
+    def forward(grid: Grid, is_eye: bool, *tensors: Tensor | None) -> Tensor:
+        return _scatter("scatter", grid, is_eye, _named(tensors))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -69,96 +64,116 @@ class _Scatter(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, radiance_bar: Tensor) -> tuple[Tensor | None, ...]:
-        _, factors, _, mean, higher, *flux = ctx.saved_tensors
-        given, (degree, has_more) = _given(ctx.is_eye, *ctx.saved_tensors)
-        _, _, needs_point, needs_factors, needs_more, *_ = ctx.needs_input_grad
-        with_along = degree > 0 and (needs_point or needs_more)
-        names = "mean", *_FLUX[: len(flux)], *(["along"] if with_along else [])
-        shape = radiance_bar.shape
-        found = {f"{name}_bar": radiance_bar.new_empty(shape) for name in names}
-        if higher is not None:
-            found["higher_bar"] = radiance_bar.new_empty(len(higher), *shape)
-        items = len(radiance_bar) * (ctx.grid.cells if mean.is_cuda else math.prod(shape[1:3]))
-        found["sums"] = radiance_bar.new_empty(max(degree, 1) + 1, items)
-        kernel = functools.partial(scatter_adjoint_kernel, degree, has_more, with_along)
-        given["radiance_bar"] = radiance_bar
-        launch_rows(kernel, ctx.grid, len(radiance_bar), given, found)
-        along_bar = found.get("along_bar")
-        factors_bar = point_bar = None
-        if needs_factors:
-            sums = found["sums"].double().view(-1, len(radiance_bar), items // len(radiance_bar))
-            factors_bar = sums.sum(-1)[: len(factors)].to(factors)
-        if needs_point and along_bar is not None:
-            point_bar = _point_bar(ctx, along_bar)
-        return (
-            None,
-            None,
-            point_bar,
-            factors_bar,
-            along_bar if needs_more else None,
-            found["mean_bar"].sum_to_size(mean.shape),
-            None if higher is None else found["higher_bar"].sum_to_size(higher.shape),
-            *(
-                found[f"{name}_bar"].sum_to_size(one.shape)
-                for name, one in zip(_FLUX, flux, strict=False)
-            ),
-        )
+        named = _named(ctx.saved_tensors)
+        factors, (colors, *shape) = named["factors"], radiance_bar.shape
+        bars = {
+            name: radiance_bar.new_empty(*one.shape[:-4], colors, *shape)
+            for name, one in named.items()
+            if name in _LIGHT
+        }
+        # Of the factors, then of the point.
+        items = colors * _items(ctx.grid, radiance_bar)
+        sums = radiance_bar.new_empty(len(factors) + 3, items)
+        kind = "scatter_back<1>" if ctx.needs_input_grad[2] else "scatter_back<0>"
+        made = {f"{name}_bar": bar for name, bar in bars.items()} | {"sums": sums}
+        given = {"items": items, "radiance_bar": radiance_bar}
+        kernel, own = _prepare(kind, ctx.grid, ctx.is_eye, named)
+        kernel.launch(items, own | given, made)
+        found = sums.double().view(len(sums), colors, -1).sum(-1).to(factors)
+        named_bars = {name: bar.sum_to_size(named[name].shape) for name, bar in bars.items()}
+        named_bars |= {"factors": found[:-3], "point": found[-3:].sum(1)}
+        return None, None, *map(named_bars.get, _TENSORS)
 
     @staticmethod
     def jvp(ctx: Any, _grid: None, _is_eye: None, *changes: Tensor | None) -> Tensor:
-        def change(*tensors: Any) -> Tensor:
-            values, d_values = split(tensors)
-            given, is_so = _given(ctx.is_eye, *values)
-            d_given = dict(zip(_TENSORS, d_values, strict=False))
-            d_radiance = given["mean"].new_empty(given["colors"], *ctx.grid.shape)
-            kernel = functools.partial(scatter_kernel, *is_so)
-            made = {"radiance": d_radiance}
-            launch_row_tangents(kernel, ctx.grid, len(d_radiance), given, d_given, made)
-            return d_radiance
+        def change(*tensors: Tensor | None) -> Tensor:
+            half = len(tensors) // 2
+            values, found = _named(tensors[:half]), _named(tensors[half:])
+            d_given = {
+                f"d_{name}": found.get(name, torch.zeros_like(one)) for name, one in values.items()
+            }
+            return _scatter("tangent", ctx.grid, ctx.is_eye, values, **d_given)
 
         d_radiance: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_radiance
 
 
-def _point_bar(ctx: Any, along_bar: Tensor) -> Tensor:
-    """The cotangent of the point or direction, by what depends on it."""
-    point, factors, _, mean, higher, *flux = ctx.saved_tensors
-    vector: Vector = (flux[0], flux[1], flux[2])
-    light = Moments(torch.zeros_like(mean), vector, higher)
-    with torch.enable_grad():
-        leaf = point.detach().requires_grad_()
-        eye = leaf if ctx.is_eye else None
-        directions = Rays(leaf, -leaf[None], eye).towards_eye(ctx.grid)
-        weighted = light.weighted(factors[..., None, None, None])
-        along = (weighted.along(directions) * along_bar).sum()
-    (point_bar,) = torch.autograd.grad(along, leaf)
-    return point_bar
+def _named(tensors: Sequence[Tensor | None]) -> dict[str, Tensor]:
+    """Those `tensors` that there are, by their names."""
+    return {name: one for name, one in zip(_TENSORS, tensors, strict=True) if one is not None}
 
 
-def _given(
-    is_eye: bool,
-    point: Tensor,
-    factors: Tensor,
-    more: Tensor | None,
-    mean: Tensor,
-    higher: Tensor | None,
-    *flux: Tensor,
-) -> tuple[dict[str, Any], tuple[int, bool]]:
-    """What both kernels are given, by its names; light's degree, and whether there is `more`."""
-    degree = len(factors) - 1
-    given = {
-        "is_eye": int(is_eye),
+def _scatter(
+    kind: str, grid: Grid, is_eye: bool, named: dict[str, Tensor], **given: Tensor
+) -> Tensor:
+    """The radiance, or its change."""
+    radiance = named["mean"].new_empty(named["factors"].shape[1], *grid.shape)
+    kernel, own = _prepare(kind, grid, is_eye, named)
+    kernel.launch(len(radiance) * _items(grid, radiance), own | given, {"radiance": radiance})
+    return radiance
+
+
+def _items(grid: Grid, like: Tensor) -> int:
+    """Items of a color: rows on a processor, and cells on a GPU."""
+    return grid.cells if like.is_cuda else grid.cells // grid.shape[2]
+
+
+def _prepare(
+    kind: str, grid: Grid, is_eye: bool, named: dict[str, Tensor]
+) -> tuple[TextKernel, dict[str, Any]]:
+    """The kernel for such light, and what it is given."""
+    mean, factors, flux, higher = (
+        named.get(name) for name in ("mean", "factors", "flux_z", "higher")
+    )
+    numbers = {
+        "width": 1 if mean.is_cuda else grid.shape[2],
+        "is_eye": is_eye,
         "colors": factors.shape[1],
         "mean_colors": len(mean),
-        "flux_colors": len(flux[0]) if flux else 1,
+        "flux_colors": 1 if flux is None else len(flux),
         "higher_colors": 1 if higher is None else higher.shape[1],
-        "point": point,
-        "factors": factors,
-        "mean": mean,
-        **dict(zip(_FLUX, flux, strict=False)),
+        "margin": MARGIN,
+        "least": 1e6 * torch.finfo(mean.dtype).tiny,
     }
-    if higher is not None:
-        given["higher"] = higher
-    if more is not None:
-        given["more"] = more
-    return given, (degree, more is not None and degree > 0)
+    for corner, values in zip(("n", "h", "l"), (grid.shape, grid.spacing, grid.lower), strict=True):
+        numbers |= {f"{corner}{axis}": value for axis, value in zip("zyx", values, strict=True)}
+    kernel = scatter_kernel(kind, len(factors) - 1, "more" in named, 8 * mean.element_size())
+    return kernel, numbers | named
+
+
+_NUMBERS = (
+    "nz, ny, nx, width, is_eye, colors, mean_colors, flux_colors, higher_colors",
+    "hz, hy, hx, lz, ly, lx, margin, least",
+)
+
+
+@functools.cache
+def scatter_kernel(kind: str, degree: int, has_more: bool, bits: int) -> TextKernel:
+    """The kernel "scatter", its "tangent", or "scatter_back", of light known to `degree`.
+
+    The last is "<1>" where the point varies. With `has_more` there is radiance besides.
+    """
+    light, bars = ", ".join(_LIGHT), [f"{name}_bar" for name in _LIGHT]
+    given, made = ", ".join(f"*{name}" for name in _TENSORS), "radiance"
+    if kind == "scatter":
+        call, more = (
+            f"scatter<F>(item, point, factors, Own::Light<const F*>{{{light}}}, radiance)",
+            "*radiance",
+        )
+    elif kind == "tangent":
+        pairs = [f"Changing<F>{{{name}, d_{name}}}" for name in _TENSORS]
+        call = f"scatter<Dual<F>>(item, {pairs[0]}, {pairs[1]}, Own::Light<Changing<F>>{{{', '.join(pairs[2:])}}}, radiance)"
+        more = ", ".join(["*radiance", *(f"*d_{name}" for name in _TENSORS)])
+    else:
+        call = f"{kind}(item, items, point, factors, {{{light}}}, radiance_bar, {{{', '.join(bars)}}}, sums)"
+        more = ", ".join(["*radiance_bar", "*sums", *(f"*{name}" for name in bars)])
+        made = " ".join(["sums", *bars])
+    text = f"""
+        typedef Outgoing<F, {degree}, {int(has_more)}> Own;
+        const Own own = {{{", ".join(_NUMBERS)}}};
+        own.{call};
+    """
+    given = f"int {_NUMBERS[0]}, items; F {_NUMBERS[1]}, {given}, {more}"
+    return TextKernel(
+        kind.split("<")[0] + "_towards", bits, text, given, made, "light/fused/outgoing.h"
+    )

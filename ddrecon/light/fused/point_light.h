@@ -10,10 +10,10 @@ template <class N> struct Between {
     int n;
     N a;
     template <class F> INLINE Between(const N& p, F most) {
-        const F at = value_of(p);
-        const int whole = (int)(at < F(0) ? F(0) : at > most ? most : at), last = (int)most - 1;
-        n = whole < last ? whole : last < 0 ? 0 : last;
-        a = pick(at > F(0) && at < most, p, N(at > F(0) ? most : F(0))) - F(n);
+        const F at = value_of(p), held = at < F(0) ? F(0) : at > most ? most : at;
+        const int whole = (int)held, last = most < F(1) ? 0 : (int)most - 1;
+        n = whole < last ? whole : last;
+        a = along(p, Sloped<F>{held - F(n), F(at > F(0) && at < most)});
     }
 };
 template <class N, class M> INLINE auto blend(const N& a, const M& low, const M& high) {
@@ -29,9 +29,7 @@ template <class F, int BLOCK> struct Ways {
         const F last = lasts[axis * ways + t];
         return last - fraction[i] * (last - firsts[axis * ways + t]);
     }
-    INLINE int count(int item) const {
-        return (item + 1) * BLOCK < ways ? BLOCK : ways - item * BLOCK;
-    }
+    INLINE int count_from(int begin) const { return begin + BLOCK < ways ? BLOCK : ways - begin; }
     INLINE long long cells() const { return (long long)depth * height * width; }
     // From a cell to its next neighbors.
     INLINE int up_z() const { return depth > 1 ? height * width : 0; }
@@ -59,21 +57,20 @@ template <class F, int BLOCK> struct Ways {
     };
 
     INLINE void integrate(int item, F* totals) const {
-        const int begin = item * BLOCK;
+        const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
             const F* __restrict field = fields + channel * cells();
             F sum[BLOCK];
-            for (int t = 0; t < count(item); ++t) sum[t] = F(0);
+            for (int t = 0; t < count; ++t) sum[t] = F(0);
             for (int i = 0; i < samples; ++i)
-                for (int t = 0; t < count(item); ++t) {
+                for (int t = 0; t < count; ++t) {
                     const int way = begin + t;
                     sum[t] +=
                         Corners<F>(*this, place(i, way, 0), place(i, way, 1), place(i, way, 2))
                             .look(*this, field);
                 }
             F* __restrict total = totals + (long long)channel * ways + begin;
-            for (int t = 0; t < count(item); ++t)
-                total[t] = sum[t] * lengths[begin + t] / F(samples);
+            for (int t = 0; t < count; ++t) total[t] = sum[t] * lengths[begin + t] / F(samples);
         }
     }
 
@@ -96,22 +93,21 @@ template <class F, int BLOCK> struct Ways {
     INLINE void integrate_back(
         int item, bool varies, const F* totals, F* fields_bar, F* firsts_bar, F* lasts_bar,
         F* lengths_bar) const {
-        const int begin = item * BLOCK;
+        const int begin = item * BLOCK, count = count_from(begin);
         for (int channel = 0; channel < channels; ++channel) {
             const F* __restrict field = fields + channel * cells();
             const F* __restrict bar = totals + (long long)channel * ways + begin;
             F part[BLOCK], az[BLOCK], ay[BLOCK], ax[BLOCK];
             int corner[BLOCK];
-            for (int t = 0; t < count(item); ++t)
-                part[t] = bar[t] * lengths[begin + t] / F(samples);
+            for (int t = 0; t < count; ++t) part[t] = bar[t] * lengths[begin + t] / F(samples);
             for (int i = 0; i < samples; ++i) {
-                for (int t = 0; t < count(item); ++t) {
+                for (int t = 0; t < count; ++t) {
                     const int way = begin + t;
                     const Corners<F> own(
                         *this, place(i, way, 0), place(i, way, 1), place(i, way, 2));
                     corner[t] = own.at, az[t] = own.z.a, ay[t] = own.y.a, ax[t] = own.x.a;
                 }
-                for (int t = 0; t < count(item); ++t) {
+                for (int t = 0; t < count; ++t) {
                     auto add_row = [&](int from, F value) HERE {
                         F* const to = fields_bar + channel * cells() + corner[t] + from;
                         add(to, value - value * ax[t]), add(to + up_x(), value * ax[t]);
@@ -125,18 +121,17 @@ template <class F, int BLOCK> struct Ways {
             if (!varies) continue;
             typedef Dual<F, 3> N;
             for (int i = 0; i < samples; ++i)
-                for (int t = 0; t < count(item); ++t) {
-                    const int way = begin + t, sizes[3] = {depth, height, width};
-                    N value(F(0));
-                    for (int side = -1; side <= 1; side += 2) {
-                        N p[3];
-                        for (int axis = 0; axis < 3; ++axis) {
-                            const F own = place(i, way, axis);
-                            p[axis] = N(own + F(side) * shift(own, sizes[axis]));
-                            p[axis].by[axis] = F(1);
-                        }
-                        value += F(0.5) * Corners<N>(*this, p[0], p[1], p[2]).look(*this, field);
-                    }
+                for (int t = 0; t < count; ++t) {
+                    const int way = begin + t;
+                    const F z = place(i, way, 0), y = place(i, way, 1), x = place(i, way, 2);
+                    auto look = [&](F side) HERE {
+                        N pz(z + side * shift(z, depth)), py(y + side * shift(y, height));
+                        N px(x + side * shift(x, width));
+                        pz.by[0] = py.by[1] = px.by[2] = F(1);
+                        return Corners<N>(*this, pz, py, px).look(*this, field);
+                    };
+                    const N value = F(0.5) * (look(F(-1)) + look(F(1)));
+                    UNROLLED
                     for (int axis = 0; axis < 3; ++axis) {
                         const F own = part[t] * value.by[axis];
                         firsts_bar[axis * ways + way] += fraction[i] * own;

@@ -1,0 +1,213 @@
+#pragma once
+#include "ddrecon/kernels/dual.h"
+// E3 towards a camera, of light by its moments in angle; `Moments.positive_along` is the
+// definition.
+
+namespace ddrecon {
+
+INLINE constexpr double find_root(double x) {
+    double found = 1.0 + x;
+    for (int i = 0; i < 40; ++i) found = 0.5 * (found + x / found);
+    return found;
+}
+// What makes the mean square of a harmonic 1; and (2 M - 1)!!.
+template <int L, int M> constexpr double NORM =
+    find_root((M ? 2 : 1) * (2 * L + 1) * FACTORIAL<L - M> / FACTORIAL<L + M>);
+template <int M> constexpr double ODD = FACTORIAL<2 * M> / (FACTORIAL<M> * (1 << M));
+
+// y_k of a vector v, z first, from those of order M and degree L on (`numerics/harmonics.py`):
+// `cosine` and `sine` are the parts of (x + i y)^M, `legendre` is that of L, `before` that of L
+// - 1.
+template <class F, int DEGREE, int M, int L, class N> INLINE void fill_order(
+    const N* v, const N& square, const N& cosine, const N& sine, const N& legendre, const N& before,
+    N* y) {
+    const N value = F(NORM<L, M>) * legendre;
+    y[L * L + L + M] = M ? value * cosine : value;
+    if constexpr (M > 0) y[L * L + L - M] = value * sine;
+    if constexpr (L < DEGREE) {
+        const N next = F(2 * L + 1) * v[0] * legendre - F(L + M) * square * before;
+        fill_order<F, DEGREE, M, L + 1>(
+            v, square, cosine, sine, F(1.0 / (L + 1 - M)) * next, legendre, y);
+    }
+}
+template <class F, int DEGREE, int M = 0, class N>
+INLINE void fill_harmonics(const N* v, const N& square, const N& cosine, const N& sine, N* y) {
+    fill_order<F, DEGREE, M, M>(v, square, cosine, sine, N(F(ODD<M>)), N(F(0)), y);
+    if constexpr (M < DEGREE)
+        fill_harmonics<F, DEGREE, M + 1>(
+            v, square, v[2] * cosine - v[1] * sine, v[2] * sine + v[1] * cosine, y);
+}
+
+// |x|, of slope 0 where x is.
+template <class F, class N> INLINE N size_of(const N& x) {
+    const F own = value_of(x);
+    const F sign = own < F(0) ? F(-1) : (own > F(0) ? F(1) : F(0));
+    return along(x, Sloped<F>{own < F(0) ? -own : own, sign});
+}
+
+// Light of DEGREE in angle: moments of degree l count times `factors` [DEGREE + 1, colors]. An item
+// is `width` cells of a row in one color. The camera is at a point, or without `is_eye` in a
+// direction.
+template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
+    int nz, ny, nx, width, is_eye, colors, mean_colors, flux_colors, higher_colors;
+    F hz, hy, hx, lz, ly, lx, margin, least;
+    static constexpr int COUNT = (DEGREE + 1) * (DEGREE + 1);
+
+    static INLINE int degree_of(int k) {
+        return (k > 0) + (k > 3) + (k > 8) + (k > 15) + (k > 24) + (k > 35) + (k > 48);
+    }
+
+    struct Row {
+        int color;
+        long long size, start;
+        F z, y, x;
+    };
+    INLINE Row row_of(int item) const {
+        const int parts = nx / width, rows = nz * ny, c = item / (rows * parts);
+        const int row = item / parts - c * rows, begin = item % parts * width;
+        const F z = lz + hz * (F(row / ny) + F(0.5)), y = ly + hy * (F(row % ny) + F(0.5));
+        return {c, (long long)rows * nx,         (long long)row * nx + begin, z,
+                y, lx + hx * (F(begin) + F(0.5))};
+    }
+
+    // Where values and cotangents lie: moments from 4 on are `higher`, `more` is radiance besides.
+    template <class In> struct Light {
+        In mean, flux_z, flux_y, flux_x, higher, more;
+    };
+    template <class In> struct Moments {
+        In first[4], higher, more;
+        long long step;
+        INLINE decltype(auto) operator()(int k, int i) const {
+            return k < 4 ? first[k][i] : higher[(k - 4) * step + i];
+        }
+    };
+    template <class In> INLINE Moments<In> moments_of(
+        const Row& row, const Light<In>& light, int mean_colors, int flux_colors,
+        int higher_colors) const {
+        auto own = [&](const In& array, int colors) HERE {
+            return array + (colors > 1 ? row.color * row.size + row.start : row.start);
+        };
+        Moments<In> found = {};
+        found.first[0] = own(light.mean, mean_colors);
+        found.step = higher_colors * row.size;
+        if constexpr (DEGREE > 0) {
+            found.first[1] = own(light.flux_z, flux_colors);
+            found.first[2] = own(light.flux_y, flux_colors);
+            found.first[3] = own(light.flux_x, flux_colors);
+        }
+        if constexpr (DEGREE > 1) found.higher = own(light.higher, higher_colors);
+        if constexpr (HAS_MORE) found.more = own(light.more, colors);
+        return found;
+    }
+
+    // Harmonics towards the camera, where those of degree 1 are a unit vector, at cell i of a row;
+    // what moments of each degree add; and what all but the mean do.
+    template <class N> struct Directed {
+        N y[COUNT], sum[DEGREE + 1], along;
+    };
+    template <class N, class P, class W, class In> INLINE void direct(
+        const Row& row, int i, const P* point, const W* factor, const Moments<In>& light,
+        Directed<N>& found) const {
+        N *const y = found.y, v[3];
+        const F center[3] = {row.z, row.y, row.x + hx * F(i)};
+        UNROLLED
+        for (int a = 0; a < 3; ++a) v[a] = is_eye ? point[a] - center[a] : N(point[a]);
+        const N square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2], distance = root(square);
+        const bool is_there = value_of(distance) > F(0);
+        const N shortened = is_eye ? pick(is_there, F(1) / distance, N(F(0))) : N(F(1));
+        UNROLLED
+        for (int a = 0; a < 3; ++a) v[a] = shortened * v[a];
+        if constexpr (DEGREE > 1)
+            fill_harmonics<F, DEGREE>(
+                v, v[0] * v[0] + v[1] * v[1] + v[2] * v[2], N(F(1)), N(F(0)), y);
+        found.along = N(F(0));
+        if constexpr (HAS_MORE) found.along = N(light.more[i]);
+        UNROLLED
+        for (int l = 1; l <= DEGREE; ++l) {
+            found.sum[l] = N(F(0));
+            UNROLLED
+            for (int k = l * l; k < (l + 1) * (l + 1); ++k) {
+                if (l == 1) y[k] = v[k - 1];
+                found.sum[l] += light(k, i) * y[k];
+            }
+            found.along += factor[l] * found.sum[l];
+        }
+    }
+
+    // The radiance `even` + `along`, bent to zero below a margin.
+    template <class N> INLINE N hold(const N& even, const N& along) const {
+        if constexpr (DEGREE == 0) return pick(value_of(even) < F(0), N(F(0)), even);
+        const N r = even + along, bend = margin * (size_of<F>(even) + size_of<F>(along));
+        const N part = r / pick(value_of(bend) < least, N(least), bend);
+        const F at = value_of(part);
+        const N opened = F(1) + pick(at < F(-1), N(F(-1)), pick(at > F(1), N(F(1)), part));
+        return pick(value_of(r) >= value_of(bend), r, F(0.25) * bend * opened * opened);
+    }
+
+    template <class N, class In>
+    INLINE void scatter(int item, In point, In factors, const Light<In>& light, F* radiance) const {
+        const Row row = row_of(item);
+        const auto moments = moments_of(row, light, mean_colors, flux_colors, higher_colors);
+        const N eye[3] = {point[0], point[1], point[2]};
+        N factor[DEGREE + 1];
+        UNROLLED
+        for (int l = 0; l <= DEGREE; ++l) factor[l] = factors[l * colors + row.color];
+        F* out = radiance + row.color * row.size + row.start;
+        INDEPENDENT
+        for (int i = 0; i < width; ++i) {
+            Directed<N> found;
+            if constexpr (DEGREE > 0) direct(row, i, eye, factor, moments, found);
+            out[i] = change_of(hold(factor[0] * moments(0, i), found.along));
+        }
+    }
+
+    // Cotangents in all colors; of factors and of the point, if it varies, `sums` of each item.
+    template <bool POINT_VARIES> INLINE void scatter_back(
+        int item, int items, const F* point, const F* factors, const Light<const F*>& light,
+        const F* radiance_bar, const Light<F*>& bars, F* sums) const {
+        REORDERED
+        typedef typename If<POINT_VARIES, Dual<F, 3>, F>::type N;
+        typedef Dual<F, 2> Both;
+        const Row row = row_of(item);
+        const auto moments = moments_of(row, light, mean_colors, flux_colors, higher_colors);
+        const auto moment_bars = moments_of(row, bars, colors, colors, colors);
+        const F* bar = radiance_bar + row.color * row.size + row.start;
+        N eye[3] = {N(point[0]), N(point[1]), N(point[2])};
+        if constexpr (POINT_VARIES)
+            for (int a = 0; a < 3; ++a) eye[a].by[a] = F(1);
+        F factor[DEGREE + 1], factor_bar[DEGREE + 1], eye_bar[3] = {F(0), F(0), F(0)};
+        UNROLLED
+        for (int l = 0; l <= DEGREE; ++l) {
+            factor[l] = factors[l * colors + row.color];
+            factor_bar[l] = F(0);
+        }
+        const int count = width;
+        INDEPENDENT
+        for (int i = 0; i < count; ++i) {
+            Directed<N> found;
+            Both even(factor[0] * moments(0, i)), along(F(0));
+            even.by[0] = along.by[1] = F(1);
+            if constexpr (DEGREE > 0) {
+                direct(row, i, eye, factor, moments, found);
+                along.value = value_of(found.along);
+            }
+            const Both held = hold(even, along);
+            const F even_bar = bar[i] * held.by[0], along_bar = bar[i] * held.by[1];
+            factor_bar[0] += moments(0, i) * even_bar;
+            moment_bars(0, i) = factor[0] * even_bar;
+            UNROLLED
+            for (int l = 1; l <= DEGREE; ++l) factor_bar[l] += value_of(found.sum[l]) * along_bar;
+            UNROLLED
+            for (int k = 1; k < COUNT; ++k)
+                moment_bars(k, i) = factor[degree_of(k)] * along_bar * value_of(found.y[k]);
+            if constexpr (HAS_MORE) moment_bars.more[i] = along_bar;
+            if constexpr (POINT_VARIES && DEGREE > 0)
+                for (int a = 0; a < 3; ++a) eye_bar[a] += along_bar * found.along.by[a];
+        }
+        UNROLLED
+        for (int l = 0; l <= DEGREE; ++l) sums[(long long)l * items + item] = factor_bar[l];
+        for (int a = 0; a < 3; ++a) sums[(DEGREE + 1LL + a) * items + item] = eye_bar[a];
+    }
+};
+
+} // namespace ddrecon
