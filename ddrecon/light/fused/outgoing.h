@@ -70,33 +70,28 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
                 y, lx + hx * (F(begin) + F(0.5))};
     }
 
-    // Where values and cotangents lie: moments from 4 on are `higher`, `more` is radiance besides.
+    // A row of light: `arrays` are the mean, the flux along z, y and x, all higher moments one
+    // after the other, and radiance besides, which has all colors.
     template <class In> struct Light {
-        In mean, flux_z, flux_y, flux_x, higher, more;
-    };
-    template <class In> struct Moments {
         In first[4], higher, more;
         long long step;
         INLINE decltype(auto) operator()(int k, int i) const {
             return k < 4 ? first[k][i] : higher[(k - 4) * step + i];
         }
     };
-    template <class In> INLINE Moments<In> moments_of(
-        const Row& row, const Light<In>& light, int mean_colors, int flux_colors,
+    template <class Arrays> INLINE auto light_of(
+        const Row& row, const Arrays& arrays, int mean_colors, int flux_colors,
         int higher_colors) const {
-        auto own = [&](const In& array, int colors) HERE {
-            return array + (colors > 1 ? row.color * row.size + row.start : row.start);
+        auto own = [&](int k, int colors) HERE {
+            return arrays(k) + (colors > 1 ? row.color * row.size + row.start : row.start);
         };
-        Moments<In> found = {};
-        found.first[0] = own(light.mean, mean_colors);
+        Light<decltype(own(0, 1))> found = {};
         found.step = higher_colors * row.size;
-        if constexpr (DEGREE > 0) {
-            found.first[1] = own(light.flux_z, flux_colors);
-            found.first[2] = own(light.flux_y, flux_colors);
-            found.first[3] = own(light.flux_x, flux_colors);
-        }
-        if constexpr (DEGREE > 1) found.higher = own(light.higher, higher_colors);
-        if constexpr (HAS_MORE) found.more = own(light.more, colors);
+        UNROLLED
+        for (int k = 0; k < (DEGREE > 0 ? 4 : 1); ++k)
+            found.first[k] = own(k, k > 0 ? flux_colors : mean_colors);
+        if constexpr (DEGREE > 1) found.higher = own(4, higher_colors);
+        if constexpr (HAS_MORE) found.more = own(5, colors);
         return found;
     }
 
@@ -106,7 +101,7 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         N y[COUNT], sum[DEGREE + 1], along;
     };
     template <class N, class P, class W, class In> INLINE void direct(
-        const Row& row, int i, const P* point, const W* factor, const Moments<In>& light,
+        const Row& row, int i, const P* point, const W* factor, const Light<In>& light,
         Directed<N>& found) const {
         N *const y = found.y, v[3];
         const F center[3] = {row.z, row.y, row.x + hx * F(i)};
@@ -144,10 +139,10 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         return pick(value_of(r) >= value_of(bend), r, F(0.25) * bend * opened * opened);
     }
 
-    template <class N, class In>
-    INLINE void scatter(int item, In point, In factors, const Light<In>& light, F* radiance) const {
+    template <class N, class In, class Arrays> INLINE void scatter(
+        int item, const In& point, const In& factors, const Arrays& arrays, F* radiance) const {
         const Row row = row_of(item);
-        const auto moments = moments_of(row, light, mean_colors, flux_colors, higher_colors);
+        const auto light = light_of(row, arrays, mean_colors, flux_colors, higher_colors);
         const N eye[3] = {point[0], point[1], point[2]};
         N factor[DEGREE + 1];
         UNROLLED
@@ -156,21 +151,23 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         INDEPENDENT
         for (int i = 0; i < width; ++i) {
             Directed<N> found;
-            if constexpr (DEGREE > 0) direct(row, i, eye, factor, moments, found);
-            out[i] = change_of(hold(factor[0] * moments(0, i), found.along));
+            if constexpr (DEGREE > 0) direct(row, i, eye, factor, light, found);
+            out[i] = change_of(hold(factor[0] * light(0, i), found.along));
         }
     }
 
     // Cotangents in all colors; of factors and of the point, if it varies, `sums` of each item.
     template <bool POINT_VARIES> INLINE void scatter_back(
-        int item, int items, const F* point, const F* factors, const Light<const F*>& light,
-        const F* radiance_bar, const Light<F*>& bars, F* sums) const {
+        int item, const F* point, const F* factors, const F* const* arrays, const F* radiance_bar,
+        F* const* bars, F* sums) const {
         REORDERED
         typedef typename If<POINT_VARIES, Dual<F, 3>, F>::type N;
         typedef Dual<F, 2> Both;
         const Row row = row_of(item);
-        const auto moments = moments_of(row, light, mean_colors, flux_colors, higher_colors);
-        const auto moment_bars = moments_of(row, bars, colors, colors, colors);
+        const auto light = light_of(
+            row, [&](int k) HERE { return arrays[k]; }, mean_colors, flux_colors, higher_colors);
+        const auto light_bar =
+            light_of(row, [&](int k) HERE { return bars[k]; }, colors, colors, colors);
         const F* bar = radiance_bar + row.color * row.size + row.start;
         N eye[3] = {N(point[0]), N(point[1]), N(point[2])};
         if constexpr (POINT_VARIES)
@@ -185,28 +182,29 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         INDEPENDENT
         for (int i = 0; i < count; ++i) {
             Directed<N> found;
-            Both even(factor[0] * moments(0, i)), along(F(0));
+            Both even(factor[0] * light(0, i)), along(F(0));
             even.by[0] = along.by[1] = F(1);
             if constexpr (DEGREE > 0) {
-                direct(row, i, eye, factor, moments, found);
+                direct(row, i, eye, factor, light, found);
                 along.value = value_of(found.along);
             }
             const Both held = hold(even, along);
             const F even_bar = bar[i] * held.by[0], along_bar = bar[i] * held.by[1];
-            factor_bar[0] += moments(0, i) * even_bar;
-            moment_bars(0, i) = factor[0] * even_bar;
+            factor_bar[0] += light(0, i) * even_bar;
+            light_bar(0, i) = factor[0] * even_bar;
             UNROLLED
             for (int l = 1; l <= DEGREE; ++l) factor_bar[l] += value_of(found.sum[l]) * along_bar;
             UNROLLED
             for (int k = 1; k < COUNT; ++k)
-                moment_bars(k, i) = factor[degree_of(k)] * along_bar * value_of(found.y[k]);
-            if constexpr (HAS_MORE) moment_bars.more[i] = along_bar;
+                light_bar(k, i) = factor[degree_of(k)] * along_bar * value_of(found.y[k]);
+            if constexpr (HAS_MORE) light_bar.more[i] = along_bar;
             if constexpr (POINT_VARIES && DEGREE > 0)
                 for (int a = 0; a < 3; ++a) eye_bar[a] += along_bar * found.along.by[a];
         }
+        const long long items = (long long)colors * nz * ny * (nx / width);
         UNROLLED
-        for (int l = 0; l <= DEGREE; ++l) sums[(long long)l * items + item] = factor_bar[l];
-        for (int a = 0; a < 3; ++a) sums[(DEGREE + 1LL + a) * items + item] = eye_bar[a];
+        for (int l = 0; l <= DEGREE; ++l) sums[l * items + item] = factor_bar[l];
+        for (int a = 0; a < 3; ++a) sums[(DEGREE + 1 + a) * items + item] = eye_bar[a];
     }
 };
 
