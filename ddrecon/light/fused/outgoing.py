@@ -11,7 +11,6 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
-from ddrecon.kernels.dual import split
 from ddrecon.kernels.text import TextKernel
 from ddrecon.light.moments import MARGIN, Moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
@@ -73,23 +72,26 @@ class _Scatter(torch.autograd.Function):
             None if one is None else radiance_bar.new_empty(*one.shape[:-4], colors, *shape)
             for one in light
         ]
-        # Of the factors, then of the point.
         items = colors * ctx.grid.cells // _width(ctx.grid, radiance_bar)
         sums = radiance_bar.new_empty(len(factors) + 3, items)
-        kind = f"scatter_back<{int(ctx.needs_input_grad[2])}>"
+        _, _, needs_point, needs_factors, *_ = ctx.needs_input_grad
+        kind = f"scatter_back<{int(needs_point)}>"
         given = {"point": point, "factors": factors, "light": light, "radiance_bar": radiance_bar}
         _launch(kind, ctx.grid, ctx.is_eye, {"light_bar": bars, "sums": sums}, **given)
-        found = sums.double().view(len(sums), colors, -1).sum(-1).to(factors)
+        point_bar = factors_bar = None
+        if needs_point or needs_factors:
+            found = sums.double().view(len(sums), colors, -1).sum(-1).to(factors)
+            factors_bar, point_bar = found[:-3], found[-3:].sum(1)
         light_bar = (
             None if bar is None else bar.sum_to_size(one.shape)
             for bar, one in zip(bars, light, strict=True)
         )
-        return None, None, found[-3:].sum(1), found[:-3], *light_bar
+        return None, None, point_bar, factors_bar, *light_bar
 
     @staticmethod
     def jvp(ctx: Any, _grid: None, _is_eye: None, *changes: Tensor | None) -> Tensor:
         def change(*tensors: Any) -> Tensor:
-            values, d_values = split(tensors)
+            values, d_values = tensors[:8], tensors[8:]
             d_point, d_factors, *d_light = (
                 torch.zeros_like(one) if d_one is None and one is not None else d_one
                 for one, d_one in zip(values, d_values, strict=True)

@@ -47,8 +47,7 @@ template <class F, int BLOCK> struct Ways {
         // The field there.
         INLINE N look(const Ways& all, const F* field) const {
             auto row = [&](int from) HERE {
-                const F* const f = field + at + from;
-                return blend(x.a, f[0], f[all.up_x()]);
+                return blend(x.a, field[at + from], field[at + from + all.up_x()]);
             };
             auto layer = [&](int from)
                              HERE { return blend(y.a, row(from), row(from + all.up_y())); };

@@ -117,7 +117,7 @@ class Receiver:
         Arguments as of `receive`; `bars`: of the moments, None for zero. Adds to the cotangent of
         the field.
         """
-        lights, entered_bar = len(entered), torch.empty_like(entered)
+        lights, entered_bar = len(entered), torch.zeros_like(entered)
         own = {"light": light, "lights": lights, "varies": varies, "entered": entered}
         own["has_bar"] = sum(1 << a for a, bar in enumerate(bars) if bar is not None)
         given = self.given | own | {"bars": _five(bars)}
@@ -125,6 +125,8 @@ class Receiver:
         width = 1 + (1 + self.moments) * self.colors
         part = max(1, MOST_SUMS // (lights * width)) if varies else self.items
         found = entered.new_zeros(lights, width, dtype=torch.float64)
+        if not own["has_bar"]:
+            return entered_bar, found
         for first in range(0, self.items, part):
             items = min(part, self.items - first)
             sums = found.new_zeros(items * varies, lights, width)
