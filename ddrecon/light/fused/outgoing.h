@@ -38,11 +38,31 @@ INLINE void fill_harmonics(const N* v, const N& square, const N& cosine, const N
             v, square, v[2] * cosine - v[1] * sine, v[2] * sine + v[1] * cosine, y);
 }
 
-// |x|, of slope 0 where x is.
-template <class F, class N> INLINE N size_of(const N& x) {
-    const F own = value_of(x);
-    const F sign = own < F(0) ? F(-1) : (own > F(0) ? F(1) : F(0));
-    return along(x, Sloped<F>{own < F(0) ? -own : own, sign});
+// `even` + `along`, bent to zero below a `margin` of their sizes; with its slopes by both.
+template <class F> struct Bent {
+    F value, by_even, by_along;
+    INLINE Bent(F even, F along, F margin, F least) {
+        const F r = even + along, size = margin * (size_of(even) + size_of(along));
+        const F divisor = size > least ? size : least, part = r / divisor;
+        const F opened = F(1) + (part < F(-1) ? F(-1) : (part > F(1) ? F(1) : part));
+        const bool is_inside = (r >= -divisor) & (r <= divisor), is_whole = r >= size;
+        const F slope = is_inside ? F(0.5) * opened * (size / divisor) : F(0);
+        const F moved = size >= least ? slope * part : F(0);
+        const F by_size = is_whole ? F(0) : margin * (F(0.25) * opened * opened - moved);
+        value = is_whole ? r : F(0.25) * size * opened * opened;
+        by_even = (is_whole ? F(1) : slope) + by_size * sign_of(even);
+        by_along = (is_whole ? F(1) : slope) + by_size * sign_of(along);
+    }
+    static INLINE F size_of(F x) { return x < F(0) ? -x : x; }
+    static INLINE F sign_of(F x) { return x < F(0) ? F(-1) : (x > F(0) ? F(1) : F(0)); }
+};
+template <class F> INLINE F bent(F even, F along, F margin, F least) {
+    return Bent<F>(even, along, margin, least).value;
+}
+template <class F>
+INLINE Dual<F> bent(const Dual<F>& even, const Dual<F>& along, F margin, F least) {
+    const Bent<F> found(even.value, along.value, margin, least);
+    return even.chain(found.value, found.by_even, along, found.by_along);
 }
 
 // Light of DEGREE in angle: moments of degree l count times `factors` [DEGREE + 1, colors]. An item
@@ -129,16 +149,6 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         }
     }
 
-    // The radiance `even` + `along`, bent to zero below a margin.
-    template <class N> INLINE N hold(const N& even, const N& along) const {
-        if constexpr (DEGREE == 0) return pick(value_of(even) < F(0), N(F(0)), even);
-        const N r = even + along, bend = margin * (size_of<F>(even) + size_of<F>(along));
-        const N part = r / pick(value_of(bend) < least, N(least), bend);
-        const F at = value_of(part);
-        const N opened = F(1) + pick(at < F(-1), N(F(-1)), pick(at > F(1), N(F(1)), part));
-        return pick(value_of(r) >= value_of(bend), r, F(0.25) * bend * opened * opened);
-    }
-
     template <class N, class In, class Arrays> INLINE void scatter(
         int item, const In& point, const In& factors, const Arrays& arrays, F* radiance) const {
         const Row row = row_of(item);
@@ -150,9 +160,14 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         F* out = radiance + row.color * row.size + row.start;
         INDEPENDENT
         for (int i = 0; i < width; ++i) {
-            Directed<N> found;
-            if constexpr (DEGREE > 0) direct(row, i, eye, factor, light, found);
-            out[i] = change_of(hold(factor[0] * light(0, i), found.along));
+            const N even = factor[0] * light(0, i);
+            if constexpr (DEGREE > 0) {
+                Directed<N> found;
+                direct(row, i, eye, factor, light, found);
+                out[i] = change_of(bent(even, found.along, margin, least));
+            } else {
+                out[i] = change_of(pick(value_of(even) < F(0), N(F(0)), even));
+            }
         }
     }
 
@@ -162,7 +177,6 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         F* const* bars, F* sums) const {
         REORDERED
         typedef typename If<POINT_VARIES, Dual<F, 3>, F>::type N;
-        typedef Dual<F, 2> Both;
         const Row row = row_of(item);
         const auto light = light_of(
             row, [&](int k) HERE { return arrays[k]; }, mean_colors, flux_colors, higher_colors);
@@ -182,14 +196,14 @@ template <class F, int DEGREE, bool HAS_MORE> struct Outgoing {
         INDEPENDENT
         for (int i = 0; i < count; ++i) {
             Directed<N> found;
-            Both even(factor[0] * light(0, i)), along(F(0));
-            even.by[0] = along.by[1] = F(1);
+            const F even = factor[0] * light(0, i);
+            F even_bar = even < F(0) ? F(0) : bar[i], along_bar = F(0);
             if constexpr (DEGREE > 0) {
                 direct(row, i, eye, factor, light, found);
-                along.value = value_of(found.along);
+                const Bent<F> whole(even, value_of(found.along), margin, least);
+                even_bar = bar[i] * whole.by_even;
+                along_bar = bar[i] * whole.by_along;
             }
-            const Both held = hold(even, along);
-            const F even_bar = bar[i] * held.by[0], along_bar = bar[i] * held.by[1];
             factor_bar[0] += light(0, i) * even_bar;
             light_bar(0, i) = factor[0] * even_bar;
             UNROLLED
