@@ -102,8 +102,9 @@ def test_what_is_left_to_torch_depends_on_scene_and_device(
     scene = make_scene(DENSITY, **settings)
     scene.lights += lights
     assert terms.parts_in_torch(scene, False, is_on_gpu) == parts
-    more = ("transport rounds",) if is_on_gpu and scene.diffusion.rounds else ()
-    assert set(terms.parts_in_torch(scene, True, is_on_gpu)) == {*parts, *more}
+    in_slabs = {*parts, *(["beams"] if scene.lights else [])}
+    in_slabs |= {"transport rounds"} if is_on_gpu and scene.diffusion.rounds else set()
+    assert set(terms.parts_in_torch(scene, True, is_on_gpu)) == in_slabs
     scene.volume.phase = HenyeyGreenstein(DENSITY - 0.5)
     assert "phases by cell" in terms.parts_in_torch(scene, False, is_on_gpu)
 

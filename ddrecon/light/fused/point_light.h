@@ -49,8 +49,9 @@ template <class F, int BLOCK> struct Ways {
             auto row = [&](int from) HERE {
                 return blend(x.a, field[at + from], field[at + from + all.up_x()]);
             };
-            auto layer = [&](int from)
-                             HERE { return blend(y.a, row(from), row(from + all.up_y())); };
+            auto layer = [&](int from) HERE {
+                return blend(y.a, row(from), row(from + all.up_y()));
+            };
             return blend(z.a, layer(0), layer(all.up_z()));
         }
     };

@@ -104,16 +104,16 @@ template <class F, int BLOCK> struct Shear : Slices {
             if (own.ray < r.n - 1 || own.ray >= r.n + height + 2 || size <= 0) continue;
 
             // Rows of slice `s` around the ray, from which columns are interpolated below.
-            auto add_slice = [&](N* to, int s, const Place<F>& r, const Place<F>& c, F weight)
-                                 HERE {
-                                     for (int up = 0; up < 2; ++up) {
-                                         const int y = own.ray - r.n - 1 + up;
-                                         if (y < 0 || y >= height) continue;
-                                         const N* from = field + cell_row(own.channel, s, y);
-                                         const F part = weight * (up ? F(1) - r.a : r.a);
-                                         add_row(to, from, lo - c.n - 1, size + 1, width, part);
-                                     }
-                                 };
+            auto add_slice = [&](N* to, int s, const Place<F>& r, const Place<F>& c,
+                                 F weight) HERE {
+                for (int up = 0; up < 2; ++up) {
+                    const int y = own.ray - r.n - 1 + up;
+                    if (y < 0 || y >= height) continue;
+                    const N* from = field + cell_row(own.channel, s, y);
+                    const F part = weight * (up ? F(1) - r.a : r.a);
+                    add_row(to, from, lo - c.n - 1, size + 1, width, part);
+                }
+            };
             clear(here, size + 1), clear(midway, size + 1);
             add_slice(here, k, r, c, F(1));
             if (k + 1 < slices) {
