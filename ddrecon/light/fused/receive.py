@@ -31,29 +31,20 @@ F *numbers, *scale, *weights, *field, *entered
 @functools.cache
 def receive_kernel(kind: str, bits: int) -> TextKernel:
     """The kernel of `receive.h` called "receive", its "tangent", or "receive_back"."""
-    arrays, duals = ", ".join(_ARRAYS), ", ".join(f"Changing<F>{{{x}, d_{x}}}" for x in _ARRAYS)
-    changes = ", ".join(f"*d_{x}" for x in _ARRAYS)
-    back, sums = (
-        "entered_bar, field_bar, sums",
-        "F *bars[5], *entered_bar, *field_bar; double *sums",
-    )
-    call, more, made = {
-        "receive": (f"receive<F, {MOST_BEAMS}>(item, adds, {arrays}, made)", "F *made[5]", "made"),
-        "tangent": (
-            f"receive<Dual<F>, {MOST_BEAMS}>(item, adds, {duals}, made)",
-            f"F {changes}, *made[5]",
-            "made",
-        ),
-        "receive_back": (
-            f"receive_back(item, first_item, varies, has_bar, {arrays}, bars, {back})",
-            sums,
-            back.replace(",", ""),
-        ),
-    }[kind]
+    arrays, more, made = ", ".join(_ARRAYS), "F *made[5]", "made"
+    call = f"receive<F, {MOST_BEAMS}>(item, adds, {arrays}, made)"
+    if kind == "tangent":
+        pairs = ", ".join(f"Changing<F>{{{one}, d_{one}}}" for one in _ARRAYS)
+        call = f"receive<Dual<F>, {MOST_BEAMS}>(item, adds, {pairs}, made)"
+        more = ", ".join([more, *(f"*d_{one}" for one in _ARRAYS)])
+    elif kind == "receive_back":
+        own = "bars, entered_bar, field_bar, sums"
+        call = f"receive_back(item, first_item, varies, has_bar, {arrays}, {own})"
+        more = "F *bars[5], *entered_bar, *field_bar; double *sums"
+        made = "entered_bar field_bar sums"
     text = f"const Receiver<F, IS_GPU ? 1 : {CHUNK}> receiver = {{{_SHARED}}};\nreceiver.{call};"
-    return TextKernel(
-        f"beams_{kind}", bits, text, f"{_GIVEN}; {more}", made, "light/fused/receive.h"
-    )
+    given = f"{_GIVEN}; {more}"
+    return TextKernel(f"beams_{kind}", bits, text, given, made, "light/fused/receive.h")
 
 
 class Receiver:

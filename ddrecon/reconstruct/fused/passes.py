@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.text import BLOCK, TextKernel, cut
 from ddrecon.losses import ROUNDING
 from ddrecon.numerics.autodiff import differentiate_once
@@ -18,8 +17,6 @@ LENGTH = 4096
 """Numbers that an item of a launch steps on a processor."""
 PART = 32
 """Cells of a row that a thread does on a GPU."""
-FEW = 1 << 15
-"""So many numbers are not worth a second thread."""
 
 
 def step_adam(
@@ -59,7 +56,7 @@ def step_adam(
     }
     made = dict(zip(("new_value", "new_first", "new_second"), new, strict=True))
     kernel = step_kernel(8 * value.element_size(), smallest.numel() > 1)
-    kernel.launch(items, given, made, _threads(value))
+    kernel.launch(items, given, made)
     return new[0], (new[1], new[2])
 
 
@@ -86,7 +83,7 @@ def _vary(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
     given = {"length": length, "nz": nz, "ny": ny, "nx": nx, "field": field}
     given |= {"kz": kz, "ky": ky, "kx": kx, "rounding": ROUNDING}
     made = {"slope": slope, "diagonal": diagonal, "totals": totals}
-    variation_kernel(8 * field.element_size()).launch(items, given, made, _threads(field))
+    variation_kernel(8 * field.element_size()).launch(items, given, made)
     return totals, slope, diagonal
 
 
@@ -134,7 +131,3 @@ def variation_kernel(bits: int) -> TextKernel:
     numbers = "int length, nz, ny, nx; F kz, ky, kx, rounding"
     given = f"{numbers}, *field, *slope, *diagonal; double *totals"
     return TextKernel("vary", bits, text, given, "slope diagonal totals", _HEADER)
-
-
-def _threads(numbers: Tensor) -> int:
-    return 1 if numbers.numel() < FEW else thread_count(numbers)
