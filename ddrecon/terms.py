@@ -47,6 +47,7 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
         "diffusion": not is_fused,
         "transport rounds": has_rounds
         and not has_kernels("transport rounds", is_on_gpu, has_slabs),
+        "beams": has_slabs and (has_skies or _has_beams(scene.lights)),
         "point lights": any(isinstance(light, PointLight) for light in scene.lights),
         "pairs of beams": is_diffuse and _has_pairs(medium, scene),
         "phases by cell": medium.is_cellwise,

@@ -107,16 +107,39 @@ INLINE Dual<F, COUNT> pick(bool is, const Dual<F, COUNT>& one, const Dual<F, COU
     return r;
 }
 
+// The root of a number > 0, or 0, where the slope counts as 0.
+template <class F, int COUNT> INLINE Dual<F, COUNT> root(const Dual<F, COUNT>& x) {
+    const F found = root(x.value);
+    return x.chain(found, found > F(0) ? F(0.5) / found : F(0));
+}
+
+// Arrays of values and of their changes, which are read as dual numbers.
+template <class F> struct Changing {
+    const F *value, *change;
+    INLINE Dual<F> operator[](long long i) const { return {value[i], change[i]}; }
+    INLINE Changing operator+(long long i) const { return {value + i, change + i}; }
+};
+// What is written of a number found: itself, or of a dual number its change.
+template <class F> INLINE F change_of(F x) { return x; }
+template <class F> INLINE F change_of(const Dual<F>& x) { return x.by[0]; }
+
+// One type or another.
+template <bool IS, class One, class Other> struct If {
+    typedef One type;
+};
+template <class One, class Other> struct If<false, One, Other> {
+    typedef Other type;
+};
+
+// Whether numbers N have derivatives.
+template <class N> constexpr bool IS_DUAL = false;
+template <class F, int COUNT> constexpr bool IS_DUAL<Dual<F, COUNT>> = true;
+
 // What a function of one number, `found` with its slope at the value of `x`, is of x itself.
 template <class F> INLINE F along(F, const Sloped<F>& found) { return found.value; }
 template <class F, int COUNT>
 INLINE Dual<F, COUNT> along(const Dual<F, COUNT>& x, const Sloped<F>& found) {
     return x.chain(found.value, found.slope);
-}
-// The root of a number > 0, or 0, where the slope counts as 0.
-template <class F, int COUNT> INLINE Dual<F, COUNT> root(const Dual<F, COUNT>& x) {
-    const F found = root(x.value);
-    return x.chain(found, found > F(0) ? F(0.5) / found : F(0));
 }
 
 } // namespace ddrecon

@@ -39,7 +39,7 @@ def sum_mass_to_cells(
     Returns `[K, z, y, x]` and a scalar.
     """
     if is_fused_whole(grid, direction):
-        from ddrecon.light.fused.sum_mass import sum_mass
+        from ddrecon.light.fused.beams import sum_mass
 
         return sum_mass(field, grid, direction, bound)
     sum_one: Callable[..., tuple[Tensor, Tensor]] = _sum_mass

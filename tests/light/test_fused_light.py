@@ -32,8 +32,8 @@ pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.kernels import text
 from ddrecon.kernels.launch import launch
 from ddrecon.light.fused import receive
-from ddrecon.light.fused.point_light import way_adjoint_kernel, way_kernel
-from ddrecon.light.fused.receive import receive_adjoint_kernel, receive_kernel
+from ddrecon.light.fused.point_light import way_kernel
+from ddrecon.light.fused.receive import receive_kernel
 from ddrecon.light.fused.shear import shear_kernels
 
 pytestmark = pytest.mark.slow
@@ -261,6 +261,6 @@ def test_the_same_threads_give_the_same_bits_and_others_the_same_numbers():
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    makers = receive_kernel, receive_adjoint_kernel, way_kernel, way_adjoint_kernel
-    kernels = [*vars(shear_kernels(32)).values(), *(make(32) for make in makers)]
+    kernels = [*vars(shear_kernels(32)).values(), way_kernel(False, 32), way_kernel(True, 32)]
+    kernels += [receive_kernel(kind, 32) for kind in ("receive", "tangent", "receive_back")]
     assert_compiles(kernels, tmp_path)

@@ -18,11 +18,7 @@ from ddrecon.light.outgoing import scatter_towards
 from ddrecon.medium.coefficients import Volume, scale_medium
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
-from ddrecon.light.fused.outgoing import scatter_fused
-from ddrecon.light.fused.outgoing_kernels import (
-    scatter_adjoint_kernel,
-    scatter_kernel,
-)
+from ddrecon.light.fused.outgoing import scatter_fused, scatter_kernel
 
 pytestmark = pytest.mark.slow
 
@@ -121,5 +117,6 @@ def test_light_of_any_degree(degree: int, has_more: bool):
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    kernels = scatter_kernel(1, False, 32), scatter_adjoint_kernel(3, True, True, 64)
+    kinds = "scatter", "tangent", "scatter_back<1>"
+    kernels = [scatter_kernel(kind, 3, True, 32) for kind in kinds]
     assert_compiles(kernels, tmp_path)

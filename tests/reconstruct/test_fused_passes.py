@@ -19,7 +19,6 @@ from ddrecon.settings import ParameterSettings
 
 pytest.importorskip("warp", reason="warp-lang is not installed (extra `fast`)")
 from ddrecon.reconstruct.fused import passes
-from ddrecon.reconstruct.fused.kernels import step_kernel, variation_kernel
 
 pytestmark = pytest.mark.slow
 
@@ -83,4 +82,4 @@ def test_bounds_may_be_without_end():
 
 
 def test_kernels_compile_for_graphics_cards(tmp_path: Path):
-    assert_compiles([step_kernel(32, True), variation_kernel(32)], tmp_path)
+    assert_compiles([passes.step_kernel(32, True), passes.variation_kernel(32)], tmp_path)

@@ -11,14 +11,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ddrecon.grid import array_order
+from ddrecon.grid import Grid, array_order
 from ddrecon.light.beam import Beam
-from ddrecon.light.fused.sum_mass import follow
+from ddrecon.light.fused.shear import Shear
 from ddrecon.light.fused.unscattered import Unscattered
 from ddrecon.light.lights import DirectionalLight
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium, along_colors
 from ddrecon.numerics.remember import remember
+from ddrecon.numerics.slicing import Slicing, across
 
 
 def follow_beams(
@@ -77,4 +78,43 @@ def attenuate(
     mean, *more = found[:count]
     flux = (more[0], more[1], more[2]) if more else None
     higher = more[3] if len(more) > 3 else None
-    return Moments(mean, flux, higher), list(found[count:])
+    centers = zip(found[count:], numbers, strict=False)
+    masses = [torch.addcmul(one, extinction.field, 0.5 * number[2]) for one, number in centers]
+    return Moments(mean, flux, higher), masses
+
+
+def sum_mass(
+    field: Tensor, grid: Grid, direction: Tensor, bound: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """The mass `[K, z, y, x]` up to where a beam enters each cell, and its path in a slice [u]."""
+    shears, numbers = follow(grid, direction[None], bound)
+    nothing = field.new_empty(1, 0, 1)
+    (entered,) = Unscattered.apply(shears, True, field, field.new_ones(1), numbers, nothing)
+    return entered, numbers[0, 2]
+
+
+@remember
+def follow(
+    grid: Grid, directions: Tensor, bound: Tensor | float
+) -> tuple[tuple[Shear, ...], Tensor]:
+    """How beams along `directions` [L, 3] cross slices, and the numbers [L, 4] of each.
+
+    These are the slope by rows and by columns, the path in a slice [u] and the `bound`.
+    """
+    shears, numbers = _cross(grid, directions)
+    bounds = torch.as_tensor(bound).to(numbers).expand(len(numbers), 1)
+    return shears, torch.cat([numbers, bounds], 1)
+
+
+@remember
+def _cross(grid: Grid, directions: Tensor) -> tuple[tuple[Shear, ...], Tensor]:
+    """The same without bounds: directions are read, whatever the `bound` is made of."""
+    speed = directions / directions.new_tensor(grid.spacing)
+    slicings = [Slicing.of(each) for each in speed.tolist()]
+    order = [[*across(slicing.axis), slicing.axis] for slicing in slicings]
+    ordered = speed.gather(1, torch.tensor(order, device=speed.device))
+    fastest = ordered[:, 2:].abs()
+    slope = ordered[:, :2] / fastest
+    slopes = [(row, column) for row, column in slope.tolist()]
+    shears = tuple(Shear(grid, *each) for each in zip(slicings, slopes, strict=True))
+    return shears, torch.cat([slope, 1 / fastest], 1)

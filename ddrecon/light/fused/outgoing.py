@@ -1,4 +1,4 @@
-"""E3 towards a camera as one function of tensors, with its derivatives."""
+"""E3 towards a camera as one function of tensors, by the kernels of `outgoing.h`."""
 
 from __future__ import annotations
 
@@ -11,14 +11,9 @@ from torch import Tensor
 
 from ddrecon.cameras import Rays
 from ddrecon.grid import Grid
-from ddrecon.kernels.dual import launch_row_tangents, split
-from ddrecon.kernels.rows import launch_rows
-from ddrecon.light.fused.outgoing_kernels import scatter_adjoint_kernel, scatter_kernel
-from ddrecon.light.moments import Moments, Vector
+from ddrecon.kernels.text import TextKernel
+from ddrecon.light.moments import MARGIN, Moments
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
-
-_FLUX = "flux_z", "flux_y", "flux_x"
-_TENSORS = "point", "factors", "more", "mean", "higher", *_FLUX
 
 
 def scatter_fused(
@@ -28,21 +23,21 @@ def scatter_fused(
 
     `factors`: as of `Moments.weighted`, [L + 1, C or 1, 1, 1, 1].
     """
-    flux = light.flux or ()
-    colors = max(map(len, (light.mean, factors[0], *flux, *([] if more is None else [more]))))
+    flux = light.flux or (None, None, None)
+    given = (light.mean, factors[0], *flux, more)
+    colors = max(len(one) for one in given if one is not None)
     degree = 0 if light.flux is None else 1
     if light.higher is not None:
         degree = math.isqrt(len(light.higher) + 4) - 1
-    by_color = factors[: degree + 1].reshape(degree + 1, -1).expand(-1, colors)
     radiance: Tensor = _Scatter.apply(
         grid,
         rays.eye is not None,
         -rays.direction[0] if rays.eye is None else rays.eye,
-        by_color,
-        more if light.flux is None or more is None else more.expand(colors, *grid.shape),
+        factors[: degree + 1].reshape(degree + 1, -1).expand(-1, colors),
         light.mean,
-        light.higher,
         *flux,
+        light.higher,
+        None if more is None or degree == 0 else more.expand(colors, *grid.shape),
     )
     return radiance
 
@@ -50,15 +45,17 @@ def scatter_fused(
 class _Scatter(torch.autograd.Function):
     """Radiance `[C, z, y, x]` towards a `point` [3], or without `is_eye` in that direction.
 
-    `factors` [L + 1, C]: of light's moments, degree by degree.
+    `factors` [L + 1, C]: of light's moments, degree by degree. `light`: the mean, the flux along z,
+    y and x, what is higher, and radiance besides; None for what there is not.
     """
 
     @staticmethod
-    def forward(grid: Grid, is_eye: bool, *tensors: Any) -> Tensor:
-        given, is_so = _given(is_eye, *tensors)
-        radiance = given["mean"].new_empty(given["colors"], *grid.shape)
-        kernel = functools.partial(scatter_kernel, *is_so)
-        launch_rows(kernel, grid, len(radiance), given, {"radiance": radiance})
+    def forward(
+        grid: Grid, is_eye: bool, point: Tensor, factors: Tensor, *light: Tensor | None
+    ) -> Tensor:
+        radiance = factors.new_empty(factors.shape[1], *grid.shape)
+        made = {"radiance": radiance}
+        _launch("scatter", grid, is_eye, made, point=point, factors=factors, light=light)
         return radiance
 
     @staticmethod
@@ -69,96 +66,96 @@ class _Scatter(torch.autograd.Function):
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, radiance_bar: Tensor) -> tuple[Tensor | None, ...]:
-        _, factors, _, mean, higher, *flux = ctx.saved_tensors
-        given, (degree, has_more) = _given(ctx.is_eye, *ctx.saved_tensors)
-        _, _, needs_point, needs_factors, needs_more, *_ = ctx.needs_input_grad
-        with_along = degree > 0 and (needs_point or needs_more)
-        names = "mean", *_FLUX[: len(flux)], *(["along"] if with_along else [])
-        shape = radiance_bar.shape
-        found = {f"{name}_bar": radiance_bar.new_empty(shape) for name in names}
-        if higher is not None:
-            found["higher_bar"] = radiance_bar.new_empty(len(higher), *shape)
-        items = len(radiance_bar) * (ctx.grid.cells if mean.is_cuda else math.prod(shape[1:3]))
-        found["sums"] = radiance_bar.new_empty(max(degree, 1) + 1, items)
-        kernel = functools.partial(scatter_adjoint_kernel, degree, has_more, with_along)
-        given["radiance_bar"] = radiance_bar
-        launch_rows(kernel, ctx.grid, len(radiance_bar), given, found)
-        along_bar = found.get("along_bar")
-        factors_bar = point_bar = None
-        if needs_factors:
-            sums = found["sums"].double().view(-1, len(radiance_bar), items // len(radiance_bar))
-            factors_bar = sums.sum(-1)[: len(factors)].to(factors)
-        if needs_point and along_bar is not None:
-            point_bar = _point_bar(ctx, along_bar)
-        return (
-            None,
-            None,
-            point_bar,
-            factors_bar,
-            along_bar if needs_more else None,
-            found["mean_bar"].sum_to_size(mean.shape),
-            None if higher is None else found["higher_bar"].sum_to_size(higher.shape),
-            *(
-                found[f"{name}_bar"].sum_to_size(one.shape)
-                for name, one in zip(_FLUX, flux, strict=False)
-            ),
+        point, factors, *light = ctx.saved_tensors
+        colors, *shape = radiance_bar.shape
+        bars = [
+            None if one is None else radiance_bar.new_empty(*one.shape[:-4], colors, *shape)
+            for one in light
+        ]
+        items = colors * ctx.grid.cells // _width(ctx.grid, radiance_bar)
+        sums = radiance_bar.new_empty(len(factors) + 3, items)
+        _, _, needs_point, needs_factors, *_ = ctx.needs_input_grad
+        kind = f"scatter_back<{int(needs_point)}>"
+        given = {"point": point, "factors": factors, "light": light, "radiance_bar": radiance_bar}
+        _launch(kind, ctx.grid, ctx.is_eye, {"light_bar": bars, "sums": sums}, **given)
+        point_bar = factors_bar = None
+        if needs_point or needs_factors:
+            found = sums.double().view(len(sums), colors, -1).sum(-1).to(factors)
+            factors_bar, point_bar = found[:-3], found[-3:].sum(1)
+        light_bar = (
+            None if bar is None else bar.sum_to_size(one.shape)
+            for bar, one in zip(bars, light, strict=True)
         )
+        return None, None, point_bar, factors_bar, *light_bar
 
     @staticmethod
     def jvp(ctx: Any, _grid: None, _is_eye: None, *changes: Tensor | None) -> Tensor:
         def change(*tensors: Any) -> Tensor:
-            values, d_values = split(tensors)
-            given, is_so = _given(ctx.is_eye, *values)
-            d_given = dict(zip(_TENSORS, d_values, strict=False))
-            d_radiance = given["mean"].new_empty(given["colors"], *ctx.grid.shape)
-            kernel = functools.partial(scatter_kernel, *is_so)
-            made = {"radiance": d_radiance}
-            launch_row_tangents(kernel, ctx.grid, len(d_radiance), given, d_given, made)
+            values, d_values = tensors[:8], tensors[8:]
+            d_point, d_factors, *d_light = (
+                torch.zeros_like(one) if d_one is None and one is not None else d_one
+                for one, d_one in zip(values, d_values, strict=True)
+            )
+            point, factors, *light = values
+            d_radiance = factors.new_empty(factors.shape[1], *ctx.grid.shape)
+            given = {"point": point, "factors": factors, "light": light}
+            given |= {"d_point": d_point, "d_factors": d_factors, "d_light": d_light}
+            _launch("tangent", ctx.grid, ctx.is_eye, {"radiance": d_radiance}, **given)
             return d_radiance
 
         d_radiance: Tensor = run_plainly(change, *ctx.saved_tensors, *changes)
         return d_radiance
 
 
-def _point_bar(ctx: Any, along_bar: Tensor) -> Tensor:
-    """The cotangent of the point or direction, by what depends on it."""
-    point, factors, _, mean, higher, *flux = ctx.saved_tensors
-    vector: Vector = (flux[0], flux[1], flux[2])
-    light = Moments(torch.zeros_like(mean), vector, higher)
-    with torch.enable_grad():
-        leaf = point.detach().requires_grad_()
-        eye = leaf if ctx.is_eye else None
-        directions = Rays(leaf, -leaf[None], eye).towards_eye(ctx.grid)
-        weighted = light.weighted(factors[..., None, None, None])
-        along = (weighted.along(directions) * along_bar).sum()
-    (point_bar,) = torch.autograd.grad(along, leaf)
-    return point_bar
+def _width(grid: Grid, like: Tensor) -> int:
+    """Cells of an item: a row on a processor, and one on a GPU."""
+    return 1 if like.is_cuda else grid.shape[2]
 
 
-def _given(
-    is_eye: bool,
-    point: Tensor,
-    factors: Tensor,
-    more: Tensor | None,
-    mean: Tensor,
-    higher: Tensor | None,
-    *flux: Tensor,
-) -> tuple[dict[str, Any], tuple[int, bool]]:
-    """What both kernels are given, by its names; light's degree, and whether there is `more`."""
-    degree = len(factors) - 1
-    given = {
-        "is_eye": int(is_eye),
-        "colors": factors.shape[1],
+def _launch(kind: str, grid: Grid, is_eye: bool, made: dict[str, Any], **given: Any) -> None:
+    """Runs `scatter_kernel` of that `kind` on all cells and colors."""
+    factors, (mean, flux, _, _, higher, more) = given["factors"], given["light"]
+    (degrees, colors), width = factors.shape, _width(grid, mean)
+    own = {
+        "width": width,
+        "is_eye": is_eye,
+        "colors": colors,
         "mean_colors": len(mean),
-        "flux_colors": len(flux[0]) if flux else 1,
+        "flux_colors": 1 if flux is None else len(flux),
         "higher_colors": 1 if higher is None else higher.shape[1],
-        "point": point,
-        "factors": factors,
-        "mean": mean,
-        **dict(zip(_FLUX, flux, strict=False)),
+        "margin": MARGIN,
+        "least": 1e6 * torch.finfo(mean.dtype).tiny,
     }
-    if higher is not None:
-        given["higher"] = higher
-    if more is not None:
-        given["more"] = more
-    return given, (degree, more is not None and degree > 0)
+    for corner, values in zip("nhl", (grid.shape, grid.spacing, grid.lower), strict=True):
+        own |= {f"{corner}{axis}": value for axis, value in zip("zyx", values, strict=True)}
+    kernel = scatter_kernel(kind, degrees - 1, more is not None, 8 * mean.element_size())
+    kernel.launch(colors * grid.cells // width, own | given, made)
+
+
+_INTEGERS = "nz, ny, nx, width, is_eye, colors, mean_colors, flux_colors, higher_colors"
+_REALS = "hz, hy, hx, lz, ly, lx, margin, least"
+
+
+@functools.cache
+def scatter_kernel(kind: str, degree: int, has_more: bool, bits: int) -> TextKernel:
+    """The kernel "scatter", its "tangent", or "scatter_back", of light known to `degree`.
+
+    The last with "<1>" where the point varies, else "<0>". With `has_more` there is radiance
+    besides.
+    """
+    if kind == "scatter":
+        light = "[&](int k) HERE { return light[k]; }"
+        call = f"scatter<F>(item, point, factors, {light}, radiance)"
+        more, made = "*radiance", "radiance"
+    elif kind == "tangent":
+        light = "[&](int k) HERE { return Changing<F>{light[k], d_light[k]}; }"
+        point, factors = (f"Changing<F>{{{name}, d_{name}}}" for name in ("point", "factors"))
+        call = f"scatter<Dual<F>>(item, {point}, {factors}, {light}, radiance)"
+        more, made = "*d_point, *d_factors, *d_light[6], *radiance", "radiance"
+    else:
+        call = f"{kind}(item, point, factors, light, radiance_bar, light_bar, sums)"
+        more, made = "*radiance_bar, *light_bar[6], *sums", "light_bar sums"
+    text = f"Outgoing<F, {degree}, {int(has_more)}>{{{_INTEGERS}, {_REALS}}}.{call};"
+    given = f"int {_INTEGERS}; F {_REALS}, *point, *factors, *light[6], {more}"
+    name = f"{kind.split('<')[0]}_towards"
+    return TextKernel(name, bits, text, given, made, "light/fused/outgoing.h")

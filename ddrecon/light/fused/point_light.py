@@ -16,7 +16,6 @@ from ddrecon.grid import Grid
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import TextKernel, cut
-from ddrecon.light.fused.point_light_code import ADJOINT, INTEGRATE
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 BLOCK = 128
@@ -66,7 +65,7 @@ class _Integral(torch.autograd.Function):
         made = dict(zip(("firsts_bar", "lasts_bar", "lengths_bar"), bars, strict=True))
         own = [{"fields_bar": share} for share in shares]
         items, _ = cut(len(length), BLOCK, length)
-        kernel = way_adjoint_kernel(field.element_size() * 8)
+        kernel = way_kernel(True, field.element_size() * 8)
         kernel.launch(items, given, made | own[0], shares=own)
         return functools.reduce(Tensor.add_, shares), *bars, None
 
@@ -82,7 +81,7 @@ def _integrate(field: Tensor, *ways: Tensor) -> Tensor:
     """The integral of `field` along `ways`."""
     total = field.new_empty(len(field), len(ways[2]))
     items, _ = cut(len(ways[2]), BLOCK, field)
-    kernel = way_kernel(field.element_size() * 8)
+    kernel = way_kernel(False, field.element_size() * 8)
     kernel.launch(items, _ways(field, *ways), {"totals": total})
     return total
 
@@ -98,21 +97,23 @@ def _ways(
     return sizes | arrays | {"fraction": fraction}
 
 
+_WAYS = "ways, samples, channels, depth, height, width, fields, firsts, lasts, lengths, fraction"
 _GIVEN = """
-int ways, samples, channels, depth, height, width;
+int ways, samples, channels, depth, height, width, varies;
 F *fields, *firsts, *lasts, *lengths, *fraction, *totals;
+F *fields_bar, *firsts_bar, *lasts_bar, *lengths_bar
 """
 
 
 @functools.cache
-def way_kernel(bits: int) -> TextKernel:
-    """The kernel of integrals along ways."""
-    return TextKernel("integrate_ways", bits, INTEGRATE, _GIVEN, "totals")
+def way_kernel(is_adjoint: bool, bits: int) -> TextKernel:
+    """The kernel of integrals along ways, `totals`; or its adjoint, from cotangents `totals`.
 
-
-@functools.cache
-def way_adjoint_kernel(bits: int) -> TextKernel:
-    """Its adjoint, from cotangents `totals`; of ends and lengths where ways vary."""
-    more = "int varies; F *fields_bar, *firsts_bar, *lasts_bar, *lengths_bar"
-    made = "fields_bar firsts_bar lasts_bar lengths_bar"
-    return TextKernel("ways_adjoint", bits, ADJOINT, _GIVEN + more, made)
+    Where ways vary, that has cotangents of their ends and lengths as well.
+    """
+    made = "fields_bar firsts_bar lasts_bar lengths_bar" if is_adjoint else "totals"
+    arrays = f"varies, totals, {made.replace(' ', ', ')}" if is_adjoint else made
+    call = f"integrate{'_back' * is_adjoint}(item, {arrays})"
+    text = f"Ways<F, IS_GPU ? 1 : {BLOCK}>{{{_WAYS}}}.{call};"
+    name = f"ways{'_adjoint' * is_adjoint}"
+    return TextKernel(name, bits, text, _GIVEN, made, "light/fused/point_light.h")

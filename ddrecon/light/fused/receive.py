@@ -1,8 +1,4 @@
-"""The light that cells receive of beams, by its moments in angle, by fused kernels.
-
-In color c that is tau = exp(-scale entered) phi(scale field step), the transmittance averaged over
-the cell along the beam, times the beam's weights: that of the mean, three of the flux, and others.
-"""
+"""The light that cells receive of beams, by its moments in angle, by the kernels of `receive.h`."""
 
 from __future__ import annotations
 
@@ -23,132 +19,32 @@ MOST_BEAMS = 16
 MOST_SUMS = 1 << 25
 """So many numbers are summed at once, where weights vary: on a GPU every cell has its own."""
 
-MOMENTS = "mean", "flux_z", "flux_y", "flux_x", "higher"
-"""The moments in the order in which weights have them; `higher` are all others."""
-
-_ITEM = """
-#if defined(__CUDA_ARCH__)
-enum { CHUNK = 1, BEAMS = 16 };
-#else
-enum { CHUNK = 512, BEAMS = 16 };
-#endif
-const size_t begin = size_t(item + first_item) * CHUNK;
-const int count = begin + CHUNK < cells ? CHUNK : (int)(cells - begin);
-const F* const steps = numbers + 4 * light + 2;
-const F* const weights = all_weights + light * moments * colors;
-"""
-# tau of a cell by entered mass and field: exp(-s e) phi(d) with d = s field step.
-_VISIBLE = """
-const F depth = s * f[t] * step, thick = depth > F(0.5) ? depth : F(0.5);
-const F far_phi = (F(1) - decay(depth)) / thick, near_psi = psi_series(depth);
-const F phi = depth < F(0.5) ? F(1) - depth * near_psi : far_phi;
-const F clear = decay(s * e[t]);
-"""
-_RECEIVE = (
-    _ITEM
-    + """
-for (int c = 0; c < colors; ++c) {
-    const F s = scale[c];
-    const size_t channel = channels == 1 ? 0 : c;
-    const F* __restrict f = field + channel * cells + begin;
-    F visible[BEAMS][CHUNK];
-    for (int i = 0; i < lights; ++i) {
-        const F* __restrict e = entered + (i * channels + channel) * cells + begin;
-        const F step = steps[4 * i];
-        for (int t = 0; t < count; ++t) {
-"""
-    + _VISIBLE
-    + """
-            visible[i][t] = clear * phi;
-        }
-    }
-    F* const outs[4] = {mean, flux_z, flux_y, flux_x};
-    for (int a = 0; a < moments; ++a) {
-        F sums[CHUNK];
-        for (int t = 0; t < count; ++t) sums[t] = F(0);
-        for (int i = 0; i < lights; ++i) {
-            const F weight = weights[(i * moments + a) * colors + c];
-            for (int t = 0; t < count; ++t) sums[t] += weight * visible[i][t];
-        }
-        F* __restrict out = (a < 4 ? outs[a] : higher + (a - 4) * colors * cells) + c * cells
-            + begin;
-        if (adds) for (int t = 0; t < count; ++t) out[t] += sums[t];
-        else for (int t = 0; t < count; ++t) out[t] = sums[t];
-    }
-}
-"""
-)
-_ADJOINT = (
-    _ITEM
-    + """
-const F* const bars[4] = {mean, flux_z, flux_y, flux_x};
-auto bar_of = [&](int a) { return a < 4 ? bars[a] : higher + (a - 4) * colors * cells; };
-for (int i = 0; i < lights * channels; ++i) {
-    const int one = i / channels, channel = i % channels;
-    const F* __restrict e = entered + i * cells + begin;
-    const F* __restrict f = field + channel * cells + begin;
-    const F step = steps[4 * one];
-    double* const found = sums + (size_t(item) * lights + one) * (1 + (1 + moments) * colors);
-    F of_entered[CHUNK], of_field[CHUNK], of_step[CHUNK];
-    for (int t = 0; t < count; ++t) of_entered[t] = of_field[t] = F(0);
-    for (int c = channels == 1 ? 0 : channel; c < (channels == 1 ? colors : channel + 1); ++c) {
-        const F s = scale[c];
-        F bar[CHUNK], visible[CHUNK], of_scale[CHUNK];
-        for (int t = 0; t < count; ++t) bar[t] = F(0);
-        for (int a = 0; a < moments; ++a) {
-            if (!(has_bar >> (a < 4 ? a : 4) & 1)) continue;
-            const F weight = weights[(one * moments + a) * colors + c];
-            const F* __restrict from = bar_of(a) + c * cells + begin;
-            for (int t = 0; t < count; ++t) bar[t] += weight * from[t];
-        }
-        for (int t = 0; t < count; ++t) {
-"""
-    + _VISIBLE
-    + """
-            const F psi = depth < F(0.5) ? near_psi : (F(1) - phi) / thick;
-            const F by_depth = clear * (psi - phi) * bar[t];
-            visible[t] = clear * phi;
-            of_entered[t] -= s * visible[t] * bar[t];
-            of_field[t] += s * step * by_depth;
-            of_scale[t] = f[t] * step * by_depth - e[t] * visible[t] * bar[t];
-            of_step[t] = s * f[t] * by_depth;
-        }
-        if (!varies) continue;
-        found[0] += total(of_step, count);
-        found[1 + c] = total(of_scale, count);
-        for (int a = 0; a < moments; ++a) {
-            if (!(has_bar >> (a < 4 ? a : 4) & 1)) continue;
-            const F* __restrict from = bar_of(a) + c * cells + begin;
-            for (int t = 0; t < count; ++t) of_scale[t] = from[t] * visible[t];
-            found[1 + (1 + a) * colors + c] = total(of_scale, count);
-        }
-    }
-    F* __restrict out = entered_bar + i * cells + begin;
-    F* __restrict of_cell = field_bar + channel * cells + begin;
-    for (int t = 0; t < count; ++t) out[t] = of_entered[t];
-    for (int t = 0; t < count; ++t) of_cell[t] += of_field[t];
-}
-"""
-)
-
-
+_SHARED = "cells, channels, colors, moments, light, lights, numbers"
+_ARRAYS = "scale", "weights", "field", "entered"
 _GIVEN = """
-long cells; int first_item, colors, channels, moments, light, lights, adds, varies, has_bar;
-F *numbers, *scale, *all_weights, *field, *entered, *mean, *flux_z, *flux_y, *flux_x, *higher;
-F *entered_bar, *field_bar; double *sums
+long cells; int first_item, channels, colors, moments, light, lights, adds, varies, has_bar;
+F *numbers, *scale, *weights, *field, *entered
 """
+"""`has_bar` says which moments have cotangents, a bit each, of which the last is for `higher`."""
 
 
 @functools.cache
-def receive_kernel(bits: int) -> TextKernel:
-    """The kernel of moments received of `lights` from number `light` on; or it `adds` to them."""
-    return TextKernel("receive", bits, _RECEIVE, _GIVEN, " ".join(MOMENTS))
-
-
-@functools.cache
-def receive_adjoint_kernel(bits: int) -> TextKernel:
-    """Its adjoint; `has_bar` says which moments have cotangents, a bit each, `higher` one."""
-    return TextKernel("receive_adjoint", bits, _ADJOINT, _GIVEN, "entered_bar field_bar sums")
+def receive_kernel(kind: str, bits: int) -> TextKernel:
+    """The kernel of `receive.h` called "receive", its "tangent", or "receive_back"."""
+    arrays, more, made = ", ".join(_ARRAYS), "F *made[5]", "made"
+    call = f"receive<F, {MOST_BEAMS}>(item, adds, {arrays}, made)"
+    if kind == "tangent":
+        pairs = ", ".join(f"Changing<F>{{{one}, d_{one}}}" for one in _ARRAYS)
+        call = f"receive<Dual<F>, {MOST_BEAMS}>(item, adds, {pairs}, made)"
+        more = ", ".join([more, *(f"*d_{one}" for one in _ARRAYS)])
+    elif kind == "receive_back":
+        own = "bars, entered_bar, field_bar, sums"
+        call = f"receive_back(item, first_item, varies, has_bar, {arrays}, {own})"
+        more = "F *bars[5], *entered_bar, *field_bar; double *sums"
+        made = "entered_bar field_bar sums"
+    text = f"const Receiver<F, IS_GPU ? 1 : {CHUNK}> receiver = {{{_SHARED}}};\nreceiver.{call};"
+    given = f"{_GIVEN}; {more}"
+    return TextKernel(f"beams_{kind}", bits, text, given, made, "light/fused/receive.h")
 
 
 class Receiver:
@@ -168,26 +64,36 @@ class Receiver:
             "moments": self.moments,
             "numbers": numbers,
             "scale": scale.contiguous(),
-            "all_weights": weights.contiguous(),
+            "weights": weights.contiguous(),
             "field": field.contiguous(),
         }
 
     def new_moments(self) -> list[Tensor]:
-        """Uninitialized moments of all colors, as `MOMENTS` names them."""
+        """Uninitialized moments of all colors: the mean, three of the flux, and all others."""
         shape = self.colors, *self.field.shape[1:]
         found = [self.field.new_empty(shape) for _ in range(min(self.moments, 4))]
         if self.moments > 4:
             found.append(self.field.new_empty(self.moments - 4, *shape))
         return found
 
-    def receive(self, light: int, entered: Tensor, moments: Sequence[Tensor], adds: bool) -> None:
-        """Writes what is received of beams from number `light` on to `moments`, or `adds` it.
+    def receive(
+        self, light: int, entered: Tensor, moments: Sequence[Tensor], **d_given: Tensor | None
+    ) -> None:
+        """Writes what is received of beams from number `light` on to `moments`; adds of the others.
 
         `entered` [n, K, z, y, x]: the mass that n of them pass up to where they enter each cell.
+        With changes `d_given` of that, and of the field, scale and weights, it is the change.
         """
-        own = {"light": light, "lights": len(entered), "adds": adds, "entered": entered}
-        made = dict(zip(MOMENTS, moments, strict=False))
-        receive_kernel(self.bits).launch(self.items, self.given | own, made)
+        given = self.given | {
+            "light": light,
+            "lights": len(entered),
+            "adds": light > 0,
+            "entered": entered,
+        }
+        for name, change in d_given.items():
+            given[name] = torch.zeros_like(given[name[2:]]) if change is None else change
+        kernel = receive_kernel("tangent" if d_given else "receive", self.bits)
+        kernel.launch(self.items, given, {"made": _five(moments)})
 
     def adjoint(
         self,
@@ -202,18 +108,25 @@ class Receiver:
         Arguments as of `receive`; `bars`: of the moments, None for zero. Adds to the cotangent of
         the field.
         """
-        lights, entered_bar = len(entered), torch.empty_like(entered)
+        lights, entered_bar = len(entered), torch.zeros_like(entered)
         own = {"light": light, "lights": lights, "varies": varies, "entered": entered}
         own["has_bar"] = sum(1 << a for a, bar in enumerate(bars) if bar is not None)
-        given = self.given | own | dict(zip(MOMENTS, bars, strict=False))
+        given = self.given | own | {"bars": _five(bars)}
         made = {"entered_bar": entered_bar, "field_bar": field_bar}
         width = 1 + (1 + self.moments) * self.colors
         part = max(1, MOST_SUMS // (lights * width)) if varies else self.items
         found = entered.new_zeros(lights, width, dtype=torch.float64)
+        if not own["has_bar"]:
+            return entered_bar, found
         for first in range(0, self.items, part):
             items = min(part, self.items - first)
             sums = found.new_zeros(items * varies, lights, width)
             given["first_item"] = first
-            receive_adjoint_kernel(self.bits).launch(items, given, made | {"sums": sums})
+            receive_kernel("receive_back", self.bits).launch(items, given, made | {"sums": sums})
             found += sums.sum(0)
         return entered_bar, found if varies else None
+
+
+def _five(moments: Sequence[Tensor | None]) -> list[Tensor | None]:
+    """`moments` as kernels have them, None for those that are missing."""
+    return [*moments, *[None] * (5 - len(moments))]

@@ -104,16 +104,16 @@ template <class F, int BLOCK> struct Shear : Slices {
             if (own.ray < r.n - 1 || own.ray >= r.n + height + 2 || size <= 0) continue;
 
             // Rows of slice `s` around the ray, from which columns are interpolated below.
-            auto add_slice = [&](N* to, int s, const Place<F>& r, const Place<F>& c, F weight)
-                                 HERE {
-                                     for (int up = 0; up < 2; ++up) {
-                                         const int y = own.ray - r.n - 1 + up;
-                                         if (y < 0 || y >= height) continue;
-                                         const N* from = field + cell_row(own.channel, s, y);
-                                         const F part = weight * (up ? F(1) - r.a : r.a);
-                                         add_row(to, from, lo - c.n - 1, size + 1, width, part);
-                                     }
-                                 };
+            auto add_slice = [&](N* to, int s, const Place<F>& r, const Place<F>& c,
+                                 F weight) HERE {
+                for (int up = 0; up < 2; ++up) {
+                    const int y = own.ray - r.n - 1 + up;
+                    if (y < 0 || y >= height) continue;
+                    const N* from = field + cell_row(own.channel, s, y);
+                    const F part = weight * (up ? F(1) - r.a : r.a);
+                    add_row(to, from, lo - c.n - 1, size + 1, width, part);
+                }
+            };
             clear(here, size + 1), clear(midway, size + 1);
             add_slice(here, k, r, c, F(1));
             if (k + 1 < slices) {
@@ -194,22 +194,25 @@ template <class F, int BLOCK> struct Shear : Slices {
         blend.rows(Taps<F>(r, rows), rays, window_row_stride, own.count);
         const F* __restrict bar = entered_bar + own.at;
         F* __restrict out = corrections_bar + own.at;
+        enum { ROW, COLUMN, LIMIT };
+        F of[3][BLOCK];
         for (int t = 0; t < own.count; ++t) {
             const F x = correction_of(column, blend.linear + t, blend.bent + t);
-            out[t] = bar[t] * Bounded<F>(x, bound).by_x;
+            const Bounded<F> part(x, bound);
+            out[t] = bar[t] * part.by_x;
+            of[LIMIT][t] = -bar[t] * part.by_bound;
         }
         if (!varies) return;
-        // Slopes along the place of rows, that of columns, and the bound.
-        typedef Dual<F, 3> N;
-        enum { ROW, COLUMN, LIMIT };
+        // Slopes along the places of rows and columns.
+        typedef Dual<F, 2> N;
         const Taps<Dual<F>> row_slope(r, rows, own.row == 0);
-        F linear[BLOCK + 3], bent[BLOCK + 3], of[3][BLOCK];
+        F linear[BLOCK + 3], bent[BLOCK + 3];
         for (int t = 0; t < own.count + 3; ++t) {
             linear[t] = row_slope.linearly(rays + t, window_row_stride).by[0];
             bent[t] = row_slope.bent(rays + t, window_row_stride).by[0];
         }
         auto change = [&](const Taps<N>& column, int t) HERE {
-            N l[4], b[4], limit(bound);
+            N l[4], b[4];
             UNROLLED
             for (int u = 0; u < 4; ++u) {
                 l[u] = N(blend.linear[t + u]);
@@ -217,10 +220,9 @@ template <class F, int BLOCK> struct Shear : Slices {
                 l[u].by[ROW] = linear[t + u];
                 b[u].by[ROW] = bent[t + u];
             }
-            limit.by[LIMIT] = F(1);
-            const N mass = mass_of(column, l, b, limit);
-            UNROLLED
-            for (int way = 0; way < 3; ++way) of[way][t] = bar[t] * mass.by[way];
+            const N mass = mass_of(column, l, b, N(bound));
+            of[ROW][t] = bar[t] * mass.by[ROW];
+            of[COLUMN][t] = bar[t] * mass.by[COLUMN];
         };
         const Taps<N> inner(c, columns, false, COLUMN), first(c, columns, own.begin == 0, COLUMN);
         INDEPENDENT

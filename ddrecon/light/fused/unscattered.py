@@ -8,10 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.kernels.dual import split
 from ddrecon.light.fused.receive import MOST_BEAMS, Receiver
 from ddrecon.light.fused.shear import Shear, change_sum
-from ddrecon.light.fused.tangents import change_received
 from ddrecon.numerics.autodiff import differentiate_once, keep, run_plainly
 
 MOST_NUMBERS = 1 << 22
@@ -21,7 +19,7 @@ cells then receive the light of several beams in one pass.
 
 
 class Unscattered(torch.autograd.Function):
-    """Moments [C, z, y, x] of L beams together, and the mass up to cells' centers of each.
+    """Moments [C, z, y, x] of L beams together, and the mass up to where each enters cells.
 
     `shears`: how each crosses the slices; `has_mass`: whether masses are wanted; `field`
     [K, z, y, x] and `scale` [C] of the extinction; `numbers` [L, 4]: of each beam its slope by rows
@@ -42,16 +40,13 @@ class Unscattered(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         receiver = Receiver(field, scale, numbers, weights)
         moments, masses = receiver.new_moments(), []
-        laid = _Laid(field)
+        laid = _lay(shears, field)
         for lights in _batches(shears, field, receiver):
             beams = [(i, shears[i]) for i in lights]
-            entered = _stack([s.lift(s.sum(laid.of(s), numbers, i).entered) for i, s in beams])
-            receiver.receive(lights[0], entered, moments, adds=lights[0] > 0)
-            if has_mass:
-                masses += [
-                    torch.addcmul(one, field, 0.5 * numbers[light, 2])
-                    for light, one in zip(lights, entered, strict=True)
-                ]
+            each = [s.lift(s.sum(laid[s.axis == 2], numbers, i).entered) for i, s in beams]
+            masses += each if has_mass else []
+            if moments:
+                receiver.receive(lights[0], _stack(each), moments)
         return *moments, *masses
 
     @staticmethod
@@ -68,39 +63,37 @@ class Unscattered(torch.autograd.Function):
         receiver = Receiver(field, scale, numbers, weights)
         count = len(bars) - len(ctx.shears) * ctx.has_mass
         moments_bar, masses_bar = bars[:count], bars[count:]
-        laid = _Laid(field)
-        is_laid = any(shear.axis == 2 for shear in ctx.shears)
-        laid_bar = _Laid(field.new_zeros(field.shape)) if is_laid else None
-        field_bar = field.new_zeros(field.shape)
+        laid = _lay(ctx.shears, field)
+        laid_bar = {is_across_x: torch.zeros_like(one) for is_across_x, one in laid.items()}
         scale_bar = torch.zeros_like(scale, dtype=torch.float64)
         numbers_bar = torch.zeros_like(numbers, dtype=torch.float64)
         weights_bar = torch.zeros_like(weights, dtype=torch.float64)
         for lights in _batches(ctx.shears, field, receiver):
             shears = [ctx.shears[light] for light in lights]
             sums = [
-                s.sum(laid.of(s), numbers, i, True) for i, s in zip(lights, shears, strict=True)
+                s.sum(laid[s.axis == 2], numbers, i, True)
+                for i, s in zip(lights, shears, strict=True)
             ]
             entered = _stack([each.shear.lift(each.entered) for each in sums])
             entered_bars, found = receiver.adjoint(
-                lights[0], entered, moments_bar, field_bar, varies
+                lights[0], entered, moments_bar, laid_bar[False], varies
             )
             for i, (light, shear, each) in enumerate(zip(lights, shears, sums, strict=True)):
                 mass_bar = masses_bar[light] if ctx.has_mass else None
                 if mass_bar is not None:
                     entered_bars[i] += mass_bar
-                    field_bar.addcmul_(mass_bar, 0.5 * numbers[light, 2])
-                to = field_bar if laid_bar is None or shear.axis != 2 else laid_bar.of(shear)
-                by_beam = each.adjoint(shear.lay(entered_bars[i]), to, varies)
+                of_entered = shear.lay(entered_bars[i])
+                by_beam = each.adjoint(of_entered, laid_bar[shear.axis == 2], varies)
                 if by_beam is not None and found is not None:
                     numbers_bar[light] += by_beam
                     numbers_bar[light, 2] += found[i, 0]
-                    if mass_bar is not None:
-                        numbers_bar[light, 2] += 0.5 * (field * mass_bar).sum(dtype=torch.float64)
             if found is not None:
                 scale_bar += found[:, 1 : 1 + len(scale)].sum(0)
-                by_weights = found[:, 1 + len(scale) :].view(len(lights), receiver.moments, -1)
+                by_weights = found[:, 1 + len(scale) :].view(len(lights), *weights.shape[1:])
                 weights_bar[lights[0] : lights[-1] + 1] = by_weights
-        field_bar = field_bar if laid_bar is None else laid_bar.add_to(field_bar)
+        field_bar = laid_bar[False]
+        if True in laid_bar:
+            field_bar += laid_bar[True].transpose(2, 3)
         if not varies:
             return None, None, field_bar, None, None, None
         by_numbers = (bar.to(field) for bar in (scale_bar, numbers_bar, weights_bar))
@@ -109,23 +102,19 @@ class Unscattered(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: None, _has: None, *changes: Tensor | None) -> tuple[Tensor, ...]:
         def change(*tensors: Any) -> tuple[Tensor, ...]:
-            (field, scale, numbers, weights), d_tensors = split(tensors)
-            d_field, d_scale, d_numbers, d_weights = d_tensors
+            field, scale, numbers, weights, d_field, d_scale, d_numbers, d_weights = tensors
             receiver = Receiver(field, scale, numbers, weights)
-            d_given = {"field": d_field, "scale": d_scale, "all_weights": d_weights}
-            d_moments, d_masses = receiver.new_moments(), []
+            d_given = {"d_field": d_field, "d_scale": d_scale, "d_weights": d_weights}
+            d_moments, d_masses = receiver.new_moments(), list[Tensor]()
             for lights in _batches(ctx.shears, field, receiver):
                 followed = [
                     change_sum(ctx.shears[light], light, field, d_field, numbers, d_numbers)
                     for light in lights
                 ]
                 entered, d_entered = (_stack(list(each)) for each in zip(*followed, strict=True))
-                d_given["entered"] = d_entered
-                change_received(receiver, lights[0], entered, d_given, d_moments)
-                for light, d_mass in zip(lights if ctx.has_mass else (), d_entered, strict=False):
-                    if d_field is not None:
-                        d_mass = torch.addcmul(d_mass, d_field, 0.5 * numbers[light, 2])
-                    d_masses.append(d_mass)
+                d_masses += d_entered if ctx.has_mass else []
+                if d_moments:
+                    receiver.receive(lights[0], entered, d_moments, d_entered=d_entered, **d_given)
             return *d_moments, *d_masses
 
         d_found: tuple[Tensor, ...] = run_plainly(change, *ctx.saved_tensors, *changes)
@@ -144,24 +133,7 @@ def _batches(shears: Sequence[Shear], field: Tensor, receiver: Receiver) -> list
     return [range(first, min(first + size, lights)) for first in range(0, lights, size)]
 
 
-class _Laid:
-    """A field as it lies in the grid, and laid out for slices across x where that is wanted."""
-
-    def __init__(self, cells: Tensor):
-        self.cells = cells.contiguous()
-        self.across_x: Tensor | None = None
-        self.shear: Shear | None = None
-
-    def of(self, shear: Shear) -> Tensor:
-        """The field as `shear` lays it, the same tensor each time."""
-        if shear.axis != 2:
-            return self.cells
-        if self.across_x is None:
-            self.across_x, self.shear = shear.lay(self.cells), shear
-        return self.across_x
-
-    def add_to(self, cells: Tensor) -> Tensor:
-        """`cells` with what was laid out added."""
-        if self.across_x is None or self.shear is None:
-            return cells
-        return cells + self.shear.lift(self.across_x)
+def _lay(shears: Sequence[Shear], field: Tensor) -> dict[bool, Tensor]:
+    """`field` as it lies, and if one of `shears` is across x, as that wants it."""
+    laid = {shear.axis == 2: shear.lay(field) for shear in shears if shear.axis == 2}
+    return {False: field.contiguous()} | laid

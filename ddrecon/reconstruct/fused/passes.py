@@ -1,25 +1,22 @@
-"""Adam's step and total variation as functions of tensors, by fused kernels."""
+"""Adam's step and total variation as functions of tensors, by the kernels of `passes.h`."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.launch import thread_count
-from ddrecon.kernels.text import cut
+from ddrecon.kernels.text import BLOCK, TextKernel, cut
 from ddrecon.losses import ROUNDING
 from ddrecon.numerics.autodiff import differentiate_once
-from ddrecon.reconstruct.fused.kernels import step_kernel, variation_kernel
 
 LENGTH = 4096
 """Numbers that an item of a launch steps on a processor."""
 PART = 32
 """Cells of a row that a thread does on a GPU."""
-FEW = 1 << 15
-"""So many numbers are not worth a second thread."""
 
 
 def step_adam(
@@ -46,11 +43,11 @@ def step_adam(
         "total": value.numel(),
         "value": value,
         "gradient": gradient,
-        "first_moment": moments[0],
-        "second_moment": moments[1],
+        "first": moments[0],
+        "second": moments[1],
         "forget_first": 1 - betas[0],
         "forget_second": 1 - betas[1],
-        "root": weights[1] ** -0.5,
+        "scale": weights[1] ** -0.5,
         "ahead": ahead,
         "smallest": smallest,
         "rate": rate / weights[0],
@@ -58,8 +55,8 @@ def step_adam(
         "high": bounds[1],
     }
     made = dict(zip(("new_value", "new_first", "new_second"), new, strict=True))
-    kernel = step_kernel(torch.finfo(value.dtype).bits, smallest.numel() > 1)
-    kernel.launch(items, given, made, _threads(value))
+    kernel = step_kernel(8 * value.element_size(), smallest.numel() > 1)
+    kernel.launch(items, given, made)
     return new[0], (new[1], new[2])
 
 
@@ -76,7 +73,7 @@ def variation_diagonal(field: Tensor, grid: Grid) -> Tensor:
 
 
 def _vary(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
-    """`totals`, `slope` and `diagonal` of `field` [..., z, y, x], by `variation_kernel`."""
+    """`totals`, `slope` and `diagonal` of `field` [..., z, y, x], as of `passes.h`."""
     side, (nz, ny, nx) = min(grid.extent), field.shape[-3:]
     slope, diagonal = field.new_empty(field.shape), field.new_empty(field.shape)
     length = PART if field.is_cuda else nx
@@ -86,7 +83,7 @@ def _vary(field: Tensor, grid: Grid) -> tuple[Tensor, Tensor, Tensor]:
     given = {"length": length, "nz": nz, "ny": ny, "nx": nx, "field": field}
     given |= {"kz": kz, "ky": ky, "kx": kx, "rounding": ROUNDING}
     made = {"slope": slope, "diagonal": diagonal, "totals": totals}
-    variation_kernel(torch.finfo(field.dtype).bits).launch(items, given, made, _threads(field))
+    variation_kernel(8 * field.element_size()).launch(items, given, made)
     return totals, slope, diagonal
 
 
@@ -110,5 +107,27 @@ class _Variation(torch.autograd.Function):
         return (total_bar / slope.numel()) * slope, None
 
 
-def _threads(numbers: Tensor) -> int:
-    return 1 if numbers.numel() < FEW else thread_count(numbers)
+_HEADER = "reconstruct/fused/passes.h"
+_STEP = "forget_first, forget_second, scale, ahead, rate, low, high"
+
+
+@functools.cache
+def step_kernel(bits: int, is_each: bool) -> TextKernel:
+    """The kernel of a step of Adam; `smallest` is one number, or `is_each` one for each."""
+    given, made = "value, gradient, first, second", "new_value, new_first, new_second"
+    text = f"Step<F>{{{_STEP}}}.take<{int(is_each)}>(begin, end, smallest, {given}, {made});"
+    arrays = ", ".join(f"*{name}" for name in f"smallest, {given}, {made}".split(", "))
+    declared = f"int length, total; F {_STEP}, {arrays}"
+    return TextKernel("step", bits, BLOCK + text, declared, made.replace(",", ""), _HEADER)
+
+
+@functools.cache
+def variation_kernel(bits: int) -> TextKernel:
+    """The kernel of lengths of the gradient, with the slope and the diagonal (E32) of their sum."""
+    text = """
+        const Variation<F> variation{nz, ny, nx, kz, ky, kx, rounding};
+        totals[item] = variation.vary(item, length, field, slope, diagonal);
+    """
+    numbers = "int length, nz, ny, nx; F kz, ky, kx, rounding"
+    given = f"{numbers}, *field, *slope, *diagonal; double *totals"
+    return TextKernel("vary", bits, text, given, "slope diagonal totals", _HEADER)
