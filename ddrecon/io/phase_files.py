@@ -1,4 +1,4 @@
-"""Phase functions from files: values over the angle, or Legendre moments.
+"""Phase functions from files: values over the angle.
 
 Text files (.csv, .txt) have numbers in columns, separated by commas or spaces, under a header that
 names the columns; `#` begins a comment. Archives (.npz) have arrays of these names.
@@ -52,26 +52,6 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return angles, values
 
 
-def read_moments(path: Path) -> np.ndarray:
-    """Legendre moments chi_l, [C, n], from l = 0 on of the file at `path`; chi_0 is not 0.
-
-    Raises FormatError.
-    """
-    with guard_reading(path):
-        names, columns = _read_columns(path)
-    if names and names[0] in ("l", "degree"):
-        if not np.array_equal(columns[0], np.arange(columns.shape[1])):
-            raise FormatError(path, f"its column {names[0]} must count 0, 1, 2, ...")
-        columns = columns[1:]
-    _require_colors(path, len(columns))
-    if columns.shape[1] < 2 or (columns[:, 0] <= 0).any():
-        raise FormatError(path, "needs chi_0 above 0, and chi_1, one a row")
-    moments = columns / columns[:, :1]
-    if np.abs(moments).max() > 1 + 1e-6:
-        raise FormatError(path, "has moments larger than chi_0; divide each by 2 l + 1")
-    return moments
-
-
 def _require_colors(path: Path, count: int) -> None:
     if count not in (1, 3):
         raise FormatError(path, f"has {count} columns of values; expected 1, or 3 for r, g, b")
@@ -91,9 +71,9 @@ def _read_columns(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 def _read_archive(path: Path) -> tuple[list[str], np.ndarray]:
-    """Arrays called angle, cosine or degree, then `value` [n] or [n, 3]."""
+    """Arrays called angle or cosine, then `value` [n] or [n, 3]."""
     arrays = read_arrays(path)
-    first = [name for name in (*ABSCISSAS, "l", "degree") if name in arrays]
+    first = [name for name in ABSCISSAS if name in arrays]
     if "value" not in arrays or arrays["value"].ndim not in (1, 2):
         raise FormatError(path, "has no array 'value' [n] or [n, 3]")
     values = np.atleast_2d(arrays["value"].T).astype(np.float64)

@@ -21,10 +21,9 @@ from ddrecon.scene_file.build_starts import (
 )
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_volume
-from ddrecon.scene_file.colors import share_colors
+from ddrecon.scene_file.choices import choose_rounds, share_colors
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.rounds import choose_rounds
 from ddrecon.variables.wildcards import name_each
 
 

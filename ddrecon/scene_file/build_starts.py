@@ -14,8 +14,7 @@ from ddrecon.errors import UsageError
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 from ddrecon.scene import Scene
-from ddrecon.scene_file.files import read_referenced, require
-from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.load import SceneFile, read_referenced, require
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile, ParameterSettings
 from ddrecon.variables.kinds import PHASE, kind_of, split_name
