@@ -18,7 +18,7 @@ from ddrecon.scene_file.light_schema import Color
 from ddrecon.scene_file.nodes import Node, describe_found, show_value
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.scene_file.schema import Backdrop, Count, Paths
-from ddrecon.settings import AUTO, Iterations, Weight
+from ddrecon.settings import AUTO, Iterations
 
 T = TypeVar("T")
 
@@ -170,13 +170,6 @@ def read_backdrop(node: Node, rule: Rule) -> float | tuple[float, ...] | Path:
     return read_path(node, rule) if isinstance(node.value, str) else read_color(node, rule)
 
 
-def read_weight(node: Node, rule: Rule) -> float | str:
-    """A number, or `auto`."""
-    if isinstance(node.value, str):
-        return read_text(node, Rule(str, {"choices": (AUTO,)}, rule.folder))
-    return read_number(node, rule)
-
-
 def read_iterations(node: Node, rule: Rule) -> int | str:
     """A whole number, or `auto`."""
     if isinstance(node.value, str):
@@ -204,7 +197,6 @@ LEAVES: dict[Any, Callable[[Node, Rule], Any]] = {
     Matrix: read_matrix,
     Color: read_color,
     Backdrop: read_backdrop,
-    Weight: read_weight,
     Iterations: read_iterations,
     tuple[float, ...]: read_fraction_list,
 }

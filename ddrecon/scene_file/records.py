@@ -39,12 +39,9 @@ from ddrecon.scene_file.schema import (
 )
 from ddrecon.scene_file.transforms import read_transforms
 from ddrecon.settings import (
-    AUTO,
-    MASKS,
     FieldFile,
     ParameterSettings,
     Start,
-    Support,
 )
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
@@ -175,14 +172,9 @@ def _read_parameters(node: Node, rule: Rule) -> dict[str, ParameterSettings]:
             if pattern_of(name) not in KINDS:
                 raise child.key_refused(f"unknown parameter{suggestion(pattern_of(name), KINDS)}")
             settings = read_record(child, ParameterSettings, rule.folder)
-            for key, is_given in (
-                ("support", settings.support is not None),
-                ("tv", settings.tv == AUTO),
-            ):
-                if is_given and name != "density":
-                    raise _mapping(child)[key].refused(
-                        f"{describe_found(_mapping(child)[key])} is for density alone"
-                    )
+            if settings.support is not None and name != "density":
+                support = _mapping(child)["support"]
+                raise support.refused(f"{describe_found(support)} is for density alone")
             parameters[name] = _require_legal(child, settings, kind_of(name))
     problems.raise_any()
     if not parameters:
@@ -236,15 +228,6 @@ def _read_start(node: Node, rule: Rule) -> Any:
     )
 
 
-def _read_support(node: Node, rule: Rule) -> float | str | FieldFile:
-    """`masks`, `auto`, a displayed value, or `{file: path}`."""
-    if isinstance(node.value, dict):
-        return read_record(node, FieldFile, rule.folder)
-    if isinstance(node.value, str):
-        return read_text(node, Rule(str, {"choices": (MASKS, AUTO)}, rule.folder))
-    return read_number(node, rule)
-
-
 def _read_views(node: Node, rule: Rule) -> tuple[ViewSection, ...]:
     """A list of views with names of their own, or the views of a ring or of transforms."""
     if isinstance(node.value, dict):
@@ -285,7 +268,6 @@ READERS: dict[Any, Callable[[Node, Rule], Any]] = {
     Density: _read_density,
     Quantity: _read_quantity,
     Start: _read_start,
-    Support: _read_support,
     Mapping[str, ParameterSettings]: _read_parameters,
     tuple[ViewSection, ...]: _read_views,
 }
