@@ -156,16 +156,10 @@ class FieldFile:
 Start = float | tuple[float, ...] | FieldFile
 """Where a parameter starts: the same number everywhere, a vector or color, or a file's values."""
 
-Weight = float | Literal["auto"]
-"""A weight, or `auto`: it is found."""
 Iterations = int | Literal["auto"]
 """How many iterations a run has, or `auto`: it ends by itself."""
 AUTO: Literal["auto"] = "auto"
-Support = float | Literal["masks", "auto"] | FieldFile
-"""Where medium may be: `masks`, the displayed value above which a pixel shows some, `auto` for a
-value that follows from the picture's noise, or a field.
-"""
-MASKS: Literal["masks"] = "masks"
+MASKS = "masks"
 
 
 @dataclass(frozen=True)
@@ -176,25 +170,27 @@ class ParameterSettings:
     learning rate `lr` (None: that of its kind).
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
-    always does). For the part `even_until` of the iterations all its cells change alike, so that
-    numbers of the whole scene are found before it.
+    always does).
 
     `tv` weighs its total variation and `l1` its mean, of density by E47; 1 would weigh them as much
-    as the whole brightness of the targets. `tv: auto` finds the weight by leaving views out.
+    as the whole brightness of the targets.
 
-    `support`: where density may be above 0, by what pictures show, widened by `support_margin`
-    pixels; None is anywhere.
+    `support`: where density may be above 0, by what pictures show: `masks`, or `auto` for what is
+    brighter than black; widened by `support_margin` pixels. None is anywhere.
     """
+
+    RETIRED: ClassVar[Mapping[str, str]] = {
+        "even_until": "cells are free from the start now: leave it out"
+    }
 
     init: Start | None = None
     lr: float | None = optional(above=0)
     min: float | None = None
     max: float | None = None
-    tv: Weight | None = optional(minimum=0)
+    tv: float | None = optional(minimum=0)
     l1: float = bounded(0.0, minimum=0)
     field: bool | None = None
-    even_until: float = bounded(0.0, minimum=0, below=1)
-    support: Support | None = optional(minimum=0, below=1)
+    support: str | None = one_of(None, (MASKS, AUTO))
     support_margin: float = bounded(2.0, minimum=0, maximum=1000, expert=True)
 
     def violations(self) -> Iterator[Violation]:

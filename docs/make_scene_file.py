@@ -403,7 +403,6 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
                 " density, of whose logarithm it is (E47), and 0 for others."
-                " `auto` finds it by leaving a view out."
             ),
             "l1": (
                 "Weight of its mean, which empties what no picture needs; for density of its"
@@ -413,15 +412,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Whether it differs from cell to cell; unless given, as its start does. Density "
                 "always does."
             ),
-            "even_until": (
-                "Part of the iterations during which all cells of a field change alike, so that "
-                "numbers of the whole scene are found before it."
-            ),
             "support": (
                 "For density: where it may be above 0. `masks`: nowhere that a view sees and its "
-                "mask, or alpha, says is empty; a number: nor where it displays no more than that "
-                "(sRGB, 0 to 1); `auto`: nor where it is as dark as its darkest tenth, within "
-                "noise; or a field that is above 0 there. Left out: anywhere."
+                "mask, or alpha, says is empty; `auto`: nor where it is as dark as its darkest "
+                "tenth, within noise. Left out: anywhere."
             ),
             "support_margin": "Pixels by which what a view shows is widened for that.",
         },

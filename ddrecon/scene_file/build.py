@@ -16,7 +16,6 @@ from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
 from ddrecon.scene_file.build_starts import (
     build_starts,
-    build_support,
     require_start_files,
 )
 from ddrecon.scene_file.build_views import build_views
@@ -75,5 +74,4 @@ def build_scene(
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
     scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
-    support = build_support(scene_file, volume.density)
-    return replace(scene, starts=build_starts(scene_file, scene), support=support)
+    return replace(scene, starts=build_starts(scene_file, scene))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ddrecon.scene_file.nodes import Node, describe_found
+from ddrecon.scene_file.nodes import Node
 from ddrecon.scene_file.problems import Problems, suggestion
-from ddrecon.settings import AUTO, ParameterSettings
+from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import (
     CROSS_SECTIONS,
     EXTINCTION_AND_ALBEDO,
@@ -34,7 +34,7 @@ def require_parameters(
             continue
         own = entries[name].entries()
         for key, what in _illegal(name, settings):
-            problems.note(own[key].refused(what.format(found=describe_found(own[key]))))
+            problems.note(own[key].refused(what))
         medium, last = split_name(name)
         others = [medium + other for other in CROSS_SECTIONS if medium + other in parameters]
         if last in EXTINCTION_AND_ALBEDO and others:
@@ -51,15 +51,8 @@ def require_parameters(
 def _illegal(name: str, settings: ParameterSettings) -> list[tuple[str, str]]:
     """What keys of the parameter `name` may not say, as keys and what is wrong."""
     kind, wrong = kind_of(name), list[tuple[str, str]]()
-    if name != "density":
-        wrong += [
-            (key, "{found} is for density alone")
-            for key, is_given in (
-                ("support", settings.support is not None),
-                ("tv", settings.tv == AUTO),
-            )
-            if is_given
-        ]
+    if settings.support is not None and name != "density":
+        wrong.append(("support", f"{settings.support!r} is for density alone"))
     for key in ("min", "max", "init"):
         value = getattr(settings, key)
         numbers = value if isinstance(value, tuple) else (value,)
