@@ -116,6 +116,8 @@ def read_value(node: Node, rule: Rule) -> Any:
 
 
 def _refused(node: Node, rule: Rule) -> Exception:
+    if str in alternatives(rule.hint) and node.value is not None:
+        _check_choice(node, rule.limits.get("choices", ()), rule)
     is_text = {str, Path} & set(alternatives(rule.hint)) and isinstance(node.value, int | float)
     quoting = " (put it in quotes)" if is_text else ""
     return node.refused(
@@ -131,7 +133,7 @@ def _check_limits(node: Node, value: float, limits: Mapping[str, Any]) -> None:
 
 def _check_choice(node: Node, choices: Sequence[Any], rule: Rule) -> None:
     if choices and node.value not in choices:
-        if what := rule.limits.get("retired", {}).get(node.value):
+        if what := rule.limits.get("retired", {}).get(str(node.value)):
             raise node.refused(f"{node.value} went: {what}")
         words = list(map(str, choices))
         near = suggestion(str(node.value), words) if len(words) > 1 else ""

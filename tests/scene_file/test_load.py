@@ -309,6 +309,9 @@ ONE_FAULT = [
         "optimize={parameters: {densty: {}}}",
         "optimize.parameters.densty: unknown parameter; did you mean 'density'?",
     ),
+    ("optimize.parameters.density.support=0.1", "density.support: expected one of masks, auto"),
+    ("optimize.parameters.g.support=auto", "g.support: 'auto' is for density alone"),
+    ("optimize.parameters.density.even_until=0.3", "even_until: cells are free from the start"),
     ("optimize.parameters.density.lr=0", "optimize.parameters.density.lr: must be above 0"),
     ("optimize.parameters.density.tv=-1", "optimize.parameters.density.tv: must be at least 0"),
     (
