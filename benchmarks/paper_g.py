@@ -29,7 +29,7 @@ FIELDS, NUMBERS = (
         f"optimize.parameters.{name}={{init: {start}, lr: 0.2{more}}}"
         for name, start in STARTS.items()
     ]
-    for more in (", field: true, even_until: 0.3, tv: 1e-4", "")
+    for more in (", field: true, tv: 1e-4", "")
 )
 TRUE = [
     *(f"volume.{name}={{file: ../../data/shapes/cloud.npz}}" for name in STARTS),
@@ -45,11 +45,7 @@ WEIGHTS = {
 }
 KINDS = {
     "the true ones": (TRUE, list(WEIGHTS)),
-    "fields, even at first": (FIELDS, ["of the config", "all alike", "first view 0.002"]),
-    "fields from the start": (
-        [given.replace(", even_until: 0.3", "") for given in FIELDS],
-        ["of the config", "all alike"],
-    ),
+    "fields": (FIELDS, ["of the config", "all alike", "first view 0.002"]),
     "one number a color": (NUMBERS, ["of the config", "all alike", "first view 0.002"]),
 }
 """What stands for sigma_a and sigma_s, and the weights it is tried with."""

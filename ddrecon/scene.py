@@ -53,8 +53,6 @@ class View:
 class Scene(Displayed):
     """A loaded scene.
 
-    `support` [z, y, x] is above 0 where density may be, if a file says so.
-
     `optimize` is what its file, `path`, says of reconstruction; `starts` holds the value that each
     optimized parameter starts from.
     """
@@ -66,7 +64,6 @@ class Scene(Displayed):
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
     starts: dict[str, Tensor] = field(default_factory=dict)
-    support: Tensor | None = None
     path: Path | None = None
 
     def view(self, name: str) -> View:

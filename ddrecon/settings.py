@@ -2,7 +2,7 @@
 
 What the scene loader checks stands with each field: the limits `minimum`, `above`, `maximum` and
 `below` of its numbers, or its `choices`, which are the names of a table of implementations. No
-table is loaded here: a scene file is read without torch. `problems` yields what is wrong with
+table is loaded here: a scene file is read without torch. `violations` yields what is wrong with
 several values together.
 """
 
@@ -12,7 +12,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, TypedDict, Unpack
+from typing import Any, ClassVar, Literal, TypedDict, Unpack
 
 DERIVATIVES = ("all", "single", "diffusion")
 """Which radiance passes derivatives on: all of it, that of beams scattered once, or that of the
@@ -26,17 +26,21 @@ See docs/theory.md, section 5.
 LENSES = {"opencv": ("k1", "k2", "k3", "k4", "p1", "p2"), "fisheye": ("k1", "k2", "k3", "k4")}
 """The coefficients of each model of a lens, in order; all are 0 where there is no distortion."""
 
-Problem = tuple[str, str]
+Violation = tuple[str, str]
 """The key of a record that breaks a rule, and what is wrong with its value."""
 
 
 class Limits(TypedDict, total=False):
-    """What each number of a field must be: `minimum` and `maximum` are legal, the others not."""
+    """What each number of a field must be: `minimum` and `maximum` are legal, the others not.
+
+    `expert`: whether no scene needs the field, so that the manual has it on a page of its own.
+    """
 
     minimum: float
     above: float
     maximum: float
     below: float
+    expert: bool
 
 
 def bounded(default: Any, **limits: Unpack[Limits]) -> Any:
@@ -54,9 +58,9 @@ def optional(**limits: Unpack[Limits]) -> Any:
     return bounded(None, **limits)
 
 
-def one_of(default: Any, choices: Collection[Any]) -> Any:
+def one_of(default: Any, choices: Collection[Any], expert: bool = False) -> Any:
     """One of `choices`, `default` where the scene gives none."""
-    return field(default=default, metadata={"choices": tuple(choices)})
+    return field(default=default, metadata={"choices": tuple(choices), "expert": expert})
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,8 @@ class RenderSettings:
     """
 
     samples_per_pixel: int = bounded(1, minimum=1, maximum=1024)
-    steps_per_voxel: int | None = optional(minimum=1, maximum=8)
-    tolerance: float = bounded(0.05, minimum=0, maximum=1)
+    steps_per_voxel: int | None = optional(minimum=1, maximum=8, expert=True)
+    tolerance: float = bounded(0.05, minimum=0, maximum=1, expert=True)
     background: bool = True
 
     @property
@@ -102,13 +106,13 @@ class DiffusionSettings:
     """Keys of old scene files, and what to write instead."""
 
     model: str = one_of("p1", ("none", "p1", "flux_limited"))
-    scheme: str = one_of("conservative", ("conservative", "printed"))
-    closure: str = one_of("geometric", ("geometric", "smooth"))
-    floor: float = bounded(FLOOR, above=0, maximum=1e3)
-    limiter: str = one_of("marshak", ("marshak", "levermore_pomraning"))
-    solver: str = one_of("multigrid", ("multigrid", "conjugate_gradient", "jacobi"))
+    scheme: str = one_of("conservative", ("conservative", "printed"), expert=True)
+    closure: str = one_of("geometric", ("geometric", "smooth"), expert=True)
+    floor: float = bounded(FLOOR, above=0, maximum=1e3, expert=True)
+    limiter: str = one_of("marshak", ("marshak", "levermore_pomraning"), expert=True)
+    solver: str = one_of("multigrid", ("multigrid", "conjugate_gradient", "jacobi"), expert=True)
     tolerance: float = bounded(1e-4, above=0, maximum=0.5)
-    warm_start: bool = True
+    warm_start: bool = bounded(True, expert=True)
     transport_rounds: int | None = optional(minimum=0, maximum=16)
     degree: int | None = one_of(None, (1, 3, 5, 7))
 
@@ -130,7 +134,7 @@ class DiffusionSettings:
     def _can_have_rounds(self) -> bool:
         return (self.model, self.scheme) == ("p1", "conservative")
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         """Settings that exclude each other."""
         if self.model == "flux_limited" and self.scheme == "printed":
             yield "scheme", "'printed' is for diffusion.model p1; flux_limited needs 'conservative'"
@@ -152,15 +156,9 @@ class FieldFile:
 Start = float | tuple[float, ...] | FieldFile
 """Where a parameter starts: the same number everywhere, a vector or color, or a file's values."""
 
-Weight = float | str
-"""A weight, or `auto`: it is found."""
-Iterations = int | str
+Iterations = int | Literal["auto"]
 """How many iterations a run has, or `auto`: it ends by itself."""
-AUTO = "auto"
-Support = float | str | FieldFile
-"""Where medium may be: `masks`, the displayed value above which a pixel shows some, `auto` for a
-value that follows from the picture's noise, or a field.
-"""
+AUTO: Literal["auto"] = "auto"
 MASKS = "masks"
 
 
@@ -172,28 +170,30 @@ class ParameterSettings:
     learning rate `lr` (None: that of its kind).
 
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
-    always does). For the part `even_until` of the iterations all its cells change alike, so that
-    numbers of the whole scene are found before it.
+    always does).
 
     `tv` weighs its total variation and `l1` its mean, of density by E47; 1 would weigh them as much
-    as the whole brightness of the targets. `tv: auto` finds the weight by leaving views out.
+    as the whole brightness of the targets.
 
-    `support`: where density may be above 0, by what pictures show, widened by `support_margin`
-    pixels; None is anywhere.
+    `support`: where density may be above 0, by what pictures show: `masks`, or `auto` for what is
+    brighter than black; widened by `support_margin` pixels. None is anywhere.
     """
+
+    RETIRED: ClassVar[Mapping[str, str]] = {
+        "even_until": "cells are free from the start now: leave it out"
+    }
 
     init: Start | None = None
     lr: float | None = optional(above=0)
     min: float | None = None
     max: float | None = None
-    tv: Weight | None = optional(minimum=0)
+    tv: float | None = optional(minimum=0)
     l1: float = bounded(0.0, minimum=0)
     field: bool | None = None
-    even_until: float = bounded(0.0, minimum=0, below=1)
-    support: Support | None = optional(minimum=0, below=1)
-    support_margin: float = bounded(2.0, minimum=0, maximum=1000)
+    support: str | None = one_of(None, (MASKS, AUTO))
+    support_margin: float = bounded(2.0, minimum=0, maximum=1000, expert=True)
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         low = -math.inf if self.min is None else self.min
         high = math.inf if self.max is None else self.max
         entries = self.init if isinstance(self.init, tuple) else (self.init,)
@@ -214,7 +214,7 @@ class NoiseSettings:
     read: float = bounded(0.0, minimum=0)
     shot: float = bounded(0.0, minimum=0)
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         if self.read == self.shot == 0:
             yield "read", "no noise at all; give read or shot, or leave noise out to estimate it"
 
@@ -236,10 +236,10 @@ class OptimizeSettings:
     loss: str | None = one_of(None, ("l2", "l1", "huber", "relative_l2", "display", "photon"))
     noise: NoiseSettings | None = None
     views_per_iteration: int = bounded(3, minimum=0)
-    derivatives: str = one_of("all", DERIVATIVES)
+    derivatives: str = one_of("all", DERIVATIVES, expert=True)
     refine_at: tuple[float, ...] = bounded((0.4, 0.8), above=0, below=1)
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         if any(
             later <= earlier
             for earlier, later in zip(self.refine_at, self.refine_at[1:], strict=False)

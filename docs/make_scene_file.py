@@ -1,4 +1,5 @@
-"""Makes docs/scene_file.md, the manual of scene files, from the schema.
+"""Makes the manual of scene files from the schema: scene_file.md, expert_keys.md, and for editors
+scene.schema.json.
 
 Keys, kinds, limits and defaults are those the program checks. Run it after each change of them:
 
@@ -7,47 +8,27 @@ Keys, kinds, limits and defaults are those the program checks. Run it after each
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
 
 from ddrecon import settings
-from ddrecon.scene_file import camera_schema, light_schema, phase_schema, schema
+from ddrecon.scene_file import schema
+from ddrecon.scene_file.read import alternatives, describe_type, type_hints
 from ddrecon.variables.default_rates import DENSITY_STEP
 from ddrecon.variables.kinds import KINDS, Kind
 
-PAGE = Path(__file__).parent / "scene_file.md"
-KIND_NAMES = {
-    light_schema.Color: "number or [r, g, b]",
-    schema.Backdrop: "file, number or [r, g, b]",
-    schema.Quantity: "number, [r, g, b] or {file: ...}",
-    schema.Density: "number or {file: ...}",
-    phase_schema.PhaseSection: "{type: ...}",
-    phase_schema.PartSection: "{type: ...}",
-    Mapping[str, schema.MediumSection]: "two media by name",
-    phase_schema.Parts: "list of two {type: ...}",
-    settings.Start: "number, list or {file: ...}",
-    settings.Weight: "number or `auto`",
-    settings.Iterations: "whole number or `auto`",
-    settings.Support: "`masks`, `auto`, number or {file: ...}",
-    schema.Triple: "[x, y, z]",
-    schema.Count: "[nx, ny, nz]",
-    camera_schema.Size: "[width, height]",
-    camera_schema.Pair: "[x, y]",
-    schema.Paths: "file, or list of files",
-    camera_schema.Matrix: "4 rows of 4 numbers",
-    tuple[float, ...]: "list of numbers",
-    float: "number",
-    int: "whole number",
-    bool: "true or false",
-    str: "text",
-    Path: "file",
-}
-"""How a user would call what a key takes."""
+FOLDER = Path(__file__).parent
+EXPERT = """\
+# Keys for experts
 
+No scene needs them: they choose between ways to compute the same, for comparisons and experiments.
+They stand in the sections of [the scene file](scene_file.md) that are named here.
+`ddrecon check` tells which of them are not at their default."""
 INTRODUCTION = """\
 Every key, with what it takes, its limits and its default, made from the program's own schema.
 
@@ -57,7 +38,11 @@ Every key, with what it takes, its limits and its default, made from the program
 - Paths are relative to the scene file.
 - Three equal colors are rendered as one, unless they are optimized.
 
-Anything unknown, repeated or out of its limits is refused with file, line, column and key."""
+Anything unknown, repeated or out of its limits is refused with file, line, column and key.
+[Keys for experts](expert_keys.md) have a page of their own.
+
+Editors that know YAML complete and check keys by [scene.schema.json](scene.schema.json).
+Its place is the file's first line: `# yaml-language-server: $schema=PATH/scene.schema.json`."""
 VOLUME = """\
 The box, and what is in it.
 Give either `sigma_a` and `sigma_s`, or `sigma_t` and `albedo`."""
@@ -114,7 +99,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "sigma_t": "Extinction coefficient per unit of density [1/u].",
             "albedo": "The part of the extinction that scatters.",
             "g": "The short form of `phase`.",
-            "phase": "Any but `two_lobe` and `blend`; its numbers are the same in all cells.",
+            "phase": "Any but `two_lobe`; its numbers are the same in all cells.",
         },
     ),
     (
@@ -128,13 +113,13 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "volume.phase: {type: henyey_greenstein}",
-        phase_schema.HenyeyGreensteinSection,
+        schema.HenyeyGreensteinSection,
         "The usual phase function of one number; `g: 0.3` is short for it.",
         {"g": "Mean cosine of the scattering angle; above 0 is forward. A file has one a cell."},
     ),
     (
         "volume.phase: {type: two_lobe}",
-        phase_schema.TwoLobeSection,
+        schema.TwoLobeSection,
         "A mixture of two Henyey-Greenstein functions: haze and smoke, which scatter backward too.",
         {
             "g": "The mean cosine of each.",
@@ -142,45 +127,14 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
         },
     ),
     (
-        "volume.phase: {type: blend}",
-        phase_schema.BlendSection,
-        "Two kinds of scatterers in the same place: droplets and air, smoke and dust.",
-        {
-            "phases": "Both phase functions; neither is `two_lobe` or `blend`, or has a g by cell.",
-            "weight": "The part of scattering that is the first's; a file has one a cell.",
-        },
-    ),
-    (
         "volume.phase: {type: rayleigh}",
-        phase_schema.RayleighSection,
+        schema.RayleighSection,
         "Air, and other particles much smaller than the wavelength.\nIt has no numbers.",
         {},
     ),
     (
-        "volume.phase: {type: draine}",
-        phase_schema.DraineSection,
-        "Dust: a Henyey-Greenstein function times 1 + alpha cos^2, normalized (Draine 2003).",
-        {
-            "g": "Of the Henyey-Greenstein function; the mean cosine itself is another.",
-            "alpha": "0 is Henyey-Greenstein's; 1 with `g: 0` is Rayleigh's.",
-        },
-    ),
-    (
-        "volume.phase: {type: legendre}",
-        phase_schema.LegendreSection,
-        "Legendre moments chi_l, the mean of P_l over scattered light; at most 2048 count.\n"
-        "Give either of both.",
-        {
-            "coefficients": "chi_0 = 1, chi_1, ...",
-            "file": (
-                ".csv, .txt or .npz (`value`) with chi_l one a row, in one column or one a color; "
-                "a column `l` before them is allowed."
-            ),
-        },
-    ),
-    (
         "volume.phase: {type: table}",
-        phase_schema.TableSection,
+        schema.TableSection,
         "Values over the angle, of any scale; see [your data](your_data.md#phase-functions).",
         {
             "file": (
@@ -191,7 +145,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "volume.phase: {type: mie}",
-        phase_schema.MieSection,
+        schema.MieSection,
         "Droplets whose radii follow a gamma distribution, by Mie's theory.\n"
         'Needs miepython: `pip install "ddrecon[mie]"`.',
         {
@@ -203,7 +157,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: directional}",
-        light_schema.DirectionalSection,
+        schema.DirectionalSection,
         "Parallel light, such as the sun's.",
         {
             "direction": "The direction in which the light travels, of any length.",
@@ -212,7 +166,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: ambient}",
-        light_schema.AmbientSection,
+        schema.AmbientSection,
         "The same light from everywhere.",
         {
             "radiance": "Of every direction.",
@@ -220,7 +174,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: environment}",
-        light_schema.EnvironmentSection,
+        schema.EnvironmentSection,
         "A latitude-longitude map (HDRI), oriented as Mitsuba's `envmap`.\n"
         "Small bright regions become suns.",
         {
@@ -239,7 +193,7 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "lights: {type: point}",
-        light_schema.PointSection,
+        schema.PointSection,
         "Light from a point, inside or outside the box.",
         {
             "position": "Where it is [u].",
@@ -286,8 +240,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "belong to the cameras in turn. For COLMAP: the folder of its pictures."
             ),
             "test_every": (
-                "For transforms without splits and COLMAP: one view in this many, the first of "
-                "them, is a test view."
+                "One view in this many, the first of them, is a test view, where transforms do "
+                "not say which are."
             ),
         },
     ),
@@ -302,12 +256,12 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "height": "Of the circle above the target [u].",
             "target": "What they look at [u].",
             "up": "The direction that is up in their images.",
-            "resolution": "Pixels; left out where there are images.",
+            "resolution": "Width and height in pixels; left out where there are images.",
         },
     ),
     (
         "camera: {type: perspective}",
-        camera_schema.PerspectiveSection,
+        schema.PerspectiveSection,
         "A pinhole camera.\nGive either `origin`, `target` and `up`, or `matrix`.",
         {
             "fov": "Horizontal field of view, in degrees.",
@@ -323,12 +277,12 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "matrix": (
                 "Camera to world, with OpenGL axes: the columns are right, up, backward and origin."
             ),
-            "resolution": "Pixels; left out where the view has an image.",
+            "resolution": "Width and height in pixels; left out where the view has an image.",
         },
     ),
     (
         "distortion: {type: opencv}",
-        camera_schema.OpencvSection,
+        schema.OpencvSection,
         "A lens as OpenCV and COLMAP calibrate it, with nerfstudio's k4.\n"
         "Everything else that is said of the camera holds for the pinhole that would be left.",
         dict.fromkeys(("k1", "k2", "k3", "k4"), "Radial: of r^2, r^4, r^6 and r^8 in turn.")
@@ -336,13 +290,13 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
     ),
     (
         "distortion: {type: fisheye}",
-        camera_schema.FisheyeSection,
+        schema.FisheyeSection,
         "A fisheye as OpenCV and COLMAP calibrate it.",
         dict.fromkeys(("k1", "k2", "k3", "k4"), "Of the angle's powers 3, 5, 7 and 9 in turn."),
     ),
     (
         "camera: {type: orthographic}",
-        camera_schema.OrthographicSection,
+        schema.OrthographicSection,
         "Parallel rays, as a satellite far away sees.\n"
         "Its other keys, `pixel_aspect` among them, are those of a perspective camera.",
         {
@@ -449,7 +403,6 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
                 " density, of whose logarithm it is (E47), and 0 for others."
-                " `auto` finds it by leaving a view out."
             ),
             "l1": (
                 "Weight of its mean, which empties what no picture needs; for density of its"
@@ -459,15 +412,10 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Whether it differs from cell to cell; unless given, as its start does. Density "
                 "always does."
             ),
-            "even_until": (
-                "Part of the iterations during which all cells of a field change alike, so that "
-                "numbers of the whole scene are found before it."
-            ),
             "support": (
                 "For density: where it may be above 0. `masks`: nowhere that a view sees and its "
-                "mask, or alpha, says is empty; a number: nor where it displays no more than that "
-                "(sRGB, 0 to 1); `auto`: nor where it is as dark as its darkest tenth, within "
-                "noise; or a field that is above 0 there. Left out: anywhere."
+                "mask, or alpha, says is empty; `auto`: nor where it is as dark as its darkest "
+                "tenth, within noise. Left out: anywhere."
             ),
             "support_margin": "Pixels by which what a view shows is widened for that.",
         },
@@ -477,40 +425,37 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
 
 
 def main() -> None:
-    """Writes the page."""
-    PAGE.write_text(page(), encoding="utf-8")
+    """Writes the pages."""
+    for name, text in pages().items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
 
 
-def page() -> str:
-    """The whole manual, in Markdown."""
-    parts = [
-        "# The scene file",
-        INTRODUCTION,
-        *(_section(*section) for section in SECTIONS),
-        _parameters(),
-    ]
-    return "\n\n".join(parts) + "\n"
+def pages() -> dict[str, str]:
+    """The text of each page, by the name of its file."""
+    manual = ["# The scene file", INTRODUCTION, *_sections(is_expert=False), _parameters()]
+    return {
+        "scene_file.md": "\n\n".join(manual) + "\n",
+        "expert_keys.md": "\n\n".join([EXPERT, *_sections(is_expert=True)]) + "\n",
+        "scene.schema.json": json_schema(),
+    }
 
 
-def _section(heading: str, record: type, what: str, texts: dict[str, str]) -> str:
-    hints = get_type_hints(record)
-    declared = {field.name: field for field in fields(record)}
-    own = {name: declared[name] for name in texts}
-    rows = [
-        f"| `{name}` | {_takes(hints[name], field)} | {_default(field)} | {texts[name]} |"
-        for name, field in own.items()
-    ]
-    return "\n".join(
-        [
-            f"## {heading}",
-            "",
-            what,
-            "",
-            "| key | takes | default | what |",
-            "|---|---|---|---|",
-            *rows,
+def _sections(is_expert: bool) -> list[str]:
+    """Each section, with a table of its keys that are for experts, or of the others."""
+    found = []
+    for heading, record, what, texts in SECTIONS:
+        declared, hints = {field.name: field for field in fields(record)}, type_hints(record)
+        rows = [
+            f"| `{name}` | {_takes(hints[name], declared[name])} | {_default(declared[name])} |"
+            f" {text} |"
+            for name, text in texts.items()
+            if bool(declared[name].metadata.get("expert")) == is_expert
         ]
-    )
+        table = ["", "| key | takes | default | what |", "|---|---|---|---|", *rows]
+        if rows or not is_expert:
+            lead = [] if is_expert else ["", what]
+            found.append("\n".join([f"## {heading}", *lead, *table]))
+    return found
 
 
 def _takes(hint: Any, field: Field[Any]) -> str:
@@ -524,20 +469,8 @@ def _takes(hint: Any, field: Field[Any]) -> str:
         "maximum": "at most {:g}",
         "below": "below {:g}",
     }
-    within = [words[key].format(value) for key, value in limits.items()]
-    return ", ".join([_kind(hint), *within])
-
-
-def _kind(hint: Any) -> str:
-    return next(
-        (name for known, name in KIND_NAMES.items() if _alternatives(known) == _alternatives(hint)),
-        "mapping",
-    )
-
-
-def _alternatives(hint: Any) -> set[Any]:
-    """What a union is one of, None left out; a hint of another kind by itself."""
-    return set(get_args(hint)) - {NoneType} if get_origin(hint) in (Union, UnionType) else {hint}
+    within = [words[key].format(value) for key, value in limits.items() if key in words]
+    return ", ".join([describe_type(hint), *within])
 
 
 def _default(field: Field[Any]) -> str:
@@ -565,7 +498,7 @@ def _parameters() -> str:
             "## Names of parameters",
             "",
             "What can be found.",
-            "N is the place of a light, or of a blend's part, in its list, counted from 0.",
+            "N is the place of a light in its list, counted from 0.",
             "NAME is a view's name, or `*` for all training views.",
             "Where there are two media, `media.cloud.density` is as `density` is, and so on.",
             "[Commands](cli.md#names-of-parameters) has the same names, by light.",
@@ -582,6 +515,78 @@ def _limits(kind: Kind) -> str:
     if kind.low == -math.inf:
         return ""
     return f"{kind.low:g} to {kind.high:g}" if kind.high < math.inf else f"at least {kind.low:g}"
+
+
+NUMBERS = {
+    "minimum": "minimum",
+    "above": "exclusiveMinimum",
+    "maximum": "maximum",
+    "below": "exclusiveMaximum",
+}
+PLAIN = {NoneType: "null", bool: "boolean", int: "integer", float: "number", str: "string"}
+
+
+def json_schema() -> str:
+    """The scene file as a JSON schema, which editors know; a line for each record."""
+    defined: dict[str, Any] = {}
+    _define(schema.SceneTree, defined)
+    lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in defined.items()]
+    head = '"$schema": "https://json-schema.org/draft/2020-12/schema", "$ref": "#/$defs/SceneTree"'
+    return f'{{{head}, "$defs": {{\n' + ",\n".join(lines) + "\n}}\n"
+
+
+def _define(record: type, defined: dict[str, Any]) -> None:
+    """Puts `record`, and all that it refers to, into `defined`."""
+    if record.__name__ in defined:
+        return
+    texts = {
+        key: text for _, kind, _, texts in SECTIONS if kind is record for key, text in texts.items()
+    }
+    tag = {"type": {"const": record.type}} if hasattr(record, "type") else {}
+    entry: dict[str, Any] = {"type": "object", "additionalProperties": False, "properties": tag}
+    defined[record.__name__] = entry
+    entry["required"] = [*tag]
+    for field in fields(record):
+        hints = [*alternatives(type_hints(record)[field.name]), *field.metadata.get("also", ())]
+        about = {"description": texts[field.name]} if field.name in texts else {}
+        entry["properties"][field.name] = about | _any_of(hints, field.metadata, defined)
+        if field.default is MISSING and field.default_factory is MISSING:
+            entry["required"].append(field.name)
+
+
+def _any_of(hints: Any, limits: Mapping[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
+    each = [_one(hint, limits, defined) for hint in hints]
+    if settings.FieldFile in hints and float in hints:
+        number = _one(float, limits, defined)
+        each.append(
+            {"type": "object", "properties": {"constant": number}, "required": ["constant"]}
+        )
+    return each[0] if len(each) == 1 else {"anyOf": each}
+
+
+def _one(hint: Any, limits: Mapping[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
+    arguments = get_args(hint)
+    if is_dataclass(hint):
+        _define(hint, defined)  # type: ignore[arg-type]
+        return {"$ref": f"#/$defs/{hint.__name__}"}  # type: ignore[union-attr]
+    if get_origin(hint) is Literal:
+        return {"enum": list(arguments)}
+    if get_origin(hint) is tuple:
+        size = {} if arguments[-1] is Ellipsis else {"minItems": len(arguments)}
+        size |= {"maxItems": size["minItems"]} if size else {}
+        return {
+            "type": "array",
+            "items": _any_of(alternatives(arguments[0]), limits, defined),
+        } | size
+    if get_origin(hint) is Mapping:
+        return {"type": "object", "additionalProperties": _any_of([arguments[1]], {}, defined)}
+    if hint in (int, str) and "choices" in limits:
+        return {"enum": list(limits["choices"])}
+    kind = {"type": PLAIN.get(hint, "string")}
+    within = {
+        NUMBERS[key]: value for key, value in limits.items() if key in NUMBERS and value is not None
+    }
+    return kind | within if hint in (int, float) else kind
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from ddrecon.diffusion.limiters import LIMITERS
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS
 from ddrecon.diffusion.solvers import SOLVERS
 from ddrecon.losses import LOSSES
-from ddrecon.scene_file.camera_schema import FisheyeSection, OpencvSection
+from ddrecon.scene_file.schema import FisheyeSection, OpencvSection
 from ddrecon.settings import LENSES, DiffusionSettings, OptimizeSettings
 
 

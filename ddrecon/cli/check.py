@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-
 from ddrecon.engine import name_engines
-from ddrecon.medium.coefficients import scale_medium
-from ddrecon.memory import Needs, count_threads, gibibytes, memory_of
-from ddrecon.numerics.harmonics import count_harmonics
+from ddrecon.memory import gibibytes, memory_of, needs_of
 from ddrecon.reconstruct.setup import select_views, start_support
 from ddrecon.reconstruct.support import describe_support, support_text
 from ddrecon.run.quality import describe_loss, loss_text
@@ -26,32 +22,25 @@ def memory_estimate(scene: Scene) -> int:
     """
     volume, grid = scene.volume, scene.volume.grid
     fields = [start for start in scene.starts.values() if tuple(start.shape[-3:]) == grid.shape]
-    medium = scale_medium(volume, scene.diffusion.angles)
-    is_directed = medium.degree > 0 or "g" in scene.starts
-    needs = Needs(
-        (grid.shape[2], grid.shape[1], grid.shape[0]),
+    needs = needs_of(
+        grid,
+        volume.phase,
         max(volume.sigma_a.shape[0], volume.sigma_s.shape[0]),
-        torch.finfo(volume.density.dtype).bits // 8,
-        sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
-        has_flux=is_directed,
-        has_rounds=scene.diffusion.rounds > 0,
-        moments=count_harmonics(scene.diffusion.angles) if is_directed else 1,
-        is_limited=scene.diffusion.model == "flux_limited",
-        varied=None
-        if scene.optimize is None
-        else sum(field.numel() for field in fields) / grid.cells,
+        volume.density,
+        scene.diffusion,
+        pixels=sum(view.camera.size[0] * view.camera.size[1] for view in scene.views),
         lights=len(scene.lights),
-        threads=count_threads(volume.density.device),
+        optimized=scene.starts,
+        varied=sum(field.numel() for field in fields) / grid.cells,
     )
     return memory_of(needs)
 
 
-def describe(scene: Scene, has_slabs: bool = False) -> dict[str, Any]:
+def describe(scene: Scene, expert: dict[str, Any], has_slabs: bool = False) -> dict[str, Any]:
     """What `ddrecon check` reports of `scene`: grid, views, physics, parameters, engine, memory.
 
-    And what can hardly be meant.
-
-    Its parameters are where they start. `has_slabs`: ranks are to share out its cells.
+    And what can hardly be meant. Its parameters are where they start. `expert`: keys for experts
+    that are not at their default; `has_slabs`: ranks are to share out its cells.
     """
     scene = with_values(scene, scene.starts)
     grid = scene.volume.grid
@@ -67,6 +56,7 @@ def describe(scene: Scene, has_slabs: bool = False) -> dict[str, Any]:
         "loss": _describe_loss(scene),
         "support": _describe_support(scene),
         "engine": engine_of_scene(scene, has_slabs),
+        "expert_keys": expert,
         "memory_bytes": memory_estimate(scene),
         "doubts": find_doubts(scene),
     }
@@ -86,6 +76,7 @@ def lines(report: dict[str, Any]) -> list[str]:
         f"optimizes: {', '.join(parameters) or 'nothing'}",
         *([loss_text(report["loss"])] if report["loss"] else []),
         *([support_text(report["support"])] if report["support"] else []),
+        *([f"for experts: {_pairs(report['expert_keys'])}"] if report["expert_keys"] else []),
         f"engine: {name_engines(report['engine'])}",
         f"memory: about {gibibytes(report['memory_bytes'])} at the peak, besides torch itself",
     ]
@@ -114,6 +105,10 @@ def _view_line(view: dict[str, Any]) -> str:
 
 def _count_entries(name: str, count: int) -> str:
     return f"{name} ({count:,} number{'s' if count > 1 else ''})"
+
+
+def _pairs(values: dict[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in values.items())
 
 
 def _by(sizes: list[float]) -> str:

@@ -64,7 +64,7 @@ def export(
 
         written = export_scene(session.load(sources[0]), output, may_exist=overwrite)
     elif kind == ".json":
-        from ddrecon.scene_file.export_transforms import export_transforms
+        from ddrecon.scene_file.transforms import export_transforms
 
         scene_file = session.read(sources[0])
         written = export_transforms(

@@ -38,8 +38,11 @@ class CountOrAuto(click.IntRange):
 def check(session: Session, scene: Path) -> None:
     """Validate SCENE and print its grid, views, engine, memory and the physics it needs."""
     from ddrecon.cli.check import describe, lines
+    from ddrecon.scene_file.dump import find_expert_keys
 
-    report = describe(session.load(scene), session.shares_cells)
+    scene_file = session.read(scene)
+    expert = find_expert_keys(scene_file.tree)
+    report = describe(session.build(scene_file), expert, session.shares_cells)
     session.show(report, lines(report))
 
 

@@ -1,4 +1,4 @@
-"""Phase functions from files: values over the angle, or Legendre moments.
+"""Phase functions from files: values over the angle.
 
 Text files (.csv, .txt) have numbers in columns, separated by commas or spaces, under a header that
 names the columns; `#` begins a comment. Archives (.npz) have arrays of these names.
@@ -51,23 +51,6 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise FormatError(path, "has values below 0, or nothing above 0")
     angles[0], angles[-1] = 0, np.pi
     return angles, values
-
-
-def read_moments(path: Path) -> np.ndarray:
-    """Legendre moments chi_l, [C, n], from l = 0 on of the file at `path`; chi_0 is not 0.
-
-    Raises FormatError.
-    """
-    name, first, values = _read_columns(path, DEGREES)
-    if first is not None and not np.array_equal(first, np.arange(len(first))):
-        raise FormatError(path, f"its column {name} must count 0, 1, 2, ...")
-    _require_colors(path, len(values))
-    if values.shape[1] < 2 or (values[:, 0] <= 0).any():
-        raise FormatError(path, "needs chi_0 above 0, and chi_1, one a row")
-    moments = values / values[:, :1]
-    if np.abs(moments).max() > 1 + 1e-6:
-        raise FormatError(path, "has moments larger than chi_0; divide each by 2 l + 1")
-    return moments
 
 
 def _require_colors(path: Path, count: int) -> None:

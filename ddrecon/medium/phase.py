@@ -177,55 +177,6 @@ class Rayleigh(PhaseFunction):
         return COUNTS[0]
 
 
-@dataclass(frozen=True, eq=False)
-class Draine(PhaseFunction):
-    """A Henyey-Greenstein function times (1 + alpha w^2), normalized.
-
-    `g` in (-1, 1) and `alpha` >= 0, scalars or [3]. alpha = 0 is Henyey-Greenstein, g = 0 with
-    alpha = 1 is Rayleigh; the mean cosine is not g. Source: Draine 2003, doi:10.1086/379118.
-    """
-
-    NAME = "draine"
-    VARIABLES = ("g", "alpha")
-
-    g: Tensor
-    alpha: Tensor
-
-    def value(self, cosine: Tensor) -> Tensor:
-        alpha, norm = beside(self.alpha, cosine), beside(self._norm, cosine)
-        g = beside(self.g, cosine)
-        return henyey_greenstein(cosine, g) * (1 + alpha * cosine * cosine) / norm
-
-    def moments(self, count: int) -> Tensor:
-        # E23: w^2 P_l is a sum of P_(l+2), P_l and P_(l-2), by two steps of Legendre's recurrence.
-        degree = torch.arange(count, dtype=self.g.dtype, device=self.g.device)
-        above = (degree + 1) * (degree + 2) / ((2 * degree + 1) * (2 * degree + 3))
-        same = (2 * degree * (degree + 1) - 1) / ((2 * degree - 1) * (2 * degree + 3))
-        below = degree * (degree - 1) / ((2 * degree - 1) * (2 * degree + 1))
-        powers = _powers(self.g, 0, count + 2)
-        lower = torch.cat([torch.zeros_like(powers[:, :2]), powers[:, : count - 2]], 1)[:, :count]
-        bent = above * powers[:, 2:] + same * powers[:, :-2] + below * lower
-        return (powers[:, :-2] + self.alpha.reshape(-1, 1) * bent) / self._norm.reshape(-1, 1)
-
-    def peak_tail(self, degree: int, count: int) -> Tensor:
-        return self._lobe.peak_tail(degree, count).expand(self._norm.numel(), -1)
-
-    def backward_tail(self, degree: int, count: int) -> Tensor:
-        return self._lobe.backward_tail(degree, count).expand(self._norm.numel(), -1)
-
-    def length(self) -> int:
-        return length_of(self.g)
-
-    @property
-    def _lobe(self) -> HenyeyGreenstein:
-        return HenyeyGreenstein(self.g)
-
-    @property
-    def _norm(self) -> Tensor:
-        """The mean of 1 + alpha w^2 over what the lobe scatters."""
-        return 1 + self.alpha * (1 + 2 * self.g * self.g) / 3
-
-
 def henyey_greenstein(cosine: Tensor, g: Tensor) -> Tensor:
     """(1 - g^2) / (1 + g^2 - 2 g `cosine`)^(3/2); both broadcast."""
     return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5

@@ -30,12 +30,11 @@ from ddrecon.reconstruct.levels import factors, resample_solutions, scene_at_lev
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
 from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
 from ddrecon.reconstruct.schedule import Schedule
-from ddrecon.reconstruct.smoothing import Smoothing, find_smoothing
 from ddrecon.reconstruct.steps import solve_numbers, step_parameters
 from ddrecon.reconstruct.tolerance import solve_tolerances
 from ddrecon.reconstruct.views import pick_views
 from ddrecon.scene import Scene, View
-from ddrecon.settings import AUTO, Iterations
+from ddrecon.settings import Iterations
 from ddrecon.variables.values import with_values
 
 TEST_EVERY = 10
@@ -91,7 +90,6 @@ class Reconstruction:
         self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
         self.memory = SolveMemory(scene.diffusion.warm_start)
         self.before_step: dict[str, Any] | None = None
-        self.smoothing: Smoothing | None = None
         self._enter_stage(0)
 
     @property
@@ -112,8 +110,6 @@ class Reconstruction:
         """
         start = perf_counter()
         compile_ahead(lambda: deepcopy(self)._iterate(start))
-        if self.iteration == 0:
-            self._settle_smoothing()
         stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
@@ -192,7 +188,6 @@ class Reconstruction:
             "misfit": self.misfit,
             "seed": self.seed,
             "schedule": self.schedule.state(),
-            "smoothing": None if self.smoothing is None else self.smoothing.described(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -202,26 +197,12 @@ class Reconstruction:
         self.total = Row(**state["total"])
         self.misfit, self.seed = state["misfit"], state["seed"]
         self.schedule.restore(state["schedule"])
-        if state["smoothing"] is not None:
-            self._smooth(Smoothing(**state["smoothing"]))
         self._enter_stage(state["stage"])
         for parameter in self.parameters:
             curvature = state["parameters"][parameter.name]["curvature"]
             parameter.curvature = None if curvature is None else curvature.to(parameter.value)
         for kind, field in state.get("solutions", {}).items():
             self.memory.last[kind] = field.to(self.scene.volume.density)
-
-    def _settle_smoothing(self) -> None:
-        """Finds the weight of density's total variation where the scene asks for that."""
-        density = self.settings.parameters.get("density")
-        if self.smoothing is None and density is not None and density.tv == AUTO:
-            self._smooth(find_smoothing(self.scene, Reconstruction))
-
-    def _smooth(self, smoothing: Smoothing) -> None:
-        self.smoothing = smoothing
-        for parameter in self.parameters:
-            if parameter.name == "density":
-                parameter.tv = smoothing.weight
 
     def _enter_stage(self, stage: int) -> None:
         """Takes scenes, parameters and solutions to the resolution of `stage`."""

@@ -40,8 +40,7 @@ class Parameter:
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
     every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
     is Adam (Kingma and Ba 2015, arXiv:1412.6980); of fields with Nesterov's momentum and a `FLOOR`
-    (E46), as short as smoothing asks (E49), begun anew at each resolution. While a field `is_even`,
-    all its cells change alike; that ends after the part `even_until` of a run. `rate` is one number
+    (E46), as short as smoothing asks (E49), begun anew at each resolution. `rate` is one number
     or one for each entry. `view` is the name of the view that it belongs to, None for what all
     views see. One that `is_fitted` is solved for instead; `curvature` is the second derivative of
     the loss by it. Its regularizers see it in the `unit` of `unit_of`.
@@ -67,9 +66,7 @@ class Parameter:
         self.view = owner.removeprefix("views.") if owner.startswith("views.") else None
         self.is_direction = kind.is_direction
         self.is_field = kind.is_cellwise and tuple(value.shape[-3:]) == grid.shape
-        self.even_until = settings.even_until if self.is_field else 0.0
-        self.is_even = self.even_until > 0
-        weight = settings.tv if isinstance(settings.tv, float) else kind.tv
+        weight = kind.tv if settings.tv is None else settings.tv
         self.tv = weight if self.is_field else 0.0
         self.unit, self.knee = unit, KNEE if kind.is_compressed else None
         self.l1 = settings.l1
@@ -111,10 +108,8 @@ class Parameter:
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
         before = self.value.detach()
-        if self.is_even:
-            gradient = gradient.mean((-3, -2, -1), keepdim=True).expand_as(gradient).contiguous()
         rate_now, smallest = rate * self.rate, self._smallest_size(gradient)
-        if self.tv and power and not self.is_even:
+        if self.tv and power:
             stiffness = stiffness_diagonal(before / self.unit, self.grid, self.knee)
             factor = DAMPING * rate * self.largest_rate * power * self.tv / self.unit**2
             smallest = torch.add(smallest, stiffness, alpha=factor)
@@ -175,12 +170,8 @@ class Parameter:
         self.grid = grid
         if self.is_field:
             self.value = self.value_on(grid).requires_grad_()
-            self.forget()
-
-    def forget(self) -> None:
-        """Has its optimizer begin anew where the value is."""
-        self.steps = 0
-        self.moments = torch.zeros_like(self.value), torch.zeros_like(self.value)
+            self.steps = 0
+            self.moments = torch.zeros_like(self.value), torch.zeros_like(self.value)
 
     def restrict(self, support: Tensor) -> None:
         """Empties it outside of `support` [z, y, x], where it stays 0 from now on."""
@@ -197,7 +188,6 @@ class Parameter:
             "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
             "moments": list(self.moments),
             "curvature": self.curvature,
-            "is_even": self.is_even,
         }
 
     def backup(self) -> dict[str, Any]:
@@ -214,6 +204,6 @@ class Parameter:
         """Takes up a `state`, whatever its resolution."""
         self.grid = Grid(tuple(state["shape"]), self.grid.lower, self.grid.upper)
         self.value = state["value"].to(self.value).clone().requires_grad_()
-        self.steps, self.is_even = int(state["steps"]), state["is_even"]
+        self.steps = int(state["steps"])
         first, second = (moment.to(self.value) for moment in state["moments"])
         self.moments = first, second

@@ -77,10 +77,6 @@ class Schedule:
         """The stage of resolution of `iteration`, counted from 0."""
         return stage_of(self.place(iteration), self.planned, self.refine_at)
 
-    def has_passed(self, iteration: int, part: float) -> bool:
-        """Whether the `part` of the run is over in `iteration`."""
-        return self.place(iteration) >= round(part * self.planned)
-
     def rate(self, iteration: int, release: float) -> float:
         """The part of their value that learning rates have in `iteration`, in [0, 1].
 

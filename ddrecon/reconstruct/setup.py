@@ -171,12 +171,12 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
 
 
 def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
-    """Where density may be, by the views of `train` or a file; None is anywhere.
+    """Where density may be, by the views of `train`; None is anywhere.
 
     Raises SceneError where that is nowhere.
     """
     density = settings.parameters.get("density")
-    support = None if density is None else find_support(train.views, density, train.support)
+    support = None if density is None else find_support(train.views, density)
     if support is not None:
         support.on(train.volume.grid)
     return support

@@ -34,7 +34,6 @@ def step_parameters(
     `schedule` says which are due in `iteration`, and how much of its learning rate counts. `power`
     is the unit of the penalties in the gradients.
     """
-    _let_go(parameters, schedule, iteration)
     solved = []
     for parameter in parameters:
         rate = schedule.rate(iteration, parameter.release)
@@ -43,18 +42,6 @@ def step_parameters(
         elif rate:
             parameter.step(gradients[parameter.name], rate, power)
     return solved
-
-
-def _let_go(parameters: Sequence[Parameter], schedule: Schedule, iteration: int) -> None:
-    """Ends the evenness of those fields among `parameters` whose time for it is over.
-
-    All optimizers then begin anew: with derivatives as large as before they would hardly move.
-    """
-    due = [p for p in parameters if p.is_even and schedule.has_passed(iteration, p.even_until)]
-    for parameter in due:
-        parameter.is_even = False
-    for parameter in parameters if due else ():
-        parameter.forget()
 
 
 def solve_numbers(

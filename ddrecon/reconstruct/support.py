@@ -18,9 +18,8 @@ from ddrecon.cameras import Camera, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.pictures.noise import estimate_noise
-from ddrecon.reconstruct.levels import resample
 from ddrecon.scene import View
-from ddrecon.settings import AUTO, MASKS, FieldFile, ParameterSettings
+from ddrecon.settings import AUTO, MASKS, ParameterSettings
 
 KEY = "optimize.parameters.density.support"
 DARKEST = 0.1
@@ -31,24 +30,21 @@ DEVIATIONS = 4.0
 
 @dataclass(frozen=True)
 class Support:
-    """What says where medium may be: `views` with what they show, or the cells of a file.
+    """What says where medium may be: `views` with what they show.
 
     `shown` [h, w] of each view is whether a pixel shows something. `margin` is how many pixels what
-    they show is widened by. `cells` [z, y, x] are above 0 where medium may be.
+    they show is widened by.
     """
 
     views: Sequence[View]
     shown: Sequence[Tensor]
     margin: float
-    cells: Tensor | None = None
 
     def on(self, grid: Grid) -> Tensor:
         """Whether medium may be in each cell of `grid`: bool [z, y, x].
 
         Raises SceneError where it may be in none.
         """
-        if self.cells is not None:
-            return resample((self.cells > 0).to(self.cells.dtype), grid) > 0
         pairs = [
             hull_of(view.camera, shown, grid, self.margin)
             for view, shown in zip(self.views, self.shown, strict=True)
@@ -61,7 +57,7 @@ class Support:
             raise SceneError(
                 f"{KEY}: no cell is left: of each that is seen, some training view shows nothing"
                 f" (view {view!r} alone leaves {100 * part:.2g} %); check the cameras and masks,"
-                " lower the threshold, or raise support_margin"
+                " or raise support_margin"
             )
         return hull
 
@@ -77,44 +73,33 @@ def support_text(support: dict[str, float]) -> str:
     return f"support: density in {part:.3g} % of the cells, where every view may show some"
 
 
-def find_support(
-    views: Sequence[View], settings: ParameterSettings, cells: Tensor | None
-) -> Support | None:
+def find_support(views: Sequence[View], settings: ParameterSettings) -> Support | None:
     """The support that `settings` of density ask for; None where medium may be anywhere.
 
-    `views` are the training views; `cells` [z, y, x] are those of the file where they name one.
-    Raises SceneError where a view shows nothing at all, or the file has no cell.
+    `views` are the training views. Raises SceneError where a view shows nothing at all.
     """
     wanted = settings.support
     if wanted is None:
         return None
-    if isinstance(wanted, FieldFile):
-        if cells is None or not bool((cells > 0).any()):
-            raise SceneError(f"{KEY}: the file has no cell above 0, where medium may be")
-        return Support((), (), 0.0, cells)
     shown = [_shown(view, wanted) for view in views]
     empty = [view.name for view, pixels in zip(views, shown, strict=True) if not pixels.any()]
     if empty:
         known = {MASKS: "its mask or alpha", AUTO: "what is brighter than its black"}
-        what = known[wanted] if isinstance(wanted, str) else f"a displayed value of {wanted:g}"
-        raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {what}")
+        raise SceneError(f"{KEY}: view {empty[0]!r} shows nothing at all, by {known[wanted]}")
     return Support(views, shown, settings.support_margin)
 
 
-def _shown(view: View, wanted: str | float) -> Tensor:
+def _shown(view: View, wanted: str) -> Tensor:
     """Which pixels of `view` show something: bool [h, w].
 
     By its mask, or without one where it is not black, as pictures are where their alpha is 0; or
-    where the brightest color is above `wanted`, a value as displayed or `auto`, or is not known.
+    with `auto`, where the brightest color is above black, or is not known.
     """
     if wanted == MASKS and view.mask is not None:
         return view.mask > 0
     if view.image is None:
         raise ValueError(f"view {view.name} has no image")
-    if wanted == AUTO:
-        threshold = brightest_black(view.image, view.step)
-    else:
-        threshold = 0.0 if wanted == MASKS else _linear(float(wanted))
+    threshold = brightest_black(view.image, view.step) if wanted == AUTO else 0.0
     shown = view.image.amax(0) > threshold
     return shown if view.mask is None else shown | (view.mask == 0)
 
@@ -128,11 +113,6 @@ def brightest_black(image: Tensor, step: float) -> float:
     brightest = image.amax(0).flatten()
     black = brightest.kthvalue(max(1, round(DARKEST * len(brightest)))).values
     return float(black + DEVIATIONS * estimate_noise(image, step).deviation(black))
-
-
-def _linear(displayed: float) -> float:
-    """The radiance that is displayed as a value of sRGB (IEC 61966-2-1)."""
-    return displayed / 12.92 if displayed <= 0.04045 else ((displayed + 0.055) / 1.055) ** 2.4
 
 
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:

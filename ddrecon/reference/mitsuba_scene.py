@@ -148,7 +148,7 @@ def _phase(phase: PhaseFunction, grid: Grid) -> dict[str, Any]:
     if isinstance(phase, HenyeyGreenstein) and phase.cells is not None:
         raise SceneError(
             "volume.g: differs from cell to cell, and Mitsuba's hg has one g;"
-            " it knows two_lobe and blend with a weight per cell"
+            " it knows two_lobe with a weight per cell"
         )
     if isinstance(phase, HenyeyGreenstein):
         return {"type": "hg", "g": phase.g.item()}

@@ -12,8 +12,7 @@ import torch
 
 from ddrecon.errors import FormatError
 from ddrecon.scene_file.dump import describe
-from ddrecon.scene_file.files import referenced_files
-from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.load import SceneFile, referenced_files
 
 LONGEST = 80
 """Values of more characters are cut short where they are shown."""

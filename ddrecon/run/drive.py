@@ -19,7 +19,6 @@ from ddrecon.ranks import alone, cells_are_shared, from_first, is_any, leave_ran
 from ddrecon.reconstruct.log import Row
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.shares import has_slabs
-from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.reconstruct.support import support_text
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.differences import fingerprint
@@ -187,6 +186,4 @@ def summary_lines(summary: dict[str, Any], folder: Path) -> list[str]:
     lines = [line, *ended, *diagnoses, f"density and all else written to {folder}"]
     if "support" in summary:
         lines.insert(1, support_text(summary["support"]))
-    if "smoothing" in summary:
-        lines.insert(1, smoothing_text(summary["smoothing"]))
     return lines

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from ddrecon.errors import SceneError
 from ddrecon.io.files.atomic import refusals
-from ddrecon.scene_file.files import referenced_files
-from ddrecon.scene_file.load import SceneFile, read_scene
+from ddrecon.scene_file.load import SceneFile, read_scene, referenced_files
 from ddrecon.variables.kinds import FIELDS, PHASE
 
 CHECKPOINT_FILES = ("checkpoints/last.pt", "checkpoints/previous.pt")

@@ -12,7 +12,6 @@ from torch import Tensor
 from ddrecon.cameras import Camera
 from ddrecon.io.images.movies import encode_frames, moving_webp_of
 from ddrecon.io.images.table import png_of
-from ddrecon.reconstruct.smoothing import smoothing_text
 from ddrecon.renderer import LightField, view_image
 from ddrecon.report.page import movie, paragraph, picture, side_by_side
 from ddrecon.report.pictures import find_white, pixels, projections, slices
@@ -54,8 +53,6 @@ def _remarks(summary: Mapping[str, Any]) -> list[str]:
     if "support" in summary:
         left_out = 100 * (1 - summary["support"]["cells"])
         remarks.append(paragraph(f"Left out by the support: {left_out:.3g} % of the cells."))
-    if "smoothing" in summary:
-        remarks.append(paragraph(smoothing_text(summary["smoothing"])))
     return remarks
 
 

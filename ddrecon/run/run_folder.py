@@ -207,6 +207,4 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     support = describe_support(run.support, run.scene.volume.grid)
     if support is not None:
         summary["support"] = support
-    if run.smoothing is not None:
-        summary["smoothing"] = run.smoothing.described()
     return summary

@@ -16,15 +16,13 @@ from ddrecon.scene import Scene
 from ddrecon.scene_file.build_lights import build_lights
 from ddrecon.scene_file.build_starts import (
     build_starts,
-    build_support,
     require_start_files,
 )
 from ddrecon.scene_file.build_views import build_views
 from ddrecon.scene_file.build_volume import build_volume
-from ddrecon.scene_file.colors import share_colors
+from ddrecon.scene_file.choices import choose_rounds, share_colors
 from ddrecon.scene_file.load import SceneFile, read_scene
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.rounds import choose_rounds
 from ddrecon.variables.wildcards import name_each
 
 
@@ -76,5 +74,4 @@ def build_scene(
     if render.steps_per_voxel is None:
         render = replace(render, steps_per_voxel=choose_steps(volume))
     scene = Scene(volume, lights, views, render, diffusion, optimize, path=scene_file.path)
-    support = build_support(scene_file, volume.density)
-    return replace(scene, starts=build_starts(scene_file, scene), support=support)
+    return replace(scene, starts=build_starts(scene_file, scene))

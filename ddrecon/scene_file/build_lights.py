@@ -12,16 +12,15 @@ from torch import Tensor
 from ddrecon.errors import DataWarning, FormatError
 from ddrecon.io.images.table import read_image
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.scene_file.colors import may_change
-from ddrecon.scene_file.files import read_referenced
-from ddrecon.scene_file.light_schema import (
+from ddrecon.scene_file.choices import may_change
+from ddrecon.scene_file.load import SceneFile, read_referenced
+from ddrecon.scene_file.problems import Problems
+from ddrecon.scene_file.schema import (
     AmbientSection,
     Color,
     DirectionalSection,
     PointSection,
 )
-from ddrecon.scene_file.load import SceneFile
-from ddrecon.scene_file.problems import Problems
 
 
 def build_lights(scene_file: SceneFile, dtype: torch.dtype, device: torch.device) -> list[Light]:

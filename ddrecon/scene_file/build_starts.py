@@ -14,8 +14,7 @@ from ddrecon.errors import UsageError
 from ddrecon.io.images.table import read_image
 from ddrecon.io.volumes.table import read_field
 from ddrecon.scene import Scene
-from ddrecon.scene_file.files import read_referenced, require
-from ddrecon.scene_file.load import SceneFile
+from ddrecon.scene_file.load import SceneFile, read_referenced, require
 from ddrecon.scene_file.problems import Problems, suggestion
 from ddrecon.settings import FieldFile, ParameterSettings
 from ddrecon.variables.kinds import PHASE, kind_of, split_name
@@ -29,10 +28,6 @@ def require_start_files(scene_file: SceneFile, problems: Problems) -> None:
         if isinstance(settings.init, FieldFile):
             with problems.collecting():
                 require(scene_file, f"optimize.parameters.{name}.init.file", settings.init.file)
-        if isinstance(settings.support, FieldFile):
-            with problems.collecting():
-                key = f"optimize.parameters.{name}.support.file"
-                require(scene_file, key, settings.support.file)
 
 
 def build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
@@ -46,19 +41,6 @@ def build_starts(scene_file: SceneFile, scene: Scene) -> dict[str, Tensor]:
             starts[name] = _start(scene_file, scene, name, settings)
     problems.raise_any()
     return starts
-
-
-def build_support(scene_file: SceneFile, like: Tensor) -> Tensor | None:
-    """The cells [z, y, x] where density may be, of the file that says so; None without one.
-
-    They are at any resolution, of the type of `like`. Raises SceneError or FormatError.
-    """
-    optimize = scene_file.tree.optimize
-    settings = optimize.parameters.get("density") if optimize else None
-    if settings is None or not isinstance(settings.support, FieldFile):
-        return None
-    key, file = "optimize.parameters.density.support.file", settings.support
-    return _read_cells(scene_file, key, "density", file, like)
 
 
 def _start(scene_file: SceneFile, scene: Scene, name: str, settings: ParameterSettings) -> Tensor:

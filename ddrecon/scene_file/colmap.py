@@ -16,16 +16,15 @@ from typing import Any, BinaryIO
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
-from ddrecon.scene_file.camera_schema import (
+from ddrecon.scene_file.nodes import Node
+from ddrecon.scene_file.schema import (
     FisheyeSection,
     LensSection,
     Matrix,
     OpencvSection,
     PerspectiveSection,
+    ViewSection,
 )
-from ddrecon.scene_file.nodes import Node
-from ddrecon.scene_file.schema import ViewSection
-from ddrecon.scene_file.view_names import name_views
 
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -51,14 +50,11 @@ class Posed:
     shift: tuple[float, ...]
 
 
-def read_colmap(
-    node: Node, folder: Path, images: Path, test_every: int | None
-) -> tuple[ViewSection, ...]:
-    """The views of the model in `folder`, which `node` of a scene names, in order of their names.
+def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
+    """The views of the model in `folder`, which `node` of a scene names, in order of their images.
 
-    Their pictures are in the folder `images`; of every `test_every` the first is a test view.
-    Raises SceneError where there is no model, FormatError for one that is damaged or distorted in a
-    way that is not known.
+    Their pictures are in the folder `images`; they have no names yet. Raises SceneError where there
+    is no model, FormatError for one that is damaged or distorted in a way that is not known.
     """
     suffix = next((end for end in ("txt", "bin") if (folder / f"images.{end}").is_file()), None)
     if suffix is None or not (folder / f"cameras.{suffix}").is_file():
@@ -73,7 +69,7 @@ def read_colmap(
     if not posed:
         raise FormatError(path, "has no images")
     views = []
-    for index, image in enumerate(posed):
+    for image in posed:
         if image.camera not in cameras:
             raise FormatError(path, f"image {image.name!r}: there is no camera {image.camera}")
         picture = Path(image.name)
@@ -82,11 +78,8 @@ def read_colmap(
                 path, f"image {image.name!r} leaves the folder of pictures; rename it"
             )
         camera = replace(cameras[image.camera], matrix=_matrix(path, image))
-        is_test = test_every is not None and index % test_every == 0
-        split = "test" if is_test else "train"
-        views.append(ViewSection("", camera, images / picture, None, split))
-    names = name_views([view.image for view in views])
-    return tuple(replace(view, name=name) for view, name in zip(views, names, strict=True))
+        views.append(ViewSection(camera=camera, image=images / picture))
+    return views
 
 
 def _matrix(path: Path, image: Posed) -> Matrix:

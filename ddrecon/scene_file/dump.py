@@ -14,7 +14,7 @@ import yaml
 
 from ddrecon.io.files.atomic import replace_file
 from ddrecon.scene_file.load import SceneFile
-from ddrecon.scene_file.scalars import resolve
+from ddrecon.scene_file.nodes import resolve
 
 
 def describe(scene_file: SceneFile) -> dict[str, Any]:
@@ -40,6 +40,25 @@ def write_described(described: dict[str, Any], path: Path) -> None:
     )
     with replace_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def find_expert_keys(value: Any, key: str = "") -> dict[str, Any]:
+    """The keys for experts that are not at their default in `value`, a tree or a part at `key`."""
+    found, inner = {}, dict[str, Any]()
+    if isinstance(value, Mapping):
+        inner = dict(value)
+    elif isinstance(value, tuple):
+        inner = {str(index): entry for index, entry in enumerate(value)}
+    elif is_dataclass(value):
+        inner = {field.name: getattr(value, field.name) for field in fields(value)}
+        found = {
+            f"{key}.{field.name}": inner[field.name]
+            for field in fields(value)
+            if field.metadata.get("expert") and inner[field.name] != field.default
+        }
+    for name, entry in inner.items():
+        found |= find_expert_keys(entry, f"{key}.{name}".strip("."))
+    return found
 
 
 def _plain(value: Any) -> Any:

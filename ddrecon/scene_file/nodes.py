@@ -1,11 +1,14 @@
 """YAML text as a tree of nodes that know their key path and where they were written.
 
 The strict part of YAML: one document of mappings, lists and scalars; no tags or repeated keys.
-Aliases, and the merge key `<<`, are written out, up to `MAX_COPIES` values.
+Aliases, and the merge key `<<`, are written out, up to `MAX_COPIES` values. What plain scalars mean
+is the core schema of YAML 1.2 (section 10.3.2): `1e-3` is a number, `yes` is text.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +17,8 @@ import yaml
 
 from ddrecon.errors import SceneError
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.scalars import Scalar, resolve
+
+Scalar = None | bool | int | float | str
 
 MAX_DEPTH = 32
 MAX_COPIES = 10_000
@@ -59,6 +63,12 @@ class Node:
         if isinstance(self.value, dict):
             return list(self.value.values())
         return self.value if isinstance(self.value, list) else []
+
+    def entries(self) -> dict[str, Node]:
+        """The nodes right below this one by name; raises SceneError where it is no mapping."""
+        if not isinstance(self.value, dict):
+            raise self.refused(f"expected a mapping, found {describe_found(self)}")
+        return self.value
 
     def walk(self) -> Iterator[Node]:
         """This node and every node below it."""
@@ -236,3 +246,33 @@ class _Composer:
 def _join(text: str) -> str:
     r"""`text` with the surrogate pairs that JSON writes as \ud83d\ude00 made one character each."""
     return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+
+
+_WORDS: dict[str, Scalar] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), math.nan),
+    **{
+        sign + word: float(sign + "inf")
+        for sign in ("", "+", "-")
+        for word in (".inf", ".Inf", ".INF")
+    },
+}
+_INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
+_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,30}")
+_OCTAL = re.compile(r"0o[0-7]{1,30}")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+
+
+def resolve(text: str) -> Scalar:
+    """The value of the unquoted scalar `text`."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    if _HEXADECIMAL.fullmatch(text):
+        return int(text, 16)
+    if _OCTAL.fullmatch(text):
+        return int(text, 8)
+    return float(text) if _FLOAT.fullmatch(text) else text

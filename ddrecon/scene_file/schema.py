@@ -2,34 +2,28 @@
 
 Vectors are (x, y, z). A field's metadata holds the bounds `minimum`, `above`, `maximum`, `below` or
 the `choices` of each number or text in it; `ALTERNATIVES` are groups of keys of which exactly one
-is given; `problems` yields (key, what is wrong) for rules about several values at once. Defaults
-are here and in `ddrecon.settings`, and nowhere else.
+is given; `violations` yields (key, what is wrong) for rules about several values at once. Records
+with a `type` are told apart by it, others by their first key. Defaults are here and in
+`ddrecon.settings`, and nowhere else.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import mul
 from pathlib import Path
 from typing import ClassVar
 
 from ddrecon.grid import Triple
-from ddrecon.scene_file.camera_schema import CameraSection, Size
-from ddrecon.scene_file.light_schema import Color, LightSection
-from ddrecon.scene_file.phase_schema import (
-    HenyeyGreensteinSection,
-    PartSection,
-    PhaseSection,
-    Quantity,
-)
 from ddrecon.settings import (
     DiffusionSettings,
     FieldFile,
     NoiseSettings,
     OptimizeSettings,
-    Problem,
     RenderSettings,
+    Violation,
     bounded,
     limited,
     one_of,
@@ -37,9 +31,16 @@ from ddrecon.settings import (
 )
 from ddrecon.variables.kinds import PAIRS, split_name
 
+Color = float | Triple
 Count = tuple[int, int, int]
-Paths = tuple[Path, ...]
+Size = tuple[int, int]
+Pair = tuple[float, float]
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row, Row]
+Density = float | FieldFile
+Quantity = Color | FieldFile
 Backdrop = Color | Path
+Paths = Path | tuple[Path, ...]
 
 MAX_CELLS = 2**30
 TAKEN = re.compile(r".*\.(reduced|single|multiple|slices|gradient|[0-9]{6,})")
@@ -51,13 +52,60 @@ BOTH = "g is the short form of a phase function: give only one of g or phase"
 
 
 @dataclass(frozen=True)
-class Constant:
-    """The same value everywhere."""
+class HenyeyGreensteinSection:
+    """`g`: mean cosine of the scattering angle."""
 
-    constant: float = limited(minimum=0)
+    type: ClassVar[str] = "henyey_greenstein"
+
+    g: Quantity = limited(above=-1, below=1)
 
 
-Density = float | FieldFile
+@dataclass(frozen=True)
+class TwoLobeSection:
+    """`weight` of a Henyey-Greenstein function with the first of `g`, the rest with the second."""
+
+    type: ClassVar[str] = "two_lobe"
+
+    g: Pair = limited(above=-1, below=1)
+    weight: Quantity = limited(minimum=0, maximum=1)
+
+
+@dataclass(frozen=True)
+class RayleighSection:
+    """Particles much smaller than the wavelength, as air."""
+
+    type: ClassVar[str] = "rayleigh"
+
+
+@dataclass(frozen=True)
+class TableSection:
+    """Values over angle or cosine, in a file."""
+
+    type: ClassVar[str] = "table"
+
+    file: Path
+
+
+@dataclass(frozen=True)
+class MieSection:
+    """Spheres whose radii follow a gamma distribution, by Mie's theory; lengths in micrometers."""
+
+    type: ClassVar[str] = "mie"
+
+    wavelength: Color = limited(above=0, maximum=1e3)
+    refractive_index: Color = limited(above=1, maximum=10)
+    effective_radius: float = limited(above=0, maximum=100)
+    effective_variance: float = limited(above=0, below=0.5)
+
+
+PartSection = HenyeyGreensteinSection | RayleighSection | TableSection | MieSection
+PhaseSection = PartSection | TwoLobeSection
+GONE = {
+    "draine": "write type: table with its values over the angle, or type: two_lobe",
+    "legendre": "write type: table with the series' values over the angle",
+    "blend": "write two media, volume.media: each has a density and a phase function of its own",
+}
+"""Phase functions of old scene files, and what to write instead."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +115,7 @@ class Bounds:
     min: Triple
     max: Triple
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         for axis, low, high in zip("xyz", self.min, self.max, strict=True):
             if low >= high:
                 yield "max", f"{high:g} along {axis} is not above min, {low:g}"
@@ -78,6 +126,7 @@ class VolumeSection:
     """`bounds` and `resolution` may be left out where a field's file has them."""
 
     ALTERNATIVES: ClassVar = PAIRS
+    RETIRED: ClassVar = GONE
 
     density: Density = limited(minimum=0)
     bounds: Bounds | None = None
@@ -89,7 +138,7 @@ class VolumeSection:
     g: Density = bounded(0.0, above=-1, below=1)
     phase: PhaseSection | None = None
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         if self.phase is not None and self.g != 0:
             yield "phase", BOTH
         x, y, z = self.resolution or (1, 1, 1)
@@ -102,6 +151,7 @@ class MediumSection:
     """One of the two media of a mixture; its phase function is the same in all cells."""
 
     ALTERNATIVES: ClassVar = PAIRS
+    RETIRED: ClassVar = GONE
 
     density: Density = limited(minimum=0)
     sigma_a: Quantity | None = optional(minimum=0)
@@ -111,7 +161,7 @@ class MediumSection:
     g: float = bounded(0.0, above=-1, below=1)
     phase: PartSection | None = None
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         if self.phase is not None and self.g != 0:
             yield "phase", BOTH
         if isinstance(getattr(self.phase, "g", None), FieldFile):
@@ -126,7 +176,7 @@ class MixtureSection:
     bounds: Bounds | None = None
     resolution: Count | None = optional(minimum=1, maximum=4096)
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         if len(self.media) != 2:
             yield "media", f"expected two media, found {len(self.media)}"
         for name in self.media:
@@ -138,6 +188,155 @@ AnyVolume = VolumeSection | MixtureSection
 
 
 @dataclass(frozen=True)
+class DirectionalSection:
+    """`direction`: the way the light travels; `irradiance` on a plane facing it."""
+
+    type: ClassVar[str] = "directional"
+
+    direction: Triple
+    irradiance: Color = limited(minimum=0)
+
+    def violations(self) -> Iterator[Violation]:
+        if not any(self.direction):
+            yield "direction", "must not be zero"
+
+
+@dataclass(frozen=True)
+class AmbientSection:
+    """The same radiance from everywhere."""
+
+    type: ClassVar[str] = "ambient"
+
+    radiance: Color = limited(minimum=0)
+
+
+@dataclass(frozen=True)
+class EnvironmentSection:
+    """A latitude-longitude map whose pole is `up`.
+
+    Its pixels are multiplied by `scale` and turned by `rotation` [degrees] about the pole.
+
+    `directions`: how many directions its light on the volume is gathered into.
+    """
+
+    type: ClassVar[str] = "environment"
+
+    file: Path
+    scale: float = bounded(1.0, minimum=0)
+    rotation: float = 0.0
+    directions: int = bounded(48, minimum=1, maximum=1024, expert=True)
+    up: str = one_of("y", ("y", "z"))
+
+
+@dataclass(frozen=True)
+class PointSection:
+    """Light from one point, inside or outside the box; `intensity`: power per solid angle."""
+
+    type: ClassVar[str] = "point"
+
+    position: Triple
+    intensity: Color = limited(minimum=0)
+
+
+LightSection = DirectionalSection | AmbientSection | EnvironmentSection | PointSection
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseSection:
+    """Where a camera stands, and its `resolution` (width, height) in pixels.
+
+    The pose is `origin`, `target` and `up` [u], or `matrix`, camera to world with OpenGL axes.
+    `pixel_aspect`: height of a pixel over its width.
+    """
+
+    ALTERNATIVES: ClassVar = (("matrix",), ("origin", "target", "up"))
+
+    origin: Triple | None = None
+    target: Triple | None = None
+    up: Triple = (0.0, 1.0, 0.0)
+    matrix: Matrix | None = None
+    resolution: Size | None = optional(minimum=1, maximum=16384)
+    pixel_aspect: float = bounded(1.0, minimum=0.01, maximum=100)
+
+    def violations(self) -> Iterator[Violation]:
+        if self.matrix is not None:
+            yield from _rigidity(self.matrix)
+
+
+def _rigidity(matrix: Matrix) -> Iterator[Violation]:
+    """Why `matrix` is no rotation and shift, where it is not."""
+    *rows, last = matrix
+    *axes, _ = zip(*rows, strict=True)
+    products = [sum(map(mul, axes[i], axes[j])) - (i == j) for i in range(3) for j in range(i, 3)]
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = axes
+    if max(abs(a - b) for a, b in zip(last, (0, 0, 0, 1), strict=True)) > 1e-4:
+        yield "matrix", "its last row must be [0, 0, 0, 1]"
+    elif not all(abs(product) <= 1e-4 for product in products):
+        yield (
+            "matrix",
+            "must be rigid, but its first three columns are not of unit length and perpendicular",
+        )
+    elif ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) < 0:
+        yield "matrix", "must be rigid, but it mirrors (determinant -1)"
+
+
+@dataclass(frozen=True)
+class OpencvSection:
+    """A lens of OpenCV's model, as COLMAP and nerfstudio have it: see `ddrecon.lenses`."""
+
+    type: ClassVar[str] = "opencv"
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+
+@dataclass(frozen=True)
+class FisheyeSection:
+    """A lens of OpenCV's fisheye model."""
+
+    type: ClassVar[str] = "fisheye"
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+
+LensSection = OpencvSection | FisheyeSection
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerspectiveSection(PoseSection):
+    """`fov`: horizontal field of view [degrees] of an image this wide about its axis.
+
+    The axis meets the image at `principal_point`, parts of its width and height from the top left.
+    With `distortion`, all this is said of the pinhole camera that is left without it.
+    """
+
+    type: ClassVar[str] = "perspective"
+
+    fov: float = limited(above=0, below=180)
+    principal_point: Pair = (0.5, 0.5)
+    distortion: LensSection | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrthographicSection(PoseSection):
+    """`width` of the image [u]."""
+
+    type: ClassVar[str] = "orthographic"
+
+    width: float = limited(above=0)
+
+
+CameraSection = PerspectiveSection | OrthographicSection
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewSection:
     """One view; its camera's `resolution` may be left out where there is an image.
 
@@ -145,19 +344,19 @@ class ViewSection:
     `offset`; `background` is what it shows where the volume is empty.
     """
 
-    name: str
+    name: str = ""
     camera: CameraSection
     image: Path | None = None
     mask: Path | None = None
     split: str = one_of("train", ("train", "test"))
-    weight: float = bounded(1.0, above=0)
+    weight: float = bounded(1.0, above=0, expert=True)
     exposure: Color = bounded(1.0, minimum=1e-3)
     offset: Color = 0.0
     background: Backdrop | None = None
     noise: NoiseSettings | None = None
 
-    def problems(self) -> Iterator[Problem]:
-        if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
+    def violations(self) -> Iterator[Violation]:
+        if self.name and not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", self.name):
             yield (
                 "name",
                 f"{self.name!r} is not a file name; use letters, digits, '_', '-' and '.',"
@@ -167,6 +366,14 @@ class ViewSection:
             yield "name", f"{self.name!r} ends in .{taken[1]}, as files of other views do"
         if self.image is None and self.camera.resolution is None:
             yield "camera", "missing key 'resolution'; only a view with an image can go without"
+
+
+def split_views(views: Sequence[ViewSection], test_every: int | None) -> list[ViewSection]:
+    """`views` with the first of every `test_every` as a test view, where any are."""
+    return [
+        replace(view, split="test") if test_every and index % test_every == 0 else view
+        for index, view in enumerate(views)
+    ]
 
 
 @dataclass(frozen=True)
@@ -192,7 +399,7 @@ class ViewSource:
     Such files are written by NeRF, instant-ngp or nerfstudio; the model is a folder.
 
     `images` is a glob pattern whose matches, sorted, belong to the ring's cameras in turn, or the
-    folder of COLMAP's pictures. Of every `test_every` views of files that say nothing of it, the
+    folder of COLMAP's pictures. Of every `test_every` views, where files say nothing of it, the
     first is a test view.
     """
 
@@ -204,18 +411,13 @@ class ViewSource:
     images: str | None = None
     test_every: int | None = optional(minimum=2)
 
-    def problems(self) -> Iterator[Problem]:
+    def violations(self) -> Iterator[Violation]:
         if self.ring is not None and self.images is None and self.ring.resolution is None:
             yield "ring", "missing key 'resolution'; only views with images can go without"
         if self.transforms is not None and self.images is not None:
             yield "images", "is for a ring or COLMAP; transforms name their images themselves"
         if self.colmap is not None and self.images is None:
             yield "colmap", "missing key 'images', the folder of its pictures"
-        if self.ring is not None and self.test_every is not None:
-            yield (
-                "test_every",
-                "is for transforms and COLMAP; list the views of a ring to keep some as test views",
-            )
 
 
 @dataclass(frozen=True)
@@ -227,29 +429,31 @@ class SceneTree:
 
     volume: AnyVolume
     lights: tuple[LightSection, ...]
-    views: tuple[ViewSection, ...]
+    views: tuple[ViewSection, ...] = field(metadata={"also": (ViewSource,)})
     render: RenderSettings = field(default_factory=RenderSettings)
     diffusion: DiffusionSettings = field(default_factory=DiffusionSettings)
     optimize: OptimizeSettings | None = None
 
-    def __post_init__(self) -> None:
-        parameters = self.optimize.parameters if self.optimize else {}
-        named = {self.own_name(name): what for name, what in parameters.items()}
-        if self.optimize and len(named) == len(parameters):
-            object.__setattr__(self, "optimize", replace(self.optimize, parameters=named))
+    @property
+    def media(self) -> Mapping[str, VolumeSection | MediumSection]:
+        """The sections of media by name, "" where there is one medium."""
+        return {"": self.volume} if isinstance(self.volume, VolumeSection) else self.volume.media
 
     def own_name(self, name: str) -> str:
         """`name`, or `g` for `phase.g` where both are that of Henyey and Greenstein."""
         medium, last = split_name(name)
-        section: VolumeSection | MediumSection | MixtureSection | None = self.volume
-        if isinstance(section, MixtureSection):
-            section = section.media.get(medium.removeprefix("media.").strip("."))
-        has_one = isinstance(section, VolumeSection | MediumSection) and isinstance(
-            section.phase, HenyeyGreensteinSection | None
-        )
+        section = self.media.get(medium.removeprefix("media.").strip("."))
+        has_one = section and isinstance(section.phase, HenyeyGreensteinSection | None)
         return f"{medium}g" if last == "phase.g" and has_one else name
 
-    def problems(self) -> Iterator[Problem]:
+    def named_once(self) -> SceneTree:
+        """The same with each parameter by its own name."""
+        if self.optimize is None:
+            return self
+        named = {self.own_name(name): what for name, what in self.optimize.parameters.items()}
+        return replace(self, optimize=replace(self.optimize, parameters=named))
+
+    def violations(self) -> Iterator[Violation]:
         parameters = self.optimize.parameters if self.optimize else {}
         if len(set(map(self.own_name, parameters))) < len(parameters):
             yield "optimize", "g and phase.g are the same number: name it once"

@@ -71,8 +71,6 @@ _MEAN_COSINE = Kind(
     fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
 _LOBE_WEIGHT = Kind(fixed_rate(0.05), low=0, high=1, is_color=True, is_cellwise=True)
-_ALPHA = Kind(fixed_rate(0.05), low=0, is_color=True)
-_MOMENTS = Kind(fixed_rate(0.02), low=-1, high=1)
 _BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, is_fitted=True)
 
 KINDS: Mapping[str, Kind] = {
@@ -82,14 +80,10 @@ KINDS: Mapping[str, Kind] = {
     "sigma_t": _CROSS_SECTION,
     "albedo": Kind(fixed_rate(0.02), low=0, high=1, is_color=True, is_cellwise=True),
     "g": replace(_MEAN_COSINE, is_cellwise=True),
-    "phase.g": replace(_MEAN_COSINE, is_color=True),
+    "phase.g": _MEAN_COSINE,
     "phase.weight": _LOBE_WEIGHT,
-    "phase.alpha": _ALPHA,
-    "phase.coefficients": _MOMENTS,
-    # of one of the two that a blend has, counted from 0
-    "phase.phases.N.g": replace(_MEAN_COSINE, is_color=True),
-    "phase.phases.N.alpha": _ALPHA,
-    "phase.phases.N.coefficients": _MOMENTS,
+    # of one of the two media of a mixture, where it is called media.NAME.g
+    "phase.phases.N.g": _MEAN_COSINE,
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,

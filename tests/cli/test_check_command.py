@@ -92,6 +92,13 @@ def test_json(succeed: Run) -> None:
     assert report["optimizes"] == {"density": 120} and report["memory_bytes"] > 0
 
 
+def test_keys_for_experts_are_told_where_they_are_not_at_their_default(succeed: Run) -> None:
+    overrides = ["-D", "diffusion.solver=jacobi", "-D", "views.0.weight=2"]
+    lines = succeed("check", "scene.yaml", *overrides).stdout.splitlines()
+    assert "for experts: views.0.weight 2.0, diffusion.solver jacobi" in lines
+    assert not json.loads(succeed("check", "scene.yaml", "--json").stdout)["expert_keys"]
+
+
 def test_memory_grows_with_cells_and_precision(succeed: Run) -> None:
     def memory(*arguments: str) -> int:
         return json.loads(succeed("check", "scene.yaml", "--json", *arguments).stdout)[

@@ -33,18 +33,6 @@ EDITS = {
         "sigma_S:",
         ["6:3: volume.sigma_S: unknown key; did you mean 'sigma_s'?", "missing key 'sigma_s'"],
     ),
-    "wrong type": (
-        "g: 0.3",
-        "g: soon",
-        ["7:6: volume.g: expected a number, {constant: number} or {file: path}, found 'soon'"],
-    ),
-    "out of range": ("g: 0.3", "g: 2", ["7:6: volume.g: must be below 1, found 2"]),
-    "repeated key": (
-        "g: 0.3",
-        "g: 0.3\n  g: 0.2",
-        ["8:3: volume.g: repeated key; it is already at scene.yaml:7:3"],
-    ),
-    "broken YAML": ("[6, 5, 4]", "[6, 5, 4", ["not YAML"]),
     "missing image": ("front.npy", "gone.npy", ["views.0.image: gone.npy does not exist"]),
     "missing volume": (
         "density: 0.2",
@@ -78,17 +66,6 @@ def test_a_wrong_scene_is_refused(refuse: Refuse, edit: str) -> None:
     assert all(line.startswith("scene.yaml:") for line in lines)
     for part in expected:
         assert any(part in line for line in lines), lines
-
-
-def test_everything_wrong_is_told_at_once(refuse: Refuse) -> None:
-    wrong = [
-        "volume.g=2",
-        "views.0.split=trian",
-        "optimize.iterations=0",
-        "lights.0.irradiance=bright",
-    ]
-    lines = refuse(2, *COMMANDS["render"], *(word for text in wrong for word in ("-D", text)))
-    assert sorted(line.split(":")[0] for line in lines) == sorted(f"-D {text}" for text in wrong)
 
 
 def test_every_missing_file_is_told_at_once(refuse: Refuse) -> None:
@@ -130,22 +107,6 @@ def test_every_command_refuses_scenes_and_data(refuse: Refuse, command: str) -> 
     assert line == "-D volume.g=2: volume.g: must be below 1, found 2"
     (line,) = refuse(3, *words, "-D", "views.0.camera.resolution=[8, 8]")
     assert line == "front.npy: is 8 x 6 pixels, but views.0.camera has 8 x 8"
-
-
-@pytest.mark.parametrize(
-    ("override", "what"),
-    [
-        ("volume.g", "-D volume.g: expected key.path=value"),
-        ("=3", "-D =3: expected key.path=value"),
-        ("volume.gg=0", "-D volume.gg=0: volume.gg: unknown key"),
-        ("volume.g=[0", "-D volume.g=[0: not YAML"),
-        ("views.7.name=a", "-D views.7.name=a: views.7: no such entry"),
-        ("volume.g.x=1", "-D volume.g.x=1: volume.g.x: volume.g is 0.3"),
-    ],
-)
-def test_bad_override(refuse: Refuse, override: str, what: str) -> None:
-    (line,) = refuse(2, *COMMANDS["check"], "-D", override)
-    assert line.startswith(what)
 
 
 def spoil_image(name: str) -> None:
@@ -309,12 +270,6 @@ def test_debug_shows_where_an_error_comes_from(run: Callable[..., object]) -> No
 
     with pytest.raises(SceneError, match="must be below 1"):
         run(*COMMANDS["check"], "--debug", "-D", "volume.g=2")
-
-
-@pytest.mark.parametrize("ending", [".reduced", ".single", ".multiple", ".slices", ".000002"])
-def test_a_view_named_like_an_output_file(refuse: Refuse, ending: str) -> None:
-    (line,) = refuse(2, *COMMANDS["render"], "-D", f"views.0.name=front{ending}")
-    assert f"'front{ending}' ends in {ending}, as files of other views do" in line
 
 
 @pytest.mark.parametrize("seed", ["-99999999999999999999", "99999999999999999999999"])

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
 
 from ddrecon.reconstruct.loop import optimize
 from ddrecon.reconstruct.setup import select_views
+from ddrecon.renderer import render
 from ddrecon.scene_file.build import load_scene
+from ddrecon.scene_file.schema import PhaseSection
+from ddrecon.settings import DiffusionSettings
 from ddrecon.variables.values import variable_names
 
 ROOT = Path(__file__).parents[2]
@@ -22,6 +26,9 @@ CONFIGS = [
 """Those with images to reconstruct from; the derivatives of the other are checked in
 tests/validate.
 """
+
+
+KINDS = sorted((ROOT / "configs" / "kinds").glob("*.yaml"))
 
 
 def small(config: Path) -> list[str]:
@@ -38,6 +45,24 @@ def small(config: Path) -> list[str]:
 
 def test_there_are_configs() -> None:
     assert {"ball", "plume"} <= {config.stem for config in CONFIGS}
+
+
+@pytest.mark.parametrize("config", KINDS, ids=lambda config: config.stem)
+def test_a_kind_of_scene_renders(config: Path) -> None:
+    if "mie" in config.read_text():
+        pytest.importorskip("miepython", reason="needs the extra `mie`")
+    sizes = ["views.0.camera.resolution=[5, 4]"] if "image:" not in config.read_text() else []
+    picture = render(load_scene(config, overrides=sizes))
+    assert bool(picture.isfinite().all()) and float(picture.min()) >= 0 < float(picture.max())
+
+
+def test_every_phase_function_and_model_has_a_config() -> None:
+    texts = [config.read_text() for config in (ROOT / "configs").rglob("*.yaml")]
+    phases = [section.type for section in get_args(PhaseSection)]
+    models = next(field for field in fields(DiffusionSettings) if field.name == "model")
+    ordinary = {"henyey_greenstein", "p1"}
+    for name in {*phases, *models.metadata["choices"]} - ordinary:
+        assert any(f"type: {name}" in text or f"model: {name}" in text for text in texts), name
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ddrecon.errors import FormatError
-from ddrecon.io.phase_files import read_moments, read_phase_table
+from ddrecon.io.phase_files import read_phase_table
 from ddrecon.numerics.angle_table import STEPS, at_even_angles
 
 DEGREES = np.array([0.0, 20.0, 90.0, 150.0, 180.0])
@@ -38,14 +38,6 @@ def test_a_table_is_read_whatever_its_form(tmp_path: Path, form: str, colors: in
     angles, found = read_phase_table(path)
     np.testing.assert_allclose(angles, np.radians(DEGREES), atol=1e-7)
     np.testing.assert_allclose(found, values)
-
-
-@pytest.mark.parametrize("header", ["", "l value", "chi"])
-def test_moments_are_divided_by_the_first(tmp_path: Path, header: str) -> None:
-    moments = np.array([2.0, 1.0, 0.4, -0.1])
-    columns = np.vstack([np.arange(4), moments]) if header.startswith("l") else moments[None]
-    found = read_moments(write(tmp_path / "moments.txt", header, columns))
-    np.testing.assert_allclose(found, moments[None] / 2)
 
 
 WRONG = {

@@ -12,7 +12,7 @@ from torch import Tensor
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
 from ddrecon.medium.coefficients import scale_medium
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.medium.phase_cells import SeenNodes
 from ddrecon.medium.phase_peak import SeenPhase
@@ -23,7 +23,7 @@ from ddrecon.validate.balance import balance_of
 
 SHAPE = (5, 4, 6)
 LOBES = torch.tensor([0.8, -0.4], dtype=torch.float64)
-HAZE = Draine(torch.tensor([0.7, 0.6, -0.5], dtype=torch.float64), LOBES[0])
+HAZE = HenyeyGreenstein(torch.tensor([0.7, 0.6, -0.5], dtype=torch.float64))
 AIR = Rayleigh(LOBES[0])
 FIELDS: dict[str, PhaseFunction] = {
     "g": HenyeyGreenstein(1.7 * random_values(*SHAPE, seed=3) - 0.8),

@@ -83,24 +83,6 @@ def test_brightness_of_the_light_does_not_matter(ball_scene: Scene) -> None:
     assert torch.allclose(plain.scene.volume.density, scaled.scene.volume.density, atol=1e-3)
 
 
-def test_a_field_is_even_for_part_of_a_run(ball_scene: Scene) -> None:
-    """Its level is found first, by the sum of all derivatives; a resumed run does the same."""
-    assert ball_scene.optimize is not None
-    density = replace(ball_scene.optimize.parameters["density"], even_until=0.5)
-    settings = replace(ball_scene.optimize, parameters={"density": density}, views_per_iteration=0)
-    run = Reconstruction(replace(ball_scene, optimize=settings))
-    losses = []
-    for made in range(1, 7):
-        losses.append(run.step().loss)
-        value = run.parameters[0].value.detach()
-        assert (value.amax() == value.amin()) == (made <= 4)
-        state, run = run.state(), Reconstruction(run.scene)
-        run.restore(state)
-    assert min(losses[1:4]) < losses[0]
-    # Where its optimizer began anew, its memory is of the steps since.
-    assert run.parameters[0].steps == 2
-
-
 def test_resuming_gives_the_same_bits_as_not_stopping(ball_scene: Scene, tmp_path: Path) -> None:
     through, losses, stops = Reconstruction(ball_scene), list[float](), (2, 5)
     while not through.is_done:

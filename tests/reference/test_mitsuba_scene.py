@@ -14,8 +14,11 @@ from torch import Tensor
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import SceneError
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, PointLight
-from ddrecon.medium.phase import Draine, HenyeyGreenstein
+from ddrecon.medium.phase import HenyeyGreenstein
 from ddrecon.medium.phase_blend import Blend, TwoLobe
+from ddrecon.medium.phase_series import Tabulated
+from ddrecon.numerics.angle_table import STEPS
+from ddrecon.numerics.legendre import even_angles
 from ddrecon.reference.colors import pick_color
 from ddrecon.reference.mitsuba_scene import FINER, is_gray, mitsuba_scene
 from ddrecon.scene import Scene
@@ -193,7 +196,9 @@ def test_a_phase_function_by_color_is_handed_over_one_color_at_a_time() -> None:
         assert phase["type"] == "blendphase" and [phase["first"], phase["second"]] == lobes
         assert phase["weight"] == pytest.approx(1 - float(weight[color]))
     scene.volume.phase = Blend(
-        Draine(weight, weight), HenyeyGreenstein(weight), random_values(*SHAPE)
+        Tabulated(1 + weight[:, None] * even_angles(STEPS).cos()),
+        HenyeyGreenstein(weight),
+        random_values(*SHAPE),
     )
     phases = [described(pick_color(scene, color))["medium"]["phase"] for color in range(3)]
     assert [one["second"]["g"] for one in phases] == pytest.approx(weight.tolist())
@@ -215,7 +220,7 @@ def test_the_weight_of_lobes_is_a_volume_where_cells_differ_and_a_g_is_refused()
 
 def test_a_table_of_values_goes_from_backward_to_forward() -> None:
     scene = make_scene(random_values(*SHAPE))
-    scene.volume.phase = Draine(*scene.volume.density.new_tensor([0.5, 1.0]))
+    scene.volume.phase = Tabulated(1 + even_angles(STEPS).cos()[None] ** 2)
     phase = described(scene)["medium"]["phase"]
     values = [float(value) for value in phase["values"].split(", ")]
     cosine = torch.linspace(-1, 1, len(values), dtype=torch.float64)

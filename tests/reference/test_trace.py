@@ -15,7 +15,7 @@ from torch import Tensor
 from ddrecon.cameras import Camera, cast_rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.light.lights import AmbientLight, DirectionalLight, EnvironmentLight, Light, PointLight
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, PhaseFunction, Rayleigh
+from ddrecon.medium.phase import HenyeyGreenstein, PhaseFunction, Rayleigh
 from ddrecon.medium.phase_blend import Blend, TwoLobe
 from ddrecon.reference.mitsuba_scene import mitsuba_scene
 from ddrecon.reference.trace import Traced, load_mitsuba, open_tracer
@@ -161,7 +161,7 @@ PHASES: dict[str, PhaseFunction] = {
     "two lobes": TwoLobe(CENTER.new_tensor([0.7, -0.5]), CENTER.new_tensor(0.6)),
     "blend": Blend(
         Rayleigh(CENTER),
-        Draine(CENTER.new_tensor(0.7), CENTER.new_tensor(1.0)),
+        HenyeyGreenstein(CENTER.new_tensor(0.7)),
         torch.linspace(0, 1, 12).expand(12, 12, 12),
     ),
     "by color": HenyeyGreenstein(CENTER.new_tensor([0.5, 0.0, -0.5])),

@@ -125,12 +125,6 @@ def test_a_result_renders_as_what_was_found(
             "{type: two_lobe, g: [0.6, -0.2], weight: [0.7, 0.5, 0.3]}",
             "phase.g: {}, phase.weight: {}",
         ),
-        ("{type: draine, g: 0.3, alpha: 0.5}", "phase.g: {}, phase.alpha: {}"),
-        (
-            "{type: blend, weight: 0.4, phases: ["
-            "{type: legendre, coefficients: [1, 0.4, 0.2]}, {type: henyey_greenstein, g: 0.3}]}",
-            "phase.weight: {}, phase.phases.0.coefficients: {}, phase.phases.1.g: {}",
-        ),
     ],
 )
 def test_a_result_has_the_phase_function_that_was_found(

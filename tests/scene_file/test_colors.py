@@ -24,8 +24,7 @@ TREE = yaml.safe_load(SCENE)
 COLORS = {
     "sigma_a": 0.6,
     "sigma_s": 9.0,
-    "phase.g": 0.3,
-    "phase.alpha": 0.5,
+    "phase.weight": 0.3,
     "lights.0.irradiance": 3.1,
     "lights.1.radiance": 0.3,
     "lights.2.intensity": 1.5,
@@ -37,7 +36,7 @@ COLORS = {
 def scene_text(**more: Any) -> str:
     """A scene whose colors are all three times those of `COLORS`."""
     three = {name: [value] * 3 for name, value in COLORS.items()}
-    phase = {"type": "draine", "g": three["phase.g"], "alpha": three["phase.alpha"]}
+    phase = {"type": "two_lobe", "g": [0.5, -0.3], "weight": three["phase.weight"]}
     sections = {name: three[name] for name in ("sigma_a", "sigma_s")}
     view = {name: three[f"views.front.{name}"] for name in ("exposure", "offset")}
     lights = [

@@ -17,8 +17,8 @@ from ddrecon.errors import DataWarning, FormatError, SceneError
 from ddrecon.light.lights import EnvironmentLight, PointLight
 from ddrecon.scene_file.build import load_scene
 from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.light_schema import EnvironmentSection, PointSection
 from ddrecon.scene_file.load import read_scene
+from ddrecon.scene_file.schema import EnvironmentSection, PointSection
 
 Write = Callable[[str], Path]
 

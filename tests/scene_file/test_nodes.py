@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 
 from ddrecon.errors import SceneError
 from ddrecon.scene_file.load import MAX_BYTES, read_scene
-from ddrecon.scene_file.nodes import Node, parse
+from ddrecon.scene_file.nodes import Node, parse, resolve
 from ddrecon.scene_file.problems import Problems
-from ddrecon.scene_file.scalars import resolve
 
 Refusal = Callable[..., list[str]]
 

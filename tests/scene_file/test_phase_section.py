@@ -13,9 +13,9 @@ import yaml
 from example_scene import SCENE, changed
 
 from ddrecon.errors import DataWarning, FormatError, SceneError
-from ddrecon.medium.phase import Draine, HenyeyGreenstein, Rayleigh
-from ddrecon.medium.phase_blend import Blend, TwoLobe
-from ddrecon.medium.phase_series import Legendre, Tabulated
+from ddrecon.medium.phase import HenyeyGreenstein, Rayleigh
+from ddrecon.medium.phase_blend import TwoLobe
+from ddrecon.medium.phase_series import Tabulated
 from ddrecon.scene_file.build import build_scene, load_scene
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.load import read_scene
@@ -25,18 +25,8 @@ SECTIONS: dict[str, tuple[type, dict[str, Any]]] = {
     "henyey_greenstein": (HenyeyGreenstein, {"g": [0.8, 0.7, 0.6]}),
     "two_lobe": (TwoLobe, {"g": [0.8, -0.3], "weight": 0.7}),
     "rayleigh": (Rayleigh, {}),
-    "draine": (Draine, {"g": 0.5, "alpha": [1, 0.5, 0]}),
-    "legendre": (Legendre, {"coefficients": [1, 0.4, 0.2]}),
     "table": (Tabulated, {"file": "table.csv"}),
-    "blend": (
-        Blend,
-        {
-            "phases": [{"type": "draine", "g": 0.5, "alpha": [1, 0.5, 0]}, {"type": "rayleigh"}],
-            "weight": 0.3,
-        },
-    ),
 }
-AIR = {"type": "rayleigh"}
 
 
 def scene_with(**phase: Any) -> str:
@@ -60,8 +50,7 @@ def test_each_kind_is_built_and_written_back(
     scene = build_scene(scene_file)
     phase = scene.volume.phase
     assert isinstance(phase, kind) and name == phase.NAME
-    if kind is not Legendre:
-        assert phase.colors == (3 if name in ("henyey_greenstein", "draine", "blend") else 1)
+    assert phase.colors == (3 if name == "henyey_greenstein" else 1)
     assert scene.volume.sigma_s.shape[0] == 3
     dump_scene(scene_file, tmp_path / "again.yaml")
     again = load_scene(tmp_path / "again.yaml").volume.phase
@@ -117,27 +106,7 @@ REFUSED = {
     "unknown": ({"phase": {"type": "two_lobes"}}, "did you mean 'two_lobe'"),
     "beyond": ({"phase": {"type": "two_lobe", "g": [1, 0], "weight": 0.5}}, "must be below 1"),
     "weight": ({"phase": {"type": "two_lobe", "g": [0, 0], "weight": 2}}, "must be at most 1"),
-    "chi_0": ({"phase": {"type": "legendre", "coefficients": [2, 1]}}, "chi_0 must be 1"),
-    "chi_l": ({"phase": {"type": "legendre", "coefficients": [1, 1.5]}}, "divide each by 2 l + 1"),
-    "a blend of one": (
-        {"phase": {"type": "blend", "phases": [AIR], "weight": 0.5}},
-        "expected two phase functions, found 1",
-    ),
-    "a blend of mixtures": (
-        {"phase": {"type": "blend", "phases": [AIR, {"type": "blend"}], "weight": 0.5}},
-        "volume.phase.phases.1.type: expected one of henyey_greenstein, rayleigh",
-    ),
-    "a g of each cell in a blend": (
-        {
-            "phase": {
-                "type": "blend",
-                "phases": [AIR, {"type": "henyey_greenstein", "g": {"file": "g.npz"}}],
-                "weight": 0.5,
-            }
-        },
-        "the weight may differ from cell to cell, and no g",
-    ),
-    "neither": ({"phase": {"type": "legendre"}}, "missing coefficients or file"),
+    "retired": ({"phase": {"type": "blend"}}, "blend went: write two media, volume.media"),
 }
 
 
@@ -172,9 +141,6 @@ def test_droplets_scatter_as_one_sphere_does_and_forward(write: Callable[[str], 
 def test_a_missing_file_is_the_scene_s_mistake(write: Callable[[str], Path]) -> None:
     with pytest.raises(SceneError, match=r"volume\.phase\.file"):
         load_scene(write(scene_with(type="table", file="nowhere.csv")))
-    parts = [AIR, {"type": "table", "file": "nowhere.csv"}]
-    with pytest.raises(SceneError, match=r"volume\.phase\.phases\.1\.file"):
-        load_scene(write(scene_with(type="blend", phases=parts, weight=0.5)))
 
 
 CELLS = (6, 5, 4)
@@ -203,9 +169,8 @@ def cells_scene(**volume: Any) -> str:
         {"phase": {"type": "henyey_greenstein", "g": {"file": "cells.npz"}}},
         {"phase": {"type": "two_lobe", "g": [0.8, -0.3], "weight": {"file": "cells.npz"}}},
         {"g": {"file": "cells.npz", "name": "weight"}},
-        {"phase": {"type": "blend", "phases": [AIR, AIR], "weight": {"file": "cells.npz"}}},
     ],
-    ids=["short", "long", "weight", "another name", "weight of a blend"],
+    ids=["short", "long", "weight", "another name"],
 )
 def test_a_number_of_each_cell_comes_from_a_file_and_is_written_back(
     volume: dict[str, Any], write: Callable[[str], Path], tmp_path: Path

@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 from example_scene import changed
 
-from ddrecon.scene_file.camera_schema import PerspectiveSection
 from ddrecon.scene_file.dump import dump_scene
 from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.ring import ring_cameras
-from ddrecon.scene_file.schema import RingSection
+from ddrecon.scene_file.schema import PerspectiveSection, RingSection
+from ddrecon.scene_file.view_sources import ring_cameras
 
 RING = {"count": 3, "radius": 3.2, "height": 0.3, "fov": 28, "resolution": [8, 6]}
 ORIGINS = [  # of the cameras of shared/reference/views_plume, train_00 to train_09
@@ -87,7 +86,7 @@ def test_as_many_images_as_cameras(refusal: Refusal, tmp_path: Path):
         ({"ring": {"count": 3, "radius": 1, "fov": 30}}, "views.ring: missing key 'resolution'"),
         ({"images": "*.exr"}, "views: missing ring or transforms"),
         ({"image": "*.exr", "ring": RING}, "views.image: unknown key; did you mean 'images'?"),
-        ("ring", "views: expected a list with at least one entry, found 'ring'"),
+        ("ring", "views: expected a list with at least one entry or a mapping, found 'ring'"),
     ],
 )
 def test_one_fault_is_one_line(refusal: Refusal, views: object, problem: str):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ddrecon.cameras import Camera, Rays, look_at
 from ddrecon.grid import Grid
 from ddrecon.march.box import cross_box
-from ddrecon.scene_file.sight import explain_blindness, sees_box
+from ddrecon.scene_file.build_views import explain_blindness, sees_box
 
 GRID = Grid.from_xyz(
     (1, 1, 1), (-1, -2, -3), (1, 2, 3)

@@ -19,11 +19,10 @@ from example_scene import SCENE, changed
 from ddrecon.cameras import cast_rays
 from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.scene_file.build import build_scene, load_scene
-from ddrecon.scene_file.camera_schema import PerspectiveSection
 from ddrecon.scene_file.dump import dump_scene
-from ddrecon.scene_file.export_transforms import export_transforms
 from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.schema import ViewSection
+from ddrecon.scene_file.schema import PerspectiveSection, ViewSection
+from ddrecon.scene_file.transforms import export_transforms
 
 Read = Callable[..., SceneFile]
 Refusal = Callable[..., list[str]]
@@ -227,7 +226,7 @@ def test_a_dumped_scene_is_the_same(read: Read, tmp_path: Path) -> None:
         ({"k5": 0.01}, "k5: k5 = 0.01 is not modeled; undistort"),
         (
             {"camera_model": "OPENCV_FISHEYE", "distortion_params": [0, 0, 0, 0, 1e-3, 0]},
-            "distortion_params: p1 = 0.001 is not modeled",
+            "distortion_params.4: p1 = 0.001 is not modeled",
         ),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR is a lens that is not modeled"),
         ({"fl_x": 0}, "fl_x: must be above 0"),
@@ -248,7 +247,7 @@ def test_what_is_no_camera_of_ours_is_refused_by_key(
 @pytest.mark.parametrize(
     ("frames", "problem"),
     [
-        ([], "frames: expected a list with at least one entry, found a list of 0"),
+        ([], "frames: expected a list with at least one frame"),
         (
             [frame(transform_matrix=POSE[:3])],
             "frames.0.transform_matrix: expected a list of 4 rows",

@@ -25,31 +25,22 @@ SMALL = [
 ]
 
 
-DRAINE = "{type: draine, g: [0.5, 0.3, -0.2], alpha: [1, 0.5, 0.2]}"
-LOBES = "{type: two_lobe, g: [0.6, -0.3], weight: [0.7, 0.6, 0.5]}"
-SERIES = "{type: legendre, coefficients: [1, 0.4, 0.2, 0.1]}"
-BLENDS = [
-    f"{{type: blend, weight: [0.7, 0.6, 0.5], phases: [{part}, {{type: rayleigh}}]}}"
-    for part in (DRAINE, SERIES)
-]
-PHASES = {
-    "phase.g": DRAINE,
-    "phase.weight": LOBES,
-    "phase.alpha": DRAINE,
-    "phase.coefficients": SERIES,
-    "phase.phases.N.g": BLENDS[0],
-    "phase.phases.N.alpha": BLENDS[0],
-    "phase.phases.N.coefficients": BLENDS[1],
-}
-"""Phase functions that have numbers other than g."""
+LOBES = "volume.phase={type: two_lobe, g: [0.6, -0.3], weight: [0.7, 0.6, 0.5]}"
+MEDIA = (
+    "volume={bounds: {min: [-0.5, -0.5, -0.5], max: [0.5, 0.5, 0.5]}, resolution: [5, 4, 3], media:"
+    " {smoke: {density: 0.7, sigma_a: 1, sigma_s: 3, g: 0.5},"
+    " air: {density: 1, sigma_a: 0, sigma_s: 1, phase: {type: rayleigh}}}}"
+)
+PHASES = {"phase.g": LOBES, "phase.weight": LOBES, "phase.phases.N.g": MEDIA}
+"""Volumes that have numbers of phase functions other than g."""
 
 
 @pytest.fixture(scope="module")
 def scenes() -> dict[str, Scene]:
     """Scenes with every kind of light, in which all kinds of variables occur, by phase function."""
     phases = {"": ["volume.g=0.3"]}
-    others = ["volume.g=0", "optimize.parameters={density: {}}"]
-    phases |= {phase: [*others, f"volume.phase={phase}"] for phase in PHASES.values()}
+    others = ["volume.g=0", "optimize="]
+    phases |= {volume: [*others, volume] for volume in PHASES.values()}
     return {
         phase: load_scene(CONFIG, overrides=[*SMALL, *changes], dtype=torch.float64)
         for phase, changes in phases.items()

@@ -1,0 +1,275 @@
+"""Reading values by their types: records from mappings, tuples from lists, numbers and text.
+
+A type may have alternatives: the kind of a YAML node, a mapping, list, text or number, tells which
+of them it is. Records are told apart by their `type`, others by their first key.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
+from functools import cache, reduce
+from operator import or_
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from ddrecon.scene_file.nodes import Node, describe_found
+from ddrecon.scene_file.problems import Problems, suggestion
+from ddrecon.settings import FieldFile
+
+R = TypeVar("R")
+type_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
+
+LARGEST = 3e38
+"""The largest magnitude that single precision holds, roughly."""
+LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
+    "minimum": ("at least", operator.ge),
+    "above": ("above", operator.gt),
+    "maximum": ("at most", operator.le),
+    "below": ("below", operator.lt),
+}
+"""What a bound in a field's metadata means."""
+WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Path: "text"}
+PLURALS = {"number": "numbers", "whole number": "whole numbers", "list of 4 numbers": "rows of 4"}
+TRIPLE = (float, float, float)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a value must be: of the type `hint`, within `limits`; relative paths start at `folder`.
+
+    `finish[kind](node, record, folder)` is what a record of that kind stands for, and
+    `finish[tuple, kind]` or `finish[Mapping, kind]` looks at all of a list or mapping together.
+    """
+
+    hint: Any
+    folder: Path
+    limits: Mapping[str, Any]
+    finish: Mapping[Any, Callable[[Node, Any, Path], Any]]
+
+
+def read_as(node: Node, hint: Any, folder: Path, **limits: float) -> Any:
+    """The value of `node`, of the type `hint` within `limits`."""
+    return read_value(node, Rule(hint, folder, limits, {}))
+
+
+def alternatives(hint: Any) -> tuple[Any, ...]:
+    """The types that `hint` allows."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def describe_type(hint: Any) -> str:
+    """What a value of the type `hint` is, in words."""
+    kinds = [kind for kind in alternatives(hint) if kind is not NoneType]
+    words = list(dict.fromkeys(_describe(kind, kinds) for kind in kinds))
+    return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+
+
+def _describe(kind: Any, kinds: Sequence[Any]) -> str:
+    arguments = get_args(kind)
+    if get_origin(kind) is Literal:
+        return " or ".join(arguments)
+    if get_origin(kind) is tuple:
+        if float in kinds and arguments == TRIPLE:
+            return "[r, g, b]"
+        if arguments[-1] is Ellipsis and arguments[0] is not float:
+            return "a list with at least one entry"
+        inner = describe_type(arguments[0]).removeprefix("a ")
+        count = "" if arguments[-1] is Ellipsis else f"{len(arguments)} "
+        return f"a list of {count}{PLURALS.get(inner, inner)}"
+    if is_dataclass(kind) and float in kinds:
+        return f"{{{fields(kind)[0].name}: ...}}"
+    return WORDS.get(kind, "a mapping")
+
+
+def read_value(node: Node, rule: Rule) -> Any:
+    """The value of `node` by `rule`; raises SceneError with everything wrong in it."""
+    kinds = alternatives(rule.hint)
+    match node.value:
+        case None if NoneType in kinds:
+            return None
+        case dict():
+            return _read_mapping(node, kinds, rule)
+        case list():
+            return _read_list(node, kinds, rule)
+        case str():
+            return _read_text(node, kinds, rule)
+        case bool() if bool in kinds:
+            return node.value
+        case bool() | None:
+            raise _refused(node, rule)
+        case int() if int in kinds:
+            _check_limits(node, node.value, rule.limits)
+            _check_choice(node, rule.limits.get("choices", ()), rule)
+            return node.value
+        case int() | float() if float in kinds:
+            if not math.isfinite(node.value) or abs(node.value) > LARGEST:
+                raise node.refused(
+                    f"expected a finite number of single precision, found {describe_found(node)}"
+                )
+            _check_limits(node, node.value, rule.limits)
+            return float(node.value)
+    raise _refused(node, rule)
+
+
+def _refused(node: Node, rule: Rule) -> Exception:
+    if str in alternatives(rule.hint) and node.value is not None:
+        _check_choice(node, rule.limits.get("choices", ()), rule)
+    is_text = {str, Path} & set(alternatives(rule.hint)) and isinstance(node.value, int | float)
+    quoting = " (put it in quotes)" if is_text else ""
+    return node.refused(
+        f"expected {describe_type(rule.hint)}, found {describe_found(node)}{quoting}"
+    )
+
+
+def _check_limits(node: Node, value: float, limits: Mapping[str, Any]) -> None:
+    for name, (words, is_within) in LIMITS.items():
+        if limits.get(name) is not None and not is_within(value, limits[name]):
+            raise node.refused(f"must be {words} {limits[name]:g}, found {value:g}")
+
+
+def _check_choice(node: Node, choices: Sequence[Any], rule: Rule) -> None:
+    if choices and node.value not in choices:
+        if what := rule.limits.get("retired", {}).get(str(node.value)):
+            raise node.refused(f"{node.value} went: {what}")
+        words = list(map(str, choices))
+        near = suggestion(str(node.value), words) if len(words) > 1 else ""
+        raise node.refused(
+            f"expected one of {', '.join(words)}, found {describe_found(node)}"
+            f"{near if 'did you' in near else ''}"
+        )
+
+
+def _read_text(node: Node, kinds: Sequence[Any], rule: Rule) -> str | Path:
+    """Text, one of the choices where there are such, or the path of a file, made absolute."""
+    choices = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
+    if not choices and not {str, Path} & set(kinds):
+        raise _refused(node, rule)
+    text = str(node.value)
+    if not text or not text.isprintable():
+        raise node.refused(f"expected text that can be printed, found {describe_found(node)}")
+    if Path in kinds:
+        return (rule.folder / text).absolute()
+    _check_choice(node, choices or rule.limits.get("choices", ()), rule)
+    return text
+
+
+def _read_list(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
+    """As many entries as the tuple among `kinds` has, or any number: of others than numbers one."""
+    entries = node.children()
+    for arguments in (get_args(kind) for kind in kinds if get_origin(kind) is tuple):
+        is_open = arguments[-1] is Ellipsis and (entries or arguments[0] is float)
+        if is_open or len(entries) == len(arguments):
+            values = read_each(entries, replace(rule, hint=arguments[0]))
+            return _finish(node, (tuple, arguments[0]), values, rule)
+    raise _refused(node, rule)
+
+
+def read_each(nodes: Sequence[Node], rule: Rule) -> tuple[Any, ...]:
+    """The value of each node by `rule`; raises SceneError with the problems of all."""
+    problems, values = Problems(), []
+    for node in nodes:
+        with problems.collecting():
+            values.append(read_value(node, rule))
+        if problems.are_many:
+            break
+    problems.raise_any()
+    return tuple(values)
+
+
+def _read_mapping(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
+    """A record, or a mapping of names to records; `{constant: number}` stands for the number."""
+    entries = node.entries()
+    if FieldFile in kinds and float in kinds and set(entries) == {"constant"}:
+        return read_value(entries["constant"], replace(rule, hint=float))
+    if records := [kind for kind in kinds if is_dataclass(kind)]:
+        kind = _pick(node, records, rule)
+        return _finish(node, kind, read_record(node, kind, rule), rule)
+    for kind in kinds:
+        if get_origin(kind) is Mapping:
+            each = get_args(kind)[1]
+            values = read_each(node.children(), replace(rule, hint=each))
+            return _finish(node, (Mapping, each), dict(zip(entries, values, strict=True)), rule)
+    raise _refused(node, rule)
+
+
+def _finish(node: Node, kind: Any, value: Any, rule: Rule) -> Any:
+    return rule.finish[kind](node, value, rule.folder) if kind in rule.finish else value
+
+
+def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
+    """That of `kinds` which the mapping `node` is, by its `type` or the first key of the record."""
+    entries = node.entries()
+    if not (tagged := {kind.type: kind for kind in kinds if hasattr(kind, "type")}):
+        return next((kind for kind in kinds if fields(kind)[0].name in entries), kinds[0])
+    if "type" not in entries:
+        raise node.refused(f"missing key 'type', one of {', '.join(tagged)}")
+    limits = {**rule.limits, "choices": tuple(tagged)}
+    return tagged[read_value(entries["type"], replace(rule, hint=str, limits=limits))]
+
+
+def read_record(node: Node, kind: type[R], rule: Rule) -> R:
+    """The record of type `kind` that the mapping `node` describes.
+
+    Raises SceneError with everything wrong in it.
+    """
+    entries, hints = node.entries(), type_hints(kind)
+    all_fields = fields(kind)  # type: ignore[arg-type]
+    declared: dict[str, Field[Any]] = {field.name: field for field in all_fields}
+    known = [*(["type"] if hasattr(kind, "type") else []), *declared]
+    retired = getattr(kind, "RETIRED", {})
+    problems, values = Problems(), {}
+    for what in _absences(kind, declared, entries):
+        problems.note(node.refused(what))
+    for name, child in entries.items():
+        with problems.collecting():
+            if name not in known:
+                raise child.key_refused(
+                    retired.get(name) or f"unknown key{suggestion(name, known)}"
+                )
+            if name in declared:
+                limits = {**declared[name].metadata, "retired": retired}
+                hint = reduce(or_, limits.get("also", ()), hints[name])
+                values[name] = read_value(child, replace(rule, hint=hint, limits=limits))
+        if problems.are_many:
+            break
+    problems.raise_any()
+    record = kind(**values)
+    for name, what in getattr(record, "violations", tuple)():
+        problems.note(entries.get(name, node).refused(what))
+    problems.raise_any()
+    return record
+
+
+def _absences(
+    kind: type, declared: Mapping[str, Field[Any]], entries: Mapping[str, Node]
+) -> list[str]:
+    """What is wrong with the set of keys given: required ones and one group of alternatives."""
+    groups: tuple[tuple[str, ...], ...] = getattr(kind, "ALTERNATIVES", ())
+    given = [
+        group
+        for group in groups
+        if any(name in entries and entries[name].value is not None for name in group)
+    ]
+    required = {
+        name
+        for name, field in declared.items()
+        if field.default is MISSING and field.default_factory is MISSING
+    }
+    # of a group, what has no default is required with it
+    needed = [[name for name in group if declared[name].default is None] for group in groups]
+    wrong = [f"missing key {name!r}" for name in declared if name in required - set(entries)]
+    if len(given) == 1:
+        names = needed[groups.index(given[0])]
+        wrong += [
+            f"missing key {name!r}"
+            for name in names
+            if name not in entries or entries[name].value is None
+        ]
+    elif groups:
+        words = " or ".join(" and ".join(names) for names in needed)
+        wrong.append(f"{'give only one of' if given else 'missing'} {words}")
+    return wrong
