@@ -6,7 +6,6 @@ names the columns; `#` begins a comment. Archives (.npz) have arrays of these na
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,6 @@ SUFFIXES = (".csv", ".txt", ".npz")
 MAX_BYTES = 1 << 26
 ABSCISSAS = ("angle", "cosine")
 """The first column: scattering angles in degrees, or their cosines."""
-DEGREES = ("l", "degree")
-"""The first column of moments, if it is not one of them."""
 ENDS = 1e-3
 """How far [rad] a table may begin from 0 and end from pi."""
 
@@ -30,12 +27,16 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     C is 1, or 3 where there is a column a color. Raises FormatError.
     """
-    name, first, values = _read_columns(path, ABSCISSAS)
-    if first is None:
+    name, (first, *others) = _read_columns(path)
+    if name not in ABSCISSAS:
         raise FormatError(path, f"its first column is {name!r}; call it angle (degrees) or cosine")
     if len(first) < 4:
         raise FormatError(path, f"has {len(first)} angles; a table needs at least 4")
-    _require_colors(path, len(values))
+    if len(others) not in (1, 3):
+        raise FormatError(
+            path, f"has {len(others)} columns of values; expected 1, or 3 for r, g, b"
+        )
+    values = np.array(others)
     if name == "cosine" and np.abs(first).max() > 1 + 1e-6:
         raise FormatError(path, "has cosines beyond -1 and 1; are they degrees? call them angle")
     angles = np.arccos(first.clip(-1, 1)) if name == "cosine" else np.radians(first)
@@ -53,34 +54,25 @@ def read_phase_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return angles, values
 
 
-def _require_colors(path: Path, count: int) -> None:
-    if count not in (1, 3):
-        raise FormatError(path, f"has {count} columns of values; expected 1, or 3 for r, g, b")
-
-
-def _read_columns(path: Path, known: Sequence[str]) -> tuple[str, np.ndarray | None, np.ndarray]:
-    """The name of the first column, "" without a header; that column, if it is `known`; the others.
-
-    All are finite.
-    """
+def _read_columns(path: Path) -> tuple[str, np.ndarray]:
+    """The name of the first column, "" without a header, and columns [k, n] of finite numbers."""
     with guard_reading(path):
         if path.suffix.lower() not in SUFFIXES:
             raise FormatError(path, f"is no table; expected {', '.join(SUFFIXES)}")
         is_archive = path.suffix.lower() == ".npz"
-        name, columns = _read_archive(path, known) if is_archive else _read_text(path)
+        name, columns = _read_archive(path) if is_archive else _read_text(path)
     if not np.isfinite(columns).all():
         raise FormatError(path, "holds numbers that are not finite")
-    first, values = (columns[0], columns[1:]) if name in known else (None, columns)
-    return name, first, values
+    return name, columns
 
 
-def _read_archive(path: Path, known: Sequence[str]) -> tuple[str, np.ndarray]:
-    """Arrays called as one of `known`, then `value` [n] or [n, 3]."""
+def _read_archive(path: Path) -> tuple[str, np.ndarray]:
+    """Arrays called angle or cosine, then `value` [n] or [n, 3]."""
     arrays = read_arrays(path)
     if "value" not in arrays or arrays["value"].ndim not in (1, 2):
         raise FormatError(path, "has no array 'value' [n] or [n, 3]")
     values = np.atleast_2d(arrays["value"].T).astype(np.float64)
-    name = next((name for name in known if name in arrays), "")
+    name = next((name for name in ABSCISSAS if name in arrays), "")
     if not name:
         return name, values
     if arrays[name].shape != values.shape[1:]:
