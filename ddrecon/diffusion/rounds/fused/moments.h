@@ -6,6 +6,17 @@
 
 namespace ddrecon {
 
+// So many at once, R or one: `step` is told how many, and the first.
+template <int N> struct Block {
+    static constexpr int size = N;
+};
+template <int R, class Step> INLINE void in_blocks(int count, Step step) {
+    int i = 0;
+    if constexpr (R > 1)
+        for (; i + R <= count; i += R) step(Block<R>(), i);
+    for (; i < count; ++i) step(Block<1>(), i);
+}
+
 // Radiance at cells of a row, by its pairs. The second of a pair is -1 where there is none.
 template <class F> struct Pairs {
     const int* places;
@@ -24,10 +35,11 @@ template <class F> INLINE const F* part_of(const F* const* parts, int k, long lo
     return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
 }
 
-// Of moments to a DEGREE, those even in x come first.
+// Of moments to a DEGREE, those even in x come first. Few stay in registers; of many, each that is
+// read counts for some pairs TOGETHER.
 template <int DEGREE> struct Order {
     static constexpr int EVEN = (DEGREE + 1) * (DEGREE + 2) / 2, ODD = DEGREE * (DEGREE + 1) / 2;
-    static constexpr int COUNT = EVEN + ODD;
+    static constexpr int COUNT = EVEN + ODD, TOGETHER = COUNT > 16 ? 4 : 1;
 };
 // Sums of rows, each by a number, for each moment.
 template <class F, int COUNT, int TERMS> struct Sums {
@@ -56,17 +68,27 @@ __attribute__((noinline)) void to_directions(
                 if (sizeof(T) > sizeof(F)) __builtin_prefetch(row + ahead);
             }
         }
-        for (int p = 0; p < pairs.count; ++p) {
-            T sum = none, difference = none;
+        in_blocks<Own::TOGETHER>(pairs.count, [&](auto block, int p) HERE {
+            constexpr int R = decltype(block)::size;
+            T sum[R], difference[R];
             UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k) sum += matrix[p * Own::EVEN + k] * in[k];
+            for (int a = 0; a < R; ++a) sum[a] = difference[a] = none;
+            UNROLLED
+            for (int k = 0; k < Own::EVEN; ++k)
+                UNROLLED
+                for (int a = 0; a < R; ++a) sum[a] += matrix[(p + a) * Own::EVEN + k] * in[k];
             if (p < pairs.odd_count)
                 UNROLLED
                 for (int k = 0; k < Own::ODD; ++k)
-                    difference += odd_matrix[p * Own::ODD + k] * in[Own::EVEN + k];
-            write(pairs.one(p) + c, sum + difference);
-            if (!pairs.is_one(p)) write(pairs.other(p) + c, sum - difference);
-        }
+                    UNROLLED
+                    for (int a = 0; a < R; ++a)
+                        difference[a] += odd_matrix[(p + a) * Own::ODD + k] * in[Own::EVEN + k];
+            UNROLLED
+            for (int a = 0; a < R; ++a) {
+                write(pairs.one(p + a) + c, sum[a] + difference[a]);
+                if (!pairs.is_one(p + a)) write(pairs.other(p + a) + c, sum[a] - difference[a]);
+            }
+        });
     });
 }
 
@@ -90,21 +112,28 @@ __attribute__((noinline)) void to_moments(
                 out[k] = (k ? F(0) : first) - read<T>(taken[k] + c);
             }
         }
-        for (int p = 0; p < pairs.count; ++p) {
-            const T one = read<T>(pairs.one(p) + c);
-            T sum = one, difference = one;
-            if (!pairs.is_one(p)) {
-                const T other = read<T>(pairs.other(p) + c);
-                sum = one + other;
-                difference = one - other;
+        in_blocks<Own::TOGETHER>(pairs.count, [&](auto block, int p) HERE {
+            constexpr int R = decltype(block)::size;
+            T sum[R], difference[R];
+            UNROLLED
+            for (int a = 0; a < R; ++a) {
+                sum[a] = difference[a] = read<T>(pairs.one(p + a) + c);
+                if (pairs.is_one(p + a)) continue;
+                const T other = read<T>(pairs.other(p + a) + c);
+                sum[a] += other;
+                difference[a] -= other;
             }
             UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k) out[k] += matrix[k * pairs.count + p] * sum;
+            for (int k = 0; k < Own::EVEN; ++k)
+                UNROLLED
+                for (int a = 0; a < R; ++a) out[k] += matrix[k * pairs.count + p + a] * sum[a];
             if (p < pairs.odd_count)
                 UNROLLED
                 for (int k = 0; k < Own::ODD; ++k)
-                    out[Own::EVEN + k] += odd_matrix[k * pairs.odd_count + p] * difference;
-        }
+                    UNROLLED
+                    for (int a = 0; a < R; ++a)
+                        out[Own::EVEN + k] += odd_matrix[k * pairs.count + p + a] * difference[a];
+        });
         UNROLLED
         for (int k = 0; k < Own::COUNT; ++k) write(found[k] + c, out[k]);
     });

@@ -110,9 +110,8 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
 
     INLINE void enter_group(int g) {
         group = (const Group*)of.groups + g;
-        const int even = group->pairs * Order<DEGREE>::EVEN;
-        const int size = even + group->odd_pairs * Order<DEGREE>::ODD;
-        for (int i = 0; i < 4; ++i) matrices[i] = of.matrices + group->matrices + i * size;
+        for (int i = 0; i < 4; ++i)
+            matrices[i] = of.matrices + group->matrices + i * group->pairs * COUNT;
     }
     INLINE Pairs<F> pairs_at(F* first, long long apart) const {
         return {of.pairs + 2 * group->first_pair, group->pairs, group->odd_pairs, first, apart};
