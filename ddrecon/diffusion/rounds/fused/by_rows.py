@@ -108,7 +108,9 @@ class Rows:
     def _scratch_rows(self) -> int:
         return NUMBERS + self.tables.most
 
-    def _run(self, function: str, flags: str, given: dict[str, Any], made: dict[str, Any]) -> Tensor:
+    def _run(
+        self, function: str, flags: str, given: dict[str, Any], made: dict[str, Any]
+    ) -> Tensor:
         """Does all jobs; the sums of moments."""
         swept, tables = self.swept, self.tables
         # Of each piece; zero where no direction of a piece goes.
@@ -134,7 +136,9 @@ class Rows:
             }  # fmt: skip
         degree, shares_field = round(self.count**0.5) - 1, str(swept.scattering is None).lower()
         whole = f"{function}{degree}, {shares_field}{flags}>"
-        bound = _kernel(whole, torch.finfo(self.like.dtype).bits).bind(given, made | {"found": sums})
+        bound = _kernel(whole, torch.finfo(self.like.dtype).bits).bind(
+            given, made | {"found": sums}
+        )
         count, work = self.lanes.number, self.like.numel() * tables.most * self.count
         is_backward = "bars" in given
         for phase in plan(self.lanes, tables.chunks, self.depth, is_backward):

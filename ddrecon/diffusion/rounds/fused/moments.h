@@ -40,6 +40,7 @@ template <class F> INLINE const F* part_of(const F* const* parts, int k, long lo
 template <int DEGREE> struct Order {
     static constexpr int EVEN = (DEGREE + 1) * (DEGREE + 2) / 2, ODD = DEGREE * (DEGREE + 1) / 2;
     static constexpr int COUNT = EVEN + ODD, TOGETHER = COUNT > 16 ? 4 : 1;
+    static constexpr int BYTES = COUNT > 16 ? 128 : 64;
 };
 // Sums of rows, each by a number, for each moment.
 template <class F, int COUNT, int TERMS> struct Sums {
@@ -55,7 +56,7 @@ __attribute__((noinline)) void to_directions(
     long long ahead, int from, int to) {
     typedef Order<DEGREE> Own;
     const F* odd_matrix = matrix + pairs.count * Own::EVEN;
-    in_steps<F>(from, to, [&](auto none, int c) HERE {
+    in_steps<Own::BYTES, F>(from, to, [&](auto none, int c) HERE {
         typedef decltype(none) T;
         T in[Own::COUNT];
         UNROLLED
@@ -100,7 +101,7 @@ __attribute__((noinline)) void to_moments(
     const Pairs<F>& pairs, long long ahead, int width) {
     typedef Order<DEGREE> Own;
     const F* odd_matrix = matrix + pairs.count * Own::EVEN;
-    in_steps<F>(0, width, [&](auto none, int c) HERE {
+    in_steps<Own::BYTES, F>(0, width, [&](auto none, int c) HERE {
         typedef decltype(none) T;
         T out[Own::COUNT];
         UNROLLED

@@ -189,7 +189,6 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         else return_stretch<IS_ALONG, ANY>(steps, back, here.from, here.to);
         return_stretch<IS_ALONG, EMPTY>(steps, back, here.to, width);
     }
-    // E11 transposed: cotangents of a step's numbers.
     template <bool IS_ALONG, Matter MATTER, int POINTS>
     INLINE void return_stretch(
         const Steps<POINTS>& given, const Back<POINTS>& given_back, int from, int to) const {
@@ -205,25 +204,22 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             const F far = gather<POINTS>(steps.near_from, steps.part, c), near = steps.near[c];
             const F mass = IS_EMPTY ? F(0) : steps.mass(c);
             const F scattering_mass = IS_EMPTY ? F(0) : steps.scattering_mass(c);
-            const F scattering_depth = scattering_mass * strength, radiance_bar = back.bar[c];
+            const F radiance_bar = back.bar[c];
             // That of the source: what goes on, returns.
             const F source_bar = IS_ALONG ? source_bars[c]
                                           : radiance_bar + gather<POINTS>(back.from, steps.part, c);
-            const Passage<Dual<F>> by = pass_through<MATTER>(scale * mass, Dual<F>(scale * mass, F(1)));
-            const Dual<F> after = light_after(arriving, far, near, scattering_depth, inflow, by);
-            const F depth_bar = source_bar * after.by[0];
-            const F scattering_depth_bar = source_bar * scattered(far, near, by).value;
-            const F scattered_bar = steps.half * (scattering_depth_bar * strength);
-            const F line_bar = source_bar * scattering_depth;
-            back.mass[c] = steps.half * (depth_bar * scale) + (SHARES_FIELD ? scattered_bar : F(0));
-            if constexpr (!SHARES_FIELD) back.scattered[c] = scattered_bar;
-            back.returning[c] = source_bar * by.passed.value;
-            back.far[c] = line_bar * (by.phi.value - by.psi.value);
-            back.bar[c] = line_bar * by.psi.value;
+            const StepBars<F> bars = return_step<MATTER>(
+                source_bar, arriving, far, near, mass, scattering_mass, scale, strength, inflow);
+            const F scattered = steps.half * bars.scattering_mass;
+            back.mass[c] = steps.half * bars.mass + (SHARES_FIELD ? scattered : F(0));
+            if constexpr (!SHARES_FIELD) back.scattered[c] = scattered;
+            back.returning[c] = bars.arriving;
+            back.far[c] = bars.far;
+            back.bar[c] = bars.near;
             if constexpr (VARIES_NUMBERS) {
-                scale_bar[c] += depth_bar * mass;
-                strength_bar[c] += scattering_depth_bar * scattering_mass;
-                inflow_bar[c] += radiance_bar - source_bar * by.lost.value;
+                scale_bar[c] += bars.scale;
+                strength_bar[c] += bars.strength;
+                inflow_bar[c] += radiance_bar + bars.inflow;
             }
         }
     }

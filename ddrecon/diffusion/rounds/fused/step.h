@@ -39,4 +39,21 @@ INLINE D light_after(
     return arriving * by.passed + (scattering_depth * scattered(far, near, by) - inflow * by.lost);
 }
 
+// E11 transposed: cotangents of a step's numbers, of that of I; `inflow` but for what I gets of it.
+template <class F> struct StepBars {
+    F arriving, far, near, mass, scattering_mass, scale, strength, inflow;
+};
+template <Matter MATTER, class F>
+INLINE StepBars<F> return_step(
+    F bar, F arriving, F far, F near, F mass, F scattering_mass, F scale, F strength, F inflow) {
+    const F q = scattering_mass * strength, depth = scale * mass;
+    const Passage<Dual<F>> by = pass_through<MATTER>(depth, Dual<F>(depth, F(1)));
+    const F depth_bar = bar * light_after(arriving, far, near, q, inflow, by).by[0];
+    const F q_bar = bar * scattered(far, near, by).value, line_bar = bar * q;
+    const F psi = by.psi.value;
+    return {bar * by.passed.value, line_bar * (by.phi.value - psi), line_bar * psi,
+            depth_bar * scale,     q_bar * strength,                depth_bar * mass,
+            q_bar * scattering_mass, -bar * by.lost.value};
+}
+
 } // namespace ddrecon

@@ -16,7 +16,6 @@ from ddrecon.diffusion.rounds.fused.swept import (
     split,
     units_of_parts,
 )
-from ddrecon.diffusion.rounds.fused.tangents import CellTangents, changes_of
 from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
@@ -150,10 +149,10 @@ class _Sweep(torch.autograd.Function):
         def change(*tensors: Any) -> tuple[Tensor, ...]:
             values, d_values = halve(tensors)
             swept = Swept.of(*ctx.of, *values)
-            d_swept = changes_of(swept, *d_values)
+            d_swept = swept.changes(*d_values)
             swept = swept.spelled()
             if ctx.by_cells:
-                changed = CellTangents(swept, d_swept).change()
+                changed = Cells(swept, d_swept).follow()
             else:
                 changed, _ = Rows(swept, ctx.threads, d_swept).follow()
             return split(d_swept.less_light(changed))

@@ -110,6 +110,27 @@ class Swept:
         moments = self.beam_factors[..., None, None, None] * beam
         return replace(self, beam_factors=None, source=in_parts(moments))
 
+    def changes(self, *changes: Tensor | None) -> Swept:
+        """What is added to all tensors, as `Swept.of` takes them; None for nothing.
+
+        The source has all its moments, a beam or not.
+        """
+        tensors = self.scales, self.extinction, self.scattering, self.factors
+        whole: list[Any] = [
+            tensor if tensor is None else torch.zeros_like(tensor) if change is None else change
+            for tensor, change in zip(tensors, changes, strict=False)
+        ]
+        d_factors, *parts = changes[len(whole) :]
+        beam, d_beam = self.source[0], parts[PARTS]
+        if self.beam_factors is not None and beam is not None:
+            # a product, of which both may change
+            d_moments = self.factors.new_zeros(len(self.factors), *beam.shape)
+            for factors, part in ((d_factors, beam), (self.beam_factors, d_beam)):
+                if factors is not None and part is not None:
+                    d_moments += factors[..., None, None, None] * part
+            parts[PARTS:] = in_parts(d_moments)
+        return Swept.of(self.grid, self.directions, *whole, None, *parts)
+
     @property
     def fields(self) -> list[Tensor]:
         """Those of extinction and of scattering; one where they share it."""
@@ -124,6 +145,16 @@ class Swept:
                 total += self.factors[k].view(-1, 1, 1, 1) * light
             if source is not None:
                 total += source
+        return found
+
+    def total_change(self, changes: Swept) -> Tensor:
+        """The change of `total`: both the factors and what they multiply change."""
+        found = self.like.new_zeros(len(self.factors), *self.like.shape)
+        crossed = replace(self, light=changes.light, source=changes.source)
+        by_factors = replace(self, factors=changes.factors, source=(None,) * PARTS)
+        for part in (crossed, by_factors):
+            if any(each is not None for each in (*part.light, *part.source)):
+                found += part.total()
         return found
 
     def less_light(self, moments: Tensor) -> Tensor:
