@@ -53,11 +53,10 @@ template <class T, class F> INLINE void write(F* p, const T& x) {
     __builtin_memcpy(p, &x, sizeof(T));
 }
 // Cells `from` to `to`: vectors of them, then single ones, of which `step` is given a value.
-template <int BYTES, class F, class Step> INLINE void in_steps(int from, int to, Step step) {
-    typedef F V __attribute__((vector_size(BYTES)));
-    constexpr int LANES = BYTES / sizeof(F);
+template <class F, class Step> INLINE void in_steps(int from, int to, Step step) {
+    typedef Vectors<F> Own;
     int c = from;
-    for (; c + LANES <= to; c += LANES) step(V{}, c);
+    for (; c + Own::LANES <= to; c += Own::LANES) step(typename Own::V{}, c);
     for (; c < to; ++c) step(F(0), c);
 }
 

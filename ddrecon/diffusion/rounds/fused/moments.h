@@ -21,8 +21,9 @@ template <int R, class Step> INLINE void in_blocks(int count, Step step) {
 template <class F> struct Pairs {
     const int* places;
     int count, odd_count;
-    F* lines;
-    long long stride;
+    F *lines, *copies;
+    long long stride, pitch;
+    INLINE F* copied(int k) const { return copies + k * pitch; }
     INLINE bool is_one(int p) const { return places[2 * p + 1] < 0; }
     INLINE F* one(int p) const { return lines + places[2 * p] * stride; }
     INLINE F* other(int p) const { return lines + places[2 * p + 1] * stride; }
@@ -35,17 +36,27 @@ template <class F> INLINE const F* part_of(const F* const* parts, int k, long lo
     return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
 }
 
-// Of moments to a DEGREE, those even in x come first. Few stay in registers; of many, each that is
-// read counts for some pairs TOGETHER.
+// Of moments to a DEGREE, those even in x come first. Few stay in registers. Many rows, which lie far
+// apart, take each other's places in a cache: they are copied one after another to where they do
+// not, and each that is read counts for some pairs at once.
 template <int DEGREE> struct Order {
     static constexpr int EVEN = (DEGREE + 1) * (DEGREE + 2) / 2, ODD = DEGREE * (DEGREE + 1) / 2;
-    static constexpr int COUNT = EVEN + ODD, TOGETHER = COUNT > 16 ? 4 : 1;
-    static constexpr int BYTES = COUNT > 16 ? 128 : 64;
+    static constexpr int COUNT = EVEN + ODD;
+    static constexpr bool ARE_MANY = COUNT > 16;
 };
 // Sums of rows, each by a number, for each moment.
 template <class F, int COUNT, int TERMS> struct Sums {
     const F* rows[COUNT][TERMS];
     F by[COUNT][TERMS];
+    template <class T> INLINE T at(int k, int c, long long ahead) const {
+        T sum{};
+        UNROLLED
+        for (int i = 0; i < TERMS; ++i) {
+            sum += by[k][i] * read<T>(rows[k][i] + c);
+            if (sizeof(T) > sizeof(F)) __builtin_prefetch(rows[k][i] + ahead + c);
+        }
+        return sum;
+    }
 };
 
 // Radiance of pairs from moments that are sums; rows are `ahead` of the next ones, which are asked
@@ -56,20 +67,18 @@ __attribute__((noinline)) void to_directions(
     long long ahead, int from, int to) {
     typedef Order<DEGREE> Own;
     const F* odd_matrix = matrix + pairs.count * Own::EVEN;
-    in_steps<Own::BYTES, F>(from, to, [&](auto none, int c) HERE {
+    for (int k = 0; Own::ARE_MANY && k < Own::COUNT; ++k)
+        in_steps<F>(from, to, [&](auto none, int c) HERE {
+            write(pairs.copied(k) + c, sums.template at<decltype(none)>(k, c, ahead));
+        });
+    in_steps<F>(from, to, [&](auto none, int c) HERE {
         typedef decltype(none) T;
         T in[Own::COUNT];
         UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k) {
-            in[k] = none;
-            UNROLLED
-            for (int i = 0; i < TERMS; ++i) {
-                const F* row = sums.rows[k][i] + c;
-                in[k] += sums.by[k][i] * read<T>(row);
-                if (sizeof(T) > sizeof(F)) __builtin_prefetch(row + ahead);
-            }
-        }
-        in_blocks<Own::TOGETHER>(pairs.count, [&](auto block, int p) HERE {
+        for (int k = 0; k < Own::COUNT; ++k)
+            if constexpr (Own::ARE_MANY) in[k] = read<T>(pairs.copied(k) + c);
+            else in[k] = sums.template at<T>(k, c, ahead);
+        in_blocks<Own::ARE_MANY ? 4 : 1>(pairs.count, [&](auto block, int p) HERE {
             constexpr int R = decltype(block)::size;
             T sum[R], difference[R];
             UNROLLED
@@ -101,19 +110,18 @@ __attribute__((noinline)) void to_moments(
     const Pairs<F>& pairs, long long ahead, int width) {
     typedef Order<DEGREE> Own;
     const F* odd_matrix = matrix + pairs.count * Own::EVEN;
-    in_steps<Own::BYTES, F>(0, width, [&](auto none, int c) HERE {
+    auto begin = [&](auto none, int k, int c) HERE {
+        typedef decltype(none) T;
+        if (!is_adding) return (k ? F(0) : first) - read<T>(taken[k] + c);
+        if (sizeof(T) > sizeof(F)) __builtin_prefetch(found[k] + ahead + c);
+        return read<T>(found[k] + c);
+    };
+    in_steps<F>(0, width, [&](auto none, int c) HERE {
         typedef decltype(none) T;
         T out[Own::COUNT];
         UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k) {
-            if (is_adding) {
-                out[k] = read<T>(found[k] + c);
-                if (sizeof(T) > sizeof(F)) __builtin_prefetch(found[k] + ahead + c);
-            } else {
-                out[k] = (k ? F(0) : first) - read<T>(taken[k] + c);
-            }
-        }
-        in_blocks<Own::TOGETHER>(pairs.count, [&](auto block, int p) HERE {
+        for (int k = 0; k < Own::COUNT; ++k) out[k] = Own::ARE_MANY ? none : begin(none, k, c);
+        in_blocks<Own::ARE_MANY ? 4 : 1>(pairs.count, [&](auto block, int p) HERE {
             constexpr int R = decltype(block)::size;
             T sum[R], difference[R];
             UNROLLED
@@ -136,8 +144,13 @@ __attribute__((noinline)) void to_moments(
                         out[Own::EVEN + k] += odd_matrix[k * pairs.count + p + a] * difference[a];
         });
         UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k) write(found[k] + c, out[k]);
+        for (int k = 0; k < Own::COUNT; ++k)
+            write((Own::ARE_MANY ? pairs.copied(k) : found[k]) + c, out[k]);
     });
+    for (int k = 0; Own::ARE_MANY && k < Own::COUNT; ++k)
+        in_steps<F>(0, width, [&](auto none, int c) HERE {
+            write(found[k] + c, begin(none, k, c) + read<decltype(none)>(pairs.copied(k) + c));
+        });
 }
 
 } // namespace ddrecon

@@ -33,7 +33,7 @@ def struct_kernel(name: str, bits: int, header: str, struct: str, function: str)
 
 
 def table(struct: str, rows: Iterable[Mapping[str, Any]]) -> Tensor:
-    """A `struct` of `given.h`, whole numbers for each of `rows`, which have its fields by name, [N, ...]."""
+    """A `struct` of `given.h` for each of `rows`, whole numbers by name, [N, ...]."""
     names = re.findall(r"(\w+)(?:\[\d\])*[,;]", _read(struct))
     numbers = [[*_flat(row[name] for name in names)] for row in rows]
     return torch.tensor(numbers, dtype=torch.int32)

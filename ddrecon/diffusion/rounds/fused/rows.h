@@ -114,7 +114,8 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             matrices[i] = of.matrices + group->matrices + i * group->pairs * COUNT;
     }
     INLINE Pairs<F> pairs_at(F* first, long long apart) const {
-        return {of.pairs + 2 * group->first_pair, group->pairs, group->odd_pairs, first, apart};
+        return {of.pairs + 2 * group->first_pair, group->pairs, group->odd_pairs, first, scratch_row(5 + of.most),
+                apart, of.pitch};
     }
     INLINE Here place(int s, int t) const {
         const int k = job.way > 0 ? s : of.depth - 1 - s;
