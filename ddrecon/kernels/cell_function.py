@@ -24,12 +24,12 @@ Tensors = tuple[Tensor, ...]
 
 
 def apply_cell(header: str, cell: str, outs: int, numbers: Tensor, *fields: Tensor) -> Tensors:
-    """What the `cell` of a `header` finds of `fields` [C or 1, z, y, x]: `outs` of them, [C, ...].
+    """What the `cell` of a `header` finds of `fields` [C, z, y, x]: `outs` of them, [C, ...].
 
-    `numbers` [N, C or 1], N > 0, are the same in all cells of a color. All of it is differentiated,
-    in both modes.
+    Fields of fewer colors, C divided by a whole number, come again and again. `numbers` [N, C or
+    1], N > 0, are the same in all cells of a color. All of it is differentiated, in both modes.
     """
-    colors = max(map(len, fields))
+    colors = max(numbers.shape[1], *map(len, fields))
     found: Tensors = _Cell.apply(header, cell, outs, numbers.expand(-1, colors), *fields)
     return found
 
@@ -43,16 +43,16 @@ class _Cell(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
-        ctx.code, tensors = inputs[:3], inputs[3:]
-        keep(ctx, *tensors)
+        ctx.header, ctx.cell, ctx.outs = inputs[:3]
+        keep(ctx, *inputs[3:])
 
     @staticmethod
     @differentiate_once
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         numbers, *fields = ctx.saved_tensors
-        found, sums = _run("cotangents", *ctx.code, numbers, fields, bars=bars)
+        found, sums = _run("cotangents", ctx.header, ctx.cell, ctx.outs, numbers, fields, bars=bars)
         numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
-        field_bars = (bar.sum_to_size(one.shape) for bar, one in zip(found, fields, strict=True))
+        field_bars = (_sum_colors(bar, len(one)) for bar, one in zip(found, fields, strict=True))
         return None, None, None, numbers_bar, *field_bars
 
     @staticmethod
@@ -67,11 +67,16 @@ class _Cell(torch.autograd.Function):
                 ],
             )
             numbers, *fields = values
-            given = {"d_numbers": d_numbers, "d_fields": d_fields}
-            return _run("tangents", *ctx.code, numbers, fields, **given)[0]
+            code = ctx.header, ctx.cell, ctx.outs, numbers, fields
+            return _run("tangents", *code, d_numbers=d_numbers, d_fields=d_fields)[0]
 
         found: Tensors = run_plainly(change, *ctx.saved_tensors, *changes[3:])
         return found
+
+
+def _sum_colors(bar: Tensor, channels: int) -> Tensor:
+    """`bar` [C, ...] of a field that has but so many colors."""
+    return bar if len(bar) == channels else bar.unflatten(0, (-1, channels)).sum(0)
 
 
 def _run(
@@ -84,14 +89,14 @@ def _run(
     **given: Any,
 ) -> tuple[Tensors, Tensor]:
     """What the kernel of that `kind` makes in all cells, and sums of cotangents [N, C * rows]."""
-    like = max(fields, key=len)
-    colors, *shape = like.shape
+    like, colors = fields[0], numbers.shape[1]
+    shape = like.shape[1:]
     # A row is a slice: a processor sees sooner that many arrays are gone through.
     width = 1 if like.is_cuda else math.prod(shape[1:])
     rows = math.prod(shape) // width
     is_back = kind == "cotangents"
     made: dict[str, Any] = {
-        "made": [like.new_empty(like.shape) for _ in range(len(fields) if is_back else outs)]
+        "made": [like.new_empty(colors, *shape) for _ in range(len(fields) if is_back else outs)]
     }
     if is_back:
         made["sums"] = like.new_empty(len(numbers), colors * rows)
@@ -101,7 +106,7 @@ def _run(
         "colors": colors,
         "numbers": numbers,
         "fields": fields,
-        "is_each": [len(field) == colors for field in fields],
+        "channels": [len(field) for field in fields],
     }
     kernel = _kernel(kind, header, cell, len(fields), outs, 8 * like.element_size())
     kernel.launch(colors * rows, own | given, made)
@@ -123,6 +128,6 @@ def _kernel(kind: str, header: str, cell: str, ins: int, outs: int, bits: int) -
         ),
     }[kind]  # fmt: skip
     name = f"{cell.split('<')[0].lower()}_{kind}"
-    text = f"find_{kind}<{cell}>(Row(item, width, rows, colors), is_each, fields, {arguments});"
-    given = f"int width, rows, colors, is_each[{ins}]; F *fields[{ins}], *numbers, {more}"
+    text = f"find_{kind}<{cell}>(Row(item, width, rows, colors), channels, fields, {arguments});"
+    given = f"int width, rows, colors, channels[{ins}]; F *fields[{ins}], *numbers, {more}"
     return TextKernel(name, bits, text, given, made, header)

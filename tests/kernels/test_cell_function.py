@@ -1,13 +1,16 @@
 """Functions of a cell: values, tangents and cotangents of all of them."""
 
+from pathlib import Path
+
 import pytest
 import torch
+from graphics_cards import assert_compiles
 from torch import Tensor
 from torch.autograd.gradcheck import gradcheck
 
 pytest.importorskip("warp", reason="Warp is not installed (extra `warp`)")
 
-from ddrecon.kernels.cell_function import apply_cell
+from ddrecon.kernels.cell_function import _kernel, apply_cell
 
 GAIN = "diffusion/rounds/fused/gain.h"
 CELLS = [(GAIN, "Gain<1, 0, 1>", 10, 8, 3), (GAIN, "Gain<0, 1, 0>", 2, 2, 3)]
@@ -32,3 +35,9 @@ def test_derivatives_are_those_of_values(
     for each in given:
         each.requires_grad_()
     assert gradcheck(find, given, check_forward_ad=True)
+
+
+def test_they_compile_for_graphics_cards(tmp_path: Path) -> None:
+    kinds = "values", "tangents", "cotangents"
+    cells = [(kind, *cell[:4], 32) for cell in CELLS for kind in kinds]
+    assert_compiles([_kernel(*each) for each in cells], tmp_path)
