@@ -12,8 +12,8 @@ struct Share {
     }
 };
 
-// A moment of higher degree by a factor, the number, as far from what it was to theta times what was
-// swept (E19). In: theta, what was swept, what was, unless that is nothing.
+// A moment of higher degree by a factor, the number, as far from what it was to theta times what
+// was swept (E19). In: theta, what was swept, what was, unless that is nothing.
 template <bool IS_BEGUN> struct Blend {
     static constexpr int INS = IS_BEGUN ? 3 : 2, OUTS = 1, NUMBERS = 1;
     template <class N> INLINE static void find(const N* in, const N* number, N* out) {

@@ -36,9 +36,9 @@ template <class F> INLINE const F* part_of(const F* const* parts, int k, long lo
     return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
 }
 
-// Of moments to a DEGREE, those even in x come first. Few stay in registers. Many rows, which lie far
-// apart, take each other's places in a cache: they are copied one after another to where they do
-// not, and each that is read counts for some pairs at once.
+// Of moments to a DEGREE, those even in x come first. Few stay in registers. Many rows, which lie
+// far apart, take each other's places in a cache: they are copied one after another to where they
+// do not, and each that is read counts for some pairs at once.
 template <int DEGREE> struct Order {
     static constexpr int EVEN = (DEGREE + 1) * (DEGREE + 2) / 2, ODD = DEGREE * (DEGREE + 1) / 2;
     static constexpr int COUNT = EVEN + ODD;
@@ -61,8 +61,7 @@ template <class F, int COUNT, int TERMS> struct Sums {
 
 // Radiance of pairs from moments that are sums; rows are `ahead` of the next ones, which are asked
 // for in time.
-template <int DEGREE, int TERMS, class F>
-__attribute__((noinline)) void to_directions(
+template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_directions(
     const F* matrix, const Sums<F, Order<DEGREE>::COUNT, TERMS>& sums, const Pairs<F>& pairs,
     long long ahead, int from, int to) {
     typedef Order<DEGREE> Own;
@@ -76,23 +75,22 @@ __attribute__((noinline)) void to_directions(
         T in[Own::COUNT];
         UNROLLED
         for (int k = 0; k < Own::COUNT; ++k)
-            if constexpr (Own::ARE_MANY) in[k] = read<T>(pairs.copied(k) + c);
-            else in[k] = sums.template at<T>(k, c, ahead);
+            if constexpr (Own::ARE_MANY)
+                in[k] = read<T>(pairs.copied(k) + c);
+            else
+                in[k] = sums.template at<T>(k, c, ahead);
         in_blocks<Own::ARE_MANY ? 4 : 1>(pairs.count, [&](auto block, int p) HERE {
             constexpr int R = decltype(block)::size;
             T sum[R], difference[R];
             UNROLLED
             for (int a = 0; a < R; ++a) sum[a] = difference[a] = none;
             UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k)
-                UNROLLED
-                for (int a = 0; a < R; ++a) sum[a] += matrix[(p + a) * Own::EVEN + k] * in[k];
-            if (p < pairs.odd_count)
-                UNROLLED
-                for (int k = 0; k < Own::ODD; ++k)
-                    UNROLLED
-                    for (int a = 0; a < R; ++a)
-                        difference[a] += odd_matrix[(p + a) * Own::ODD + k] * in[Own::EVEN + k];
+            for (int k = 0; k < Own::EVEN; ++k) UNROLLED
+            for (int a = 0; a < R; ++a) sum[a] += matrix[(p + a) * Own::EVEN + k] * in[k];
+            if (p < pairs.odd_count) UNROLLED
+            for (int k = 0; k < Own::ODD; ++k) UNROLLED
+            for (int a = 0; a < R; ++a)
+                difference[a] += odd_matrix[(p + a) * Own::ODD + k] * in[Own::EVEN + k];
             UNROLLED
             for (int a = 0; a < R; ++a) {
                 write(pairs.one(p + a) + c, sum[a] + difference[a]);
@@ -104,8 +102,7 @@ __attribute__((noinline)) void to_directions(
 
 // The transpose: moments that `found` rows get, or what is added to them. Those that nothing is in
 // yet begin with `first` in the mean, less the rows `taken`.
-template <int DEGREE, class F>
-__attribute__((noinline)) void to_moments(
+template <int DEGREE, class F> __attribute__((noinline)) void to_moments(
     const F* matrix, F* const* found, const F* const* taken, F first, bool is_adding,
     const Pairs<F>& pairs, long long ahead, int width) {
     typedef Order<DEGREE> Own;
@@ -133,15 +130,12 @@ __attribute__((noinline)) void to_moments(
                 difference[a] -= other;
             }
             UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k)
-                UNROLLED
-                for (int a = 0; a < R; ++a) out[k] += matrix[k * pairs.count + p + a] * sum[a];
-            if (p < pairs.odd_count)
-                UNROLLED
-                for (int k = 0; k < Own::ODD; ++k)
-                    UNROLLED
-                    for (int a = 0; a < R; ++a)
-                        out[Own::EVEN + k] += odd_matrix[k * pairs.count + p + a] * difference[a];
+            for (int k = 0; k < Own::EVEN; ++k) UNROLLED
+            for (int a = 0; a < R; ++a) out[k] += matrix[k * pairs.count + p + a] * sum[a];
+            if (p < pairs.odd_count) UNROLLED
+            for (int k = 0; k < Own::ODD; ++k) UNROLLED
+            for (int a = 0; a < R; ++a)
+                out[Own::EVEN + k] += odd_matrix[k * pairs.count + p + a] * difference[a];
         });
         UNROLLED
         for (int k = 0; k < Own::COUNT; ++k)

@@ -12,6 +12,7 @@ from ddrecon.diffusion.rounds.fused.by_rows import Rows
 from ddrecon.diffusion.rounds.fused.swept import (
     PARTS,
     Swept,
+    less_light,
     parts_of,
     split,
     units_of_parts,
@@ -102,7 +103,7 @@ class _Sweep(torch.autograd.Function):
     def forward(by_cells: bool, may_save: bool, *given: Any) -> tuple[Any, ...]:
         swept, threads = Swept.of(*given), thread_count(Swept.of(*given).like)
         if by_cells:
-            return *split(swept.less_light(Cells(swept).follow())), None
+            return *split(less_light(swept.light, Cells(swept).follow())), None
         is_saved = may_save and any(
             isinstance(each, Tensor) and each.requires_grad for each in given
         )
@@ -155,6 +156,6 @@ class _Sweep(torch.autograd.Function):
                 changed = Cells(swept, d_swept).follow()
             else:
                 changed, _ = Rows(swept, ctx.threads, d_swept).follow()
-            return split(d_swept.less_light(changed))
+            return split(less_light(d_swept.light, changed))
 
         return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None

@@ -2,8 +2,8 @@
 #include "ddrecon/diffusion/rounds/fused/lines.h"
 // Cells that radiance reaches, one a thread: sweeps on a GPU (E11, E12).
 //
-// All directions go on by a slice at a time, each across the axis along which it crosses most cells.
-// What scatters and I are arrays of all directions, [D, C, z, y, x].
+// All directions go on by a slice at a time, each across the axis along which it crosses most
+// cells. What scatters and I are arrays of all directions, [D, C, z, y, x].
 
 namespace ddrecon {
 
@@ -30,8 +30,10 @@ template <class N, bool SHARES_FIELD, class F> struct CellStep {
           own_e(of.extinction_channels > 1 ? color * cells : 0),
           own_sc(of.scattering_channels > 1 ? color * cells : 0) {}
     INLINE N pair(const F* values, const F* changes, long long at) const {
-        if constexpr (sizeof(N) == sizeof(F)) return values[at];
-        else return N(values[at], changes[at]);
+        if constexpr (sizeof(N) == sizeof(F))
+            return values[at];
+        else
+            return N(values[at], changes[at]);
     }
     INLINE N number(int which) const {
         return pair(of.scales, of.d_scales, which * of.colors + color);
@@ -73,9 +75,9 @@ template <class N, bool SHARES_FIELD, class F> struct CellStep {
                 add_masses(found, part, index(from));
             }
             for (int a = 0; a < 3; ++a)
-                from.at[a] = from.at[a] < 0               ? 0
-                           : from.at[a] < of.shape[a] ? from.at[a]
-                                                          : of.shape[a] - 1;
+                from.at[a] = from.at[a] < 0             ? 0
+                             : from.at[a] < of.shape[a] ? from.at[a]
+                                                        : of.shape[a] - 1;
             found.far += part * pair(of.near, of.d_near, all + index(from));
         }
         add_masses(found, F(1), index(own));
