@@ -25,10 +25,10 @@ Tensors = tuple[Tensor, ...]
 
 
 def apply_cell(header: str, cell: str, outs: int, numbers: Tensor, *fields: Tensor) -> Tensors:
-    """What the `cell` of a `header` finds of `fields` [C or 1, z, y, x]: `outs` of them, [C, ...].
+    """What the `cell` of a `header` finds of `fields` [C, z, y, x]: `outs` of them, [C, ...].
 
-    `numbers` [N, C or 1], N > 0, are the same in all cells of a color. All of it is differentiated,
-    in both modes.
+    Fields of fewer colors, C divided by a whole number, come again and again. `numbers` [N, C or
+    1], N > 0, are the same in all cells of a color. All of it is differentiated, in both modes.
     """
     colors, (z, y, x) = max(numbers.shape[1], *map(len, fields)), fields[0].shape[1:]
     # A row is a slice: a processor sees sooner that many arrays are gone through.
@@ -85,7 +85,7 @@ class RowFunction:
             "colors": colors,
             "numbers": numbers,
             "fields": fields,
-            "is_each": [len(field) == colors for field in fields],
+            "channels": [len(field) for field in fields],
         }
         self.kernel(kind, len(fields), 8 * like.element_size()).launch(
             items, {**own, **self.more, **given}, made
@@ -117,7 +117,7 @@ class _Found(torch.autograd.Function):
         (numbers, *fields), added = ctx.saved_tensors, ctx.function.added
         found, sums = ctx.function.run("cotangents", numbers, fields, bars=bars)
         numbers_bar = sums.double().view(*numbers.shape, -1).sum(-1).to(numbers)
-        field_bars = (bar.sum_to_size(one.shape) for bar, one in zip(found, fields, strict=True))
+        field_bars = (_sum_colors(bar, len(one)) for bar, one in zip(found, fields, strict=True))
         return None, numbers_bar, *field_bars, *(bars * added)[:added]
 
     @staticmethod
@@ -138,6 +138,11 @@ class _Found(torch.autograd.Function):
         return found
 
 
+def _sum_colors(bar: Tensor, channels: int) -> Tensor:
+    """`bar` [C, ...] of a field that has but so many colors."""
+    return bar if len(bar) == channels else bar.unflatten(0, (-1, channels)).sum(0)
+
+
 @functools.cache
 def _kernel(
     kind: str, ins: int, bits: int, header: str, name: str, place: str, declared: str, outs: int
@@ -156,8 +161,8 @@ def _kernel(
     }[kind]  # fmt: skip
     title = f"{name.split('<')[0].lower()}_{kind}"
     text = "const Row row(item, width, rows, colors);"
-    text += f"find_{kind}<{name}>(row, {place}is_each, fields, {arguments});"
+    text += f"find_{kind}<{name}>(row, {place}channels, fields, {arguments});"
     given = (
-        f"int width, rows, colors, is_each[{ins}]; F *fields[{ins}], *numbers, {more};{declared}"
+        f"int width, rows, colors, channels[{ins}]; F *fields[{ins}], *numbers, {more};{declared}"
     )
     return TextKernel(title, bits, text, given, made, header)

@@ -12,24 +12,25 @@ namespace ddrecon {
 // What an item does: one of the `rows` of a color, of `width` cells.
 struct Row {
     int width, color, colors;
-    long long item, items, start, at;
+    long long item, items, size, start, at;
     INLINE Row(int item, int width, int rows, int colors)
         : width(width),
           color(item / rows),
           colors(colors),
           item(item),
           items((long long)rows * colors),
+          size((long long)rows * width),
           start((long long)(item % rows) * width),
           at((long long)item * width) {}
-    // The row in each of COUNT arrays; in those of one color that all share, unless it `is_each`.
+    // The row in each of COUNT arrays; those of fewer colors, `channels`, come again and again.
     template <int COUNT, class P> INLINE void in_all(P* const* arrays, P** found) const {
         UNROLLED
         for (int k = 0; k < COUNT; ++k) found[k] = arrays[k] + at;
     }
     template <int COUNT, class P>
-    INLINE void in_all(P* const* arrays, const int* is_each, P** found) const {
+    INLINE void in_all(P* const* arrays, const int* channels, P** found) const {
         UNROLLED
-        for (int k = 0; k < COUNT; ++k) found[k] = arrays[k] + (is_each[k] ? at : start);
+        for (int k = 0; k < COUNT; ++k) found[k] = arrays[k] + (color % channels[k] * size + start);
     }
     template <int COUNT, class F> INLINE void of_color(const F* numbers, F* found) const {
         UNROLLED
@@ -38,10 +39,10 @@ struct Row {
 };
 
 template <class Cell, class F> INLINE void find_values(
-    const Row& row, const int* is_each, const F* const* fields, const F* numbers, F* const* made) {
+    const Row& row, const int* channels, const F* const* fields, const F* numbers, F* const* made) {
     const F* in[Cell::INS];
     F number[Cell::NUMBERS], *out[Cell::OUTS];
-    row.in_all<Cell::INS>(fields, is_each, in);
+    row.in_all<Cell::INS>(fields, channels, in);
     row.of_color<Cell::NUMBERS>(numbers, number);
     row.in_all<Cell::OUTS>(made, out);
     INDEPENDENT
@@ -56,13 +57,13 @@ template <class Cell, class F> INLINE void find_values(
 }
 
 template <class Cell, class F> INLINE void find_tangents(
-    const Row& row, const int* is_each, const F* const* fields, const F* const* d_fields,
+    const Row& row, const int* channels, const F* const* fields, const F* const* d_fields,
     const F* numbers, const F* d_numbers, F* const* made) {
     typedef Dual<F> N;
     const F *in[Cell::INS], *d_in[Cell::INS];
     F number[Cell::NUMBERS], d_number[Cell::NUMBERS], *out[Cell::OUTS];
-    row.in_all<Cell::INS>(fields, is_each, in);
-    row.in_all<Cell::INS>(d_fields, is_each, d_in);
+    row.in_all<Cell::INS>(fields, channels, in);
+    row.in_all<Cell::INS>(d_fields, channels, d_in);
     row.of_color<Cell::NUMBERS>(numbers, number);
     row.of_color<Cell::NUMBERS>(d_numbers, d_number);
     row.in_all<Cell::OUTS>(made, out);
@@ -82,14 +83,14 @@ template <class Cell, class F> INLINE void find_tangents(
 // Dual numbers with a direction for all that is given have the slopes by which cotangents `bars` of
 // what was found become those of what was given: of fields `made`, of numbers `sums` over a row.
 template <class Cell, class F> INLINE void find_cotangents(
-    const Row& row, const int* is_each, const F* const* fields, const F* numbers,
+    const Row& row, const int* channels, const F* const* fields, const F* numbers,
     const F* const* bars, F* const* made, F* sums) {
     REORDERED
     constexpr int GIVEN = Cell::INS + Cell::NUMBERS;
     typedef Dual<F, GIVEN> N;
     const F *in[Cell::INS], *bar[Cell::OUTS];
     F number[Cell::NUMBERS], sum[Cell::NUMBERS], *out[Cell::INS];
-    row.in_all<Cell::INS>(fields, is_each, in);
+    row.in_all<Cell::INS>(fields, channels, in);
     row.of_color<Cell::NUMBERS>(numbers, number);
     row.in_all<Cell::OUTS>(bars, bar);
     row.in_all<Cell::INS>(made, out);

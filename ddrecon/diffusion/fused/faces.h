@@ -202,24 +202,25 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
 
 // What an item does: its row's values, changes, or cotangents.
 template <class Flow, class F> INLINE void find_values(
-    const Row& row, const Mesh<F>& mesh, int own, F times, const int* is_each,
+    const Row& row, const Mesh<F>& mesh, int own, F times, const int* channels,
     const F* const* fields, const F* numbers, F* const* made) {
     const F* in[Flow::INS];
     F number[Flow::NUMBERS], *out[Flow::OUTS];
-    row.in_all<Flow::INS>(fields, is_each, in);
+    row.in_all<Flow::INS>(fields, channels, in);
     row.of_color<Flow::NUMBERS>(numbers, number);
     Flow::rows_of(row, mesh, made, out, own);
-    mesh.visit([&](const auto& mesh)
-                   HERE { Flow::find(row, mesh, in, number, out, row.color < own, times); });
+    mesh.visit([&](const auto& mesh) HERE {
+        Flow::find(row, mesh, in, number, out, row.color < own, times);
+    });
 }
 template <class Flow, class F> INLINE void find_tangents(
-    const Row& row, const Mesh<F>& mesh, int own, F times, const int* is_each,
+    const Row& row, const Mesh<F>& mesh, int own, F times, const int* channels,
     const F* const* fields, const F* const* d_fields, const F* numbers, const F* d_numbers,
     F* const* made) {
     const F *in[Flow::INS], *d_in[Flow::INS];
     F number[Flow::NUMBERS], d_number[Flow::NUMBERS], *out[Flow::OUTS];
-    row.in_all<Flow::INS>(fields, is_each, in);
-    row.in_all<Flow::INS>(d_fields, is_each, d_in);
+    row.in_all<Flow::INS>(fields, channels, in);
+    row.in_all<Flow::INS>(d_fields, channels, d_in);
     row.of_color<Flow::NUMBERS>(numbers, number);
     row.of_color<Flow::NUMBERS>(d_numbers, d_number);
     Flow::rows_of(row, mesh, made, out, own);
@@ -227,15 +228,16 @@ template <class Flow, class F> INLINE void find_tangents(
     Dual<F> duals[Flow::NUMBERS];
     for (int k = 0; k < Flow::INS; ++k) pairs[k] = {in[k], d_in[k]};
     for (int k = 0; k < Flow::NUMBERS; ++k) duals[k] = {number[k], d_number[k]};
-    mesh.visit([&](const auto& mesh)
-                   HERE { Flow::find(row, mesh, pairs, duals, out, row.color < own, times); });
+    mesh.visit([&](const auto& mesh) HERE {
+        Flow::find(row, mesh, pairs, duals, out, row.color < own, times);
+    });
 }
 template <class Flow, class F> INLINE void find_cotangents(
-    const Row& row, const Mesh<F>& mesh, int own, F times, const int* is_each,
+    const Row& row, const Mesh<F>& mesh, int own, F times, const int* channels,
     const F* const* fields, const F* numbers, const F* const* bars, F* const* made, F* sums) {
     const F *in[Flow::GIVEN], *bar[Flow::OUTS];
     F number[Flow::NUMBERS], sum[Flow::NUMBERS], *out[Flow::MADE];
-    row.in_all<Flow::GIVEN>(fields, is_each, in);
+    row.in_all<Flow::GIVEN>(fields, channels, in);
     row.of_color<Flow::NUMBERS>(numbers, number);
     row.in_all<Flow::MADE>(made, out);
     Flow::rows_of(row, mesh, bars, bar, own);

@@ -11,9 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.cells import COLLECT_CELL, FOLLOW_CELL, GIVEN, RETURN_CELL
-from ddrecon.diffusion.rounds.fused.schedule import POINTS, steps_of
-from ddrecon.diffusion.rounds.fused.share import constants
+from ddrecon.diffusion.rounds.fused.records import struct_kernel, table
+from ddrecon.diffusion.rounds.fused.schedule import steps_of
 from ddrecon.diffusion.rounds.fused.swept import Parts, Swept, moment_of, units_of_parts
 from ddrecon.grid import Grid
 from ddrecon.kernels.text import TextKernel
@@ -29,43 +28,40 @@ NUMBER_BARS = "scale_bars", "strength_bars", "inflow_bars"
 class Directions:
     """Some directions of a sweep, as kernels and sums are given them.
 
-    Of each, whole `numbers` [D, 17] and `parts` [D, 5] of its step, and what moments [K, D] are
-    made by, `summing` radiance, and `spreading` to it; the sum of their `weight`.
+    Of each a `Course` and `Parts`, and what moments [K, D] are made by, `summing` radiance, and
+    `spreading` to it; the sum of their `weight`.
     """
 
-    numbers: Tensor
+    courses: Tensor
     parts: Tensor
     summing: Tensor
     spreading: Tensor
     weight: float
 
-    @property
-    def count(self) -> int:
-        """How many they are."""
-        return len(self.numbers)
-
 
 class Cells:
-    """The arrays of a sweep on a GPU, and the launches of kernels on them."""
+    """The arrays of a sweep on a GPU, and the launches of kernels on them.
 
-    def __init__(self, swept: Swept):
-        self.swept, self.like = swept, swept.total()
+    Of a sweep and its `changes`, what is found is the change of what is swept.
+    """
+
+    def __init__(self, swept: Swept, changes: Swept | None = None):
+        self.swept, self.changes, self.like = swept, changes, swept.total()
         _, self.colors, *self.shape = self.like.shape
-        self.kernels = functools.partial(
-            cell_kernels, torch.finfo(self.like.dtype).bits, swept.scattering is None
-        )
 
     def follow(self) -> Tensor:
         """The moments of radiance [K, C, z, y, x]."""
-        found = torch.zeros_like(self.like)
-        for some in self._parts(arrays=2):
-            found += torch.tensordot(some.summing, self._follow(some)["light"], 1)
-            found[0] += some.weight * self.swept.scales[2].view(-1, 1, 1, 1)
+        found, inflow = torch.zeros_like(self.like), (self.changes or self.swept).scales[2]
+        for some in self._parts(arrays=2 if self.changes is None else 4):
+            _, made = self._follow(some)
+            light = made["light" if self.changes is None else "d_light"]
+            found += torch.tensordot(some.summing, light, 1)
+            found[0] += some.weight * inflow.view(-1, 1, 1, 1)
         return found
 
     def transpose(self, bars: Parts, varies_numbers: bool) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Cotangents of `scales` [3, C], of moments and of fields, of those `bars` of light."""
-        swept, (_, back, collect) = self.swept, self.kernels(varies_numbers)
+        swept = self.swept
         fields = [torch.zeros_like(field) for field in swept.fields]
         given_bars = torch.zeros_like(self.like)
         for k, total in enumerate(given_bars):
@@ -73,28 +69,26 @@ class Cells:
                 total += bar
         found, scales = torch.zeros_like(self.like), torch.zeros_like(swept.scales)
         for some in self._parts(arrays=10):
-            given = self._follow(some)
-            light = given["light"]
-            given["bar"] = torch.tensordot(some.summing.T, given_bars, 1)
-            names = BARS[: 2 + len(fields)] + NUMBER_BARS * varies_numbers
-            given |= {name: torch.empty_like(light) for name in names}
-            for number in reversed(range(max(self.shape))):
-                self._launch(back, given | {"slice": number}, some.count * self.colors * self.most)
-            given["q_bars"] = q_bars = torch.empty_like(light)
-            self._launch(collect, given, light.numel())
-            found += torch.tensordot(some.spreading, q_bars, 1)
-            for field, bar in zip(fields, (given["returning"], light), strict=False):
+            given, made = self._follow(some)
+            light = made["light"]
+            made["bar"] = torch.tensordot(some.summing.T, given_bars, 1).contiguous()
+            names = *BARS[: 2 + len(fields)], *NUMBER_BARS * varies_numbers, "q_bars"
+            made |= {name: torch.empty_like(light) for name in names}
+            flag = f", {str(varies_numbers).lower()}"
+            self._cross(f"return_cells<{self._flag}{flag}>", some, given, made, is_backward=True)
+            self._kernel(f"collect_cells<{self._flag}>").launch(light.numel(), given, made)
+            found += torch.tensordot(some.spreading, made["q_bars"], 1)
+            for field, bar in zip(fields, (made["returning"], light), strict=False):
                 field += bar.sum(0).sum_to_size(field.shape)
             if varies_numbers:
-                scales += torch.stack(
-                    [given[n].double().sum((0, 2, 3, 4)).to(scales) for n in NUMBER_BARS]
-                )
+                sums = [made[name].double().sum((0, 2, 3, 4)) for name in NUMBER_BARS]
+                scales += torch.stack(sums).to(scales)
         return scales, found, fields
 
     @property
-    def most(self) -> int:
-        """Cells of the largest slice."""
-        return torch.Size(self.shape).numel() // min(self.shape)
+    def _flag(self) -> str:
+        """Whether extinction and scattering have the same field, in C++."""
+        return str(self.swept.scattering is None).lower()
 
     def _parts(self, arrays: int) -> Iterator[Directions]:
         """Directions, so many at once that `arrays` of them have room."""
@@ -106,31 +100,48 @@ class Cells:
             place = self.like.dtype, self.like.device
             yield _directions(*of, first, most, degree, *place)
 
-    def _follow(self, some: Directions) -> dict[str, Any]:
-        """Radiance along directions, `light` [D, C, z, y, x], and what else kernels are given."""
-        swept, like = self.swept, self.like
-        near = torch.tensordot(some.spreading.T, like, 1).contiguous()
-        scattering = swept.extinction if swept.scattering is None else swept.scattering
-        depth, height, width = self.shape
-        given: dict[str, Any] = {
-            "near": near, "light": torch.empty_like(near),
-            "extinction": swept.extinction.contiguous(), "scattering": scattering.contiguous(),
-            "scales": swept.scales, "parts": some.parts, "steps": some.numbers,
-            "extinction_channels": len(swept.extinction), "scattering_channels": len(scattering),
-            "depth": depth, "height": height, "width": width, "colors": self.colors,
-            "most": self.most, "slice": 0,
+    def _follow(self, some: Directions) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What kernels are given, and radiance along directions, `light` [D, C, z, y, x]."""
+        swept, changes, number = self.swept, self.changes, "F"
+        near = torch.tensordot(some.spreading.T, self.like, 1)
+        made = {"light": near.new_empty(near.shape)}
+        given = {
+            "near": near, "scales": swept.scales, "parts": some.parts, "courses": some.courses,
+            "extinction": swept.fields[0], "extinction_channels": len(swept.fields[0]),
+            "scattering": swept.fields[-1], "scattering_channels": len(swept.fields[-1]),
+            "shape": self.shape, "colors": self.colors, "most": self._most, "slice": 0,
         }  # fmt: skip
-        for number in range(max(self.shape)):
-            self._launch(
-                self.kernels(False)[0],
-                given | {"slice": number},
-                some.count * self.colors * self.most,
-            )
-        return given
+        if changes is not None:
+            number = "Dual<F>"
+            made["d_light"] = near.new_empty(near.shape)
+            given |= {
+                "d_near": torch.tensordot(some.spreading.T, swept.total_change(changes), 1),
+                "d_extinction": changes.fields[0], "d_scattering": changes.fields[-1],
+                "d_scales": changes.scales,
+            }  # fmt: skip
+        self._cross(f"follow_cells<{number}, {self._flag}>", some, given, made)
+        return given, made
 
-    def _launch(self, kernel: TextKernel, values: dict[str, Any], count: int) -> None:
-        made = {name: value for name, value in values.items() if name in kernel.made}
-        kernel.launch(count, {n: v for n, v in values.items() if n not in made}, made)
+    @property
+    def _most(self) -> int:
+        """Cells of the largest slice."""
+        return torch.Size(self.shape).numel() // min(self.shape)
+
+    def _cross(
+        self,
+        function: str,
+        some: Directions,
+        given: dict[str, Any],
+        made: dict[str, Any],
+        is_backward: bool = False,
+    ) -> None:
+        """Goes through the slices, one after the other."""
+        bound, slices = self._kernel(function).bind(given, made), range(max(self.shape))
+        for number in reversed(slices) if is_backward else slices:
+            bound.launch(len(some.courses) * self.colors * self._most, slice=number)
+
+    def _kernel(self, function: str) -> TextKernel:
+        return cell_kernel(function, torch.finfo(self.like.dtype).bits)
 
 
 @functools.cache
@@ -145,12 +156,6 @@ def _directions(
 ) -> Directions:
     """At most so many directions of a sweep from the `first`; a GPU would wait for each copy."""
     steps, weights = zip(*steps_of(grid, directions)[first : first + most], strict=True)
-    numbers, parts = [], []
-    for step in steps:
-        fill = POINTS - len(step.points)
-        places = [n for point in step.points for n in point] + [0] * 3 * fill
-        numbers.append([*step.signs, step.axis, len(step.points), *places])
-        parts.append([step.half, *step.weights, *[0.0] * fill])
     weight, ways = (
         torch.tensor(each, dtype=torch.float64)
         for each in (weights, [step.direction for step in steps])
@@ -158,8 +163,8 @@ def _directions(
     values, units = harmonics(ways, degree), units_of_parts(degree)[:, None]
     with torch.inference_mode(False):
         return Directions(
-            torch.tensor(numbers, dtype=torch.int32, device=device),
-            torch.tensor(parts, dtype=dtype, device=device),
+            table("Course", [step.course() for step in steps]).to(device),
+            torch.tensor([step.parts() for step in steps], dtype=dtype, device=device),
             (units * values * weight).to(device, dtype),
             (values / units).to(device, dtype),
             math.fsum(weights),
@@ -167,15 +172,6 @@ def _directions(
 
 
 @functools.cache
-def cell_kernels(bits: int, shares_field: bool, varies_numbers: bool) -> list[TextKernel]:
-    """The kernels that follow radiance, follow it back, and collect what steps from a cell have."""
-    fixed = constants(SHARES_FIELD=shares_field, VARIES_NUMBERS=varies_numbers)
-    texts = {
-        "follow": (FOLLOW_CELL, "light"),
-        "return": (RETURN_CELL, " ".join(("bar", *BARS, *NUMBER_BARS))),
-        "collect": (COLLECT_CELL, "q_bars returning light"),
-    }
-    return [
-        TextKernel(f"{name}_cells", bits, fixed + text, GIVEN, made)
-        for name, (text, made) in texts.items()
-    ]
+def cell_kernel(function: str, bits: int) -> TextKernel:
+    """The kernel of a function of `sweep_cells.h`."""
+    return struct_kernel(function.split("<")[0], bits, "sweep_cells.h", "CellSweep", function)

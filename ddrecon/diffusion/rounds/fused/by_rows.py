@@ -23,7 +23,8 @@ FEW = 4
 LARGE = 2**20
 """Cells of a large volume."""
 NUMBERS = 7
-"""Rows of a lane's own besides those of directions: two empty ones, and what the adjoint sums."""
+"""Rows of a lane's own besides those of directions and of moments: two empty ones, and what the
+adjoint sums."""
 
 
 class Rows:
@@ -106,7 +107,7 @@ class Rows:
 
     @property
     def _scratch_rows(self) -> int:
-        return NUMBERS + self.tables.most
+        return NUMBERS + self.tables.most + self.count
 
     def _run(
         self, function: str, flags: str, given: dict[str, Any], made: dict[str, Any]

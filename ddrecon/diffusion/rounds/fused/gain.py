@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
-from ddrecon.diffusion.rounds.fused.share import numbers_by_color
 from ddrecon.kernels.cell_function import apply_cell
 from ddrecon.light.moments import Moments, Vector
 from ddrecon.medium.coefficients import Medium
@@ -25,11 +25,13 @@ def gain_fused(
     for light in (change, off):
         if light is not None:
             fields += [light.mean, *(light.flux or ())]
+    numbers = medium.extinction.scale * length, medium.remaining.scale, cosine
+    colors = max(map(Tensor.numel, numbers))
     source, mean, *flux = apply_cell(
         "diffusion/rounds/fused/gain.h",
         f"Gain<{', '.join(str(int(flag)) for flag in is_so)}>",
         2 if change.flux is None else 8,
-        numbers_by_color(medium, length, [medium.remaining.scale, cosine]),
+        torch.stack([one.reshape(-1).expand(colors) for one in numbers]),
         *fields,
     )
     if not flux:

@@ -52,4 +52,14 @@ template <class F> struct Surrounded {
     int fields, extinction_channels, scattering_channels, depth, height, width, pitch, margin;
 };
 
+// What kernels of cells are given (`sweep_cells.h`).
+template <class F> struct CellSweep {
+    const F *extinction, *scattering, *scales, *near;
+    const F *d_extinction, *d_scattering, *d_scales, *d_near, *parts;
+    const int* courses;
+    int slice, shape[3], colors, most, extinction_channels, scattering_channels;
+    F *light, *d_light, *bar, *q_bars, *returning, *far_bar, *mass_bar, *scattered_bar;
+    F *scale_bars, *strength_bars, *inflow_bars;
+};
+
 } // namespace ddrecon

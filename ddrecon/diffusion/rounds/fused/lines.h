@@ -19,25 +19,28 @@ template <class F> struct Line<Dual<F>> {
 };
 // A line whose changes lie so much behind its values.
 template <class N, class F> INLINE Line<N> line_at(const F* at, long long behind) {
-    if constexpr (sizeof(N) == sizeof(F)) return {(F*)at};
-    else return {(F*)at, (F*)at + behind};
+    if constexpr (sizeof(N) == sizeof(F))
+        return {(F*)at};
+    else
+        return {(F*)at, (F*)at + behind};
 }
 
 // What reaches cell c from those where its step begins.
 template <int POINTS, class N, class F>
 INLINE N gather(const Line<N>* from, const F* part, long long c) {
-    if constexpr (POINTS == 1) return from[0][c];
+    if constexpr (POINTS == 1)
+        return from[0][c];
     else
-        return part[0] * from[0][c] + part[1] * from[1][c] + part[2] * from[2][c]
-             + part[3] * from[3][c];
+        return part[0] * from[0][c] + part[1] * from[1][c] + part[2] * from[2][c] +
+               part[3] * from[3][c];
 }
 
-template <int POINTS, class F>
-INLINE F gather(const F* const* from, const F* part, long long c) {
-    if constexpr (POINTS == 1) return from[0][c];
+template <int POINTS, class F> INLINE F gather(const F* const* from, const F* part, long long c) {
+    if constexpr (POINTS == 1)
+        return from[0][c];
     else
-        return part[0] * from[0][c] + part[1] * from[1][c] + part[2] * from[2][c]
-             + part[3] * from[3][c];
+        return part[0] * from[0][c] + part[1] * from[1][c] + part[2] * from[2][c] +
+               part[3] * from[3][c];
 }
 
 template <class F> struct Vectors {

@@ -6,12 +6,24 @@
 
 namespace ddrecon {
 
+// So many at once, R or one: `step` is told how many, and the first.
+template <int N> struct Block {
+    static constexpr int size = N;
+};
+template <int R, class Step> INLINE void in_blocks(int count, Step step) {
+    int i = 0;
+    if constexpr (R > 1)
+        for (; i + R <= count; i += R) step(Block<R>(), i);
+    for (; i < count; ++i) step(Block<1>(), i);
+}
+
 // Radiance at cells of a row, by its pairs. The second of a pair is -1 where there is none.
 template <class F> struct Pairs {
     const int* places;
     int count, odd_count;
-    F* lines;
-    long long stride;
+    F *lines, *copies;
+    long long stride, pitch;
+    INLINE F* copied(int k) const { return copies + k * pitch; }
     INLINE bool is_one(int p) const { return places[2 * p + 1] < 0; }
     INLINE F* one(int p) const { return lines + places[2 * p] * stride; }
     INLINE F* other(int p) const { return lines + places[2 * p + 1] * stride; }
@@ -24,90 +36,115 @@ template <class F> INLINE const F* part_of(const F* const* parts, int k, long lo
     return k < 4 ? parts[places[k]] : parts[4] ? parts[4] + (k - 4) * all : nullptr;
 }
 
-// Of moments to a DEGREE, those even in x come first.
+// Of moments to a DEGREE, those even in x come first. Few stay in registers. Many rows, which lie
+// far apart, take each other's places in a cache: they are copied one after another to where they
+// do not, and each that is read counts for some pairs at once.
 template <int DEGREE> struct Order {
     static constexpr int EVEN = (DEGREE + 1) * (DEGREE + 2) / 2, ODD = DEGREE * (DEGREE + 1) / 2;
     static constexpr int COUNT = EVEN + ODD;
+    static constexpr bool ARE_MANY = COUNT > 16;
 };
 // Sums of rows, each by a number, for each moment.
 template <class F, int COUNT, int TERMS> struct Sums {
     const F* rows[COUNT][TERMS];
     F by[COUNT][TERMS];
+    template <class T> INLINE T at(int k, int c, long long ahead) const {
+        T sum{};
+        UNROLLED
+        for (int i = 0; i < TERMS; ++i) {
+            sum += by[k][i] * read<T>(rows[k][i] + c);
+            if (sizeof(T) > sizeof(F)) __builtin_prefetch(rows[k][i] + ahead + c);
+        }
+        return sum;
+    }
 };
 
 // Radiance of pairs from moments that are sums; rows are `ahead` of the next ones, which are asked
 // for in time.
-template <int DEGREE, int TERMS, class F>
-__attribute__((noinline)) void to_directions(
+template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_directions(
     const F* matrix, const Sums<F, Order<DEGREE>::COUNT, TERMS>& sums, const Pairs<F>& pairs,
     long long ahead, int from, int to) {
     typedef Order<DEGREE> Own;
     const F* odd_matrix = matrix + pairs.count * Own::EVEN;
+    for (int k = 0; Own::ARE_MANY && k < Own::COUNT; ++k)
+        in_steps<F>(from, to, [&](auto none, int c) HERE {
+            write(pairs.copied(k) + c, sums.template at<decltype(none)>(k, c, ahead));
+        });
     in_steps<F>(from, to, [&](auto none, int c) HERE {
         typedef decltype(none) T;
         T in[Own::COUNT];
         UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k) {
-            in[k] = none;
+        for (int k = 0; k < Own::COUNT; ++k)
+            if constexpr (Own::ARE_MANY)
+                in[k] = read<T>(pairs.copied(k) + c);
+            else
+                in[k] = sums.template at<T>(k, c, ahead);
+        in_blocks<Own::ARE_MANY ? 4 : 1>(pairs.count, [&](auto block, int p) HERE {
+            constexpr int R = decltype(block)::size;
+            T sum[R], difference[R];
             UNROLLED
-            for (int i = 0; i < TERMS; ++i) {
-                const F* row = sums.rows[k][i] + c;
-                in[k] += sums.by[k][i] * read<T>(row);
-                if (sizeof(T) > sizeof(F)) __builtin_prefetch(row + ahead);
+            for (int a = 0; a < R; ++a) sum[a] = difference[a] = none;
+            UNROLLED
+            for (int k = 0; k < Own::EVEN; ++k) UNROLLED
+            for (int a = 0; a < R; ++a) sum[a] += matrix[(p + a) * Own::EVEN + k] * in[k];
+            if (p < pairs.odd_count) UNROLLED
+            for (int k = 0; k < Own::ODD; ++k) UNROLLED
+            for (int a = 0; a < R; ++a)
+                difference[a] += odd_matrix[(p + a) * Own::ODD + k] * in[Own::EVEN + k];
+            UNROLLED
+            for (int a = 0; a < R; ++a) {
+                write(pairs.one(p + a) + c, sum[a] + difference[a]);
+                if (!pairs.is_one(p + a)) write(pairs.other(p + a) + c, sum[a] - difference[a]);
             }
-        }
-        for (int p = 0; p < pairs.count; ++p) {
-            T sum = none, difference = none;
-            UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k) sum += matrix[p * Own::EVEN + k] * in[k];
-            if (p < pairs.odd_count)
-                UNROLLED
-                for (int k = 0; k < Own::ODD; ++k)
-                    difference += odd_matrix[p * Own::ODD + k] * in[Own::EVEN + k];
-            write(pairs.one(p) + c, sum + difference);
-            if (!pairs.is_one(p)) write(pairs.other(p) + c, sum - difference);
-        }
+        });
     });
 }
 
 // The transpose: moments that `found` rows get, or what is added to them. Those that nothing is in
 // yet begin with `first` in the mean, less the rows `taken`.
-template <int DEGREE, class F>
-__attribute__((noinline)) void to_moments(
+template <int DEGREE, class F> __attribute__((noinline)) void to_moments(
     const F* matrix, F* const* found, const F* const* taken, F first, bool is_adding,
     const Pairs<F>& pairs, long long ahead, int width) {
     typedef Order<DEGREE> Own;
     const F* odd_matrix = matrix + pairs.count * Own::EVEN;
+    auto begin = [&](auto none, int k, int c) HERE {
+        typedef decltype(none) T;
+        if (!is_adding) return (k ? F(0) : first) - read<T>(taken[k] + c);
+        if (sizeof(T) > sizeof(F)) __builtin_prefetch(found[k] + ahead + c);
+        return read<T>(found[k] + c);
+    };
     in_steps<F>(0, width, [&](auto none, int c) HERE {
         typedef decltype(none) T;
         T out[Own::COUNT];
         UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k) {
-            if (is_adding) {
-                out[k] = read<T>(found[k] + c);
-                if (sizeof(T) > sizeof(F)) __builtin_prefetch(found[k] + ahead + c);
-            } else {
-                out[k] = (k ? F(0) : first) - read<T>(taken[k] + c);
-            }
-        }
-        for (int p = 0; p < pairs.count; ++p) {
-            const T one = read<T>(pairs.one(p) + c);
-            T sum = one, difference = one;
-            if (!pairs.is_one(p)) {
-                const T other = read<T>(pairs.other(p) + c);
-                sum = one + other;
-                difference = one - other;
+        for (int k = 0; k < Own::COUNT; ++k) out[k] = Own::ARE_MANY ? none : begin(none, k, c);
+        in_blocks<Own::ARE_MANY ? 4 : 1>(pairs.count, [&](auto block, int p) HERE {
+            constexpr int R = decltype(block)::size;
+            T sum[R], difference[R];
+            UNROLLED
+            for (int a = 0; a < R; ++a) {
+                sum[a] = difference[a] = read<T>(pairs.one(p + a) + c);
+                if (pairs.is_one(p + a)) continue;
+                const T other = read<T>(pairs.other(p + a) + c);
+                sum[a] += other;
+                difference[a] -= other;
             }
             UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k) out[k] += matrix[k * pairs.count + p] * sum;
-            if (p < pairs.odd_count)
-                UNROLLED
-                for (int k = 0; k < Own::ODD; ++k)
-                    out[Own::EVEN + k] += odd_matrix[k * pairs.odd_count + p] * difference;
-        }
+            for (int k = 0; k < Own::EVEN; ++k) UNROLLED
+            for (int a = 0; a < R; ++a) out[k] += matrix[k * pairs.count + p + a] * sum[a];
+            if (p < pairs.odd_count) UNROLLED
+            for (int k = 0; k < Own::ODD; ++k) UNROLLED
+            for (int a = 0; a < R; ++a)
+                out[Own::EVEN + k] += odd_matrix[k * pairs.count + p + a] * difference[a];
+        });
         UNROLLED
-        for (int k = 0; k < Own::COUNT; ++k) write(found[k] + c, out[k]);
+        for (int k = 0; k < Own::COUNT; ++k)
+            write((Own::ARE_MANY ? pairs.copied(k) : found[k]) + c, out[k]);
     });
+    for (int k = 0; Own::ARE_MANY && k < Own::COUNT; ++k)
+        in_steps<F>(0, width, [&](auto none, int c) HERE {
+            write(found[k] + c, begin(none, k, c) + read<decltype(none)>(pairs.copied(k) + c));
+        });
 }
 
 } // namespace ddrecon

@@ -21,8 +21,8 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
     static constexpr int COUNT = Light::COUNT, KINDS = SHARES_FIELD ? 3 : 4;
     enum { RETURNING, FAR, MASS, SCATTERED };
 
-    // Cells whose steps begin at those of a row, by their lines. What begins beyond a face of the box
-    // took q at the face: then there may be two for each slice, row and column.
+    // Cells whose steps begin at those of a row, by their lines. What begins beyond a face of the
+    // box took q at the face: then there may be two for each slice, row and column.
     struct Target {
         const F* lines;
         int shift;
@@ -90,8 +90,10 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         if (VARIES_NUMBERS) clear(scale_bar), clear(strength_bar), clear(inflow_bar);
         const auto begin = light.find_beginnings(here);
         for (int j = 0; j < light.group->members; ++j)
-            if (light.course(j).count == 1) return_direction<1>(here, begin, j);
-            else return_direction<4>(here, begin, j);
+            if (light.course(j).count == 1)
+                return_direction<1>(here, begin, j);
+            else
+                return_direction<4>(here, begin, j);
         if (VARIES_NUMBERS) {
             const F* const rows[3] = {scale_bar, strength_bar, inflow_bar};
             for (int i = 0; i < 3; ++i) of.sums[3 * job.sums_at + i] += total(rows[i], width);
@@ -99,16 +101,21 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         to_moments<DEGREE>(light.matrices[1], found, taken, F(0), is_adding, pairs, ahead, width);
     }
 
-    template <int POINTS>
-    INLINE void return_direction(
+    template <int POINTS> INLINE void return_direction(
         const Here& here, const typename Light::Beginnings& begin, int j) const {
         const Steps<POINTS> steps = light.template find_steps<POINTS>(here, begin, j);
         const Course& course = light.course(j);
         const int x_way = course.signs[2];
         F* own = line(here.s, here.t, j);
-        Back<POINTS> back = {{}, {}, bar_of(j), own, own + FAR * pitch, own + MASS * pitch,
+        Back<POINTS> back = {{},
+                             {},
+                             bar_of(j),
+                             own,
+                             own + FAR * pitch,
+                             own + MASS * pitch,
                              own + (KINDS - 1) * pitch};
-        for (int kind = 0; kind < KINDS; ++kind) own[kind * pitch - 1] = own[kind * pitch + width] = F(0);
+        for (int kind = 0; kind < KINDS; ++kind)
+            own[kind * pitch - 1] = own[kind * pitch + width] = F(0);
         // What returns from the cells to which light went on, but for those of this row.
         const F* next[4];
         for (int i = 0; i < 4; ++i) {
@@ -180,18 +187,16 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
         passing[-1] = passing[width] = F(0);
         carry_on(bars, passing + x_way, -x_way, width);
     }
-    template <bool IS_ALONG, int POINTS>
-    INLINE void return_steps(
+    template <bool IS_ALONG, int POINTS> INLINE void return_steps(
         const Here& here, const Steps<POINTS>& steps, const Back<POINTS>& back) const {
         return_stretch<IS_ALONG, EMPTY>(steps, back, 0, here.from);
         if (steps.half * here.deepest < F(0.25))
             return_stretch<IS_ALONG, THIN>(steps, back, here.from, here.to);
-        else return_stretch<IS_ALONG, ANY>(steps, back, here.from, here.to);
+        else
+            return_stretch<IS_ALONG, ANY>(steps, back, here.from, here.to);
         return_stretch<IS_ALONG, EMPTY>(steps, back, here.to, width);
     }
-    // E11 transposed: cotangents of a step's numbers.
-    template <bool IS_ALONG, Matter MATTER, int POINTS>
-    INLINE void return_stretch(
+    template <bool IS_ALONG, Matter MATTER, int POINTS> INLINE void return_stretch(
         const Steps<POINTS>& given, const Back<POINTS>& given_back, int from, int to) const {
         const Steps<POINTS> steps = given;
         const Back<POINTS> back = given_back;
@@ -205,25 +210,22 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
             const F far = gather<POINTS>(steps.near_from, steps.part, c), near = steps.near[c];
             const F mass = IS_EMPTY ? F(0) : steps.mass(c);
             const F scattering_mass = IS_EMPTY ? F(0) : steps.scattering_mass(c);
-            const F scattering_depth = scattering_mass * strength, radiance_bar = back.bar[c];
+            const F radiance_bar = back.bar[c];
             // That of the source: what goes on, returns.
-            const F source_bar = IS_ALONG ? source_bars[c]
-                                          : radiance_bar + gather<POINTS>(back.from, steps.part, c);
-            const Passage<Dual<F>> by = pass_through<MATTER>(scale * mass, Dual<F>(scale * mass, F(1)));
-            const Dual<F> after = light_after(arriving, far, near, scattering_depth, inflow, by);
-            const F depth_bar = source_bar * after.by[0];
-            const F scattering_depth_bar = source_bar * scattered(far, near, by).value;
-            const F scattered_bar = steps.half * (scattering_depth_bar * strength);
-            const F line_bar = source_bar * scattering_depth;
-            back.mass[c] = steps.half * (depth_bar * scale) + (SHARES_FIELD ? scattered_bar : F(0));
-            if constexpr (!SHARES_FIELD) back.scattered[c] = scattered_bar;
-            back.returning[c] = source_bar * by.passed.value;
-            back.far[c] = line_bar * (by.phi.value - by.psi.value);
-            back.bar[c] = line_bar * by.psi.value;
+            const F source_bar =
+                IS_ALONG ? source_bars[c] : radiance_bar + gather<POINTS>(back.from, steps.part, c);
+            const StepBars<F> bars = return_step<MATTER>(
+                source_bar, arriving, far, near, mass, scattering_mass, scale, strength, inflow);
+            const F scattered = steps.half * bars.scattering_mass;
+            back.mass[c] = steps.half * bars.mass + (SHARES_FIELD ? scattered : F(0));
+            if constexpr (!SHARES_FIELD) back.scattered[c] = scattered;
+            back.returning[c] = bars.arriving;
+            back.far[c] = bars.far;
+            back.bar[c] = bars.near;
             if constexpr (VARIES_NUMBERS) {
-                scale_bar[c] += depth_bar * mass;
-                strength_bar[c] += scattering_depth_bar * scattering_mass;
-                inflow_bar[c] += radiance_bar - source_bar * by.lost.value;
+                scale_bar[c] += bars.scale;
+                strength_bar[c] += bars.strength;
+                inflow_bar[c] += radiance_bar + bars.inflow;
             }
         }
     }

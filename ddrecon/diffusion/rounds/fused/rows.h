@@ -8,11 +8,11 @@
 // before: wherever a direction goes, they were done already. Of a row and a direction there are two
 // lines of numbers: NEAR, what scatters along it, and LIGHT, I less the light from outside; of
 // tangents their changes as well. Lines of the last slice are kept, each in the place of one that
-// no step needs any more. I before each slab of slices is saved: for the adjoint, light goes through
-// a slab once more, and lines of all its slices are kept.
+// no step needs any more. I before each slab of slices is saved: for the adjoint, light goes
+// through a slab once more, and lines of all its slices are kept.
 //
-// Behind each row there are at least two cells that hold what is beyond its ends. Where a step meets
-// no medium, light is only moved: that is decided for stretches of a row.
+// Behind each row there are at least two cells that hold what is beyond its ends. Where a step
+// meets no medium, light is only moved: that is decided for stretches of a row.
 
 namespace ddrecon {
 
@@ -31,9 +31,9 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         F deepest;
         const int* range;
     };
-    // Lines where steps to a row may begin, of the group's first direction: in this slice or the one
-    // before, in this row or the one before. Beyond the faces of the box are neither medium nor I; q
-    // is repeated there.
+    // Lines where steps to a row may begin, of the group's first direction: in this slice or the
+    // one before, in this row or the one before. Beyond the faces of the box are neither medium nor
+    // I; q is repeated there.
     struct Beginnings {
         Line<N> near[4], light[4];
         bool is_inside[4];
@@ -45,8 +45,10 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         F half, part[POINTS];
         INLINE N mass(int c) const { return half * (e[c] + gather<POINTS>(e_from, part, c)); }
         INLINE N scattering_mass(int c) const {
-            if constexpr (SHARES_FIELD) return mass(c);
-            else return half * (sc[c] + gather<POINTS>(sc_from, part, c));
+            if constexpr (SHARES_FIELD)
+                return mass(c);
+            else
+                return half * (sc[c] + gather<POINTS>(sc_from, part, c));
         }
     };
 
@@ -71,8 +73,11 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
           stride((long long)LINES * of.most * of.pitch),
           scratch(of.scratch + (long long)job.lane * of.scratch_rows * of.pitch),
           empty(scratch + of.margin),
-          lines(of.lines + job.lane * ((KEEPS ? (of.slab + 1LL) * of.height : of.height + 2) * stride
-                                       + of.margin) + of.margin),
+          lines(
+              of.lines +
+              job.lane *
+                  ((KEEPS ? (of.slab + 1LL) * of.height : of.height + 2) * stride + of.margin) +
+              of.margin),
           e_cells(field(of.extinction, of.extinction_channels)),
           sc_cells(field(of.scattering, of.scattering_channels)),
           scale(number(0)),
@@ -85,8 +90,10 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
     }
     INLINE N number(int which) const {
         const int at = which * of.colors + job.color;
-        if constexpr (IS_CHANGED) return N(of.scales[at], of.d_scales[at]);
-        else return of.scales[at];
+        if constexpr (IS_CHANGED)
+            return N(of.scales[at], of.d_scales[at]);
+        else
+            return of.scales[at];
     }
     // The first rows are empty.
     INLINE F* scratch_row(int i) const { return scratch + (2LL + i) * of.pitch; }
@@ -110,20 +117,26 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
 
     INLINE void enter_group(int g) {
         group = (const Group*)of.groups + g;
-        const int even = group->pairs * Order<DEGREE>::EVEN;
-        const int size = even + group->odd_pairs * Order<DEGREE>::ODD;
-        for (int i = 0; i < 4; ++i) matrices[i] = of.matrices + group->matrices + i * size;
+        for (int i = 0; i < 4; ++i)
+            matrices[i] = of.matrices + group->matrices + i * group->pairs * COUNT;
     }
     INLINE Pairs<F> pairs_at(F* first, long long apart) const {
-        return {of.pairs + 2 * group->first_pair, group->pairs, group->odd_pairs, first, apart};
+        return {of.pairs + 2 * group->first_pair, group->pairs, group->odd_pairs, first,
+                scratch_row(5 + of.most),         apart,        of.pitch};
     }
     INLINE Here place(int s, int t) const {
         const int k = job.way > 0 ? s : of.depth - 1 - s;
         const int r = group->y_way > 0 ? t : of.height - 1 - t;
         const int* range = of.ranges + 4 * (k * of.height + r);
-        return {s, t, range[0], range[1], k * plane + (long long)r * of.width,
-                k * sheet + (long long)r * of.pitch,
-                value_of(scale) * of.densest[k * of.height + r], range};
+        return {
+            s,
+            t,
+            range[0],
+            range[1],
+            k * plane + (long long)r * of.width,
+            k * sheet + (long long)r * of.pitch,
+            value_of(scale) * of.densest[k * of.height + r],
+            range};
     }
     INLINE Beginnings find_beginnings(const Here& here) const {
         Beginnings found;
@@ -173,7 +186,8 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         for (int i = 0; i < COUNT; ++i) {
             const int k = of.order[i], own = k * of.colors + job.color;
             const F* light = part_of(of.light_parts, k, all);
-            const F* source = of.beam_factors ? of.source_parts[0] : part_of(of.source_parts, k, all);
+            const F* source =
+                of.beam_factors ? of.source_parts[0] : part_of(of.source_parts, k, all);
             sums.rows[i][0] = row_of(light, at), sums.rows[i][1] = row_of(source, at);
             sums.by[i][0] = of.factors[own];
             sums.by[i][1] = of.beam_factors ? of.beam_factors[own] : F(1);
@@ -205,7 +219,8 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
                 enter_group(g);
                 for (int t = 0; t < of.height; ++t) {
                     const Here here = place(s, t);
-                    find_scattering(here, KEEPS ? 0 : here.range[2], KEEPS ? of.width : here.range[3]);
+                    find_scattering(
+                        here, KEEPS ? 0 : here.range[2], KEEPS ? of.width : here.range[3]);
                     follow_row(here);
                     if constexpr (!KEEPS) add_moments(here, job.adds || g > job.group_from);
                 }
@@ -220,23 +235,26 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             const Line<N> light = line(here.s, here.t, LIGHT, group->before + j);
             light.put(-1, N(F(0)));
             light.put(width, N(F(0)));
-            if (own.signs[2] > 0) near.put(-1, near[0]);
-            else near.put(width, near[width - 1]);
+            if (own.signs[2] > 0)
+                near.put(-1, near[0]);
+            else
+                near.put(width, near[width - 1]);
             if (KEEPS && here.s < slice_from) {
                 const F* row = saved_row(here.s + 1, here.t, group->begin + j);
                 for (int c = 0; c < width; ++c) light.at[c] = row[c];
                 continue;
             }
-            if (own.count == 1) follow_direction<1>(here, begin, light, j);
-            else follow_direction<4>(here, begin, light, j);
+            if (own.count == 1)
+                follow_direction<1>(here, begin, light, j);
+            else
+                follow_direction<4>(here, begin, light, j);
             if (!KEEPS && of.saved && here.s + 1 < of.depth && slab_of(here.s + 1) == here.s + 1) {
                 F* row = saved_row(here.s + 1, here.t, group->begin + j);
                 for (int c = 0; c < width; ++c) row[c] = light.at[c];
             }
         }
     }
-    template <int POINTS>
-    INLINE void follow_direction(
+    template <int POINTS> INLINE void follow_direction(
         const Here& here, const Beginnings& begin, const Line<N>& light, int j) const {
         Steps<POINTS> steps = find_steps<POINTS>(here, begin, j);
         const Course& own = course(j);
@@ -254,21 +272,22 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
         carry_on(light.at, carried.at, way, width);
         if constexpr (IS_CHANGED) {
             INDEPENDENT
-            for (int c = 0; c < width; ++c) light.change[c] += carried.change[c] * light.at[c - way];
+            for (int c = 0; c < width; ++c)
+                light.change[c] += carried.change[c] * light.at[c - way];
             carry_on(light.change, carried.at, way, width);
         }
     }
     // All steps of a row, by stretches.
-    template <bool IS_ALONG, int POINTS>
-    INLINE void follow_steps(const Here& here, const Steps<POINTS>& steps, const Line<N>& light) const {
+    template <bool IS_ALONG, int POINTS> INLINE void follow_steps(
+        const Here& here, const Steps<POINTS>& steps, const Line<N>& light) const {
         follow_stretch<IS_ALONG, EMPTY>(steps, light, 0, here.from);
         if (steps.half * here.deepest < F(0.25))
             follow_stretch<IS_ALONG, THIN>(steps, light, here.from, here.to);
-        else follow_stretch<IS_ALONG, ANY>(steps, light, here.from, here.to);
+        else
+            follow_stretch<IS_ALONG, ANY>(steps, light, here.from, here.to);
         follow_stretch<IS_ALONG, EMPTY>(steps, light, here.to, of.width);
     }
-    template <bool IS_ALONG, Matter MATTER, int POINTS>
-    INLINE void follow_stretch(
+    template <bool IS_ALONG, Matter MATTER, int POINTS> INLINE void follow_stretch(
         const Steps<POINTS>& given, const Line<N>& light, int from, int to) const {
         const Steps<POINTS> steps = given;
         const N scale = this->scale, strength = this->strength, inflow = this->inflow;
@@ -317,7 +336,8 @@ template <class N, int DEGREE, bool SHARES_FIELD, class F>
 INLINE void follow_rows(int lane, const Sweep<F>& of) {
     const Job* jobs = (const Job*)of.jobs;
     for (int i = of.starts[lane]; i < of.starts[lane + 1]; ++i)
-        Rows<N, F, DEGREE, SHARES_FIELD, false>(of, jobs[i]).follow(jobs[i].slice_from, jobs[i].slice_to);
+        Rows<N, F, DEGREE, SHARES_FIELD, false>(of, jobs[i])
+            .follow(jobs[i].slice_from, jobs[i].slice_to);
 }
 
 } // namespace ddrecon

@@ -219,7 +219,7 @@ class _Maker:
         weights = values.new_tensor([unit[0][1] for unit in units])[:, None]
         even = len(self.order) - self.odd
         for matrix in (values / of_parts, values * of_parts * weights):
-            parts = matrix[:, :even], matrix[:odd_pairs, even:]
+            parts = matrix[:, :even], matrix[:, even:]
             self.matrices += [part.reshape(-1) for part in parts]
             self.matrices += [part.T.reshape(-1) for part in parts]
 

@@ -5,8 +5,8 @@
 
 namespace ddrecon {
 
-// What a step meets: no matter; steps of less than half an optical depth alone, in which what passes
-// needs no exponential; any.
+// What a step meets: no matter; steps of less than half an optical depth alone, in which what
+// passes needs no exponential; any.
 enum Matter { EMPTY, THIN, ANY };
 
 // What a depth does to light, with slopes where it is a dual number: of a linear source on the way
@@ -23,8 +23,9 @@ template <Matter MATTER, class F, class N> INLINE Passage<N> pass_through(F d, c
     const F psi = is_thin ? near : (F(1) - phi) * inverse;
     const F psi_slope = is_thin ? near_slope : (phi - F(2) * psi) * inverse;
     const F lost = d * phi, passed = MATTER == ANY ? kept : F(1) - lost;
-    return {along(depth, Sloped<F>{phi, psi - phi}), along(depth, Sloped<F>{psi, psi_slope}),
-            along(depth, Sloped<F>{passed, -passed}), along(depth, Sloped<F>{lost, passed})};
+    return {
+        along(depth, Sloped<F>{phi, psi - phi}), along(depth, Sloped<F>{psi, psi_slope}),
+        along(depth, Sloped<F>{passed, -passed}), along(depth, Sloped<F>{lost, passed})};
 }
 
 // The mean along a step of what scatters at its beginning, `far`, and at its end.
@@ -32,11 +33,27 @@ template <class N, class D> INLINE D scattered(const N& far, const N& near, cons
     return far * by.phi + (near - far) * by.psi;
 }
 // I at the end of a step, less the light from outside, `inflow`, which is there without a medium.
-template <class N, class D>
-INLINE D light_after(
+template <class N, class D> INLINE D light_after(
     const N& arriving, const N& far, const N& near, const N& scattering_depth, const N& inflow,
     const Passage<D>& by) {
     return arriving * by.passed + (scattering_depth * scattered(far, near, by) - inflow * by.lost);
+}
+
+// E11 transposed: cotangents of a step's numbers, of that of I; `inflow` but for what I gets of it.
+template <class F> struct StepBars {
+    F arriving, far, near, mass, scattering_mass, scale, strength, inflow;
+};
+template <Matter MATTER, class F> INLINE StepBars<F> return_step(
+    F bar, F arriving, F far, F near, F mass, F scattering_mass, F scale, F strength, F inflow) {
+    const F q = scattering_mass * strength, depth = scale * mass;
+    const Passage<Dual<F>> by = pass_through<MATTER>(depth, Dual<F>(depth, F(1)));
+    const F depth_bar = bar * light_after(arriving, far, near, q, inflow, by).by[0];
+    const F q_bar = bar * scattered(far, near, by).value, line_bar = bar * q;
+    const F psi = by.psi.value;
+    return {bar * by.passed.value,   line_bar * (by.phi.value - psi),
+            line_bar * psi,          depth_bar * scale,
+            q_bar * strength,        depth_bar * mass,
+            q_bar * scattering_mass, -bar * by.lost.value};
 }
 
 } // namespace ddrecon

@@ -12,11 +12,11 @@ from ddrecon.diffusion.rounds.fused.by_rows import Rows
 from ddrecon.diffusion.rounds.fused.swept import (
     PARTS,
     Swept,
+    less_light,
     parts_of,
     split,
     units_of_parts,
 )
-from ddrecon.diffusion.rounds.fused.tangents import CellTangents, changes_of
 from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
@@ -103,7 +103,7 @@ class _Sweep(torch.autograd.Function):
     def forward(by_cells: bool, may_save: bool, *given: Any) -> tuple[Any, ...]:
         swept, threads = Swept.of(*given), thread_count(Swept.of(*given).like)
         if by_cells:
-            return *split(swept.less_light(Cells(swept).follow())), None
+            return *split(less_light(swept.light, Cells(swept).follow())), None
         is_saved = may_save and any(
             isinstance(each, Tensor) and each.requires_grad for each in given
         )
@@ -150,12 +150,12 @@ class _Sweep(torch.autograd.Function):
         def change(*tensors: Any) -> tuple[Tensor, ...]:
             values, d_values = halve(tensors)
             swept = Swept.of(*ctx.of, *values)
-            d_swept = changes_of(swept, *d_values)
+            d_swept = swept.changes(*d_values)
             swept = swept.spelled()
             if ctx.by_cells:
-                changed = CellTangents(swept, d_swept).change()
+                changed = Cells(swept, d_swept).follow()
             else:
                 changed, _ = Rows(swept, ctx.threads, d_swept).follow()
-            return split(d_swept.less_light(changed))
+            return split(less_light(d_swept.light, changed))
 
         return *run_plainly(change, *ctx.saved_tensors, *changes[4:]), None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ddrecon.grid import Grid
-from ddrecon.kernels.rows import launch_rows, row_kernel
 from ddrecon.light.moments import Moments
 from ddrecon.numerics.harmonics import count_harmonics
 
@@ -58,6 +56,14 @@ def moment_of(parts: Parts, k: int) -> Tensor | None:
         return parts[_OF_HARMONIC[k]]
     higher = parts[PARTS - 1]
     return None if higher is None else higher[k - 4]
+
+
+def less_light(light: Parts, moments: Tensor) -> Tensor:
+    """`moments` [K, C, z, y, x] less the mean and the flux of `light`, in place."""
+    for k in range(min(4, len(moments))):
+        if (part := moment_of(light, k)) is not None:
+            moments[k] -= part
+    return moments
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,27 @@ class Swept:
         moments = self.beam_factors[..., None, None, None] * beam
         return replace(self, beam_factors=None, source=in_parts(moments))
 
+    def changes(self, *changes: Tensor | None) -> Swept:
+        """What is added to all tensors, as `Swept.of` takes them; None for nothing.
+
+        The source has all its moments, a beam or not.
+        """
+        tensors = self.scales, self.extinction, self.scattering, self.factors
+        whole: list[Any] = [
+            tensor if tensor is None else torch.zeros_like(tensor) if change is None else change
+            for tensor, change in zip(tensors, changes, strict=False)
+        ]
+        d_factors, *parts = changes[len(whole) :]
+        beam, d_beam = self.source[0], parts[PARTS]
+        if self.beam_factors is not None and beam is not None:
+            # a product, of which both may change
+            d_moments = self.factors.new_zeros(len(self.factors), *beam.shape)
+            for factors, part in ((d_factors, beam), (self.beam_factors, d_beam)):
+                if factors is not None and part is not None:
+                    d_moments += factors[..., None, None, None] * part
+            parts[PARTS:] = in_parts(d_moments)
+        return Swept.of(self.grid, self.directions, *whole, None, *parts)
+
     @property
     def fields(self) -> list[Tensor]:
         """Those of extinction and of scattering; one where they share it."""
@@ -126,12 +153,15 @@ class Swept:
                 total += source
         return found
 
-    def less_light(self, moments: Tensor) -> Tensor:
-        """`moments` [K, C, z, y, x] less the mean and the flux of light, in place."""
-        for k in range(min(4, len(moments))):
-            if (light := moment_of(self.light, k)) is not None:
-                moments[k] -= light
-        return moments
+    def total_change(self, changes: Swept) -> Tensor:
+        """The change of `total`: both the factors and what they multiply change."""
+        found = self.like.new_zeros(len(self.factors), *self.like.shape)
+        crossed = replace(self, light=changes.light, source=changes.source)
+        by_factors = replace(self, factors=changes.factors, source=(None,) * PARTS)
+        for part in (crossed, by_factors):
+            if any(each is not None for each in (*part.light, *part.source)):
+                found += part.total()
+        return found
 
     def light_bars(self, found: Tensor, bars: Parts, needs: Sequence[bool]) -> Parts:
         """Cotangents of those parts of light that need them.
@@ -140,11 +170,7 @@ class Swept:
         """
         if not any(needs):
             return (None,) * PARTS
-        first = found.new_empty(min(4, len(found)), *found.shape[1:])
-        given: dict[str, Any] = {f"bar_{k}": moment_of(bars, k) for k in range(len(first))}
-        given |= {"factors": self.factors, "found": found}
-        given |= {"colors": len(found[0]), "count": len(first)}
-        launch_rows(light_bar_kernel, self.grid, len(found[0]), given, {"light": first})
+        first = less_light(bars, self.factors[:4, :, None, None, None] * found[:4])
         higher = self.factors[4:, :, None, None, None] * found[4:] if needs[PARTS - 1] else None
         parts = zip(in_parts(first)[: PARTS - 1], needs, strict=False)
         kept = (part if need else None for part, need in parts)
@@ -163,10 +189,7 @@ class Swept:
         if self.beam_factors is None:
             parts = zip(in_parts(bar), needs, strict=True)
             return tuple(part if need else None for part, need in parts)
-        found = bar.new_empty(bar[0].shape)
-        given: dict[str, Any] = {"factors": self.beam_factors, "found": bar}
-        given |= {"colors": len(found), "count": len(bar)}
-        launch_rows(beam_bar_kernel, self.grid, len(found), given, {"beam": found})
+        found = torch.einsum("kc,kczyx->czyx", self.beam_factors, bar)
         return found, *[None] * (PARTS - 1)
 
 
@@ -178,41 +201,3 @@ def _products(bar: Tensor, moments: Sequence[Tensor | None]) -> Tensor:
             terms = zip(moment.flatten(1), bar[k].flatten(1), strict=True)
             found[k] = torch.stack([torch.dot(*each) for each in terms])
     return found.to(bar.dtype)
-
-
-_LIGHT_BARS = """
-const F* const bars[4] = {bar_0, bar_1, bar_2, bar_3};
-const long long all = colors * size, at = c * size + start;
-for (int k = 0; k < count; ++k) {
-    const F *row = found + k * all + at, factor = factors[k * colors + c];
-    const F* taken = bars[k] ? bars[k] + at : row;
-    const F sign = bars[k] ? F(-1) : F(0);
-    F* light_row = light + k * all + at;
-    INDEPENDENT
-    for (int i = begin; i < end; ++i) light_row[i] = factor * row[i] + sign * taken[i];
-}
-"""
-
-
-@functools.cache
-def light_bar_kernel(bits: int) -> Any:
-    """The kernel of cotangents of light's mean and flux, of which the same were taken away."""
-    arrays = "factors found bar_0 bar_1 bar_2 bar_3"
-    return row_kernel("light_bars", bits, _LIGHT_BARS, arrays, "light", "colors count")
-
-
-_BEAM_BAR = """
-const long long all = colors * size, at = c * size + start;
-F* sum = beam + at;
-for (int k = 0; k < count; ++k) {
-    const F *from = found + k * all + at, factor = factors[k * colors + c];
-    INDEPENDENT
-    for (int i = begin; i < end; ++i) sum[i] = factor * from[i] + (k > 0 ? sum[i] : F(0));
-}
-"""
-
-
-@functools.cache
-def beam_bar_kernel(bits: int) -> Any:
-    """The kernel of the cotangent of a beam, of which all moments of the source are parts."""
-    return row_kernel("beam_bar", bits, _BEAM_BAR, "factors found", "beam", "colors count")
