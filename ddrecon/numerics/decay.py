@@ -4,8 +4,7 @@ Over depths from a to b >= a the mean of exp(-depth) is exp(-a) phi(b - a), with
 
     phi(d) = (1 - exp(-d)) / d,    psi(d) = phi + phi' = (1 - phi) / d.
 
-Where d is small the closed forms, and their derivatives, are differences of nearly equal numbers:
-there psi is its series.
+Where d is small psi is its series: its closed form is a difference of nearly equal numbers there.
 """
 
 from __future__ import annotations
@@ -14,6 +13,8 @@ import math
 
 import torch
 from torch import Tensor
+
+from ddrecon.numerics.autodiff import is_varied
 
 SERIES_BELOW = 1e-2
 """Below this depth psi is its series."""
@@ -24,9 +25,12 @@ TERMS = 6
 def decay_mean(depth: Tensor) -> Tensor:
     """phi(`depth`): the mean of exp(-depth s) over s in [0, 1]; `depth` >= 0, of any shape."""
     at = depth.detach()
-    phi, psi = _phi_and_psi(at, -torch.expm1(-at))
+    shifted = at + torch.finfo(at.dtype).tiny
+    phi = -torch.expm1(-shifted) / shifted
+    if not is_varied(depth):
+        return phi
     # The second term is 0 and has the slope: so one array is kept, where autograd would keep ten.
-    return phi + (psi - phi) * (depth - at)
+    return phi + (_psi(at, phi) - phi) * (depth - at)
 
 
 def decayed_sum(weight: Tensor, begin: Tensor, end: Tensor, scale: Tensor) -> Tensor:
@@ -46,22 +50,16 @@ def decayed_line(near: Tensor, far: Tensor, depth: Tensor) -> tuple[Tensor, Tens
     phi + (near - far) psi; the second, the part of what enters at the far end, is 1 - exp(-depth).
     `depth` [N, C, ...] >= 0; `near` and `far` have its shape, or one of them has one channel.
     """
-    lost = -torch.expm1(-depth)
-    phi, psi = _phi_and_psi(depth, lost)
-    return far * phi + (near - far) * psi, lost
+    phi = decay_mean(depth)
+    psi = _psi(depth, phi)
+    return far * phi + (near - far) * psi, -torch.expm1(-depth)
 
 
-def _phi_and_psi(depth: Tensor, lost: Tensor) -> tuple[Tensor, Tensor]:
-    """Both, given what is `lost`, 1 - exp(-depth)."""
-    is_thin, thick = depth < SERIES_BELOW, depth.clamp(min=SERIES_BELOW)
-    psi = torch.where(is_thin, _series(depth), (1 - lost / thick) / thick)
-    return torch.where(is_thin, 1 - depth * psi, lost / thick), psi
-
-
-def _series(depth: Tensor) -> Tensor:
-    """psi as the sum over k of (-`depth`)^k / (k + 2)!."""
+def _psi(depth: Tensor, phi: Tensor) -> Tensor:
+    """psi, given `phi`; or as the sum over k of (-`depth`)^k / (k + 2)!."""
     *others, last = (depth.new_tensor(1 / math.factorial(k + 2)) for k in range(TERMS))
-    total = last.expand_as(depth)
+    series = last.expand_as(depth)
     for factor in reversed(others):
-        total = torch.addcmul(factor, depth, total, value=-1)
-    return total
+        series = torch.addcmul(factor, depth, series, value=-1)
+    thick = depth.clamp(min=SERIES_BELOW)
+    return torch.where(depth < SERIES_BELOW, series, (1 - phi) / thick)

@@ -60,17 +60,7 @@ def test_moments_are_those_of_the_values(phase: PhaseFunction):
     found = legendre_moments(phase.value(torch.tensor(NODES)), 12)
     torch.testing.assert_close(found, phase.moments(12), rtol=0, atol=1e-7)
     assert len(found) == phase.colors
-
-
-@each_phase
-def test_the_mean_over_the_sphere_is_one(phase: PhaseFunction):
     assert torch.equal(phase.moments(1), torch.ones_like(phase.moments(1)))
-
-
-@pytest.mark.parametrize("g", MEAN_COSINES)
-def test_moments_of_henyey_and_greenstein_are_powers_of_the_mean_cosine(g: float):
-    expected = torch.tensor([g**degree for degree in range(4)], dtype=torch.float64)
-    torch.testing.assert_close(HenyeyGreenstein(scalar(g)).moments(4)[0], expected)
 
 
 @pytest.mark.parametrize(
@@ -197,13 +187,6 @@ def test_along_rays_all_derivatives_agree_with_differences(name: str):
     )
 
 
-def test_isotropic_scattering_is_one_everywhere():
-    assert torch.equal(
-        HenyeyGreenstein(scalar(0.0)).value(torch.linspace(-1, 1, 7, dtype=torch.float64)),
-        torch.ones(1, 7, dtype=torch.float64),
-    )
-
-
 # --- the scaled medium ---------------------------------------------------------------------------
 
 
@@ -216,11 +199,6 @@ def test_scaling_a_forward_peak_leaves_no_backward_rest(phase: PhaseFunction, de
     if isinstance(phase, Tabulated | Rayleigh):
         rest = (phase.moments(2)[:, 1] - f) / (1 - f)
         assert bool((rest >= -1e-12).all())
-
-
-@pytest.mark.parametrize("g", [-0.95, -0.2, 0.0])
-def test_nothing_is_scaled_without_a_forward_peak(g: float):
-    assert HenyeyGreenstein(scalar(g)).forward_fraction(1) == 0
 
 
 def test_the_scaling_has_a_continuous_derivative_at_zero():
