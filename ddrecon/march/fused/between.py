@@ -11,6 +11,7 @@ from torch import Tensor
 from ddrecon.kernels.launch import thread_count
 from ddrecon.kernels.shares import count_shares
 from ddrecon.kernels.text import TextKernel, cut
+from ddrecon.march.fused.kernels import names_of
 from ddrecon.march.lattice import DOUBT, find_uneven, interpolate
 from ddrecon.numerics.autodiff import differentiate_once, keep
 
@@ -22,11 +23,9 @@ FEW = 1 << 14
 
 _HEADER = "march/fused/pixels.h"
 _PIXELS = """
-int channels, rows, columns, length, total, pixels; F *values, *places; long *hit;
+F *values; int channels, rows, columns, length, total, pixels; F *places; long *hit;
 """
-_RECORD = (
-    "const Pixels<F> them = {values, channels, rows, columns, length, total, pixels, places, hit};"
-)
+_RECORD = f"const Pixels<F> them = {{{names_of(_PIXELS)}}};"
 
 
 @functools.cache

@@ -22,9 +22,8 @@ NEIGHBORS, TURNS = 128, 8
 """Packets that one thread does after each other, at least, as they meet the same cells; and how
 often each thread has its turn, at most.
 """
-
-
 NAMES = "rays", "angles", "coefficients", "numbers", "table", "fronts"
+"""What a walk is given besides fields and what stays, in the order of its arguments."""
 
 
 class Integrate(torch.autograd.Function):
@@ -37,7 +36,7 @@ class Integrate(torch.autograd.Function):
     @staticmethod
     def forward(layout: Layout, cells: Cells, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rays = tensors[0]
-        out, _ = _empty(layout, rays)
+        out = rays.new_empty(layout.outputs, len(rays))
         masses = rays.new_empty(layout.extinction, len(rays), dtype=torch.float64)
         packets, given = _packets(cells, tensors, thread_count(rays))
         kernel = integral_kernel(layout, cells.is_sliced)
@@ -60,11 +59,8 @@ class Integrate(torch.autograd.Function):
             for bar, room in zip(bars, _empty(ctx.layout, tensors[0]), strict=False)
         )
         ends = {"masses": masses, "out_bar": out_bar, "masses_bar": masses_bar}
-        return (
-            None,
-            None,
-            *_transpose(ctx.layout, ctx.cells, tensors, ctx.needs_input_grad[2:], ends),
-        )
+        needs = ctx.needs_input_grad[2:]
+        return None, None, *_transpose(ctx.layout, ctx.cells, tensors, needs, ends)
 
     @staticmethod
     def jvp(ctx: Any, *changes: Tensor | None) -> tuple[Tensor, Tensor, None]:

@@ -5,19 +5,14 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-from ddrecon.kernels.text import TextKernel
+from ddrecon.kernels.text import TextKernel, declarations
 from ddrecon.march.fused.layout import Layout
 
 _GIVEN = """
 F *planes, *rays, *angles, *coefficients, *numbers, *table, *fronts; int *slices, *walked, *dealt;
-int ray_count, node_count, depth, rows, columns, words;
-int plane_stride, row_stride, column_stride;
+int ray_count, node_count, depth, rows, columns, words, plane_stride, row_stride, column_stride;
 """
-_RECORD = """
-const Given<F> of_all = {
-    planes, rays, angles, coefficients, numbers, table, fronts, slices, walked, dealt, ray_count,
-    node_count, depth, rows, columns, words, plane_stride, row_stride, column_stride, fields};
-"""
+_CHANGES = "F *d_rays, *d_angles, *d_coefficients, *d_numbers, *d_table, *d_fronts"
 
 
 class Case(NamedTuple):
@@ -37,8 +32,7 @@ class Case(NamedTuple):
 def integral_kernel(layout: Layout, is_sliced: bool) -> TextKernel:
     """The kernel of E1 to E3 along packets of rays: `out` [outputs, R] and `masses` [K, R]."""
     text = f"walk<F, {_written(layout, Case(is_sliced))}, VALUES>(item, of_all, {{}}, out, masses);"
-    given = f"F *fields[{layout.channels}], *out; double *masses"
-    return _kernel("integrate", layout, text, given, "out masses", "walk")
+    return _kernel("integrate", layout, 1, text, "F *out; double *masses", "out masses", "walk")
 
 
 @functools.cache
@@ -48,16 +42,12 @@ def tangent_kernel(layout: Layout, case: Case) -> TextKernel:
     Behind the fields it is given their changes; those of others may be left out, but for
     `d_numbers`.
     """
-    changes = ", ".join(
-        f"d_{name}" for name in ("rays", "angles", "coefficients", "numbers", "table", "fronts")
-    )
     text = f"""
-    const Changes<F> changes = {{{changes}}};
+    const Changes<F> changes = {{{names_of(_CHANGES)}}};
     walk<F, {_written(layout, case)}, TANGENT>(item, of_all, changes, d_out, d_masses);
     """
-    pointers = ", ".join(f"*{name}" for name in changes.split(", "))
-    given = f"F *fields[{2 * layout.channels}], {pointers}, *d_out, *d_masses"
-    return _kernel("integrate_tangent", layout, text, given, "d_out d_masses", "walk")
+    given, made = f"{_CHANGES}, *d_out, *d_masses", "d_out d_masses"
+    return _kernel("integrate_tangent", layout, 2, text, given, made, "walk")
 
 
 @functools.cache
@@ -67,23 +57,32 @@ def adjoint_kernel(layout: Layout, case: Case) -> TextKernel:
     These are left out where none are asked for, as are those of others. Each packet has its own
     `numbers_bar` [2 C + 1, packets].
     """
+    given = f"""
+    F *out_bar, *masses_bar; double *masses, *numbers_bar;
+    F *rays_bar, *angles_bar, *coefficients_bar, *table_bar, *fronts_bar, *bars[{layout.channels}];
+    int packets
+    """
     text = f"""
-    const Bars<F> of_bars = {{
-        out_bar, masses_bar, masses, numbers_bar, rays_bar, angles_bar, coefficients_bar, table_bar,
-        fronts_bar, bars, packets}};
+    const Bars<F> of_bars = {{{names_of(given)}}};
     Back<F, {_written(layout, case)}>(item, of_all, of_bars).run();
     """
-    given = f"""
-    F *fields[{layout.channels}], *out_bar, *masses_bar; double *masses, *numbers_bar; int packets;
-    F *rays_bar, *angles_bar, *coefficients_bar, *table_bar, *fronts_bar, *bars[{layout.channels}]
-    """
     made = "numbers_bar rays_bar angles_bar coefficients_bar table_bar fronts_bar bars"
-    return _kernel("transpose", layout, text, given, made, "back")
+    return _kernel("transpose", layout, 1, text, given, made, "back")
 
 
-def _kernel(name: str, layout: Layout, text: str, given: str, made: str, header: str) -> TextKernel:
+def _kernel(
+    name: str, layout: Layout, lists: int, text: str, given: str, made: str, header: str
+) -> TextKernel:
+    """The kernel of `text`, which has `of_all`; with so many `lists` of fields."""
+    all_given = f"{_GIVEN} F *fields[{lists * layout.channels}];"
+    record = f"const Given<F> of_all = {{{names_of(all_given)}}};"
     path = f"march/fused/{header}.h"
-    return TextKernel(name, layout.bits, _RECORD + text, _GIVEN + given, made, path)
+    return TextKernel(name, layout.bits, record + text, all_given + given, made, path)
+
+
+def names_of(given: str) -> str:
+    """The names that `given` declares, in order: they make a record of C++."""
+    return ", ".join(name for _, _, name, _ in declarations(given))
 
 
 def _written(layout: Layout, case: Case) -> str:
