@@ -157,10 +157,9 @@ class Run:
     def verdict(self, launched: int) -> tuple[int, float]:
         """How many iterations were needed of those launched, and the relative residual left."""
         odd = launched % 2
-        left, norm = (
-            self.sums[SUMS[name] + n].sum(-1) for name, n in (("RESIDUAL", odd), ("SOURCE_NORM", 0))
-        )
-        relative = left.sqrt() / norm.sqrt().clamp(min=self.tiny)
+        rows = SUMS["RESIDUAL"] + odd, SUMS["SOURCE_NORM"]
+        left, norm = (self.sums[row].sum(-1).sqrt() for row in rows)
+        relative = left / norm.clamp(min=self.tiny)
         return int(self.sums[SUMS["COUNT"] + odd].max()), float(relative.max())
 
     def vector(self, name: str) -> Tensor:
