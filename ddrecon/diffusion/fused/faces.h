@@ -13,8 +13,8 @@ template <class F> struct Pairs {
 template <class F> INLINE void put(F* to, F x) { *to = x; }
 template <class F> INLINE void put(F* to, const Dual<F>& x) { *to = x.by[0]; }
 
-// What a face conducts between D here and there: h times their harmonic mean... and on the box
-// 1 / (2 + h / (2 D)); with its slopes.
+// What a face conducts, with its slopes: the harmonic mean of D here and there (E7), and on the box
+// 1 / (2 + h / (2 D)) (E6). Times 1 / h^2, or 1 / h on the box, it is what the matrix has.
 template <class F> struct Conduction {
     F value, by_here, by_there;
 };
@@ -33,9 +33,11 @@ INLINE Dual<F> conducted(const Dual<F>& here, const Dual<F>& there, F h, bool in
 }
 
 enum { GAIN, FLUX, SYSTEM };
-// L1, or what cells gain from Q1, or all of E7. Of fields: D, kappa_s, then L0 or Q0, kappa_a
-// unless it is SHARED with kappa_s, Q1 along z, y and x, the sum of so many FLUXES, and what is
-// BEGUN. Of numbers: what the fields of kappa_s and kappa_a are times, and the radiance outside.
+// What cells gain from Q1, -div(D kappa_s Q1), or L1 (E5), or all of E7. Given are fields: D,
+// kappa_s but for its scale; then, unless it is a gain, L0 or Q0; kappa_a, unless it has the field
+// of kappa_s (SHARED); Q1 along z, y and x, as a sum of so many FLUXES; and as many as are BEGUN,
+// to which what is found is added. And numbers: the scale of kappa_s, the radiance outside, the
+// scale of kappa_a.
 template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
     static constexpr bool HAS_MEAN = WHAT != GAIN, IS_SYSTEM = WHAT == SYSTEM;
     enum {
@@ -61,7 +63,7 @@ template <int WHAT, int FLUXES, int BEGUN, bool SHARED> struct Flow {
             for (int a = 0; a < 3; ++a) found[2 + a] = mesh.at_faces(arrays[2 + a], a, color);
         }
     }
-    // Q1 along an axis, `at` a cell or that beyond its face.
+    // Q1 along an axis, where `at` reads: in this cell or beyond its face.
     template <class In, class At> INLINE static auto flux(const In* in, int axis, At at) {
         auto q = at(in[Q + axis]);
         UNROLLED

@@ -3,9 +3,9 @@
 
 namespace ddrecon {
 
-// A row of cells in a grid. Neighbors lie below and above (`side` 0 and 1) along z, y and x (`axis`
-// 0 to 2). Faces between cells lie in arrays, of all colors or one: the row's first one above a
-// cell is number `face` of a color's `faces`.
+// A row of cells in a grid, from its number x on. Neighbors lie below and above (`side` 0 and 1)
+// along z, y and x (`axis` 0 to 2). Faces between cells lie in arrays, so many `faces` of a color;
+// that above the row's first cell is number `face`.
 template <class F> struct Mesh {
     typedef F Number;
     int nx, x;

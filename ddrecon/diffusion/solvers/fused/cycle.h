@@ -45,30 +45,23 @@ template <class F> APART void go_down(
     const Size coarse = (Size)cy * cx;
     const F* scale = is_level ? grids.level(way.next, matrix).scale : zero;
     for (int k = from; k < to; ++k) {
-        const F* r;
+        const F* r = slot(8);
         if (way.z >= 0) {
             const F *before = residual(2 * k - 1), *one = residual(2 * k);
             const F *two = residual(2 * k + 1), *after = residual(2 * k + 2);
-            const F* b = grids.weights(way.z, BELOW, matrix) + k * slice;
-            const F* a = grids.weights(way.z, ABOVE, matrix) + k * slice;
-            restrict_pair(
-                before, one, two, after, k > 0 ? b - slice : zero, k > 0 ? a - slice : zero, b, a,
-                slot(8), slice);
-            r = slot(8);
+            const Weights<F> own = grids.weights(way.z, matrix, k * slice);
+            const Weights<F> last = k > 0 ? own + -slice : Weights<F>{zero, zero};
+            restrict_pair(before, one, two, after, last, own, slot(8), slice);
         } else {
             r = residual(k);
         }
         if (way.y >= 0) {
-            const Size place = (Size)k * cy * l.nx;
-            restrict_y(
-                r, slot(9), grids.weights(way.y, BELOW, matrix) + place,
-                grids.weights(way.y, ABOVE, matrix) + place, zero, l.ny, l.nx);
+            const Weights<F> own = grids.weights(way.y, matrix, (Size)k * cy * l.nx);
+            restrict_y(r, slot(9), own, zero, l.ny, l.nx);
             r = slot(9);
         }
         if (way.x >= 0) {
-            restrict_x(
-                r, slot(10), grids.weights(way.x, BELOW, matrix) + k * coarse,
-                grids.weights(way.x, ABOVE, matrix) + k * coarse, cy, l.nx);
+            restrict_x(r, slot(10), grids.weights(way.x, matrix, k * coarse), cy, l.nx);
             r = slot(10);
         }
         F* __restrict o = out + k * coarse;
@@ -97,21 +90,17 @@ template <class F> APART double go_up(
     // slice k of the coarser grid, interpolated along x and y
     const auto prolonged = [&](int k) -> const F* {
         for (; spread <= k; ++spread) {
-            const F* in = u + (Size)spread * cy * cx;
+            const Size place = (Size)spread * cy * cx;
+            const F* in = u + place;
             F* const done = slot.ring(8, spread);
             if (way.x >= 0) {
-                const Size place = (Size)spread * cy * cx;
                 F* const rows = way.y >= 0 ? slot(12) : done;
-                prolong_x(
-                    in, rows, grids.weights(way.x, BELOW, matrix) + place,
-                    grids.weights(way.x, ABOVE, matrix) + place, cy, l.nx);
+                prolong_x(in, rows, grids.weights(way.x, matrix, place), cy, l.nx);
                 in = rows;
             }
             if (way.y >= 0) {
-                const Size place = (Size)spread * cy * l.nx;
-                prolong_y(
-                    in, done, grids.weights(way.y, BELOW, matrix) + place,
-                    grids.weights(way.y, ABOVE, matrix) + place, l.ny, l.nx);
+                const Weights<F> own = grids.weights(way.y, matrix, (Size)spread * cy * l.nx);
+                prolong_y(in, done, own, l.ny, l.nx);
                 in = done;
             }
             if (in != done)
@@ -133,8 +122,8 @@ template <class F> APART double go_up(
         if (to == k) {
             for (Size i = 0; i < slice; ++i) y[i] += taken[i] * here[i];
         } else {
-            const F* __restrict w = to > k ? grids.weights(way.z, BELOW, matrix) + k * slice
-                                           : grids.weights(way.z, ABOVE, matrix) + to * slice;
+            const F* __restrict w = to > k ? grids.weights(way.z, matrix, k * slice).below
+                                           : grids.weights(way.z, matrix, to * slice).above;
             for (Size i = 0; i < slice; ++i)
                 y[i] += taken[i] * (here[i] + w[i] * (there[i] - here[i]));
         }

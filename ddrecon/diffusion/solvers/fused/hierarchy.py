@@ -39,43 +39,30 @@ It is checked, so no result depends on it.
 class Hierarchy:
     """The grids of an operator: numbers `data`, laid out as `stages` say.
 
-    Which axes are strong is known only with the conductances of each level. So that nobody waits
-    for them, a hierarchy is made with the axes of the last one of its shape; `strengths` then say
-    whether these were right. `shares`: of a color, so that threads have equally many.
+    Which axes are strong is known only with the conductances of each level: `strengths`. So a
+    hierarchy is made with the axes of the last one of its shape, and made anew where these were
+    wrong. `shares`: of a color, so that threads have equally many.
     """
 
     stages: Stages
     shares: int
     data: Tensor
     strengths: Tensor
-    is_checked: bool = False
 
     @staticmethod
     def of(operator: Operator) -> Hierarchy:
-        """All grids of `operator`; which axes are strong may have to be checked yet."""
+        """All grids of `operator`."""
         shape, colors = shape_of(operator)
-        axes = _last_axes.get((shape, colors))
-        if axes is not None:
-            return make(operator, axes)
-        return make(operator, first_guess(shape)).checked(operator)
-
-    def checked(self, operator: Operator) -> Hierarchy:
-        """This hierarchy if it coarsens the axes it should, else one that does."""
-        (shape, colors), made = shape_of(operator), self
+        made = make(operator, _last_axes.get((shape, colors), first_guess(shape)))
         while (axes := strong_axes(shape, made.axes, made.means())) != made.axes:
             made = make(operator, axes)
         _last_axes[shape, colors] = axes
-        made.is_checked = True
         return made
 
     @property
     def scale(self) -> Tensor:
-        """S of the finest grid [matrices, z, y, x]."""
-        return self.array(0, "SCALE")
-
-    def array(self, stage: int, name: str) -> Tensor:
-        """What the table calls so, of the cells of a `stage`, [matrices, z, y, x] (a view)."""
-        return self.stages.view(self.data, stage, name, self.stages.shape(stage))
+        """S of the finest grid [matrices, z, y, x] (a view)."""
+        return self.stages.view(self.data, 0, "SCALE", self.stages.shape(0))
 
     @property
     def axes(self) -> Axes:

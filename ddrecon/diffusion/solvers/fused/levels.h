@@ -26,6 +26,11 @@ template <class F> struct Level {
     Size slice, cells;
     const F *cz, *cy, *cx, *scale, *taken;
 };
+// What each cell of the coarser grid sends below and above.
+template <class F> struct Weights {
+    const F *below, *above;
+    INLINE Weights operator+(Size count) const { return {below + count, above + count}; }
+};
 // The stages that are coarsened along each axis, or -1; and the next level's.
 struct Ways {
     int z, y, x, next;
@@ -51,8 +56,10 @@ template <class F> struct Grids {
         for (; s < w.next; ++s) (at(s, AXIS) == 0 ? w.z : at(s, AXIS) == 1 ? w.y : w.x) = s;
         return w;
     }
-    INLINE const F* weights(int s, int column, int matrix) const {
-        return data + at(s, column) + matrix * at(s + 1, NZ) * at(s + 1, NY) * at(s + 1, NX);
+    // Of the grid of stage s, from a `place` on in the coarser one.
+    INLINE Weights<F> weights(int s, int matrix, Size place) const {
+        const F* own = data + matrix * at(s + 1, NZ) * at(s + 1, NY) * at(s + 1, NX) + place;
+        return {own + at(s, BELOW), own + at(s, ABOVE)};
     }
 };
 

@@ -46,12 +46,12 @@ def solve(
     """
     made = source.new_empty(source.shape)
     if source[0].numel() < ALONE:
-        return _solve_checked(operator, source, guess, tolerance, most, made)
+        return _solve(operator, source, guess, tolerance, most, made)
     if source.nbytes >= TRIMMED:
         trim_freed_memory()
     guess = None if guess is None or guess.shape != source.shape else guess
     found = [
-        _solve_checked(
+        _solve(
             operator.of_color(color),
             source[color : color + 1],
             None if guess is None else guess[color : color + 1],
@@ -66,7 +66,7 @@ def solve(
     return Solution(made, max(part.iterations for part in found), worst)
 
 
-def _solve_checked(
+def _solve(
     operator: Operator,
     source: Tensor,
     guess: Tensor | None,
@@ -74,36 +74,16 @@ def _solve_checked(
     most: int,
     made: Tensor,
 ) -> Solution:
-    """The solution, written to `made`, by a hierarchy that coarsens the axes it should."""
-    hierarchy = operator.once(Hierarchy.of)
-    solution = _solve(hierarchy, source, guess, tolerance, most, made)
-    while not hierarchy.is_checked:
-        found = hierarchy.checked(operator)
-        operator.prepared[Hierarchy.of] = found
-        if found is not hierarchy:
-            solution = _solve(found, source, guess, tolerance, most, made)
-        hierarchy = found
-    return solution
-
-
-def _solve(
-    hierarchy: Hierarchy,
-    source: Tensor,
-    guess: Tensor | None,
-    tolerance: float,
-    most: int,
-    made: Tensor,
-) -> Solution:
-    """The solution in `made`, by a hierarchy that need not be checked."""
-    run, counts = Run(hierarchy, source, guess, tolerance), _counts[source.shape]
-    launched = min(max(counts), most)
-    run.iterate(0, launched)
-    count, residual = run.verdict(launched)
-    while residual > tolerance and launched < most:
-        more = min(2 * launched + 1, launched + MOST_AHEAD, most)
-        run.iterate(launched, more)
-        launched = more
-        count, residual = run.verdict(launched)
+    """The solution, written to `made`."""
+    hierarchy, counts = operator.once(Hierarchy.of), _counts[source.shape]
+    run, launched, more = Run(hierarchy, source, guess, tolerance), 0, max(counts)
+    is_open = True
+    while is_open:
+        end = min(launched + more, most)
+        run.iterate(launched, end)
+        count, residual = run.verdict(end)
+        launched, more = end, min(end + 1, MOST_AHEAD)
+        is_open = residual > tolerance and launched < most
     counts.append(count)
     torch.mul(run.vector("Y"), hierarchy.scale, out=made)  # u = S y
     give_back(run.vectors, run.coarser, run.scratch)
@@ -157,10 +137,9 @@ class Run:
     def verdict(self, launched: int) -> tuple[int, float]:
         """How many iterations were needed of those launched, and the relative residual left."""
         odd = launched % 2
-        left, norm = (
-            self.sums[SUMS[name] + n].sum(-1) for name, n in (("RESIDUAL", odd), ("SOURCE_NORM", 0))
-        )
-        relative = left.sqrt() / norm.sqrt().clamp(min=self.tiny)
+        rows = SUMS["RESIDUAL"] + odd, SUMS["SOURCE_NORM"]
+        left, norm = (self.sums[row].sum(-1).sqrt() for row in rows)
+        relative = left / norm.clamp(min=self.tiny)
         return int(self.sums[SUMS["COUNT"] + odd].max()), float(relative.max())
 
     def vector(self, name: str) -> Tensor:

@@ -39,9 +39,7 @@ template <class F> struct Maker {
     // A of a stage and a color: the finest as it is given, others in `work`.
     INLINE Grid<F> grid_of(int s, int color) const {
         Grid<F> g;
-        g.nz = (int)at(s, NZ);
-        g.ny = (int)at(s, NY);
-        g.nx = (int)at(s, NX);
+        g.nz = (int)at(s, NZ), g.ny = (int)at(s, NY), g.nx = (int)at(s, NX);
         g.cells = (Size)g.nz * g.ny * g.nx;
         for (int a = 0; a < 3; ++a) {
             const int ny = g.ny - (s == 0 && a == 1), nx = g.nx - (s == 0 && a == 2);
@@ -76,10 +74,10 @@ template <class F> struct Maker {
             const int z = r / g.ny, y = r - z * g.ny, nx = g.nx;
             row_of(g, 2, z, y, padded + 1);
             const F* __restrict x = padded;
-            const F* __restrict up = row_of(g, 0, z, y, zero), * __restrict down =
-                                                                   row_of(g, 0, z - 1, y, zero);
-            const F* __restrict back = row_of(g, 1, z, y, zero), * __restrict front =
-                                                                     row_of(g, 1, z, y - 1, zero);
+            const F* __restrict up = row_of(g, 0, z, y, zero);
+            const F* __restrict down = row_of(g, 0, z - 1, y, zero);
+            const F* __restrict back = row_of(g, 1, z, y, zero);
+            const F* __restrict front = row_of(g, 1, z, y - 1, zero);
             const F* __restrict loss = g.loss + (Size)r * nx;
             F* __restrict scale = in_data(s, SCALE, color, g.cells) + (Size)r * nx;
             F* __restrict taken = in_data(s, TAKEN, color, g.cells) + (Size)r * nx;
@@ -112,14 +110,7 @@ template <class F> struct Maker {
                 const int count = a == 2 ? nx - 1 : nx;
                 for (int i = 0; i < count; ++i) out[i] = faces[i] * here[i] * there[i];
                 if (a == 2) out[nx - 1] = F(0);
-                double total = 0.0;
-                int i = 0;
-                F part[16] = {};
-                for (; i + 16 <= nx; i += 16)
-                    for (int k = 0; k < 16; ++k) part[k] += out[i + k];
-                for (int k = 0; k < 16; ++k) total += (double)part[k];
-                for (; i < nx; ++i) total += (double)out[i];
-                sums[a] += total;
+                sums[a] += total(out, nx);
             }
         }
     }
