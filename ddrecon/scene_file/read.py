@@ -32,7 +32,14 @@ LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
     "below": ("below", operator.lt),
 }
 """What a bound in a field's metadata means."""
-WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Path: "text"}
+WORDS = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "text",
+    Path: "a file",
+}
+WORDS[Path] = "a file"
 PLURALS = {"number": "numbers", "whole number": "whole numbers", "list of 4 numbers": "rows of 4"}
 TRIPLE = (float, float, float)
 
