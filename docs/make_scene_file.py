@@ -1,5 +1,4 @@
-"""Makes the manual of scene files from the schema: scene_file.md, expert_keys.md, and for editors
-scene.schema.json.
+"""Makes scene_file.md and expert_keys.md, the manual of scene files, and scene.schema.json.
 
 Keys, kinds, limits and defaults are those the program checks. Run it after each change of them:
 
@@ -40,6 +39,7 @@ Every key, with what it takes, its limits and its default, made from the program
 
 Anything unknown, repeated or out of its limits is refused with file, line, column and key.
 [Keys for experts](expert_keys.md) have a page of their own.
+Small scenes with other phase functions, models and losses are in `configs/kinds`.
 
 Editors that know YAML complete and check keys by [scene.schema.json](scene.schema.json).
 Its place is the file's first line: `# yaml-language-server: $schema=PATH/scene.schema.json`."""

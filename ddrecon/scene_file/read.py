@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache, reduce
 from operator import or_
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from ddrecon.scene_file.nodes import Node, describe_found
 from ddrecon.scene_file.problems import Problems, suggestion
@@ -32,13 +32,19 @@ LIMITS: dict[str, tuple[str, Callable[[float, float], bool]]] = {
     "below": ("below", operator.lt),
 }
 """What a bound in a field's metadata means."""
-WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text", Path: "text"}
+WORDS = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "text",
+    Path: "a file",
+}
+WORDS[Path] = "a file"
 PLURALS = {"number": "numbers", "whole number": "whole numbers", "list of 4 numbers": "rows of 4"}
 TRIPLE = (float, float, float)
 
 
-@dataclass(frozen=True)
-class Rule:
+class Rule(NamedTuple):
     """What a value must be: of the type `hint`, within `limits`; relative paths start at `folder`.
 
     `finish[kind](node, record, folder)` is what a record of that kind stands for, and
@@ -56,6 +62,7 @@ def read_as(node: Node, hint: Any, folder: Path, **limits: float) -> Any:
     return read_value(node, Rule(hint, folder, limits, {}))
 
 
+@cache
 def alternatives(hint: Any) -> tuple[Any, ...]:
     """The types that `hint` allows."""
     return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
@@ -163,7 +170,7 @@ def _read_list(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
     for arguments in (get_args(kind) for kind in kinds if get_origin(kind) is tuple):
         is_open = arguments[-1] is Ellipsis and (entries or arguments[0] is float)
         if is_open or len(entries) == len(arguments):
-            values = read_each(entries, replace(rule, hint=arguments[0]))
+            values = read_each(entries, rule._replace(hint=arguments[0]))
             return _finish(node, (tuple, arguments[0]), values, rule)
     raise _refused(node, rule)
 
@@ -184,14 +191,14 @@ def _read_mapping(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
     """A record, or a mapping of names to records; `{constant: number}` stands for the number."""
     entries = node.entries()
     if FieldFile in kinds and float in kinds and set(entries) == {"constant"}:
-        return read_value(entries["constant"], replace(rule, hint=float))
+        return read_value(entries["constant"], rule._replace(hint=float))
     if records := [kind for kind in kinds if is_dataclass(kind)]:
         kind = _pick(node, records, rule)
         return _finish(node, kind, read_record(node, kind, rule), rule)
     for kind in kinds:
         if get_origin(kind) is Mapping:
             each = get_args(kind)[1]
-            values = read_each(node.children(), replace(rule, hint=each))
+            values = read_each(node.children(), rule._replace(hint=each))
             return _finish(node, (Mapping, each), dict(zip(entries, values, strict=True)), rule)
     raise _refused(node, rule)
 
@@ -208,7 +215,7 @@ def _pick(node: Node, kinds: Sequence[Any], rule: Rule) -> Any:
     if "type" not in entries:
         raise node.refused(f"missing key 'type', one of {', '.join(tagged)}")
     limits = {**rule.limits, "choices": tuple(tagged)}
-    return tagged[read_value(entries["type"], replace(rule, hint=str, limits=limits))]
+    return tagged[read_value(entries["type"], rule._replace(hint=str, limits=limits))]
 
 
 def read_record(node: Node, kind: type[R], rule: Rule) -> R:
@@ -231,9 +238,11 @@ def read_record(node: Node, kind: type[R], rule: Rule) -> R:
                     retired.get(name) or f"unknown key{suggestion(name, known)}"
                 )
             if name in declared:
-                limits = {**declared[name].metadata, "retired": retired}
+                limits: Mapping[str, Any] = declared[name].metadata
+                if retired:
+                    limits = {**limits, "retired": retired}
                 hint = reduce(or_, limits.get("also", ()), hints[name])
-                values[name] = read_value(child, replace(rule, hint=hint, limits=limits))
+                values[name] = read_value(child, rule._replace(hint=hint, limits=limits))
         if problems.are_many:
             break
     problems.raise_any()

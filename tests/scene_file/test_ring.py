@@ -59,6 +59,11 @@ def test_ring_views_have_names_and_no_images(read: Read, tmp_path: Path):
     assert read_scene(tmp_path / "dump.yaml").tree == scene_file.tree
 
 
+def test_one_view_in_so_many_is_a_test_view_whatever_the_source(read: Read):
+    tree = read(changed(views={"ring": RING, "test_every": 2})).tree
+    assert [view.split for view in tree.views] == ["test", "train", "test"]
+
+
 def test_images_are_sorted_and_relative_to_the_scene(read: Read, tmp_path: Path):
     (tmp_path / "targets").mkdir()
     for name in ("c", "a", "b"):

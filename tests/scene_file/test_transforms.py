@@ -258,7 +258,7 @@ def test_what_is_no_camera_of_ours_is_refused_by_key(
         ),
         ([{"file_path": "a.png"}], "frames.0: missing key 'transform_matrix'"),
         ([frame(), 3], "frames.1: expected a mapping, found 3"),
-        ([frame(7)], "frames.0.file_path: expected text, found 7"),
+        ([frame(7)], "frames.0.file_path: expected a file, found 7"),
     ],
 )
 def test_what_is_wrong_with_a_frame_is_told_by_key(
