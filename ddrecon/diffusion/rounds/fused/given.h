@@ -4,9 +4,9 @@
 
 namespace ddrecon {
 
-// A direction: the signs of its way along z, y, x, the axis across which its
-// slices lie, and the cells where its steps begin, of which the first may be `along` the row. Each
-// point tells how many cells it lies before the step's end, none or one.
+// A direction: the signs of its way along z, y, x, the axis across which its slices lie, and the
+// cells where its steps begin, of which the first may be `along` the row. Each point tells how many
+// cells it lies before the step's end, none or one.
 struct Course {
     int signs[3], axis, is_along, count, points[4][3];
 };
@@ -15,11 +15,10 @@ template <class F> struct Parts {
     F half, part[4];
 };
 
-// Directions that go through the rows together: the way in y, which of all
-// directions they are, their pairs, of which the first have moments odd in x, where their matrices
-// lie, and how many directions of the chunk are before them.
+// Directions that go through the rows together: the way in y, which of all directions they are,
+// their pairs, where their matrices lie, and how many directions of the chunk are before them.
 struct Group {
-    int y_way, begin, members, first_pair, pairs, odd_pairs, matrices, before;
+    int y_way, begin, members, first_pair, pairs, matrices, before;
 };
 
 // Directions through slices of a color, on the way up or down in z, `way` 1 or -1: `to_middle`

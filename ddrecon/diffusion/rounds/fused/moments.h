@@ -20,7 +20,7 @@ template <int R, class Step> INLINE void in_blocks(int count, Step step) {
 // Radiance at cells of a row, by its pairs. The second of a pair is -1 where there is none.
 template <class F> struct Pairs {
     const int* places;
-    int count, odd_count;
+    int count;
     F *lines, *copies;
     long long stride, pitch;
     INLINE F* copied(int k) const { return copies + k * pitch; }
@@ -65,7 +65,6 @@ template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_dire
     const F* matrix, const Sums<F, Order<DEGREE>::COUNT, TERMS>& sums, const Pairs<F>& pairs,
     long long ahead, int from, int to) {
     typedef Order<DEGREE> Own;
-    const F* odd_matrix = matrix + pairs.count * Own::EVEN;
     for (int k = 0; Own::ARE_MANY && k < Own::COUNT; ++k)
         in_steps<F>(from, to, [&](auto none, int c) HERE {
             write(pairs.copied(k) + c, sums.template at<decltype(none)>(k, c, ahead));
@@ -85,12 +84,11 @@ template <int DEGREE, int TERMS, class F> __attribute__((noinline)) void to_dire
             UNROLLED
             for (int a = 0; a < R; ++a) sum[a] = difference[a] = none;
             UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k) UNROLLED
-            for (int a = 0; a < R; ++a) sum[a] += matrix[(p + a) * Own::EVEN + k] * in[k];
-            if (p < pairs.odd_count) UNROLLED
-            for (int k = 0; k < Own::ODD; ++k) UNROLLED
-            for (int a = 0; a < R; ++a)
-                difference[a] += odd_matrix[(p + a) * Own::ODD + k] * in[Own::EVEN + k];
+            for (int k = 0; k < Own::COUNT; ++k) {
+                T* const found = k < Own::EVEN ? sum : difference;
+                UNROLLED
+                for (int a = 0; a < R; ++a) found[a] += matrix[(p + a) * Own::COUNT + k] * in[k];
+            }
             UNROLLED
             for (int a = 0; a < R; ++a) {
                 write(pairs.one(p + a) + c, sum[a] + difference[a]);
@@ -106,7 +104,6 @@ template <int DEGREE, class F> __attribute__((noinline)) void to_moments(
     const F* matrix, F* const* found, const F* const* taken, F first, bool is_adding,
     const Pairs<F>& pairs, long long ahead, int width) {
     typedef Order<DEGREE> Own;
-    const F* odd_matrix = matrix + pairs.count * Own::EVEN;
     auto begin = [&](auto none, int k, int c) HERE {
         typedef decltype(none) T;
         if (!is_adding) return (k ? F(0) : first) - read<T>(taken[k] + c);
@@ -130,12 +127,11 @@ template <int DEGREE, class F> __attribute__((noinline)) void to_moments(
                 difference[a] -= other;
             }
             UNROLLED
-            for (int k = 0; k < Own::EVEN; ++k) UNROLLED
-            for (int a = 0; a < R; ++a) out[k] += matrix[k * pairs.count + p + a] * sum[a];
-            if (p < pairs.odd_count) UNROLLED
-            for (int k = 0; k < Own::ODD; ++k) UNROLLED
-            for (int a = 0; a < R; ++a)
-                out[Own::EVEN + k] += odd_matrix[k * pairs.count + p + a] * difference[a];
+            for (int k = 0; k < Own::COUNT; ++k) {
+                const T* const given = k < Own::EVEN ? sum : difference;
+                UNROLLED
+                for (int a = 0; a < R; ++a) out[k] += matrix[k * pairs.count + p + a] * given[a];
+            }
         });
         UNROLLED
         for (int k = 0; k < Own::COUNT; ++k)

@@ -35,8 +35,8 @@ def struct_kernel(name: str, bits: int, header: str, struct: str, function: str)
 def table(struct: str, rows: Iterable[Mapping[str, Any]]) -> Tensor:
     """A `struct` of `given.h` for each of `rows`, whole numbers, which have its fields by name."""
     names = re.findall(r"(\w+)(?:\[\d\])*[,;]", _read(struct))
-    numbers = [[*_flat(row[name] for name in names)] for row in rows]
-    return torch.tensor(numbers, dtype=torch.int32)
+    numbers = [[torch.tensor(row[name]).flatten() for name in names] for row in rows]
+    return torch.stack([torch.cat(row) for row in numbers]).int()
 
 
 def _read(struct: str) -> str:
@@ -44,11 +44,3 @@ def _read(struct: str) -> str:
     text = Path(__file__).with_name("given.h").read_text(encoding="utf-8")
     (body,) = re.findall(rf"struct {struct} {{(.*?)\n}};", text, re.DOTALL)
     return " ".join(body.replace("* ", " *").split())
-
-
-def _flat(values: Iterable[Any]) -> Iterable[int]:
-    for value in values:
-        if isinstance(value, Iterable):
-            yield from _flat(value)
-        else:
-            yield int(value)

@@ -189,12 +189,10 @@ template <class F, int DEGREE, bool SHARES_FIELD, bool VARIES_NUMBERS> struct Re
     }
     template <bool IS_ALONG, int POINTS> INLINE void return_steps(
         const Here& here, const Steps<POINTS>& steps, const Back<POINTS>& back) const {
-        return_stretch<IS_ALONG, EMPTY>(steps, back, 0, here.from);
-        if (steps.half * here.deepest < F(0.25))
-            return_stretch<IS_ALONG, THIN>(steps, back, here.from, here.to);
-        else
-            return_stretch<IS_ALONG, ANY>(steps, back, here.from, here.to);
-        return_stretch<IS_ALONG, EMPTY>(steps, back, here.to, width);
+        const bool is_thin = steps.half * here.deepest < F(0.25);
+        in_stretches(here.from, here.to, width, is_thin, [&](auto of, int from, int to) HERE {
+            return_stretch<IS_ALONG, decltype(of)::matter>(steps, back, from, to);
+        });
     }
     template <bool IS_ALONG, Matter MATTER, int POINTS> INLINE void return_stretch(
         const Steps<POINTS>& given, const Back<POINTS>& given_back, int from, int to) const {

@@ -121,7 +121,7 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             matrices[i] = of.matrices + group->matrices + i * group->pairs * COUNT;
     }
     INLINE Pairs<F> pairs_at(F* first, long long apart) const {
-        return {of.pairs + 2 * group->first_pair, group->pairs, group->odd_pairs, first,
+        return {of.pairs + 2 * group->first_pair, group->pairs, first,
                 scratch_row(5 + of.most),         apart,        of.pitch};
     }
     INLINE Here place(int s, int t) const {
@@ -277,15 +277,12 @@ template <class N, class F, int DEGREE, bool SHARES_FIELD, bool KEEPS> struct Ro
             carry_on(light.change, carried.at, way, width);
         }
     }
-    // All steps of a row, by stretches.
     template <bool IS_ALONG, int POINTS> INLINE void follow_steps(
         const Here& here, const Steps<POINTS>& steps, const Line<N>& light) const {
-        follow_stretch<IS_ALONG, EMPTY>(steps, light, 0, here.from);
-        if (steps.half * here.deepest < F(0.25))
-            follow_stretch<IS_ALONG, THIN>(steps, light, here.from, here.to);
-        else
-            follow_stretch<IS_ALONG, ANY>(steps, light, here.from, here.to);
-        follow_stretch<IS_ALONG, EMPTY>(steps, light, here.to, of.width);
+        const bool is_thin = steps.half * here.deepest < F(0.25);
+        in_stretches(here.from, here.to, of.width, is_thin, [&](auto of, int from, int to) HERE {
+            follow_stretch<IS_ALONG, decltype(of)::matter>(steps, light, from, to);
+        });
     }
     template <bool IS_ALONG, Matter MATTER, int POINTS> INLINE void follow_stretch(
         const Steps<POINTS>& given, const Line<N>& light, int from, int to) const {

@@ -198,16 +198,12 @@ class _Maker:
         return begin, len(self.groups)
 
     def _add_group(self, units: list[Unit], y_way: int, before: int) -> None:
-        # Pairs with harmonics odd in x come first.
-        units = sorted(units, key=lambda unit: -abs(unit[0][0].direction[2]))
-        odd_pairs = sum(self.odd > 0 and unit[0][0].direction[2] != 0 for unit in units)
-        self.groups.append(
-            {
-                "y_way": y_way, "begin": len(self.steps), "members": sum(map(len, units)),
-                "first_pair": len(self.pairs), "pairs": len(units), "odd_pairs": odd_pairs,
-                "matrices": sum(map(len, self.matrices)), "before": before,
-            }
-        )  # fmt: skip
+        group = {
+            "y_way": y_way, "begin": len(self.steps), "members": sum(map(len, units)),
+            "first_pair": len(self.pairs), "pairs": len(units),
+            "matrices": sum(map(len, self.matrices)), "before": before,
+        }  # fmt: skip
+        self.groups.append(group)
         place = 0
         for unit in units:
             self.pairs.append([place, place + 1 if len(unit) > 1 else -1])
@@ -217,11 +213,8 @@ class _Maker:
         values = self._harmonics([unit[0][0].direction for unit in units])[self.order].T
         of_parts = self.units[self.order]
         weights = values.new_tensor([unit[0][1] for unit in units])[:, None]
-        even = len(self.order) - self.odd
         for matrix in (values / of_parts, values * of_parts * weights):
-            parts = matrix[:, :even], matrix[:, even:]
-            self.matrices += [part.reshape(-1) for part in parts]
-            self.matrices += [part.T.reshape(-1) for part in parts]
+            self.matrices += [matrix.reshape(-1), matrix.T.reshape(-1)]
 
     def _harmonics(self, directions: list[Direction]) -> Tensor:
         """Y_k [K, N] of `directions`."""

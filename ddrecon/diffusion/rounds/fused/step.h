@@ -8,6 +8,20 @@ namespace ddrecon {
 // What a step meets: no matter; steps of less than half an optical depth alone, in which what
 // passes needs no exponential; any.
 enum Matter { EMPTY, THIN, ANY };
+template <Matter MATTER> struct Of {
+    static constexpr Matter matter = MATTER;
+};
+// All steps to `width` cells of a row, which meet matter `from` one `to` another: `pass` does those
+// of a stretch.
+template <class Pass>
+INLINE void in_stretches(int from, int to, int width, bool is_thin, Pass pass) {
+    pass(Of<EMPTY>(), 0, from);
+    if (is_thin)
+        pass(Of<THIN>(), from, to);
+    else
+        pass(Of<ANY>(), from, to);
+    pass(Of<EMPTY>(), to, width);
+}
 
 // What a depth does to light, with slopes where it is a dual number: of a linear source on the way
 // `phi - psi` counts at the beginning and `psi` at the end; what passes, and what is lost.

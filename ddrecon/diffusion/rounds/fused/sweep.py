@@ -17,7 +17,6 @@ from ddrecon.diffusion.rounds.fused.swept import (
     split,
     units_of_parts,
 )
-from ddrecon.kernels.dual import split as halve
 from ddrecon.kernels.launch import thread_count
 from ddrecon.light.moments import Moments
 from ddrecon.medium.coefficients import Medium
@@ -148,9 +147,9 @@ class _Sweep(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *changes: Any) -> tuple[Tensor | None, ...]:
         def change(*tensors: Any) -> tuple[Tensor, ...]:
-            values, d_values = halve(tensors)
-            swept = Swept.of(*ctx.of, *values)
-            d_swept = swept.changes(*d_values)
+            half = len(tensors) // 2
+            swept = Swept.of(*ctx.of, *tensors[:half])
+            d_swept = swept.changes(*tensors[half:])
             swept = swept.spelled()
             if ctx.by_cells:
                 changed = Cells(swept, d_swept).follow()
