@@ -60,7 +60,7 @@ def parts_of(cells: int, rounds: int = 1) -> tuple[float, float, int, int]:
             taken.append(time.process_time() - start)
         times.append(min(taken[1:]))
     view = (times[1] - times[0]) / 4
-    return times[0] - view, view, run.scene.volume.grid.cells, sent[-1]
+    return times[0] - view, view, run.problem.scene.volume.grid.cells, sent[-1]
 
 
 def memory_speed() -> float:
