@@ -18,8 +18,8 @@ from torch import Tensor
 from ddrecon.numerics.conjugate_gradients import conjugate_gradients
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.scene_file.build import load_scene
+from ddrecon.uncertainty.samples import Uncertainty
 
 SCRIPT = "paper_g.py"
 COARSER = 4

@@ -30,7 +30,7 @@ from path_replay import DENSITY, HEADROOM, Replay, why_not
 from ddrecon.io.volumes.table import read_field
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.rates import rate_at
+from ddrecon.reconstruct.schedule import rate_at
 from ddrecon.reference.trace import open_tracer
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene

@@ -26,14 +26,14 @@ from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.levels import resample
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.posterior import TOLERANCE, Posterior, generator_of
-from ddrecon.reconstruct.prior import Prior
 from ddrecon.reconstruct.roughness import Roughness
-from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
 from ddrecon.settings import ParameterSettings
+from ddrecon.uncertainty.posterior import TOLERANCE, Posterior, generator_of
+from ddrecon.uncertainty.prior import Prior
+from ddrecon.uncertainty.samples import Uncertainty
 
 ROOT = Path(__file__).parents[1]
 STEPS = 3

@@ -22,8 +22,6 @@ KNEE = 1.2
 
 It is in optical depths across the box's shortest side, whatever the unit of density is.
 """
-THIN = 0.24
-"""The same for `l1` of density."""
 HUBER = 0.05
 """Errors above this part of the targets' root mean square count linearly in the Huber loss."""
 RELATIVE = 0.05
@@ -91,8 +89,6 @@ LOSSES: dict[str, Callable[[Tensor, Target], Tensor]] = {
     "display": display,
     "photon": photon,
 }
-QUADRATIC = ("l2", "display", "photon")
-"""Those that are mean squares of errors times the target's slope."""
 
 
 @dataclass(frozen=True)

@@ -172,15 +172,16 @@ class ParameterSettings:
     `field`: whether it differs from cell to cell (None: if it does so where it starts; density
     always does).
 
-    `tv` weighs its total variation and `l1` its mean, of density by E47; 1 would weigh them as much
-    as the whole brightness of the targets.
+    `tv` weighs its total variation, of density by E47; 1 would weigh it as much as the whole
+    brightness of the targets.
 
     `support`: where density may be above 0, by what pictures show: `masks`, or `auto` for what is
     brighter than black; widened by `support_margin` pixels. None is anywhere.
     """
 
     RETIRED: ClassVar[Mapping[str, str]] = {
-        "even_until": "cells are free from the start now: leave it out"
+        "even_until": "cells are free from the start now: leave it out",
+        "l1": "haze is left out by support: masks or support: auto; leave l1 out",
     }
 
     init: Start | None = None
@@ -188,7 +189,6 @@ class ParameterSettings:
     min: float | None = None
     max: float | None = None
     tv: float | None = optional(minimum=0)
-    l1: float = bounded(0.0, minimum=0)
     field: bool | None = None
     support: str | None = one_of(None, (MASKS, AUTO))
     support_margin: float = bounded(2.0, minimum=0, maximum=1000, expert=True)

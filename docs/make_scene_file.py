@@ -395,7 +395,8 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
             "lr": (
                 "Learning rate, in the parameter's own unit; chosen by its size unless given."
                 f" Of density it then has an optical depth of {DENSITY_STEP:g} across the box's"
-                " shortest side."
+                " shortest side. Numbers that are no field move by at most four times as much in"
+                " an iteration."
             ),
             "min": "Its smallest value.",
             "max": "Its largest value.",
@@ -403,10 +404,6 @@ SECTIONS: list[tuple[str, type, str, dict[str, str]]] = [
                 "Weight of its total variation, which smooths a field. 1 would weigh as much as "
                 f"the whole brightness of the pictures. Unless given, {KINDS['density'].tv:g} for"
                 " density, of whose logarithm it is (E47), and 0 for others."
-            ),
-            "l1": (
-                "Weight of its mean, which empties what no picture needs; for density of its"
-                " logarithm (E47), and 0.05 empties haze."
             ),
             "field": (
                 "Whether it differs from cell to cell; unless given, as its start does. Density "

@@ -16,7 +16,6 @@ from torch._subclasses.fake_tensor import FakeTensorDeviceMismatchError, FakeTen
 
 from ddrecon.diffusion.implicit import SolveMemory
 from ddrecon.engine import use_engine
-from ddrecon.reconstruct import joint, posterior, schedule
 from ddrecon.reconstruct.gradients import differentiate
 from ddrecon.reconstruct.levels import scene_at_level
 from ddrecon.reconstruct.log import Result
@@ -122,7 +121,7 @@ def test_derivatives_there_are_those_of_the_processor() -> None:
 
 
 def run(name: str, device: torch.device) -> Result:
-    """Two iterations: one in which each moves alone, and a joint one where there are cameras."""
+    """Two iterations."""
     level, overrides = RUNS[name]
     path, overrides = (
         CONFIGS / f"{name}.yaml",
@@ -138,14 +137,9 @@ def run(name: str, device: torch.device) -> Result:
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["torch", "warp"])
 @pytest.mark.parametrize("name", RUNS)
-def test_iterations_there_find_what_they_find_on_the_processor(
-    name: str, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_iterations_there_find_what_they_find_on_the_processor(name: str, engine: str) -> None:
     if engine == "warp":
         pytest.importorskip("warp")
-    monkeypatch.setattr(schedule, "TOGETHER", 2)
-    monkeypatch.setattr(joint, "MOST", 1)
-    monkeypatch.setattr(posterior, "INNER", 1)
     use_engine(engine)
     with near_kernels() if engine == "warp" else contextlib.nullcontext():
         there = run(name, FAR)

@@ -48,7 +48,7 @@ def export(
     as its volumes.
     """
     from ddrecon.io.volumes.table import FORMATS
-    from ddrecon.run.uncertainty_folder import volumes_in
+    from ddrecon.uncertainty.folder import volumes_in
 
     sources = tuple(path for source in sources for path in volumes_in(source) or [source])
     kind, known = output.suffix.lower(), (".xml", ".json", *FORMATS)

@@ -73,8 +73,7 @@ def uncertainty(
     from ddrecon.io.files.folders import claim_folder
     from ddrecon.pictures.noise import Noise
     from ddrecon.ranks import is_first
-    from ddrecon.reconstruct.next_view import FEWEST
-    from ddrecon.run.uncertainty import (
+    from ddrecon.uncertainty.drive import (
         Request,
         drive_uncertainty,
         dtype_of,
@@ -82,7 +81,8 @@ def uncertainty(
         state_of,
         take_up,
     )
-    from ddrecon.run.uncertainty_folder import uncertainty_lines
+    from ddrecon.uncertainty.folder import uncertainty_lines
+    from ddrecon.uncertainty.next_view import FEWEST
 
     if next_view and samples < FEWEST:
         raise click.UsageError(f"--next-view takes at least {FEWEST} samples; found {samples}")
@@ -113,8 +113,8 @@ def add_uncertainty(
     run: Reconstruction, folder: Path, is_quiet: bool
 ) -> tuple[dict[str, Any], list[str]]:
     """How sure `run` is, told in `uncertainty` within its `folder`: the record, and its lines."""
-    from ddrecon.run.uncertainty import Request, drive_uncertainty
-    from ddrecon.run.uncertainty_folder import uncertainty_lines
+    from ddrecon.uncertainty.drive import Request, drive_uncertainty
+    from ddrecon.uncertainty.folder import uncertainty_lines
 
     path = folder / "uncertainty"
     path.mkdir(exist_ok=True)
@@ -132,6 +132,6 @@ def add_uncertainty(
 
 def follow_added(run: Reconstruction) -> None:
     """Does this rank's part of what `add_uncertainty` does on the first."""
-    from ddrecon.run.uncertainty import Request, follow_uncertainty
+    from ddrecon.uncertainty.drive import Request, follow_uncertainty
 
     follow_uncertainty(run, SAMPLES, Request(run.seed))

@@ -1,18 +1,25 @@
-"""Gauges: changes of several parameters together that no picture shows, and that are not made.
+"""What is known of numbers without pictures: gauges, and how calibrations err.
+
+A gauge is a change of several parameters together that no picture shows, and that is not made.
 
 Twice the exposure of all cameras is half the light; all cameras moved together move the volume.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ddrecon.cameras import Camera
+from ddrecon.grid import Grid
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.scene import Scene, View
+from ddrecon.variables.default_rates import PIXELS
 
 
 @dataclass
@@ -88,3 +95,35 @@ def _common_motion(view: View, scene: Scene) -> Tensor:
     if view.camera.is_perspective:
         motion[3:, 6] = axes.T @ away
     return motion
+
+
+def weigh_calibration(pose: Parameter, curvature: Tensor, unit: Tensor, scene: Scene) -> Tensor:
+    """The second derivative [6, 6] of what the calibration of a camera adds to its view's loss.
+
+    It is as strong as what the picture, by the loss's `curvature` [6, 6], says of a shift in the
+    image by `TRUST`; both are in the `unit` [6] of the twist `pose`, its rates.
+    """
+    assert pose.view is not None
+    of_shifts = curvature.diagonal()[3:5].mean() / PIXELS**2
+    prior = calibration_prior(scene.view(pose.view).camera, scene.volume.grid).cpu()
+    return prior * unit * unit[:, None] * (tuning.TRUST**2 * of_shifts)
+
+
+def calibration_prior(camera: Camera, grid: Grid) -> Tensor:
+    """The inverse covariance [6, 6] of a twist of `camera` where its calibration is off (E29).
+
+    The direction errs by `TURN`, and by itself: a camera turns about its own place, not about the
+    volume as a twist does. The place errs by `SHIFT` of the distance from the middle of `grid`.
+    """
+    pose = camera.pose.detach().double()
+    away = pose[:, :3].T @ (pose[:, 3] - pose.new_tensor(grid.center_xyz))
+    distance = float(away.norm())
+    if not camera.is_perspective:
+        # Parallel rays come from no place: only what is across them counts.
+        away, distance = torch.zeros_like(away), math.hypot(*grid.extent) / 2
+    x, y, z = away.tolist()
+    # Where the camera goes, in its own axes: turn x away + shift.
+    turned = pose.new_tensor([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+    place = torch.cat([turned, torch.eye(3).to(pose)], 1) / (tuning.SHIFT * distance)
+    turn = torch.cat([torch.eye(3).to(pose), torch.zeros(3, 3).to(pose)], 1) / tuning.TURN
+    return place.T @ place + turn.T @ turn

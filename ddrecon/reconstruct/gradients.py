@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.shares import agree_on, own_views, sum_found
 from ddrecon.renderer import LightField, solve_light, view_picture
 from ddrecon.scene import Scene, View
@@ -162,3 +163,14 @@ class _Cut:
         self.tensors.append(tensor)
         self.leaves.append(tensor.detach().requires_grad_())
         return self.leaves[-1]
+
+
+def solve_tolerances(misfit: float) -> dict[str, float]:
+    """The relative residual at which each kind of solve may stop, by kind.
+
+    The gradient is J^T e, e being how far the images are from their targets, so that an error of
+    the light of relative size t changes e by t times the image, or by t / misfit of itself, misfit
+    being |e| over the size of the targets. The adjoint solve is linear in e: its relative error is
+    the gradient's, whatever the misfit. `misfit` >= 0 is that of the last images compared.
+    """
+    return {"forward": tuning.GRADIENT_ERROR * min(misfit, 1.0), "adjoint": tuning.GRADIENT_ERROR}

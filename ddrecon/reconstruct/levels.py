@@ -11,13 +11,10 @@ from torch.nn.functional import adaptive_avg_pool2d, adaptive_avg_pool3d, interp
 from ddrecon.grid import Grid
 from ddrecon.medium.coefficients import Volume
 from ddrecon.medium.mixture import mix_media
+from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
 from ddrecon.slabs.ghosts import Ghosts
 from ddrecon.slabs.slab import Slab, own_slab
-
-FEWEST_CELLS = 8
-FEWEST_PIXELS = 16
-"""No side of a grid or image longer than these is coarsened below them."""
 
 
 def factors(scene: Scene, refine_at: tuple[float, ...]) -> list[int]:
@@ -27,7 +24,7 @@ def factors(scene: Scene, refine_at: tuple[float, ...]) -> list[int]:
     """
     longest = max(scene.volume.grid.shape)
     powers = (2**k for k in range(len(refine_at), -1, -1))
-    fits = [power for power in powers if longest // power >= FEWEST_CELLS or power == 1]
+    fits = [power for power in powers if longest // power >= tuning.FEWEST_CELLS or power == 1]
     return [fits[0]] * (len(refine_at) + 1 - len(fits)) + fits
 
 
@@ -106,7 +103,7 @@ def _resample_cross_section(sigma: Tensor, grid: Grid) -> Tensor:
 def _view_at_level(view: View, factor: int) -> View:
     """`view` with up to `factor` times fewer pixels, a power of two, along each side."""
     powers = (2**k for k in range(factor.bit_length()))
-    fits = [power for power in powers if min(view.camera.size) // power >= FEWEST_PIXELS]
+    fits = [power for power in powers if min(view.camera.size) // power >= tuning.FEWEST_PIXELS]
     camera, image, mask = view.camera.resize(max(fits, default=1)), view.image, view.mask
     background = view.background
     if background is not None and background.shape[1:] != (1, 1):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -17,28 +16,21 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.engine import current_engine
 from ddrecon.errors import RanksError, SolveError
-from ddrecon.losses import QUADRATIC
-from ddrecon.ranks import cells_are_shared, from_first
-from ddrecon.reconstruct import setup
-from ddrecon.reconstruct.ahead import compile_ahead
+from ddrecon.ranks import cells_are_shared, from_first, rank_count
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.divergence import NotFiniteError, explain_divergence
-from ddrecon.reconstruct.gauges import find_gauges
-from ddrecon.reconstruct.gradients import Differentiated, differentiate
-from ddrecon.reconstruct.joint import moves_together, step_together
-from ddrecon.reconstruct.levels import factors, resample_solutions, scene_at_level
+from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
+from ddrecon.reconstruct.levels import resample_solutions
 from ddrecon.reconstruct.log import NO_ROWS, Result, Row, sum_rows
+from ddrecon.reconstruct.numbers import NumberSteps, Point
 from ddrecon.reconstruct.objective import Comparison, add_penalties, read_numbers, render_quality
-from ddrecon.reconstruct.schedule import Schedule
-from ddrecon.reconstruct.steps import solve_numbers, step_parameters
-from ddrecon.reconstruct.tolerance import solve_tolerances
-from ddrecon.reconstruct.views import pick_views
+from ddrecon.reconstruct.schedule import Schedule, pick_views
+from ddrecon.reconstruct.setup import Problem, start_parameters
 from ddrecon.scene import Scene, View
 from ddrecon.settings import Iterations
 from ddrecon.variables.values import with_values
-
-TEST_EVERY = 10
-"""Test views are rendered every so many iterations, and at the last."""
 
 
 def optimize(
@@ -60,31 +52,19 @@ def optimize(
 
 
 class Reconstruction:
-    """The state of a run: its parameters, their resolution, and the sum of its log, `total`.
+    """A run: its `problem`, which stays, and its state.
 
-    The objective is the weighted mean of the views' image loss plus, for each parameter, its
-    penalty times `power`, the mean square of the targets as the `loss` compares them. `misfit` is
-    the root of the last mean loss over `power`. `before_step` is the state before the last step.
+    That is its `parameters`, the `level` of resolution, the sum of its log, `total`, and `misfit`,
+    the root of the last mean loss over the problem's power. `before_step` is the state before the
+    last step.
     """
 
     def __init__(self, scene: Scene, iterations: Iterations | None = None):
-        self.settings = setup.require_settings(scene, iterations)
-        self.scene = scene
-        self.train = setup.select_views(scene, is_test=False)
-        self.test = setup.select_views(scene, is_test=True)
-        setup.require_usable(self.train, self.settings)
-        self.loss = setup.choose_loss(self.settings, self.train)
-        views = replace(scene, views=[*self.train.views, *self.test.views])
-        self.noises = setup.known_noises(views, self.settings, self.loss)
-        self.power = setup.mean_power(setup.targets_of(self.train, self.loss, self.noises))
-        self.parameters = setup.start_parameters(scene, self.settings)
-        setup.choose_steps(self.parameters, self.train, self.loss in QUADRATIC)
-        self.gauges = find_gauges(self.train, self.parameters)
-        self.support = setup.start_support(self.train, self.settings)
-        self.factors = factors(scene, self.settings.refine_at)
-        weights = {view.name: view.weight for view in self.train.views}
-        is_joint = moves_together(self.parameters, self.loss)
-        self.schedule = Schedule(self.settings, weights, is_joint)
+        self.problem = Problem.of(scene, iterations)
+        settings, train = self.problem.settings, self.problem.train
+        self.parameters = start_parameters(scene, settings)
+        self.numbers = NumberSteps(train, self.parameters)
+        self.schedule = Schedule(settings, {view.name: view.weight for view in train.views})
         self.total = NO_ROWS
         self.misfit = 1.0
         self.seed = from_first(torch.initial_seed())  # a script may seed each rank otherwise
@@ -109,7 +89,7 @@ class Reconstruction:
         step, since it was this step that led astray.
         """
         start = perf_counter()
-        compile_ahead(lambda: deepcopy(self)._iterate(start))
+        _compile_ahead(lambda: deepcopy(self)._iterate(start))
         stage = self.schedule.stage(self.iteration)
         if stage > self.stage:
             self._enter_stage(stage)
@@ -129,12 +109,13 @@ class Reconstruction:
     def _iterate(self, start: float) -> Row:
         """One iteration, begun at `start` [s]."""
         # See: which views this iteration compares.
+        level = self.level
         compared = Comparison(
-            self._views(), self.targets, self._is_test_due, noise_targets=self.noise_targets
+            self._views(), level.targets, self._is_test_due, noise_targets=level.noise_targets
         )
         # Differentiate: the objective and its derivative by every parameter.
         objective = self._differentiate(compared)
-        loss, gradients = add_penalties(objective, self.parameters, self.power)
+        loss, gradients = add_penalties(objective, self.parameters, self.problem.power)
         # Check: a derivative that is not finite would spoil the parameters for good.
         numbers = read_numbers(compared, objective, loss, gradients, self.parameters)
         # Remember: the state to go back to; the old one is dropped first, to hold one copy only.
@@ -144,7 +125,8 @@ class Reconstruction:
         self.before_step = self.state() | {"parameters": backups}
         del self.before_step["solutions"]
         # Step: every parameter against its derivative.
-        self.misfit = math.sqrt(numbers.of_images / self.power) if self.power else 1.0
+        power = self.problem.power
+        self.misfit = math.sqrt(numbers.of_images / power) if power else 1.0
         self._step(gradients, compared)
         # Judge: is there more to be done, here or at all?
         penalty = numbers.loss - numbers.of_images
@@ -163,7 +145,7 @@ class Reconstruction:
             test_psnr=test_psnr,
             forward_iterations=sum(count for kind, count in solves if kind == "forward"),
             adjoint_iterations=sum(count for kind, count in solves if kind == "adjoint"),
-            cells=self.train_level.volume.grid.cells,
+            cells=self.level.train.volume.grid.cells,
             ssim=numbers.ssim,
             test_ssim=test_ssim,
             chi_square=numbers.chi_square,
@@ -173,10 +155,10 @@ class Reconstruction:
 
     def current_scene(self) -> Scene:
         """The scene at full resolution, with everything as reconstructed so far."""
-        grid = self.scene.volume.grid
+        grid = self.problem.scene.volume.grid
         with torch.no_grad():
             values = {parameter.name: parameter.value_on(grid) for parameter in self.parameters}
-            return with_values(self.scene, values)
+            return with_values(self.problem.scene, values)
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps: tensors and plain values, enough to go on to the same bits."""
@@ -188,6 +170,7 @@ class Reconstruction:
             "misfit": self.misfit,
             "seed": self.seed,
             "schedule": self.schedule.state(),
+            "numbers": self.numbers.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -198,33 +181,24 @@ class Reconstruction:
         self.misfit, self.seed = state["misfit"], state["seed"]
         self.schedule.restore(state["schedule"])
         self._enter_stage(state["stage"])
-        for parameter in self.parameters:
-            curvature = state["parameters"][parameter.name]["curvature"]
-            parameter.curvature = None if curvature is None else curvature.to(parameter.value)
+        self.numbers.restore(state["numbers"])
         for kind, field in state.get("solutions", {}).items():
-            self.memory.last[kind] = field.to(self.scene.volume.density)
+            self.memory.last[kind] = field.to(self.problem.scene.volume.density)
 
     def _enter_stage(self, stage: int) -> None:
         """Takes scenes, parameters and solutions to the resolution of `stage`."""
-        self.stage = stage
-        self.train_level, self.test_level = (
-            scene_at_level(scene, self.factors[stage]) for scene in (self.train, self.test)
-        )
-        self.targets, self.test_targets = (
-            setup.targets_of(level, self.loss, self.noises)
-            for level in (self.train_level, self.test_level)
-        )
-        self.noise_targets = setup.noise_targets(self.train_level, self.train, self.noises)
-        before, grid = self.parameters[0].grid, self.train_level.volume.grid
-        self.memory.last = resample_solutions(self.memory.last, before, grid)
+        self.stage, self.level = stage, self.problem.at(stage)
+        before, volume = self.parameters[0].grid, self.level.train.volume
+        self.memory.last = resample_solutions(self.memory.last, before, volume.grid)
+        self.numbers.forget()
         for parameter in self.parameters:
-            if parameter.grid != grid:
-                parameter.refine(grid)
-            parameter.curvature = None
-        setup.keep_within(self.support, self.parameters, self.train_level, self.test_level)
+            if parameter.grid != volume.grid:
+                parameter.refine(volume.grid)
+            if volume.support is not None and parameter.name == "density":
+                parameter.restrict(volume.support)
 
     def _views(self) -> list[View]:
-        views, wanted = self.train_level.views, self.settings.views_per_iteration
+        views, wanted = self.level.train.views, self.problem.settings.views_per_iteration
         return [views[i] for i in pick_views(len(views), wanted, self.iteration, self.seed)]
 
     def _values(self) -> dict[str, Tensor]:
@@ -236,7 +210,7 @@ class Reconstruction:
         self.memory.tolerance_floor = solve_tolerances(self.misfit)
         names = [view.name for view in compared.views]
         try:
-            return differentiate(self.train_level, names, self._values(), compared, self.memory)
+            return differentiate(self.level.train, names, self._values(), compared, self.memory)
         except SolveError:
             # The adjoint cannot be solved for a loss that is not finite.
             compared.gather()
@@ -246,34 +220,40 @@ class Reconstruction:
             self.memory.tolerance_floor = {}
 
     def _step(self, gradients: dict[str, Tensor], compared: Comparison) -> None:
-        """Every parameter against its derivative, but those of views not seen or not yet due.
-
-        What cameras do, and how bright lights are, goes part of the way to what fits best.
-        """
-        if self.schedule.moves_together(self.iteration):
-            known = self.targets, self.power, self.gauges, self.memory.last
-            step_together(self.train_level, self.parameters, *known)
-            return
+        """Moves what is due: fields and maps by Adam, and single numbers all at once (E43)."""
         values = {name: value.detach() for name, value in self._values().items()}
-        names = {view.name for view in compared.views}
-        seen = [p for p in self.parameters if p.view is None or p.view in names]
-        solved = step_parameters(seen, gradients, self.schedule, self.iteration, self.power)
-        about = self.train_level, values, self.targets, self.memory.last
-        solve_numbers(solved, gradients, compared, *about, self.iteration)
-        for gauge in self.gauges:
-            gauge.hold()
+        rates = {p.name: self.schedule.rate(self.iteration, p.release) for p in self.parameters}
+        for p in self.parameters:
+            if rates[p.name] and (p.is_field or p not in self.numbers.numbers):
+                p.step(gradients[p.name], rates[p.name], self.problem.power)
+        due = [name for name, rate in rates.items() if rate]
+        point = Point(self.level.train, values, self.memory.last)
+        self.numbers.step(point, gradients, compared, due, self.iteration)
 
     @property
     def _is_test_due(self) -> bool:
         """Whether test views, and SSIM, are looked at in this iteration."""
         iteration = self.iteration + 1
-        return iteration % TEST_EVERY == 0 or self.schedule.is_over(iteration)
+        return iteration % tuning.TEST_EVERY == 0 or self.schedule.is_over(iteration)
 
     def _test_quality(self) -> tuple[float | None, float | None]:
         """The mean PSNR [dB] and SSIM of the test views.
 
         None without any, or where it is not their turn.
         """
-        if not self._is_test_due or not self.test_level.views:
+        if not self._is_test_due or not self.level.test.views:
             return None, None
-        return render_quality(self.test_level, self.parameters, self.test_targets, self.memory)
+        level = self.level
+        return render_quality(level.test, self.parameters, level.test_targets, self.memory)
+
+
+def _compile_ahead(computation: Callable[[], object]) -> None:
+    """Has the fused kernels of `computation` compiled side by side, where none is loaded yet.
+
+    `computation` is rehearsed: called with kernels that do nothing, on what nobody else reads. Of
+    several ranks none does so, as what one of them leaves out the others would wait for.
+    """
+    if current_engine() == "warp" and rank_count() == 1:
+        from ddrecon.kernels.compiling import compile_rehearsed
+
+        compile_rehearsed(computation)

@@ -158,7 +158,7 @@ def add_penalties(
     """
     loss, gradients = objective.loss, dict(objective.gradients)
     for parameter in parameters:
-        if parameter.tv or parameter.l1:
+        if parameter.tv:
             penalty = parameter.penalty(power)
             loss = loss + penalty.detach()
             gradients[parameter.name] += torch.autograd.grad(penalty, parameter.value)[0]

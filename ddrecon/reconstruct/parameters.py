@@ -9,41 +9,22 @@ from torch import Tensor
 
 from ddrecon.engine import current_engine
 from ddrecon.grid import Grid
-from ddrecon.losses import KNEE, THIN, compress, total_variation
+from ddrecon.losses import KNEE, compress, total_variation
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.levels import resample
 from ddrecon.reconstruct.roughness import stiffness_diagonal
 from ddrecon.settings import ParameterSettings
 from ddrecon.variables.kinds import kind_of
-
-BETAS = (0.9, 0.99)
-"""How much Adam's first and second moments keep of themselves in a step.
-
-The second forgets sooner than customary, since runs are short.
-"""
-FLOOR = 0.3
-"""What is added to the size of a cell's derivative, as a part of the root mean square of all.
-
-So cells that no picture says much of are not moved as far as any by what noise says.
-"""
-DAMPING = 2 * (1 - BETAS[0]) * (1 + 2 * BETAS[0]) / (1 + BETAS[0])
-"""What part of smoothing's stiffness is added to it besides (E49).
-
-Half of it would be where steps neither swell nor fade, in a field that smoothing alone moves.
-"""
-HALVED = 1 << 20
-"""Of fields of so many numbers, what a run goes back to has moments in half the bits."""
 
 
 class Parameter:
     """The value of one variable, and the optimizer that moves it within its bounds.
 
     A field is `[..., z, y, x]` on `grid` and follows its refinement; anything else is the same at
-    every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. The optimizer
-    is Adam (Kingma and Ba 2015, arXiv:1412.6980); of fields with Nesterov's momentum and a `FLOOR`
-    (E46), as short as smoothing asks (E49), begun anew at each resolution. `rate` is one number
-    or one for each entry. `view` is the name of the view that it belongs to, None for what all
-    views see. One that `is_fitted` is solved for instead; `curvature` is the second derivative of
-    the loss by it. Its regularizers see it in the `unit` of `unit_of`.
+    every resolution. It stays 0 where its `support` [z, y, x] is 0; None is nowhere. Adam moves
+    fields, begun anew at each resolution, and maps (E46, E49); `NumberSteps` moves other numbers.
+    `rate` is one number or one for each entry. `view` is the name of the view that it belongs to,
+    None for what all views see. Its total variation is that of it in the `unit` of `unit_of`.
     """
 
     def __init__(
@@ -60,8 +41,6 @@ class Parameter:
         self.low = kind.low if settings.min is None else settings.min
         self.high = kind.high if settings.max is None else settings.max
         self.release = kind.release
-        self.is_fitted = kind.is_fitted and settings.lr is None
-        self.curvature: Tensor | None = None
         owner, _, self.key = name.rpartition(".")
         self.view = owner.removeprefix("views.") if owner.startswith("views.") else None
         self.is_direction = kind.is_direction
@@ -69,28 +48,24 @@ class Parameter:
         weight = kind.tv if settings.tv is None else settings.tv
         self.tv = weight if self.is_field else 0.0
         self.unit, self.knee = unit, KNEE if kind.is_compressed else None
-        self.l1 = settings.l1
         self.value = value.clone().requires_grad_()
         self.support: Tensor | None = None
         self.steps = 0
         self.moments = (torch.zeros_like(value), torch.zeros_like(value))
 
     def penalty(self, power: float = 1.0) -> Tensor:
-        """What its regularizers add to the loss, where the targets' mean square is `power`.
+        """What its total variation adds to the loss, where the targets' mean square is `power`.
 
-        See `ParameterSettings` for the weights.
+        See `ParameterSettings` for its weight.
         """
-        value, parts = self.value / self.unit, list[Tensor]()
-        if self.tv:
-            variation = total_variation
-            if current_engine() == "warp":
-                from ddrecon.reconstruct.fused.passes import total_variation as variation
-            seen = value if self.knee is None else compress(value, self.knee)
-            parts.append((power * self.tv) * variation(seen, self.grid))
-        if self.l1:
-            size = value.abs() if self.knee is None else compress(value, THIN)
-            parts.append((power * self.l1) * size.mean())
-        return sum(parts[1:], parts[0]) if parts else value.new_zeros(())
+        if not self.tv:
+            return self.value.new_zeros(())
+        variation = total_variation
+        if current_engine() == "warp":
+            from ddrecon.reconstruct.fused.passes import total_variation as variation
+        value = self.value / self.unit
+        seen = value if self.knee is None else compress(value, self.knee)
+        return (power * self.tv) * variation(seen, self.grid)
 
     @property
     def largest_rate(self) -> float:
@@ -98,63 +73,54 @@ class Parameter:
         return self.rate if isinstance(self.rate, float) else float(self.rate.max())
 
     def step(self, gradient: Tensor, rate: float, power: float = 0.0) -> None:
-        """Moves the value against `gradient`, and back within its bounds.
+        """Moves a field or map against `gradient`, and back within its bounds (E46, E49).
 
         `rate` is the part of its learning rate that counts now, `power` the unit of the penalties
-        in the gradient, as in `add_penalties`. With m and v the running means of the derivative and
-        of its square, each divided by the part of 1 that their weights sum to, Adam moves the value
-        by -rate m / sqrt(v), and a field as E46 and E49 say.
+        in the gradient, as in `add_penalties`.
         """
         self.steps += 1
         # All are new tensors: the old ones are the state before the step.
-        before = self.value.detach()
-        rate_now, smallest = rate * self.rate, self._smallest_size(gradient)
+        before, warm_up = self.value.detach(), min(self.steps / tuning.WARM_UP, 1.0)
+        rate *= warm_up * self.largest_rate
+        keep, weights = tuning.BETAS, [1 - beta ** float(self.steps) for beta in tuning.BETAS]
+        # The mean of the new second moments, before there are any; a tensor, so that no device has
+        # to be waited for. Squares of less than the last term are none.
+        mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - keep[1])
+        smallest = (mean * (tuning.FLOOR**2 / weights[1])).sqrt()
+        smallest = smallest + torch.finfo(gradient.dtype).tiny ** 0.5
         if self.tv and power:
             stiffness = stiffness_diagonal(before / self.unit, self.grid, self.knee)
-            factor = DAMPING * rate * self.largest_rate * power * self.tv / self.unit**2
+            factor = tuning.STIFFNESS * rate * power * self.tv / self.unit**2
             smallest = torch.add(smallest, stiffness, alpha=factor)
-        value, self.moments = self._step(before, gradient, rate_now, smallest)
-        if self.is_direction:
-            value.mul_(before.norm() / value.norm())
+        if current_engine() == "warp":
+            from ddrecon.reconstruct.fused.passes import step_adam
+
+            many = self.moments, keep, self.steps, rate, smallest, keep[0], (self.low, self.high)
+            value, self.moments = step_adam(before, gradient, *many)
+        else:
+            first = self.moments[0].lerp(gradient, 1 - keep[0])
+            second = self.moments[1].mul(keep[1]).addcmul_(gradient, gradient, value=1 - keep[1])
+            size = (second.sqrt() / weights[1] ** 0.5) + smallest
+            value = before - gradient.lerp(first, keep[0]) / size * (rate / weights[0])
+            value, self.moments = value.clamp_(self.low, self.high), (first, second)
         if self.support is not None:
             value.mul_(self.support)
         self.value = value.requires_grad_()
 
-    def _step(
-        self, before: Tensor, gradient: Tensor, rate: float | Tensor, smallest: Tensor
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """The value within its bounds, and the moments, after the step from `before`.
+    def move(self, change: Tensor) -> None:
+        """Moves the value by `change`, one number for each entry, and back within its bounds.
 
-        `smallest`, a number or one for each entry, is added to the size of derivatives.
+        A field by factors of 1 + `change`, one for each color; a direction keeps its length.
         """
-        if current_engine() == "warp" and isinstance(rate, float):
-            from ddrecon.reconstruct.fused.passes import step_adam
-
-            bounds, ahead = (self.low, self.high), BETAS[0] if self.is_field else 1.0
-            return step_adam(
-                before, gradient, self.moments, BETAS, self.steps, rate, smallest, ahead, bounds
-            )
-        first, second = self.moments
-        weights = [1 - beta ** float(self.steps) for beta in BETAS]
-        first = first.lerp(gradient, 1 - BETAS[0])
-        second = second.mul(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-        size = (second.sqrt() / weights[1] ** 0.5) + smallest
-        onward = gradient.lerp(first, BETAS[0]) if self.is_field else first
-        value = before - onward / size * (rate / weights[0])
-        return value.clamp_(self.low, self.high), (first, second)
-
-    def _smallest_size(self, gradient: Tensor) -> Tensor:
-        """What is added to the size of each entry's derivative, `gradient` among them: one number.
-
-        It is a tensor, so that no device has to be waited for.
-        """
-        # Squares of less are none.
-        least = torch.finfo(gradient.dtype).tiny ** 0.5
-        if not self.is_field:
-            return gradient.new_tensor(least)
-        # Of the mean of the new second moments, before there are any.
-        mean = torch.lerp(self.moments[1].mean(), gradient.square().mean(), 1 - BETAS[1])
-        return (mean * (FLOOR**2 / (1 - BETAS[1] ** float(self.steps)))).sqrt() + least
+        before = self.value.detach()
+        change = change.to(before)
+        if self.is_field:
+            value = before * (1 + change.view_as(before[..., :1, :1, :1]))
+        else:
+            value = before + change.view_as(before)
+        if self.is_direction:
+            value = value * (before.norm() / value.norm())
+        self.value = value.clamp(self.low, self.high).requires_grad_()
 
     def value_on(self, grid: Grid) -> Tensor:
         """A copy of its value, on `grid` where it is a field."""
@@ -187,7 +153,6 @@ class Parameter:
             "shape": list(self.grid.shape),
             "steps": torch.tensor(float(self.steps), dtype=self.value.dtype),
             "moments": list(self.moments),
-            "curvature": self.curvature,
         }
 
     def backup(self) -> dict[str, Any]:
@@ -196,7 +161,7 @@ class Parameter:
         It is gone back to only where a step led astray.
         """
         state = self.state()
-        if self.value.numel() >= HALVED and self.value.dtype is torch.float32:
+        if self.value.numel() >= tuning.HALVED and self.value.dtype is torch.float32:
             state["moments"] = [moment.bfloat16() for moment in self.moments]
         return state
 

@@ -1,4 +1,6 @@
-"""How far along a run is, and when it ends: after a number of iterations, or when it is done.
+"""How far along a run is, what it looks at, and when it ends.
+
+That is after a number of iterations, or when it is done.
 
 A run with `iterations: auto` has parts: a part for each resolution, and a last one at the lowest
 learning rates. A part ends when what is left of the pictures is noise (the discrepancy principle,
@@ -13,22 +15,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from ddrecon.reconstruct.levels import stage_of
-from ddrecon.reconstruct.rates import rate_at
-from ddrecon.settings import AUTO, OptimizeSettings
+import torch
 
-PLANNED = 300
-"""A run that ends by itself refines and slows down as one of so many iterations, or sooner."""
-MOST = 1000
-"""It makes at most so many."""
-WINDOW = 20
-"""Iterations over which the loss has to fall,"""
-FALL = 0.01
-"""by more than this part of itself; else it has come to rest."""
-TOGETHER = 32
-"""Of so many iterations at a resolution, the last is one in which all that is sought moves together
-(E43).
-"""
+from ddrecon.reconstruct import tuning
+from ddrecon.reconstruct.levels import stage_of
+from ddrecon.settings import AUTO, OptimizeSettings
 
 
 @dataclass
@@ -48,21 +39,16 @@ class Progress:
 
 
 class Schedule:
-    """When a run of `settings` refines, slows down and ends; `weights` are its views' by name.
+    """When a run of `settings` refines, slows down and ends; `weights` are its views' by name."""
 
-    `is_joint`: it takes joint steps (E43).
-    """
-
-    def __init__(
-        self, settings: OptimizeSettings, weights: Mapping[str, float], is_joint: bool = False
-    ):
+    def __init__(self, settings: OptimizeSettings, weights: Mapping[str, float]):
         self.is_auto = settings.iterations == AUTO
-        self.planned = PLANNED if self.is_auto else int(settings.iterations)
-        self.most = MOST if self.is_auto else self.planned
-        self.refine_at, self.weights, self.is_joint = settings.refine_at, weights, is_joint
+        self.planned = tuning.PLANNED if self.is_auto else int(settings.iterations)
+        self.most = tuning.MOST if self.is_auto else self.planned
+        self.refine_at, self.weights = settings.refine_at, weights
         # Twice over all views, so that a window does not tell one view from another.
         seen = settings.views_per_iteration or len(weights)
-        self.window = max(WINDOW, 2 * math.ceil(len(weights) / seen))
+        self.window = max(tuning.WINDOW, 2 * math.ceil(len(weights) / seen))
         self.progress = Progress()
 
     def is_over(self, iteration: int) -> bool:
@@ -83,10 +69,6 @@ class Schedule:
         It is for parameters that begin to move after the part `release` of the run.
         """
         return rate_at(self.place(iteration), self.planned, round(release * self.planned))
-
-    def moves_together(self, iteration: int) -> bool:
-        """Whether `iteration` is one of the last at its resolution, in which all moves together."""
-        return self.place(iteration) in self._joint_places(self._part(iteration))
 
     @property
     def chi_square(self) -> float | None:
@@ -123,17 +105,16 @@ class Schedule:
     def _judge(self, iteration: int, part: int) -> None:
         """Ends the run, or `part` of it, where that is done after `iteration`."""
         now, ends, place = self.progress, self._part_ends, self.place(iteration + 1)
-        joint = self._joint_places(part)
         is_noise = self.chi_square is not None and self.chi_square <= 1
         is_at_rest = _is_at_rest(now.recent, self.window)
-        if is_noise and part >= len(self.refine_at) and place >= joint.stop:
+        if is_noise and part >= len(self.refine_at):
             now.ended = "noise"
         elif is_at_rest and part == len(ends):
             now.ended = "rest"
         elif iteration + 1 >= self.most:
             now.ended = "bound"
         elif part < len(ends) and (is_noise or is_at_rest):
-            now.skipped += max((joint.start if joint else ends[part]) - place, 0)
+            now.skipped += max(ends[part] - place, 0)
 
     def ending(self, made: int) -> dict[str, Any]:
         """Why a run that has `made` so many iterations ended: the kind, in words, and chi^2."""
@@ -141,8 +122,8 @@ class Schedule:
         what = {
             "noise": "what is left is noise",
             "rest": (
-                f"the loss has come to rest: it fell by less than {FALL:.0%} in {self.window}"
-                " iterations"
+                f"the loss has come to rest: it fell by less than {tuning.FALL:.0%}"
+                f" in {self.window} iterations"
             ),
             "bound": f"{self.most} iterations are the most that auto makes, though the loss fell",
             "iterations": f"{made} iterations were asked for",
@@ -165,12 +146,6 @@ class Schedule:
         """Where in the plan each part ends but the last."""
         return [round(part * self.planned) for part in self.refine_at] + [self.planned]
 
-    def _joint_places(self, part: int) -> range:
-        """Where in the plan `part` has its joint steps: its last places, if any."""
-        begin, *ends = [0, *self._part_ends][part : part + 2]
-        count = (ends[0] - begin) // TOGETHER if ends and self.is_joint else 0
-        return range(ends[0] - count, ends[0]) if count else range(0)
-
     def _part(self, iteration: int) -> int:
         """The number of the part that `iteration` belongs to."""
         return sum(self.place(iteration) >= end for end in self._part_ends)
@@ -181,4 +156,37 @@ def _is_at_rest(losses: Sequence[float], window: int) -> bool:
     if len(losses) < 2 * window:
         return False
     before, after = sum(losses[-2 * window : -window]), sum(losses[-window:])
-    return after > (1 - FALL) * before
+    return after > (1 - tuning.FALL) * before
+
+
+def rate_at(iteration: int, iterations: int, begin: int = 0) -> float:
+    """The part of their value that learning rates have in an iteration, in (0, 1].
+
+    It is for parameters that move from iteration `begin` on, and 0 before. After the last of
+    `iterations` it falls no more.
+    """
+    if iteration < begin:
+        return 0.0
+    fall: float = tuning.FINAL_RATE ** min(1.0, (iteration - begin) / (iterations - begin))
+    return fall
+
+
+def pick_views(count: int, wanted: int, iteration: int, seed: int) -> list[int]:
+    """The numbers of the views, of `count`, that `iteration` compares.
+
+    They are `wanted` views (0: all). Every view comes once before any comes again, in an order that
+    `seed` decides.
+    """
+    if not 0 < wanted < count:
+        return list(range(count))
+    # Over a run, views are taken from shuffled passes over all of them, one after another.
+    places = range(iteration * wanted, (iteration + 1) * wanted)
+    orders = {number: _shuffle(count, seed, number) for number in {i // count for i in places}}
+    return [orders[place // count][place % count] for place in places]
+
+
+def _shuffle(count: int, seed: int, number: int) -> list[int]:
+    """The order of `count` views in pass `number` over them."""
+    generator = torch.Generator().manual_seed(seed % 2**32 * 1_000_003 + number)
+    order: list[int] = torch.randperm(count, generator=generator).tolist()
+    return order

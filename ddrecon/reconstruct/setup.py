@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -11,16 +11,77 @@ from ddrecon.errors import FormatError, SceneError, UsageError
 from ddrecon.light.lights import BRIGHTNESS
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise, estimate_noise
-from ddrecon.reconstruct.brightness import RELEASE, can_solve_light
 from ddrecon.reconstruct.divergence import describe_flaw
+from ddrecon.reconstruct.levels import factors, scene_at_level
 from ddrecon.reconstruct.objective import target_of
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.rates import default_rate
 from ddrecon.reconstruct.support import Support, find_support
-from ddrecon.scene import Scene
+from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, Iterations, OptimizeSettings
 from ddrecon.variables.default_rates import unit_of
+from ddrecon.variables.kinds import kind_of
 from ddrecon.variables.values import value_of, variable_names, with_values
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a run is to find, and from what; nothing of it changes.
+
+    The objective is the weighted mean of the image loss of `train`'s views plus, for each
+    parameter, its penalty times `power`, the mean square of the targets as the `loss` compares
+    them. `test` has the views that are held out, `factors` how much coarser each stage is.
+    """
+
+    scene: Scene
+    settings: OptimizeSettings
+    train: Scene
+    test: Scene
+    loss: str
+    noises: Mapping[str, Noise]
+    power: float
+    support: Support | None
+    factors: Sequence[int]
+
+    @staticmethod
+    def of(scene: Scene, iterations: Iterations | None = None) -> Problem:
+        """What `scene` asks for, in as many `iterations` as it says, or as given.
+
+        Raises SceneError and FormatError where that cannot be had.
+        """
+        settings = require_settings(scene, iterations)
+        train, test = (select_views(scene, is_test) for is_test in (False, True))
+        require_usable(train, settings)
+        loss = choose_loss(settings, train)
+        views = replace(scene, views=[*train.views, *test.views])
+        noises = known_noises(views, settings, loss)
+        power = mean_power(targets_of(train, loss, noises))
+        support = start_support(train, settings)
+        levels = factors(scene, settings.refine_at)
+        return Problem(scene, settings, train, test, loss, noises, power, support, levels)
+
+    def at(self, stage: int) -> Level:
+        """It at the resolution of `stage`."""
+        factor, fine = self.factors[stage], self.train
+        train, test = (scene_at_level(scene, factor) for scene in (fine, self.test))
+        if self.support is not None:
+            cells = self.support.on(train.volume.grid)
+            train, test = (
+                replace(scene, volume=replace(scene.volume, support=cells))
+                for scene in (train, test)
+            )
+        targets, shown = (targets_of(scene, self.loss, self.noises) for scene in (train, test))
+        return Level(train, test, targets, shown, noise_targets(train, fine, self.noises))
+
+
+@dataclass(frozen=True)
+class Level:
+    """A problem at one resolution: its scenes, and what their views are compared with, by name."""
+
+    train: Scene
+    test: Scene
+    targets: Mapping[str, Target]
+    test_targets: Mapping[str, Target]
+    noise_targets: Mapping[str, Target]
 
 
 def require_settings(scene: Scene, iterations: Iterations | None) -> OptimizeSettings:
@@ -110,13 +171,16 @@ def _name_some(names: list[str]) -> str:
 
 def noises_of(scene: Scene, settings: OptimizeSettings) -> dict[str, Noise]:
     """The noise of the picture of each view of `scene`, by name: given, or estimated from it."""
-    given = settings.noise
     return {
-        view.name: view.noise
-        or (Noise(given.read, given.shot, view.step) if given else None)
-        or estimate_noise(target_of(view), view.step)
+        view.name: given_noise(view, settings) or estimate_noise(target_of(view), view.step)
         for view in scene.views
     }
+
+
+def given_noise(view: View, settings: OptimizeSettings) -> Noise | None:
+    """The noise of the picture of `view`, as its scene says, by the view or for all."""
+    given = settings.noise
+    return view.noise or (Noise(given.read, given.shot, view.step) if given else None)
 
 
 def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[str, Noise]:
@@ -124,7 +188,7 @@ def known_noises(scene: Scene, settings: OptimizeSettings, loss: str) -> dict[st
 
     It is known where the scene gives that of every training view, or where `loss` compares by it.
     """
-    is_given = all(view.is_test or view.noise or settings.noise for view in scene.views)
+    is_given = all(view.is_test or given_noise(view, settings) for view in scene.views)
     return noises_of(scene, settings) if is_given or loss == "photon" else {}
 
 
@@ -165,8 +229,12 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
     parameters, begun = [], with_values(scene, starts)
     for name, start in starts.items():
         wanted = settings.parameters[name]
-        rate, unit = wanted.lr or default_rate(begun, name, start), unit_of(begun, name)
+        rate, unit = wanted.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
         parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid, unit))
+    # Numbers wait for fields alone.
+    if not any(parameter.is_field for parameter in parameters):
+        for parameter in parameters:
+            parameter.release = 0.0
     return parameters
 
 
@@ -180,33 +248,3 @@ def start_support(train: Scene, settings: OptimizeSettings) -> Support | None:
     if support is not None:
         support.on(train.volume.grid)
     return support
-
-
-def keep_within(support: Support | None, parameters: Sequence[Parameter], *levels: Scene) -> None:
-    """Keeps density in `support` from now on: that of `parameters`, and of scenes on one grid."""
-    if support is None:
-        return
-    cells = support.on(levels[0].volume.grid)
-    for level in levels:
-        level.volume = replace(level.volume, support=cells)
-    for parameter in parameters:
-        if parameter.name == "density":
-            parameter.restrict(cells)
-
-
-def choose_steps(parameters: Sequence[Parameter], train: Scene, is_quadratic: bool) -> None:
-    """Has poses and lights among `parameters` descend where they are not to be solved for.
-
-    Poses with a loss that is no sum of squares (E29); and where those of only some of several views
-    of `train` are sought, or of a single one: then no calibration of all is to be mended, but a
-    camera to be found, which may be far off. For lights see `can_solve_light`.
-    """
-    poses = [parameter for parameter in parameters if parameter.key == "camera"]
-    if not is_quadratic or not len(poses) == len(train.views) > 1:
-        for pose in poses:
-            pose.is_fitted = False
-    for light in parameters:
-        if light.name.startswith("lights.") and light.is_fitted:
-            light.is_fitted = can_solve_light(light, parameters)
-            if light.is_fitted and any(parameter.is_field for parameter in parameters):
-                light.release = RELEASE

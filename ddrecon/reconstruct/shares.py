@@ -25,15 +25,10 @@ from ddrecon.ranks import (
     sum_numbers,
     sum_over_ranks,
 )
-from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct import tuning
 from ddrecon.scene import Scene, View
 from ddrecon.settings import RenderSettings
 from ddrecon.slabs.slab import Slab, own_slab
-
-CELL_COST = 0.5
-"""What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
-COARSE = 16
-"""A view's rays are counted as if it had about so many pixels along its shorter side."""
 
 
 def require_sharing(scene: Scene) -> None:
@@ -125,14 +120,14 @@ def view_cost(scene: Scene, view: View) -> float:
     All, because the light that leaves towards a camera is found in each cell.
     """
     grid, camera = scene.volume.grid, view.camera
-    coarse = camera.resize(max(1, min(camera.size) // COARSE))
+    coarse = camera.resize(max(1, min(camera.size) // tuning.COARSE))
     with torch.no_grad():
         rays = cast_rays(coarse)
         crossing = cross_box(grid, rays)
         length = float((crossing.far - crossing.near).sum()) / len(rays.direction)
     height, width = camera.size
     on_rays = height * width * scene.render.samples_per_pixel * length / min(grid.spacing)
-    return on_rays * scene.render.steps + CELL_COST * grid.cells
+    return on_rays * scene.render.steps + tuning.CELL_COST * grid.cells
 
 
 def sum_found(found: Sequence[Tensor | None], likes: Sequence[Tensor]) -> list[Tensor | None]:
@@ -167,22 +162,6 @@ def gather_numbers(
         for place, number in zip(places, numbers, strict=True):
             row[place] = number
     return [list(row) for row in sum_over_ranks([table])[0]]
-
-
-def take_from_owners(parameters: Sequence[Parameter], own: Collection[str]) -> None:
-    """Gives `parameters` of views the values found by the rank that rendered these.
-
-    `own` are the views that this one did.
-    """
-    if rank_count() == 1:
-        return
-    values = [parameter.value.detach() for parameter in parameters]
-    values = [
-        value if parameter.view in own else torch.zeros_like(value)
-        for value, parameter in zip(values, parameters, strict=True)
-    ]
-    for parameter, value in zip(parameters, sum_over_ranks(values), strict=True):
-        parameter.value = value.clone().requires_grad_()
 
 
 def agree_on(gradients: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -18,14 +18,11 @@ from ddrecon.cameras import Camera, project
 from ddrecon.errors import SceneError
 from ddrecon.grid import Grid
 from ddrecon.pictures.noise import estimate_noise
+from ddrecon.reconstruct import tuning
 from ddrecon.scene import View
 from ddrecon.settings import AUTO, MASKS, ParameterSettings
 
 KEY = "optimize.parameters.density.support"
-DARKEST = 0.1
-"""So much of each picture, at least, is background."""
-DEVIATIONS = 4.0
-"""Black is less than this above it."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +108,8 @@ def brightest_black(image: Tensor, step: float) -> float:
     than that by `DEVIATIONS` of the noise there (E26) shows something.
     """
     brightest = image.amax(0).flatten()
-    black = brightest.kthvalue(max(1, round(DARKEST * len(brightest)))).values
-    return float(black + DEVIATIONS * estimate_noise(image, step).deviation(black))
+    black = brightest.kthvalue(max(1, round(tuning.DARKEST * len(brightest)))).values
+    return float(black + tuning.DEVIATIONS * estimate_noise(image, step).deviation(black))
 
 
 def hull_of(camera: Camera, shown: Tensor, grid: Grid, margin: float) -> tuple[Tensor, Tensor]:

@@ -136,7 +136,8 @@ def drive_run(
                 total=total, initial=run.iteration, desc="optimize", **bar_settings(is_quiet)
             ) as bar:
                 if not is_quiet:
-                    tqdm.write(loss_text(describe_loss(run.settings, run.train)), file=sys.stderr)
+                    loss = describe_loss(run.problem.settings, run.problem.train)
+                    tqdm.write(loss_text(loss), file=sys.stderr)
                 while not run.is_done:
                     folder.save_in_time(run)
                     row = run.step()

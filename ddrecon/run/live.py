@@ -104,10 +104,10 @@ class LiveRun:
         dtype = next(iter(state["parameters"].values()))["value"].dtype
         run = Reconstruction(load_scene(self.folder / "scene.yaml", dtype=dtype))
         run.restore(state)
-        self.iterations = run.settings.iterations
+        self.iterations = run.problem.settings.iterations
         with torch.no_grad():
             scene, light_field, images, quality = render_run(run)
-        given = given_fields(run.scene)
+        given = given_fields(run.problem.scene)
         findings = Findings(scene, given, light_field, images, quality, [], {}, {}, "")
         volume = section("Volume", volume_section(findings))
         return [volume, section("Views", *view_section(findings))]

@@ -70,7 +70,7 @@ def render_views(
     That is its split, PSNR and SSIM, and of a test view the exposure it was given to compare it.
     """
     shown = [view for view in scene.views if view.image is not None]
-    targets = targets_of(replace(scene, views=shown), run.loss, run.noises)
+    targets = targets_of(replace(scene, views=shown), run.problem.loss, run.problem.noises)
     pictures, quality = {}, {}
     for view in shown:
         target, fitted = targets[view.name], dict[str, Tensor]()
@@ -99,9 +99,9 @@ def render_run(
 
 def compared_by(run: Reconstruction) -> dict[str, Any]:
     """What `run` minimizes and what its pictures are compared in, for its summary."""
-    described = describe_loss(run.settings, run.train)
-    if run.loss == "photon":
-        described["noise"] = {name: vars(noise) for name, noise in run.noises.items()}
+    described = describe_loss(run.problem.settings, run.problem.train)
+    if run.problem.loss == "photon":
+        described["noise"] = {name: vars(noise) for name, noise in run.problem.noises.items()}
     return described
 
 

@@ -132,7 +132,7 @@ class RunFolder:
         summary = _summary(run) | {"views": quality, "diagnoses": diagnoses}
         write_json(self.path / "summary.json", summary)
         settings = (self.path / "scene.yaml").read_text(encoding="utf-8")
-        given = given_fields(run.scene)
+        given = given_fields(run.problem.scene)
         findings = Findings(
             scene, given, light_field, images, quality, log, summary, environment, settings
         )
@@ -204,7 +204,7 @@ def _summary(run: Reconstruction) -> dict[str, Any]:
     total = dict(vars(run.total))
     summary = {"iterations": total.pop("iteration"), **total} | compared_by(run)
     summary["ended"] = run.schedule.ending(run.iteration)
-    support = describe_support(run.support, run.scene.volume.grid)
+    support = describe_support(run.problem.support, run.problem.scene.volume.grid)
     if support is not None:
         summary["support"] = support
     return summary

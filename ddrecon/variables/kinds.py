@@ -48,8 +48,8 @@ class Kind:
     vector points matters, and a step keeps its length. `tv` is the default weight of total
     variation, taken of what `losses.compress` makes of one that `is_compressed`;
     `difference_steps` are those of finite differences. `release` is the part of a run after which
-    the variable begins to move; one that `is_fitted` is solved for rather than moved along its
-    derivative, unless a scene gives its learning rate.
+    the variable begins to move where fields are sought, of which a lamp would learn wrong things
+    while they are empty.
     """
 
     rate: Rate
@@ -63,7 +63,6 @@ class Kind:
     is_compressed: bool = False
     difference_steps: tuple[float, ...] = LONG_STEPS
     release: float = 0.0
-    is_fitted: bool = False
 
 
 _CROSS_SECTION = Kind(cross_section_rate, low=0, is_color=True, is_cellwise=True)
@@ -71,7 +70,7 @@ _MEAN_COSINE = Kind(
     fixed_rate(0.05), low=-STEEPEST_G, high=STEEPEST_G, difference_steps=SHORT_STEPS
 )
 _LOBE_WEIGHT = Kind(fixed_rate(0.05), low=0, high=1, is_color=True, is_cellwise=True)
-_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, is_fitted=True)
+_BRIGHTNESS = Kind(brightness_rate, low=0, is_color=True, release=0.3)
 
 KINDS: Mapping[str, Kind] = {
     "density": Kind(density_rate, low=0, is_cellwise=True, tv=3e-3, is_compressed=True),
@@ -87,7 +86,7 @@ KINDS: Mapping[str, Kind] = {
     "lights.N.irradiance": _BRIGHTNESS,
     "lights.N.radiance": _BRIGHTNESS,
     "lights.N.intensity": _BRIGHTNESS,
-    "lights.N.scale": Kind(brightness_rate, low=0, is_fitted=True),
+    "lights.N.scale": Kind(brightness_rate, low=0, release=0.3),
     # in degrees
     "lights.N.rotation": Kind(fixed_rate(1.0), difference_steps=SHORT_STEPS),
     "lights.N.direction": Kind(
@@ -99,12 +98,10 @@ KINDS: Mapping[str, Kind] = {
         pose_rate,
         components=("rotation_x", "rotation_y", "rotation_z", *XYZ),
         difference_steps=SHORT_STEPS,
-        release=0.15,
-        is_fitted=True,
     ),
     # what a camera does to radiance: a factor, and what is added to it
-    "views.NAME.exposure": Kind(exposure_rate, low=1e-3, is_color=True, is_fitted=True),
-    "views.NAME.offset": Kind(offset_rate, is_color=True, is_fitted=True),
+    "views.NAME.exposure": Kind(exposure_rate, low=1e-3, is_color=True),
+    "views.NAME.offset": Kind(offset_rate, is_color=True),
     # of a perspective camera: its focal length in widths of the image, and the rest of its lens
     "views.NAME.focal": Kind(fixed_rate(1e-3), low=1e-3, difference_steps=SHORT_STEPS),
     "views.NAME.principal_point": Kind(

@@ -11,7 +11,7 @@ from click.testing import Result
 from far_device import FAR
 
 from ddrecon.cli import session
-from ddrecon.reconstruct import posterior
+from ddrecon.uncertainty import posterior
 
 Run = Callable[..., Result]
 

@@ -22,7 +22,7 @@ COUNT = 4
 @pytest.fixture
 def finished(folder: Path, succeed: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run of density from one picture."""
-    monkeypatch.setattr("ddrecon.reconstruct.next_view.CANDIDATES", COUNT)
+    monkeypatch.setattr("ddrecon.uncertainty.next_view.CANDIDATES", COUNT)
     succeed("optimize", "scene.yaml", "-o", "run", "-q", *SCENE)
 
 

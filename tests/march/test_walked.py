@@ -1,4 +1,4 @@
-"""Outside of a volume's support nothing is walked, and inside of it nothing else changes (E50)."""
+"""Outside of a volume's support nothing is walked, and inside of it nothing else changes (E35)."""
 
 from __future__ import annotations
 

@@ -31,9 +31,9 @@ import ddrecon.cli.uncertainty
 import ddrecon.ranks
 import ddrecon.run.render_folder
 import ddrecon.run.report_volume
-import ddrecon.run.uncertainty
 import ddrecon.scene_file.build
 import ddrecon.scene_file.doubts
+import ddrecon.uncertainty.drive
 from ddrecon.cli import main
 from ddrecon.errors import FormatError
 from ddrecon.reconstruct.loop import Reconstruction

@@ -11,7 +11,7 @@ from media import box_grid, random_values
 
 from ddrecon.errors import FormatError, SceneError, SolveError, UsageError
 from ddrecon.io.volumes.table import read_field
-from ddrecon.reconstruct import parameters
+from ddrecon.reconstruct import tuning
 from ddrecon.reconstruct.loop import Reconstruction, optimize
 from ddrecon.reconstruct.parameters import Parameter
 from ddrecon.run.checkpoint import FORMAT, load_checkpoint, save_checkpoint
@@ -127,7 +127,7 @@ def test_divergence_keeps_the_last_good_state(ball_scene: Scene) -> None:
     run.step()
     good = run.parameters[0].value.detach().clone()
     run.step()
-    run.train_level.views[0].image[0, 3, 4] = float("inf")
+    run.level.train.views[0].image[0, 3, 4] = float("inf")
     with pytest.raises(SolveError, match="not finite"):
         run.step()
     assert torch.equal(run.parameters[0].value, good)
@@ -144,7 +144,7 @@ def test_a_scene_without_training_images_is_refused(ball_scene: Scene) -> None:
 
 
 def test_a_backup_is_the_state_with_rounded_moments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parameters, "HALVED", 1)
+    monkeypatch.setattr(tuning, "HALVED", 1)
     grid, start = box_grid((3, 4, 5)), random_values(3, 4, 5, dtype=torch.float32)
     one, other = (Parameter("density", ParameterSettings(), 0.1, start, grid) for _ in range(2))
     one.step(random_values(3, 4, 5, seed=1, dtype=torch.float32) - 0.5, 1.0)

@@ -7,7 +7,7 @@ import torch
 from media import make_scene, random_values
 
 from ddrecon.errors import UsageError
-from ddrecon.reconstruct.next_view import find_error, find_gain, find_products, shots_around
+from ddrecon.uncertainty.next_view import find_error, find_gain, find_products, shots_around
 
 SIZE, PIXELS = 40, 60
 

@@ -10,11 +10,11 @@ from media import make_camera, make_scene, random_values
 
 from ddrecon.losses import Target
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.numbers import number_curvature, single_numbers, solve_numbers_within
+from ddrecon.reconstruct.numbers import number_curvature, single_numbers
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.posterior import Posterior
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
+from ddrecon.uncertainty.posterior import Posterior, solve_numbers_within
 from ddrecon.variables.values import value_of
 
 NAMES = (
@@ -48,16 +48,19 @@ def curvature() -> Curvature:
 
 
 def test_it_is_the_part_of_the_matrix_between_numbers(curvature: Curvature) -> None:
+    """And the levels of fields."""
     numbers = single_numbers(curvature.parameters)
     assert [number.name for number in numbers] == [name for name in NAMES if name != "density"]
-    chosen = curvature.join({number.name: torch.ones_like(number.value) for number in numbers})
-    places = chosen.nonzero()[:, 0]
-    found = number_curvature(curvature, numbers)
+    parts = []
+    for p in curvature.parameters:
+        entries = torch.eye(p.value.numel()).double().view(-1, *p.value.shape)
+        for way in p.value.detach()[None] if p.is_field else entries:
+            parts.append(curvature.join({p.name: way}))
+    basis = torch.stack(parts, 1)
+    found = number_curvature(curvature, curvature.parameters)
     size = found.diagonal().sqrt()
-    for ways in random_values(3, len(places)) - 0.5:
-        change = torch.zeros(curvature.size, dtype=torch.float64)
-        change[places] = ways / size
-        wanted = curvature.data_product(change)[places]
+    for ways in random_values(3, len(found)) - 0.5:
+        wanted = basis.T @ curvature.data_product(basis @ (ways / size))
         # Solves for tangents and adjoints end at their tolerance.
         torch.testing.assert_close(found @ (ways / size) / size, wanted / size, rtol=0, atol=1e-5)
 

@@ -7,11 +7,13 @@ import torch
 from media import box_grid, random_values
 from torch import Tensor
 
-from ddrecon.reconstruct.parameters import BETAS, DAMPING, FLOOR, Parameter
+from ddrecon.reconstruct.parameters import Parameter
+from ddrecon.reconstruct.tuning import BETAS, FLOOR, STIFFNESS, WARM_UP
 from ddrecon.settings import ParameterSettings
 
 GRID = box_grid((4, 6, 5))
 RATE = 1e-3
+FIRST = RATE / WARM_UP
 
 
 def start() -> Parameter:
@@ -25,7 +27,7 @@ def test_the_first_step_goes_ahead_of_the_derivative_over_its_floored_size() -> 
     before = parameter.value.detach()
     parameter.step(gradient, 1.0)
     size = gradient.abs() + FLOOR * gradient.square().mean().sqrt()
-    moved = before - RATE * (1 + BETAS[0]) * gradient / size
+    moved = before - FIRST * (1 + BETAS[0]) * gradient / size
     torch.testing.assert_close(parameter.value.detach(), moved)
 
 
@@ -51,16 +53,16 @@ def test_a_step_counts_the_curvature_of_smoothing_where_a_field_is_even() -> Non
     parameter.value = value
     parameter.step(gradient, 1.0, power)
     size = gradient.abs() + FLOOR * gradient.square().mean().sqrt()
-    size += DAMPING * RATE * hessian.diagonal().view(GRID.shape)
+    size += STIFFNESS * FIRST * hessian.diagonal().view(GRID.shape)
     torch.testing.assert_close(
-        parameter.value.detach(), value - RATE * (1 + BETAS[0]) * gradient / size
+        parameter.value.detach(), value - FIRST * (1 + BETAS[0]) * gradient / size
     )
 
 
 @pytest.mark.parametrize("part, largest", [(1.0, 1.0), (0.5, 0.6)])
 def test_half_of_the_damping_is_where_steps_no_longer_fade(part: float, largest: float) -> None:
     # A step of length 1 over the damping meets eigenvalues of smoothing over its diagonal up to 2.
-    keep, length = BETAS[0], part * 2 / (DAMPING / 2)
+    keep, length = BETAS[0], part * 2 / (STIFFNESS / 2)
     mean = torch.tensor([[1 - keep, keep]], dtype=torch.float64)
     onward = keep * mean + torch.tensor([[1 - keep, 0.0]])
     matrix = torch.cat([torch.tensor([[1.0, 0.0]]) - length * onward, mean])

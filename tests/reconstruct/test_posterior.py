@@ -13,9 +13,9 @@ from ddrecon.losses import Target
 from ddrecon.numerics.conjugate_gradients import conjugate_gradients
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.posterior import Posterior, generator_of
 from ddrecon.scene import View
 from ddrecon.settings import ParameterSettings
+from ddrecon.uncertainty.posterior import Posterior, generator_of
 
 SHAPE = (6, 6, 6)
 CELLS = 216

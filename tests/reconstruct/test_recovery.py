@@ -100,23 +100,49 @@ def image_error(scene: Scene, truth: Scene) -> float:
     return float((found - wanted).norm() / wanted.norm())
 
 
-def degrees_between(one: Tensor, other: Tensor) -> float:
-    return math.degrees(math.acos(min(1.0, float(one @ other / one.norm() / other.norm()))))
+ONE = torch.ones(3)
+STARTS: dict[str, Tensor] = {
+    "sigma_a": ONE,
+    "sigma_s": 8 * ONE,
+    "g": torch.tensor(0.0),
+    "lights.0.irradiance": 2 * ONE,
+    "lights.0.direction": torch.tensor([1.0, -2.0, -1.0]),
+    "lights.1.radiance": 0.3 * ONE,
+    "views.view_0.exposure": 0.5 * ONE,
+    "views.view_0.offset": torch.tensor([0.05]),
+    "views.view_1.camera": torch.tensor([0.04, -0.05, 0.03, 0.05, 0.03, 0.1]),
+    "views.view_2.focal": torch.tensor(1.5),
+    "views.view_2.principal_point": torch.tensor([0.55, 0.45]),
+}
+"""One of each kind of number, off from what `scene_of` has."""
 
 
-def test_the_colors_of_two_lights() -> None:
+@pytest.mark.parametrize("name", STARTS)
+def test_a_number_alone_comes_back(name: str) -> None:
     scene = photographed(scene_of(cloud(12), 3, 16))
-    starts = {"lights.0.irradiance": torch.ones(3), "lights.1.radiance": torch.full((3,), 0.3)}
-    found = recovered(scene, starts, 48)
-    for name in starts:
-        assert float((value_of(found, name) / value_of(scene, name) - 1).abs().max()) < 1e-3
+    truth, start = value_of(scene, name), STARTS[name]
+    found = value_of(recovered(scene, {name: start}, 40), name)
+    if name.endswith(".direction"):
+        found = found * (truth.norm() / found.norm())
+    if name.endswith(".camera"):
+        # A twist is about the camera as it is: what is left of it.
+        truth, found = pose_of(scene), pose_of(recovered(scene, {name: start}, 40))
+        start = pose_of(with_values(scene, {name: start}))
+    assert float((found - truth).norm()) < 0.01 * float((start - truth).norm())
 
 
-def test_the_direction_of_a_light() -> None:
-    scene = photographed(scene_of(cloud(12), 3, 16))
-    start, truth = torch.tensor([1.0, -2.0, -1.0]), value_of(scene, "lights.0.direction")
-    found = value_of(recovered(scene, {"lights.0.direction": start}, 80), "lights.0.direction")
-    assert degrees_between(start, truth) > 45 and degrees_between(found, truth) < 0.5
+def pose_of(scene: Scene) -> Tensor:
+    return scene.view("view_1").camera.pose
+
+
+def test_all_together_render_as_the_truth() -> None:
+    """Also with the density, which then has light and medium to share its level with."""
+    scene = photographed(scene_of(cloud(12), 3, 12))
+    for fields in ({}, {"density": 0.5 * scene.volume.density + 0.1}):
+        starts = STARTS | fields
+        found = recovered(scene, starts, 80, density=ParameterSettings(tv=0.0))
+        assert image_error(with_values(scene, starts), scene) > 0.5
+        assert image_error(found, scene) < 0.01
 
 
 def test_a_phase_function_that_scatters_backward() -> None:
@@ -135,27 +161,6 @@ def test_a_phase_function_that_scatters_backward() -> None:
     assert (
         abs(float(value_of(recovered(scene, {"g": torch.tensor(0.67)}, 140), "g")) + 0.802) < 0.02
     )
-
-
-@pytest.mark.parametrize("is_perspective", [True, False])
-def test_a_camera_turned_by_three_degrees_where_it_stands(is_perspective: bool) -> None:
-    scene = scene_of(cloud(12), 1, 24)
-    (view,) = scene.views
-    view.camera.is_perspective, view.camera.half_width = (
-        is_perspective,
-        0.27 if is_perspective else 0.6,
-    )
-    scene = photographed(scene)
-    pose = view.camera.pose
-    axis = torch.tensor([1.0, 0.5, 0.7])
-    x, y, z = axis / axis.norm() * math.radians(3)
-    turn = torch.linalg.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
-    turned = replace(view.camera, pose=torch.cat([pose[:, :3] @ turn, pose[:, 3:]], 1))
-    start = replace(scene, views=[replace(scene.views[0], camera=turned)])
-    found = recovered(start, {"views.view_0.camera": torch.zeros(6)}, 250).views[0].camera.pose
-    backward = [item[:, 2] for item in (turned.pose, found, pose)]
-    assert degrees_between(backward[0], backward[2]) > 2
-    assert all(degrees_between(found[:, axis], pose[:, axis]) < 0.1 for axis in range(3))
 
 
 def colored(volume: Volume) -> dict[str, Tensor]:
@@ -183,22 +188,3 @@ def test_absorption_and_scattering_fields_of_a_cloud_of_known_density() -> None:
             for value in (value_of(found, name), starts[name])
         )
         assert start > 0.15 and error < 0.75 * start, name
-
-
-def test_everything_jointly_renders_as_the_truth() -> None:
-    truth = photographed(scene_of(cloud(12), 3, 12))
-    off = {
-        "density": 0.5 * truth.volume.density + 0.1,
-        "sigma_a": torch.ones(3),
-        "sigma_s": torch.full((3,), 8.0),
-        "g": torch.tensor(0.0),
-        "lights.0.irradiance": torch.full((3,), 2.0),
-        "lights.0.direction": torch.tensor([-1.2, -2.0, -0.6]),
-        "lights.1.radiance": torch.full((3,), 0.2),
-        "views.view_1.camera": torch.zeros(6),
-    }
-    shift = torch.tensor([0.03, -0.03, 0.02, 0.02, 0.03, 0.1])
-    moved = with_values(truth, {"views.view_1.camera": shift})
-    found = recovered(moved, off, 80, density=ParameterSettings(tv=0.0))
-    assert image_error(with_values(moved, off), truth) > 0.5
-    assert image_error(found, truth) < 0.03

@@ -14,8 +14,8 @@ from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.levels import scene_at_level, stage_of
 from ddrecon.reconstruct.log import Result
 from ddrecon.reconstruct.loop import Reconstruction, optimize
-from ddrecon.reconstruct.rates import FINAL_RATE, rate_at
-from ddrecon.reconstruct.schedule import FALL, MOST, PLANNED, WINDOW, Schedule
+from ddrecon.reconstruct.schedule import Schedule, rate_at
+from ddrecon.reconstruct.tuning import FALL, FINAL_RATE, MOST, PLANNED, WINDOW
 from ddrecon.renderer import render
 from ddrecon.scene import Scene
 from ddrecon.scene_file.build import load_scene
@@ -26,12 +26,10 @@ ONE = {"front": 1.0}
 LossOf = Callable[[int], float]
 
 
-def schedule_of(
-    weights: dict[str, float] = ONE, iterations: int | str = AUTO, is_joint: bool = False
-) -> Schedule:
+def schedule_of(weights: dict[str, float] = ONE, iterations: int | str = AUTO) -> Schedule:
     parameters = {"density": ParameterSettings()}
     settings = OptimizeSettings(parameters, iterations, refine_at=(0.4, 0.8))
-    return Schedule(settings, weights, is_joint)
+    return Schedule(settings, weights)
 
 
 def drive(schedule: Schedule, loss_of: LossOf, chi_square_of: LossOf | None = None) -> list[int]:
@@ -76,25 +74,6 @@ def test_at_the_noise_a_coarse_grid_is_refined_and_the_finest_ends() -> None:
     stages = drive(schedule, lambda made: 0.5**made, lambda made: 1.01 if made % 7 else 1.0)
     assert stages == [0] + [1] * 7 + [2] * 7
     assert schedule.ending(len(stages))["kind"] == "noise"
-
-
-@pytest.mark.parametrize("chi_square", [2.0, 0.9], ids=["rest", "noise"])
-def test_joint_steps_end_every_resolution(chi_square: float) -> None:
-    """However soon it ends: as many as the plan has there, and none before."""
-    planned, schedule = schedule_of(iterations=PLANNED, is_joint=True), schedule_of(is_joint=True)
-    expected = [planned.stage(i) for i in range(PLANNED) if planned.moves_together(i)]
-    joint: list[int] = []
-
-    def loss_of(made: int) -> float:
-        if schedule.moves_together(made):
-            joint.append(made)
-        return 1.0
-
-    stages = drive(schedule, loss_of, lambda _: chi_square)
-    assert len(stages) < PLANNED and set(expected) == {0, 1, 2}
-    assert [stages[made] for made in joint] == expected
-    # The next iteration is at another resolution, or at the lowest rates.
-    assert {stages.index(1) - 1, stages.index(2) - 1} < set(joint)
 
 
 def test_noise_is_that_of_all_views() -> None:

@@ -111,15 +111,15 @@ def test_outside_of_its_support_a_volume_stays_empty() -> None:
     for view in scene.views:
         view.mask = (view.image.amax(0) > 0.26).to(view.image)
     run = Reconstruction(scene)
-    assert run.support is not None
+    assert run.problem.support is not None
     grids = set()
     while not run.is_done:
         run.step()
         (density,) = run.parameters
-        hull = run.support.on(density.grid)
+        hull = run.problem.support.on(density.grid)
         grids.add(density.grid)
         assert not density.value[~hull].any() and density.value[hull].min() >= 0.01
-        assert torch.equal(run.train_level.volume.support, hull)
+        assert torch.equal(run.level.train.volume.support, hull)
         assert 0.1 < float(hull.float().mean()) < 1
     assert len(grids) > 1
     truth = np.load(BALL.parents[1] / "data" / "ball" / "density.npz")["density"]
@@ -133,8 +133,8 @@ def test_masks_say_what_is_empty() -> None:
         mask[12:20, 12:20] = 1
     views = [replace(view, mask=mask) for view, mask in zip(scene.views, masks, strict=True)]
     run = Reconstruction(replace(scene, views=views))
-    assert run.support is not None
-    part = float(run.support.on(scene.volume.grid).float().mean())
+    assert run.problem.support is not None
+    part = float(run.problem.support.on(scene.volume.grid).float().mean())
     assert 0 < part < 0.2
 
 

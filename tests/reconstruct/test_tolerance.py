@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ddrecon.diffusion.implicit import SolveMemory
-from ddrecon.reconstruct.gradients import Differentiated, differentiate
+from ddrecon.reconstruct.gradients import Differentiated, differentiate, solve_tolerances
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.tolerance import GRADIENT_ERROR, solve_tolerances
+from ddrecon.reconstruct.tuning import GRADIENT_ERROR
 from ddrecon.scene import Scene
 
 

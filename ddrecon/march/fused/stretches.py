@@ -1,4 +1,4 @@
-"""Which segments of rays are walked: those that a volume's support touches (E50).
+"""Which segments of rays are walked: those that a volume's support touches (E35).
 
 Between two nodes whose cells all lie outside there is no matter and never will be: the segment adds
 nothing, and to no derivative that is asked for. A packet of rays has a bit for each segment, found

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ddrecon.numerics.around import mean_around
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.prior import normal_like
+from ddrecon.uncertainty.prior import normal_like
 
 PROBES = 3
 """Random pictures that it is found by."""

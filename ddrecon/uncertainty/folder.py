@@ -14,12 +14,12 @@ from torch import Tensor
 from ddrecon.io.files.json_file import write_json
 from ddrecon.io.images.table import write_linear
 from ddrecon.io.volumes.table import write_field
-from ddrecon.reconstruct.next_view import Candidate, NextView
-from ddrecon.reconstruct.posterior import Sample
-from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.run.checkpoint import LAST, load_checkpoint, save_checkpoint
 from ddrecon.run.run_folder import CHECKPOINTS
-from ddrecon.run.uncertainty_report import write_uncertainty_report
+from ddrecon.uncertainty.next_view import Candidate, NextView
+from ddrecon.uncertainty.posterior import Sample
+from ddrecon.uncertainty.report import write_uncertainty_report
+from ddrecon.uncertainty.samples import Uncertainty
 
 RECORD = "uncertainty.json"
 """What tells a folder of this kind."""

@@ -9,11 +9,11 @@ from typing import Any
 from torch import Tensor
 
 from ddrecon.io.images.table import png_of
-from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.report.error_bar import draw_error_bar
 from ddrecon.report.page import paragraph, picture, section, table, write_page
 from ddrecon.report.pictures import slices
 from ddrecon.report.volumes import find_white_value
+from ddrecon.uncertainty.samples import Uncertainty
 
 STRONG = 0.5
 """Correlations above this are told of."""

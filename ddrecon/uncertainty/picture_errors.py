@@ -12,8 +12,8 @@ from torch import Tensor
 from ddrecon.losses import Target
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.information import Information
-from ddrecon.reconstruct.posterior import Posterior
+from ddrecon.uncertainty.information import Information
+from ddrecon.uncertainty.posterior import Posterior
 
 LEAST_LEFT = 0.1
 """At least this part of all numbers is taken for noise: a run that fits all else shows none."""

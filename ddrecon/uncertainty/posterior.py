@@ -14,10 +14,10 @@ from torch import Tensor
 
 from ddrecon.numerics.conjugate_gradients import Solved, conjugate_gradients
 from ddrecon.reconstruct.curvature import Curvature
-from ddrecon.reconstruct.information import Information
-from ddrecon.reconstruct.limits import find_bounds, find_gauge, find_kept
-from ddrecon.reconstruct.numbers import number_curvature, single_numbers, solve_numbers_within
-from ddrecon.reconstruct.prior import DIAGONAL, Prior, normal_like, rounding_of
+from ddrecon.reconstruct.gauges import find_gauges
+from ddrecon.reconstruct.numbers import number_curvature, single_numbers
+from ddrecon.uncertainty.information import Information
+from ddrecon.uncertainty.prior import DIAGONAL, Prior, normal_like, rounding_of
 
 TOLERANCE = 0.5
 """How small a sample's residual is to be, of a right side's usual size."""
@@ -35,6 +35,8 @@ PRECONDITION = 0.1
 """or fewer, where so small a part of the residual is left."""
 PROBED = -1
 """The number of random vectors that belong to no sample, but to information."""
+GAUGE = 1e6
+"""How much more than by pictures a number is held by what no picture shows."""
 BEGIN = 0.25
 """The part of the way from a draw of the prior to what pictures roughly leave of it (E39)."""
 
@@ -247,3 +249,65 @@ class Posterior:
 def generator_of(seed: int, number: int) -> torch.Generator:
     """What draws the numbers of sample `number` >= 0, or those `PROBED`."""
     return torch.Generator().manual_seed((seed % 2**31) * 1_000_003 + number + 2)
+
+
+def find_bounds(curvature: Curvature) -> tuple[Tensor, Tensor]:
+    """The lowest and the highest value of every entry, [n] each."""
+    values, parameters = curvature.values, curvature.parameters
+    low = {p.name: torch.full_like(values[p.name], p.low) for p in parameters}
+    high = {p.name: torch.full_like(values[p.name], p.high) for p in parameters}
+    return curvature.join(low), curvature.join(high)
+
+
+def find_kept(curvature: Curvature) -> Tensor:
+    """Which entries stay as they are, [n]: cells outside of a field's support."""
+    kept = {
+        p.name: (p.support == 0).expand(p.value.shape).to(p.value)
+        for p in curvature.parameters
+        if p.support is not None
+    }
+    return curvature.join(kept) > 0
+
+
+def find_gauge(curvature: Curvature) -> Tensor | None:
+    """What changes have no part in, as orthonormal columns [n, k]; None where there is nothing.
+
+    That is what no picture shows (see `gauges`), and the length of a direction.
+    """
+    columns, values = list[Tensor](), curvature.values
+    for gauge in find_gauges(curvature.scene, curvature.parameters):
+        sizes = [parameter.value.numel() for parameter in gauge.parameters]
+        for column in gauge.directions.T:
+            parts = zip(gauge.parameters, column.split(sizes), strict=True)
+            # Of a relative gauge, changes are those of logarithms.
+            columns.append(
+                curvature.join(
+                    {
+                        p.name: part / values[p.name].flatten() if gauge.is_relative else part
+                        for p, part in parts
+                    }
+                )
+            )
+    columns += [
+        curvature.join({p.name: values[p.name]}) for p in curvature.parameters if p.is_direction
+    ]
+    return torch.linalg.qr(torch.stack(columns, 1))[0] if columns else None
+
+
+def solve_numbers_within(
+    matrix: Tensor, right: Tensor, is_fixed: Tensor, gauge: Tensor | None
+) -> Tensor:
+    """x [k] with `matrix` [k, k] x = `right` [k] where not `is_fixed`, there 0; `gauge`^T x is 0.
+
+    `gauge` [k, j] has what no picture shows in its columns.
+    """
+    free = ~is_fixed.to(matrix.device)
+    bent, unit = matrix[free][:, free], matrix.diagonal()[free].clamp(min=1e-300).rsqrt()
+    bent = bent * unit * unit[:, None]
+    if gauge is not None:
+        held = gauge.to(matrix)[free] * unit[:, None]
+        held = held / held.norm(dim=0).clamp(min=1e-300)
+        bent = bent + GAUGE * held @ held.T
+    solved = torch.zeros_like(right)
+    solved[free] = (unit * torch.linalg.solve(bent, unit * right.to(matrix)[free])).to(right)
+    return solved

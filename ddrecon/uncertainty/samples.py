@@ -12,12 +12,13 @@ from ddrecon.numerics.around import mean_around
 from ddrecon.pictures.noise import Noise
 from ddrecon.reconstruct.curvature import Curvature
 from ddrecon.reconstruct.gradients import differentiate
-from ddrecon.reconstruct.information import Information
 from ddrecon.reconstruct.loop import Reconstruction
 from ddrecon.reconstruct.objective import Comparison, add_penalties
 from ddrecon.reconstruct.parameters import Parameter
-from ddrecon.reconstruct.picture_errors import PictureErrors, find_errors, know_errors
-from ddrecon.reconstruct.posterior import (
+from ddrecon.reconstruct.setup import given_noise
+from ddrecon.uncertainty.information import Information
+from ddrecon.uncertainty.picture_errors import PictureErrors, find_errors, know_errors
+from ddrecon.uncertainty.posterior import (
     NUMBERS,
     PROBED,
     TOLERANCE,
@@ -47,11 +48,12 @@ class Uncertainty:
         self.parameters = run.parameters
         self.curvature = curvature_of(run)
         gradient = gradient_of(run, self.curvature)
-        known = know_errors(self.curvature, run.targets, _noises(run, noise))
+        targets = run.level.targets
+        known = know_errors(self.curvature, targets, _noises(run, noise))
         information = Information(self.curvature, generator_of(seed, PROBED))
         # What residuals said takes a solve to find: a run that goes on has it.
         self.errors = (
-            known or errors or find_errors(self.curvature, run.targets, gradient, seed, information)
+            known or errors or find_errors(self.curvature, targets, gradient, seed, information)
         )
         if tolerance is None:
             tolerance = NUMBERS if self.tabled else TOLERANCE
@@ -169,28 +171,22 @@ class Uncertainty:
 
 def curvature_of(run: Reconstruction) -> Curvature:
     """The curvature of the objective of `run` where it is."""
-    level, memory = run.train_level, run.memory
-    return Curvature(level, run.parameters, run.targets, run.power, memory.last)
+    level, memory = run.level.train, run.memory
+    return Curvature(level, run.parameters, run.level.targets, run.problem.power, memory.last)
 
 
 def gradient_of(run: Reconstruction, curvature: Curvature) -> Tensor:
     """The derivative of the objective of `run`, of all its training views, where it is."""
-    views = list(run.train_level.views)
-    compared = Comparison(views, run.targets)
+    views = list(run.level.train.views)
+    compared = Comparison(views, run.level.targets)
     names = [view.name for view in views]
     values = {parameter.name: parameter.value for parameter in run.parameters}
-    objective = differentiate(run.train_level, names, values, compared, curvature.new_memory())
-    return curvature.join(add_penalties(objective, run.parameters, run.power)[1])
+    objective = differentiate(run.level.train, names, values, compared, curvature.new_memory())
+    return curvature.join(add_penalties(objective, run.parameters, run.problem.power)[1])
 
 
 def _noises(run: Reconstruction, noise: Noise | None) -> dict[str, Noise]:
     """The noise of training pictures by name, as `noise` or their scene says."""
-    given = run.settings.noise
-    found = {}
-    for view in run.train_level.views:
-        said = noise or view.noise
-        if said is None and given is not None:
-            said = Noise(given.read, given.shot, view.step)
-        if said is not None:
-            found[view.name] = said
-    return found
+    settings, views = run.problem.settings, run.level.train.views
+    found = {view.name: noise or given_noise(view, settings) for view in views}
+    return {name: said for name, said in found.items() if said is not None}

@@ -17,15 +17,15 @@ from ddrecon.pictures.noise import Noise
 from ddrecon.progress import bar_settings
 from ddrecon.ranks import from_first, is_any, leave_ranks
 from ddrecon.reconstruct.loop import Reconstruction
-from ddrecon.reconstruct.next_view import NextView, shots_around
-from ddrecon.reconstruct.picture_errors import PictureErrors
-from ddrecon.reconstruct.posterior import Sample
-from ddrecon.reconstruct.uncertainty import Uncertainty
 from ddrecon.run.checkpoint import LAST, UNUSABLE, load_checkpoint
 from ddrecon.run.leftovers import remove_samples
 from ddrecon.run.run_folder import CHECKPOINTS, require_run
-from ddrecon.run.uncertainty_folder import UncertaintyFolder
 from ddrecon.scene import Scene
+from ddrecon.uncertainty.folder import UncertaintyFolder
+from ddrecon.uncertainty.next_view import NextView, shots_around
+from ddrecon.uncertainty.picture_errors import PictureErrors
+from ddrecon.uncertainty.posterior import Sample
+from ddrecon.uncertainty.samples import Uncertainty
 
 
 def state_of(folder: Path) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def take_up(scene: Scene, state: dict[str, Any], folder: Path) -> Reconstruction
         run.restore(state)
     except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise FormatError(folder / CHECKPOINTS / LAST, UNUSABLE) from error
-    if run.stage + 1 < len(run.factors):
+    if run.stage + 1 < len(run.problem.factors):
         raise UsageError(
             f"{folder}: the run stopped before its last resolution; finish it with "
             "`ddrecon optimize --resume`"
@@ -115,7 +115,7 @@ def _begin(
     errors = None if state is None else PictureErrors(**state["errors"])
     kind, ranking = request.next_view, None
     # Before anything takes long: there may be nothing to rank.
-    shots = [] if kind is None else shots_around(run.train_level, kind)
+    shots = [] if kind is None else shots_around(run.level.train, kind)
     found = Uncertainty(run, request.seed, request.noise, request.tolerance, errors)
     if shots:
         ranking = NextView(found.curvature, shots, found.errors.deviation)

@@ -1,0 +1,76 @@
+"""Every constant of the optimization that is no law of physics, and what it was chosen on.
+
+A module reads them as `tuning.NAME`, so that an ablation changes one place.
+"""
+
+from __future__ import annotations
+
+import math
+
+# How fields move: Adam (E46, E49). Chosen on the plume, by its density error.
+BETAS = (0.9, 0.99)
+"""How much Adam's moments keep of themselves in a step; the second less than customary, since runs
+are short."""
+FLOOR = 0.3
+"""What is added to the size of a cell's derivative, as a part of the root mean square of all.
+
+So cells that no picture says much of are not moved as far as any by what noise says.
+"""
+STIFFNESS = 2 * (1 - BETAS[0]) * (1 + 2 * BETAS[0]) / (1 + BETAS[0])
+"""What part of smoothing's stiffness is added to it besides (E49). Derived, not chosen: half of it
+is where steps neither swell nor fade, in a field that smoothing alone moves."""
+WARM_UP = 5
+"""Iterations at a resolution over which rates rise to their value: Adam's first steps are all of
+full size, and would throw away what a coarser grid has found. With 10 the plume is less close."""
+FINAL_RATE = 0.2
+"""Rates fall exponentially over a run, to this part of their value."""
+HALVED = 1 << 20
+"""Of fields of so many numbers, what a run goes back to has moments in half the bits: memory."""
+
+# How numbers move: damped Gauss-Newton steps (E43). Chosen on the capture at half size, and seen on
+# Fig. 10 and 14.
+MOST_ENTRIES = 16
+"""Parameters of more values, such as maps of radiance, are not among single numbers."""
+DAMPING = 1.0
+"""How much of its own curvature each parameter is held by: alone, it goes half of the way."""
+LARGEST_STEP = 4.0
+"""No number moves by more than so many times its rate."""
+LEVEL_RATE = 0.05
+"""The rate of a field's level, as a part of it."""
+REFRESH = 16
+"""Iterations after which a picture's curvature is found anew: sooner, early at a resolution. With 4
+results are the same, and take longer."""
+LEAST = 1e-4
+"""Least curvature, as a part of the parameter's largest: what no picture shows stays."""
+TURN, SHIFT = math.radians(1.0), 0.005
+"""How far a calibration's direction of a camera may be off [rad], and its place, as a part of its
+distance from the volume: what films from ordinary calibrations err by (E29)."""
+TRUST = 0.5
+"""Pixels by which a volume may be off that was made with such cameras: pictures count against the
+calibration as if each image were known no better."""
+
+# How long a run is, and how exact (`schedule`, `levels`).
+PLANNED, MOST = 300, 1000
+"""A run that ends by itself refines and slows down as one of so many iterations, or sooner; and
+makes at most so many."""
+WINDOW, FALL = 20, 0.01
+"""Iterations over which the loss has to fall, by more than this part of itself; else it has come to
+rest."""
+FEWEST_CELLS, FEWEST_PIXELS = 8, 16
+"""No side of a grid or image longer than these is coarsened below them."""
+GRADIENT_ERROR = 0.01
+"""The relative error that each of the two solves may make in the gradient."""
+TEST_EVERY = 10
+"""Test views are rendered every so many iterations, and at the last."""
+
+# Support by pictures (`support`). Chosen on the capture.
+DARKEST = 0.1
+"""So much of each picture, at least, is background."""
+DEVIATIONS = 4.0
+"""Black is less than so many deviations of noise above it."""
+
+# How ranks share views (`shares`). Chosen by timing the plume.
+CELL_COST = 0.5
+"""What a view costs for each cell of the grid, whatever it sees, in units of a cell on a ray."""
+COARSE = 16
+"""A view's rays are counted as if it had about so many pixels along its shorter side."""
