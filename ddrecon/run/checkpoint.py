@@ -14,7 +14,7 @@ from ddrecon.errors import DataWarning, FormatError, UsageError
 from ddrecon.io.files.atomic import replace_file_durably
 from ddrecon.run.differences import differences
 
-FORMAT = 6
+FORMAT = 7
 """What a checkpoint holds; counts up when that changes."""
 LAST, PREVIOUS = "last.pt", "previous.pt"
 """The names of the last checkpoint and of the one before it."""
