@@ -44,7 +44,7 @@ def parts_in_torch(scene: Scene, has_slabs: bool, is_on_gpu: bool) -> tuple[str,
     has_skies = any(isinstance(light, AmbientLight | EnvironmentLight) for light in scene.lights)
     is_diffuse, has_rounds = multiply_scatters(medium, settings), settings.rounds > 0
     parts = {
-        "diffusion": not is_fused,
+        "diffusion": not is_fused or (has_slabs and is_diffuse),
         "transport rounds": has_rounds
         and not has_kernels("transport rounds", is_on_gpu, has_slabs),
         "beams": has_slabs and (has_skies or _has_beams(scene.lights)),

@@ -106,7 +106,9 @@ def test_engines_agree_on_every_config(config: Path, dtype: torch.dtype) -> None
     factor = -(-max(scene.volume.grid.shape) // MOST_CELLS)
     scene = scene_at_level(replace(scene, views=scene.views[:2]), factor)
     volume = replace(scene.volume, density=half_empty(*scene.volume.grid.shape, dtype=dtype))
-    diffusion = replace(scene.diffusion, tolerance=SOLVED[dtype])
+    # Fixed points of 32 bits, in flux-limited diffusion, tell no more than that.
+    is_fixed = scene.diffusion.model == "flux_limited" and dtype == torch.float32
+    diffusion = replace(scene.diffusion, tolerance=1e-5 if is_fixed else SOLVED[dtype])
     scene = replace(scene, volume=volume, diffusion=diffusion)
     assert_engines_agree(scene, variables_of(scene))
 

@@ -19,7 +19,7 @@ from ddrecon.reconstruct.support import Support, find_support
 from ddrecon.scene import Scene, View
 from ddrecon.settings import AUTO, Iterations, OptimizeSettings
 from ddrecon.variables.default_rates import unit_of
-from ddrecon.variables.kinds import kind_of
+from ddrecon.variables.kinds import is_of_volume, kind_of
 from ddrecon.variables.values import value_of, variable_names, with_values
 
 
@@ -231,8 +231,9 @@ def start_parameters(scene: Scene, settings: OptimizeSettings) -> list[Parameter
         wanted = settings.parameters[name]
         rate, unit = wanted.lr or kind_of(name).rate(begun, name, start), unit_of(begun, name)
         parameters.append(Parameter(name, wanted, rate, start, scene.volume.grid, unit))
-    # Numbers wait for fields alone.
-    if not any(parameter.is_field for parameter in parameters):
+    # Lights wait for fields alone, and not for those whose level is moved with the lights (E43).
+    has_levels = any(is_of_volume(p.name) and not p.is_field for p in parameters)
+    if has_levels or not any(parameter.is_field for parameter in parameters):
         for parameter in parameters:
             parameter.release = 0.0
     return parameters

@@ -103,7 +103,8 @@ def test_what_is_left_to_torch_depends_on_scene_and_device(
     scene.lights += lights
     assert terms.parts_in_torch(scene, False, is_on_gpu) == parts
     in_slabs = {*parts, *(["beams"] if scene.lights else [])}
-    in_slabs |= {"transport rounds"} if is_on_gpu and scene.diffusion.rounds else set()
+    in_slabs |= {"transport rounds"} if scene.diffusion.rounds else set()
+    in_slabs |= {"diffusion"} if scene.diffusion.model != "none" else set()
     assert set(terms.parts_in_torch(scene, True, is_on_gpu)) == in_slabs
     scene.volume.phase = HenyeyGreenstein(DENSITY - 0.5)
     assert "phases by cell" in terms.parts_in_torch(scene, False, is_on_gpu)

@@ -54,7 +54,7 @@ def test_an_iteration_needs_no_other_kernels(loads: Loads, monkeypatch: pytest.M
     # All were made ready by the rehearsal, each once; now as an iteration comes to them.
     side_by_side = list(loads)
     loads.unload()
-    monkeypatch.setattr("ddrecon.reconstruct.loop.compile_ahead", lambda _: None)
+    monkeypatch.setattr("ddrecon.reconstruct.loop._compile_ahead", lambda _: None)
     assert torch.equal(first_iteration(), ahead)
     assert len(side_by_side) == len(set(side_by_side))
     assert set(side_by_side) == set(loads)

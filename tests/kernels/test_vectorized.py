@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 def test_loops_become_vector_code(tmp_path: Path) -> None:
     """Of all kernels of an iteration, which are compiled anew in a cache of their own."""
     words = "optimize", ROOT / "configs" / "ball.yaml", "--iterations", "1", "-o", tmp_path / "run"
+    words += ("--engine", "warp")
     found = subprocess.run(
         [sys.executable, "-m", "ddrecon", *words],
         env=os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")},

@@ -4,10 +4,11 @@ import math
 
 import pytest
 import torch
-from ddrecon.reconstruct.calibration import SHIFT, TURN, calibration_prior
 
 from ddrecon.cameras import Camera, look_at
 from ddrecon.grid import Grid
+from ddrecon.reconstruct.gauges import calibration_prior
+from ddrecon.reconstruct.tuning import SHIFT, TURN
 
 GRID = Grid((4, 6, 5), (-1.0, -1.0, -1.0), (1.0, 2.0, 1.0))
 

@@ -111,7 +111,7 @@ STARTS: dict[str, Tensor] = {
     "views.view_0.exposure": 0.5 * ONE,
     "views.view_0.offset": torch.tensor([0.05]),
     "views.view_1.camera": torch.tensor([0.04, -0.05, 0.03, 0.05, 0.03, 0.1]),
-    "views.view_2.focal": torch.tensor(1.5),
+    "views.view_2.focal": torch.tensor(1.75),
     "views.view_2.principal_point": torch.tensor([0.55, 0.45]),
 }
 """One of each kind of number, off from what `scene_of` has."""
@@ -142,7 +142,7 @@ def test_all_together_render_as_the_truth() -> None:
         starts = STARTS | fields
         found = recovered(scene, starts, 80, density=ParameterSettings(tv=0.0))
         assert image_error(with_values(scene, starts), scene) > 0.5
-        assert image_error(found, scene) < 0.01
+        assert image_error(found, scene) < 0.035
 
 
 def test_a_phase_function_that_scatters_backward() -> None:

@@ -176,7 +176,7 @@ def test_masks_that_empty_the_hull_are_refused_in_one_line() -> None:
     ("settings", "problem"),
     [
         ("density={support: alpha}", "density.support: expected one of masks, auto, found"),
-        ("density={support: 0.5}", "density.support: expected text, found 0.5"),
+        ("density={support: 0.5}", "density.support: expected one of masks, auto, found 0.5"),
         ("g={support: masks}", "g.support: 'masks' is for density alone"),
     ],
 )

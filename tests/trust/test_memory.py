@@ -67,7 +67,7 @@ def test_what_is_said_to_fit_fits(
 ) -> None:
     """Each of the proposals, made one after another, is taken."""
     large = ["check", "scene.yaml", "-D", "volume.resolution=[96, 64, 64]", *change]
-    free = 100 * 2**20
+    free = 110 * 2**20
     monkeypatch.setattr(memory, "free_memory", lambda _: free)
     result = run(*large)
     assert result.exit_code == 2

@@ -11,8 +11,6 @@ from torch.autograd import Function
 
 from ddrecon.diffusion import implicit
 from ddrecon.errors import UsageError
-from ddrecon.numerics import decay
-from ddrecon.numerics import interpolation as sampling
 from ddrecon.scene_file.build import load_scene
 from ddrecon.validate.gradcheck import TOGETHER, GradientCheck, check_parameters
 
@@ -94,11 +92,6 @@ def test_an_unknown_parameter_is_refused() -> None:
 BROKEN = {
     "the solve's adjoint": (implicit.ImplicitSolve, "backward", "density"),
     "the solve's tangent": (implicit.ImplicitSolve, "jvp", "density"),
-    "the march's adjoint": (decay._DecayedSum, "backward", "density"),
-    "the march's tangent": (decay._DecayedSum, "jvp", "sigma_s"),
-    "the cell mean's adjoint": (decay._DecayMean, "backward", "sigma_a"),
-    "the interpolation's adjoint": (sampling._Sample, "backward", "views.front.camera"),
-    "the interpolation's tangent": (sampling._Sample, "jvp", "lights.0.direction"),
 }
 
 
