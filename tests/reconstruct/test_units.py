@@ -168,4 +168,4 @@ def test_a_run_is_the_same_in_every_unit(
     kind, expected = reference
     actual = found(kind, density, length)
     off = {name: float((actual[name] - value).norm()) for name, value in expected.items()}
-    assert not {name for name, error in off.items() if error > 1e-6 * expected[name].norm()}
+    assert not {name for name, error in off.items() if error > 1e-4 * expected[name].norm()}
