@@ -1,1 +1,1 @@
-"""The integral along view rays. Read `plain.py` first: it is all of it, in plain sums."""
+"""The integral along view rays. Read `integral.py` first: it is the definition."""

@@ -93,11 +93,8 @@ def _build_view(
             ).to(device, dtype)
     size = _size(section.camera, image)
     if size is not None:
-        for path, picture in (
-            (section.image, image),
-            (section.mask, mask),
-            (section.background, background),
-        ):
+        paths = section.image, section.mask, section.background
+        for path, picture in zip(paths, (image, mask, background), strict=True):
             if picture is not None and tuple(picture.shape[-2:]) != size:
                 wrong = f"is {_by(picture.shape[-2:])} pixels, but {key}.camera has {_by(size)}"
                 problems.note(FormatError(path, wrong))
