@@ -1,5 +1,6 @@
 """A rehearsal comes to every kernel that is launched in earnest, and leaves nothing behind."""
 
+import logging
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +10,7 @@ import torch
 
 pytest.importorskip("warp")
 
-from ddrecon.engine import use_engine
+from ddrecon.engine import LOG, use_engine
 from ddrecon.kernels import compiling
 from ddrecon.kernels import launch as launching
 from ddrecon.kernels.text import TextKernel
@@ -48,9 +49,13 @@ def first_iteration() -> torch.Tensor:
 
 
 @pytest.mark.slow
-def test_an_iteration_needs_no_other_kernels(loads: Loads, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_iteration_needs_no_other_kernels(
+    loads: Loads, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     use_engine("warp")
-    ahead = first_iteration()
+    with caplog.at_level(logging.DEBUG, LOG):
+        ahead = first_iteration()
+    assert "ended early" not in caplog.text
     # All were made ready by the rehearsal, each once; now as an iteration comes to them.
     side_by_side = list(loads)
     loads.unload()

@@ -50,7 +50,9 @@ def run_rounds(
     grid = problem.medium.grid
     light = _renewed(light, grid)
     for round_index, factor in enumerate(_blending(problem.medium, rounds), 1):
-        light = _renewed(_round(problem, light, solve, degree, round_index, factor), grid)
+        cosine = _flux_factor(problem.medium, round_index == rounds)
+        made = _round(problem, light, solve, degree, round_index, cosine, factor)
+        light = _renewed(made, grid)
     return light
 
 
@@ -68,9 +70,13 @@ def _round(
     solve: SolverWithMemory[Operator],
     degree: int,
     round_index: int,
+    cosine: Tensor,
     factor: Tensor | None,
 ) -> Moments:
-    """What one round makes of `light` (E12); with a `factor`, `factor` as far from light (E19)."""
+    """What one round makes of `light` (E12); with a `factor`, `factor` as far from light (E19).
+
+    `cosine`: as of `_flux_factor`.
+    """
     operator, right = problem.system
     medium, outside = problem.medium, problem.outside
     is_lit_from_outside = is_varied(outside) or is_any_nonzero(outside)
@@ -82,7 +88,7 @@ def _round(
     if round_index > 1:
         imbalance = _imbalance(operator, right, light.mean)
         off = Moments(imbalance, problem.flux(light.mean, begun=light.flux, sign=-1))
-    gain, source, turned = _gain(medium, change, off, degree)
+    gain, source, turned = _gain(medium, change, off, degree, cosine)
     solve_round = replace(solve, round_index=round_index, start=light.mean.detach())
     mean = problem.solved(solve_round, problem.right_side(source, turned))
     # the round's L0 and L1: u plus its gain, 3 F(u) plus its gain
@@ -109,6 +115,17 @@ def _blend(
     return light.plus(_times(new.plus(_times(light, -1)), factor))
 
 
+def _flux_factor(medium: Medium, is_last: bool) -> Tensor:
+    """How much of the change of the flux counts in a round: p_1 in the last (E12).
+
+    That passes on smooth changes whole, and multiplies fine ones by up to p_1 / (1 - p_1), above 1
+    where scattering is peaked. So earlier rounds take as much of it as multiplies neither by more
+    than p_1 / (2 - p_1).
+    """
+    p_1 = remaining_moments(medium)[1]
+    return p_1 if is_last else p_1 * (1 - p_1) / (2 - p_1)
+
+
 def _times(light: Moments, factor: Tensor | float) -> Moments:
     return light.scaled(factor, factor, factor)
 
@@ -128,15 +145,14 @@ def _blending(medium: Medium, rounds: int) -> list[Tensor | None]:
 
 
 def _gain(
-    medium: Medium, change: Moments, off: Moments | None, degree: int
+    medium: Medium, change: Moments, off: Moments | None, degree: int, cosine: Tensor
 ) -> tuple[Moments, Tensor, Vector | None]:
     """The gains theta (L0' - L0) and theta (L1' - 3 F(L0)) of E12, and what they add to S.
 
-    That is kappa_s theta (L0' - L0) - theta (S - A L0). And theta p_1 (L1' - L1), by how much the
-    flux that scatters changes (E17). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and
+    That is kappa_s theta (L0' - L0) - theta (S - A L0). And c = theta `cosine` (L1' - L1), by how
+    much the flux that scatters changes (E17). `change`: L0' - L0 and L1' - L1; `off`: S - A L0 and
     L1 - 3 F(L0), None for zero.
     """
-    cosine = remaining_moments(medium)[1]
     if is_fused() and not medium.is_cellwise:
         from ddrecon.diffusion.rounds.fused.gain import gain_fused
 
@@ -152,7 +168,7 @@ def _gain(
 
 
 def _turned(share: Tensor, cosine: Tensor, change: Vector) -> Vector:
-    """theta p_1 (L1' - L1)."""
+    """theta `cosine` (L1' - L1)."""
     z, y, x = (share * cosine * along for along in change)
     return z, y, x
 

@@ -60,9 +60,8 @@ class Coarsest:
         for axis, conductance in zip(AXES, operator.conductances, strict=True):
             low, high = lower_cells(number, axis).flatten(), upper_cells(number, axis).flatten()
             matrix[:, low, high] = matrix[:, high, low] = -conductance.flatten(1).double()
-        return Coarsest(
-            torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L).to(operator.loss.dtype)
-        )
+        # Of no medium, as in a rehearsal, it is not finite; no error.
+        return Coarsest(torch.linalg.inv_ex(matrix).inverse.to(operator.loss.dtype))
 
     def correction(self, residual: Tensor) -> Tensor:
         """A^-1 `residual`."""

@@ -13,8 +13,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ddrecon.diffusion.implicit import SolveMemory
+from ddrecon.diffusion.closures import Closure
+from ddrecon.diffusion.conservative import DiffusionProblem
+from ddrecon.diffusion.implicit import SolveMemory, SolverWithMemory
 from ddrecon.diffusion.rounds.sweep import DIRECTIONS, sweep
+from ddrecon.diffusion.rounds.transport import run_rounds
+from ddrecon.diffusion.solvers.multigrid import multigrid
 from ddrecon.light.moments import Moments
 from ddrecon.light.reduced import reduced_light
 from ddrecon.medium.coefficients import scale_medium
@@ -87,6 +91,31 @@ def test_no_thickness_of_cells_lets_rounds_grow(g: float, thickness: float, patt
     first, later = (light_after(scene, rounds) for rounds in (int(g != 0), 6))
     assert bool(torch.isfinite(later).all()) and float(later.norm()) < 2 * float(first.norm())
     assert float((later - light_after(scene, 7)).norm()) < 0.05 * float(later.norm())
+
+
+@pytest.mark.parametrize(
+    ("g", "degree", "thickness"),
+    [(-0.8, 3, 0.1), (0.6, 5, 6.0), (0.85, 5, 1.5), (0.85, 7, 1.5), (0.95, 5, 1.5), (0.95, 7, 6.0)],
+)
+def test_rounds_forget_where_they_began(g: float, degree: int, thickness: float):
+    """From noise, which holds all waves, and in a box full of it, where diffusion passes few on."""
+    cells, random = (1, 16, 16, 16), torch.Generator().manual_seed(7)
+    scene = make_scene(
+        torch.ones(cells[1:], dtype=torch.float64),
+        sigma_a=(0.001,),
+        sigma_s=(16 * thickness,),
+        g=g,
+        tolerance=1e-8,
+    )
+    medium = scale_medium(scene.volume, degree)
+    noise = torch.randn((degree + 1) ** 2, *cells, generator=random, dtype=torch.float64)
+    nothing = Moments.of_harmonics(torch.zeros_like(noise))
+    problem = DiffusionProblem(
+        medium, Closure("geometric", medium.grid), nothing, noise.new_zeros(1, 1, 1, 1), True
+    )
+    solve = SolverWithMemory(multigrid, 1e-8, SolveMemory(is_warm=False))
+    light = run_rounds(problem, Moments.of_harmonics(noise), solve, 16, degree)
+    assert float(light.harmonics(degree).norm()) < 1e-3 * float(noise.norm())
 
 
 @pytest.mark.parametrize(
