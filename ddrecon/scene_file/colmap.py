@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from ddrecon.errors import FormatError
 from ddrecon.io.files.reading import guard_reading
@@ -40,14 +40,12 @@ parameters in order.
 MOST_VIEWS, LARGEST_SIDE = 10**5, 16384
 
 
-@dataclass(frozen=True)
-class Posed:
+class Posed(NamedTuple):
     """An image of a model: its `name`, its camera's number, and the rotation and shift to it."""
 
     name: str
     camera: int
-    rotation: tuple[float, ...]
-    shift: tuple[float, ...]
+    pose: Sequence[float]
 
 
 def read_colmap(node: Node, folder: Path, images: Path) -> list[ViewSection]:
@@ -86,23 +84,17 @@ def _matrix(path: Path, image: Posed) -> Matrix:
     """Camera to world with OpenGL axes."""
     import numpy as np
 
-    quaternion, shift = np.array(image.rotation), np.array(image.shift)
+    quaternion, shift = np.array(image.pose[:4]), np.array(image.pose[4:])
     norm = math.sqrt(float(quaternion @ quaternion))
     if not (math.isfinite(norm) and norm > 0 and np.isfinite(shift).all()):
         raise FormatError(path, f"image {image.name!r}: its pose is not finite, or no rotation")
     w, x, y, z = quaternion / norm
-    to_camera = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    to_world = np.eye(3) - 2 * w * cross + 2 * cross @ cross
     pose = np.eye(4)
-    pose[:3, :3] = to_camera.T * (1, -1, -1)
-    pose[:3, 3] = -to_camera.T @ shift
-    a, b, c, d = (tuple(float(entry) for entry in row) for row in pose)
-    return a, b, c, d  # type: ignore[return-value]
+    pose[:3, :3] = to_world * (1, -1, -1)
+    pose[:3, 3] = -to_world @ shift
+    return tuple(map(tuple, pose.tolist()))  # type: ignore[return-value]
 
 
 def _camera(
@@ -182,7 +174,7 @@ def _text_images(path: Path) -> Iterator[Posed]:
                 path,
                 f"line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
             ) from error
-        yield Posed(name, camera, tuple(pose[:4]), tuple(pose[4:]))
+        yield Posed(name, camera, pose)
         next(lines, None)
 
 
@@ -204,7 +196,7 @@ def _binary_images(path: Path) -> Iterator[Posed]:
                 name += letter
             (points,) = _unpack(path, stream, "<Q")
             stream.seek(24 * points, 1)
-            yield Posed(name.decode(), camera, tuple(pose[:4]), tuple(pose[4:]))
+            yield Posed(name.decode(), camera, pose)
 
 
 def _count(path: Path, stream: BinaryIO) -> int:

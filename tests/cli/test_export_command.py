@@ -13,7 +13,7 @@ import pytest
 from click.testing import Result
 from small_scene import contents
 
-from ddrecon.io.volumes.table import FORMATS, field_names, read_field, write_field
+from ddrecon.io.volumes.table import field_names, read_field, write_field
 
 Run = Callable[..., Result]
 Refuse = Callable[..., list[str]]
@@ -61,19 +61,6 @@ def test_overwrite(succeed: Run, refuse: Refuse) -> None:
     first = Path("smoke.xml").read_bytes()
     succeed("export", "scene.yaml", "-o", "smoke.xml", "--overwrite", "-D", "volume.g=0")
     assert Path("smoke.xml").read_bytes() != first
-
-
-def test_other_suffixes(refuse: Refuse) -> None:
-    (line,) = refuse(2, "export", "density.npz", "-o", "smoke.obj")
-    known = ", ".join((".xml", ".json", *FORMATS))
-    assert line == f"-o smoke.obj: unknown format '.obj'; known: {known}"
-
-
-def test_one_scene_at_a_time(refuse: Refuse) -> None:
-    assert (
-        refuse(2, "export", "scene.yaml", "scene.yaml", "-o", "smoke.xml")[-1]
-        == "Error: one scene at a time is written as .xml"
-    )
 
 
 def test_volumes_through_every_format_keep_a_corner_in_its_place(
@@ -132,12 +119,6 @@ def test_volumes_that_do_not_go_together(refuse: Refuse, succeed: Run) -> None:
     succeed("export", "density.npz", "-o", "two.vti", "--overwrite")
 
 
-def test_no_folder(refuse: Refuse, folder: Path) -> None:
-    assert refuse(2, "export", "scene.yaml", "-o", "none/smoke.xml") == [
-        "none/smoke.xml: there is no folder none"
-    ]
-
-
 def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
     """What differs by cell as fields, the rest as metadata where the format has a place for it."""
     succeed("optimize", "scene.yaml", "-o", "run", "-q", "--iterations", "1")
@@ -157,14 +138,8 @@ def test_a_run_is_exported_as_it_stands(succeed: Run, refuse: Refuse) -> None:
         assert np.array_equal(ours.values, theirs.values) and np.array_equal(
             ours.bounds, theirs.bounds
         )
-    succeed(
-        "export",
-        "scene.yaml",
-        "-o",
-        "by_cell.npz",
-        "-D",
-        "volume.sigma_s={file: density.npz, name: density}",
-    )
+    by_cell = "-D", "volume.sigma_s={file: density.npz, name: density}"
+    succeed("export", "scene.yaml", "-o", "by_cell.npz", *by_cell)
     assert field_names(Path("by_cell.npz")) == ["density", "sigma_t", "albedo"]
     sought = "optimize.parameters.albedo={init: 0.8, field: true}"
     succeed("optimize", "scene.yaml", "-o", "field", "-q", "--iterations", "2", "-D", sought)

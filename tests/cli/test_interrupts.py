@@ -22,7 +22,7 @@ CHECK = "from ddrecon.cli import main; main(['check', 'scene.yaml'])"
 MOMENTS = {
     **{
         f"{module} is imported": f"sys.meta_path.insert(0, PressAt({module!r})); {CHECK}"
-        for module in ("click", "yaml", "torch")
+        for module in ("click", "torch")
     },
     "a command runs": f"""
 import ddrecon.scene_file.load as load
@@ -46,16 +46,8 @@ def test_an_interrupt_is_one_line(folder: object, moment: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
-def test_what_is_done_stays_done() -> None:
-    program = (
-        "import atexit; atexit.register(press); from ddrecon.cli import main; main(['--help'])"
-    )
-    done = subprocess.run([sys.executable, "-c", PRESS + program], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "") and "--help" in done.stdout
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.0, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("seconds", [0.0, 1.0])
 def test_ctrl_c_at_the_start(folder: object, seconds: float) -> None:
     """So long after the program's first import, however long Python itself takes until then.
 

@@ -18,9 +18,7 @@ COMMANDS = (
     ["reference", "scene.yaml", "-o", "out", "-D", "views=3"],
     ["bench", "scene.yaml", "-D", "volume"],
     ["info", "wrong.yaml"],
-    ["info", "missing.npz"],
     ["export", "wrong.yaml", "-o", "out.vdb"],
-    ["export", "missing.npz", "-o", "out.vdb"],
     ["check", "scene.yaml", "--dtype", "float16"],
 )
 PROGRAM = f"""

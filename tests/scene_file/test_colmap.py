@@ -116,22 +116,6 @@ def test_one_in_so_many_is_a_test_view(read: Read, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("views", "problem"),
-    [
-        ({"colmap": "sparse/1", "images": "p"}, "sparse/1 has no COLMAP model; expected cameras"),
-        ({"colmap": "sparse/0"}, "colmap: missing key 'images', the folder of its pictures"),
-        ({"colmap": "sparse/0", "transforms": "t.json", "images": "p"}, "give only one of"),
-    ],
-)
-def test_what_is_no_model_is_refused(
-    refusal: Callable[..., list[str]], tmp_path: Path, views: dict[str, Any], problem: str
-) -> None:
-    write_text(tmp_path / "sparse/0", "PINHOLE")
-    (line,) = refusal(changed(views=views))
-    assert problem in line
-
-
-@pytest.mark.parametrize(
     ("file", "old", "new", "problem"),
     [
         ("cameras.txt", "PINHOLE", "FOV", "camera 7: lens model FOV is not known; undistort"),
