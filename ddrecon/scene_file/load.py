@@ -61,23 +61,18 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
 
     Raises SceneError with one line per problem.
     """
-    path = Path(path)
-    problems = Problems()
-    try:
+    path, problems = Path(path), Problems()
+    root = tree = None
+    with problems.collecting():
         root = parse(_text(path), lambda line, column: f"{path}:{line}:{column}", problems)
-    except SceneError as error:
-        raise SceneError([*problems.lines, *error.problems]) from None
-    if root.value is None:
-        raise root.refused("is empty")
-    for text in overrides:
-        with problems.collecting():
-            override(root, text, problems)
-    try:
-        rule = Rule(SceneTree, path.absolute().parent, {}, FINISH)
-        tree = read_record(root, SceneTree, rule)
-    except SceneError as error:
-        raise SceneError([*problems.lines, *error.problems]) from None
+        if root.value is None:
+            raise root.refused("is empty")
+        for text in overrides:
+            with problems.collecting():
+                override(root, text, problems)
+        tree = read_record(root, SceneTree, Rule(SceneTree, path.absolute().parent, {}, FINISH))
     problems.raise_any()
+    assert root is not None and tree is not None
     return SceneFile(tree, path, {node.key: node.where for node in root.walk()})
 
 

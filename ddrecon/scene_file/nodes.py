@@ -11,7 +11,6 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import yaml
 
@@ -24,12 +23,8 @@ MAX_DEPTH = 32
 MAX_COPIES = 10_000
 """So many values may come of aliases: a few of these could stand for billions."""
 MERGE = "<<"
-FAST = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+LOADER = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """The parser in C, where it is there: some twenty times faster."""
-SHORT = 2**17
-"""What the parser in C refuses the other one looks at, if it has no more characters: its messages
-are better, and it takes all of JSON.
-"""
 
 Locate = Callable[[int, int], str]
 """Tells where a 1-based line and column are: `file:line:column`, or the override they belong to."""
@@ -97,16 +92,7 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     Raises SceneError where the text has no such tree: broken syntax, several documents, tags.
     """
     try:
-        composer = _Composer(text, locate, FAST)
-        try:
-            root = composer.document(key)
-        except (yaml.YAMLError, UnicodeEncodeError):
-            if len(text) > SHORT:
-                raise
-            composer = _Composer(text, locate, yaml.BaseLoader)
-            root = composer.document(key)
-        problems.lines += composer.repeated.lines
-        return root
+        return _Composer(text, locate, problems).document(key)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = locate(mark.line + 1, mark.column + 1) if mark else locate(1, 1)
@@ -114,7 +100,7 @@ def parse(text: str, locate: Locate, problems: Problems, key: str = "") -> Node:
     except UnicodeEncodeError:
         where, what = locate(1, 1), "its text is not UTF-8"
     except yaml.reader.ReaderError as error:
-        before = text[: error.position]
+        before = text.encode(errors="replace")[: error.position].decode(errors="ignore")
         where = locate(before.count("\n") + 1, len(before) - before.rfind("\n"))
         what = f"the character {error.character!r} is not allowed"
     raise SceneError(f"{where}: not YAML: {what}")
@@ -126,9 +112,9 @@ class _Composer:
     `anchors` are the nodes that aliases may stand for, by name; `copies` counts what they became.
     """
 
-    def __init__(self, text: str, locate: Locate, loader: Any):
-        self.events = yaml.parse(text, Loader=loader)
-        self.locate, self.repeated = locate, Problems()
+    def __init__(self, text: str, locate: Locate, problems: Problems):
+        self.events = yaml.parse(text, Loader=LOADER)
+        self.locate, self.problems = locate, problems
         self.anchors: dict[str, Node] = {}
         self.copies = 0
 
@@ -155,7 +141,7 @@ class _Composer:
         if depth > MAX_DEPTH:
             raise node.refused(f"nested more than {MAX_DEPTH} deep")
         if isinstance(event, yaml.ScalarEvent):
-            node.value = resolve(event.value) if not event.style else _join(event.value)
+            node.value = event.value if event.style else resolve(event.value)
         elif isinstance(event, yaml.SequenceStartEvent):
             node.value = entries = list[Node]()
             while not isinstance(event := next(self.events), yaml.SequenceEndEvent):
@@ -206,7 +192,7 @@ class _Composer:
                 next(self.events), parent.child_key(name), self.where(event), depth + 1
             )
             if name in entries:
-                self.repeated.note(
+                self.problems.note(
                     child.key_refused(f"repeated key; it is already at {entries[name].key_where}")
                 )
             else:
@@ -216,11 +202,6 @@ class _Composer:
     def where(self, event: yaml.Event) -> str:
         mark = event.start_mark
         return self.locate(mark.line + 1, mark.column + 1) if mark else self.locate(1, 1)
-
-
-def _join(text: str) -> str:
-    r"""`text` with the surrogate pairs that JSON writes as \ud83d\ude00 made one character each."""
-    return text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
 _WORDS: dict[str, Scalar] = {

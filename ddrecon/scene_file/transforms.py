@@ -12,7 +12,8 @@ import json
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,13 +66,20 @@ def read_transforms(
     for path in paths:
         with problems.collecting():
             document = _document(node, path)
-            try:
+            with in_file(path):
                 views += _file_views(document, path, test_every)
-            except SceneError as error:
-                first, *others = error.problems
-                raise FormatError(path, first.removeprefix(f"{path}: "), others) from error
     problems.raise_any()
     return tuple(views)
+
+
+@contextmanager
+def in_file(path: Path) -> Iterator[None]:
+    """What is wrong with nodes in the block is the fault of the file at `path`."""
+    try:
+        yield
+    except SceneError as error:
+        first, *others = error.problems
+        raise FormatError(path, first.removeprefix(f"{path}: "), others) from error
 
 
 def _document(node: Node, path: Path) -> Node:
@@ -83,7 +91,7 @@ def _document(node: Node, path: Path) -> Node:
                 path, f"is larger than {MAX_BYTES // 2**20} MiB; it holds more than cameras"
             )
         try:
-            return _node("", str(path), json.loads(path.read_bytes(), parse_int=_whole))
+            return node_of("", str(path), json.loads(path.read_bytes(), parse_int=_whole))
         except (ValueError, RecursionError) as error:
             raise FormatError(path, f"not JSON: {error}") from error
 
@@ -93,13 +101,15 @@ def _whole(digits: str) -> int | float:
     return int(digits) if len(digits) < 300 else float(digits)
 
 
-def _node(key: str, where: str, value: Any) -> Node:
+def node_of(key: str, where: str, value: Any) -> Node:
     """`value`, as JSON has it, as a node at `key` and all those below it."""
     node = Node(key, where, where, value)
     if isinstance(value, dict):
-        node.value = {name: _node(node.child_key(name), where, one) for name, one in value.items()}
+        node.value = {
+            name: node_of(node.child_key(name), where, one) for name, one in value.items()
+        }
     elif isinstance(value, list):
-        node.value = [_node(node.child_key(index), where, one) for index, one in enumerate(value)]
+        node.value = [node_of(node.child_key(index), where, one) for index, one in enumerate(value)]
     return node
 
 
@@ -163,7 +173,7 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
         read_as(own[name], Path, folder) if name in own else None
         for name in ("file_path", "mask_path")
     )
-    camera = _read_camera(frame, {**shared, **own}, folder)
+    camera = read_camera(frame, {**shared, **own}, folder)
     if image is None and camera.resolution is None:
         raise frame.refused(
             "has neither file_path nor w and h, so that its number of pixels is unknown"
@@ -173,7 +183,7 @@ def _frame_view(frame: Node, shared: Entries, folder: Path) -> ViewSection:
     return ViewSection(camera=camera, image=image, mask=mask)
 
 
-def _read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
+def read_camera(frame: Node, entries: Entries, folder: Path) -> PerspectiveSection:
     """The camera that `entries` describe, those of `frame` and of its file.
 
     Raises SceneError for what is wrong.

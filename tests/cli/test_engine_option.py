@@ -15,7 +15,7 @@ from media import half_empty, make_scene
 
 from ddrecon import engine, terms
 from ddrecon.cli import check
-from ddrecon.cli.session import Session, show_compilations
+from ddrecon.cli.session import Session
 from ddrecon.light.lights import PointLight
 from ddrecon.medium.phase import HenyeyGreenstein
 
@@ -153,11 +153,3 @@ def test_a_compilation_is_announced_once(
     for _ in range(2):
         result = succeed("check", "scene.yaml", *quiet)
         assert result.stderr.splitlines() == expected
-
-
-def test_no_handler_stays() -> None:
-    before = LOG.level, list(LOG.handlers)
-    with pytest.raises(KeyError), show_compilations(is_quiet=False):
-        assert len(LOG.handlers) == len(before[1]) + 1
-        raise KeyError
-    assert (LOG.level, LOG.handlers) == before

@@ -77,21 +77,11 @@ def test_rounds_and_degree_follow_from_the_phase_function_and_from_thick_cells(
 
 def test_every_tensor_has_the_type_asked_for(write: Write):
     scene = load_scene(write(SCENE), dtype=torch.float64)
-    tensors = [
-        scene.volume.density,
-        scene.volume.sigma_a,
-        scene.volume.sigma_s,
-        scene.volume.g,
-        scene.views[0].camera.pose,
-    ]
-    assert {
-        tensor.dtype
-        for tensor in [
-            *tensors,
-            *(value for light in scene.lights for value in vars(light).values()),
-        ]
-    } == {torch.float64}
-    assert scene.volume.sigma_a[0].item() == 0.6
+    volume, camera = scene.volume, scene.views[0].camera
+    tensors = [volume.density, volume.sigma_a, volume.sigma_s, volume.g, camera.pose]
+    tensors += [value for light in scene.lights for value in vars(light).values()]
+    assert {tensor.dtype for tensor in tensors} == {torch.float64}
+    assert volume.density.is_contiguous() and volume.sigma_a[0].item() == 0.6
 
 
 def test_extinction_and_albedo(write: Write):
