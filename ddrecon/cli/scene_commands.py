@@ -108,7 +108,7 @@ def render(
         require_mp4()
     loaded = session.build(scene_file)
     require_sharing(loaded)
-    views = session.pick_views(loaded, names)
+    views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
     if lights or count is not None:
         loaded = remove_targets(loaded, views, count)
         views = list(loaded.views)

@@ -25,12 +25,11 @@ from ddrecon.progress import bar_settings
 from ddrecon.ranks import is_first, join_ranks, rank_count
 from ddrecon.run.result import RESULT
 from ddrecon.scene_file.load import SceneFile, read_scene
-from ddrecon.scene_file.problems import suggestion
 
 if TYPE_CHECKING:
     import torch
 
-    from ddrecon.scene import Scene, View
+    from ddrecon.scene import Scene
 
 STDOUT = Path("-")
 """Where `--json` without a file sends a report."""
@@ -120,15 +119,6 @@ class Session:
         """The scene at `path` as tensors."""
         return self.build(self.read(path))
 
-    def pick_views(self, scene: Scene, names: tuple[str, ...]) -> list[View]:
-        """The views of `scene` called `names`, or all; raises UsageError for an unknown name."""
-        known = [view.name for view in scene.views]
-        if unknown := [name for name in names if name not in known]:
-            raise UsageError(
-                [f"--view {name}: no such view{suggestion(name, known)}" for name in unknown]
-            )
-        return [view for view in scene.views if not names or view.name in names]
-
     def progress(self, items: Sequence[Any], what: str) -> Iterable[Any]:
         """`items` with a progress bar on stderr, unless quiet."""
         return tqdm(items, desc=what, leave=self.verbose, **bar_settings(self.is_quiet))
@@ -193,23 +183,22 @@ def _own_gpu() -> torch.device:
     return torch.device("cuda", place)
 
 
-class _LinesAboveBars(logging.Handler):
-    """Prints each message as a line on stderr, above the progress bar that may be there."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if is_first():
-            tqdm.write(record.getMessage(), file=sys.stderr)
-
-
 @contextmanager
 def show_compilations(is_quiet: bool) -> Iterator[None]:
-    """What the engine logs, that it compiles kernels, becomes lines on stderr, unless quiet."""
-    log, handler = logging.getLogger(LOG), _LinesAboveBars()
-    level = log.level
+    """What the engine logs, that it compiles kernels, becomes lines on stderr, unless quiet.
+
+    They stand above the progress bar that may be there.
+    """
+
+    def show(record: logging.LogRecord) -> bool:
+        if is_first():
+            tqdm.write(record.getMessage(), file=sys.stderr)
+        return False
+
+    log = logging.getLogger(LOG)
     log.setLevel(logging.WARNING if is_quiet else logging.INFO)
-    log.addHandler(handler)
+    log.addFilter(show)
     try:
         yield
     finally:
-        log.removeHandler(handler)
-        log.setLevel(level)
+        log.removeFilter(show)

@@ -90,7 +90,7 @@ def reference(
     )
     from ddrecon.reference.trace import open_tracer
 
-    views = session.pick_views(loaded, names)
+    views = [loaded.view(name) for name in dict.fromkeys(names)] or loaded.views
     tracer = open_tracer(loaded, views, threads=session.threads)
     with claim_folder(output, may_exist=overwrite):
         shown = None if is_only_traced else loaded

@@ -37,6 +37,7 @@ def test_a_run_records_its_engine(succeed: Run) -> None:
     succeed("optimize", "scene.yaml", "-o", "out", "-q", "--engine", "torch", "--iterations", "1")
     environment = json.loads(Path("out/environment.json").read_text())
     assert environment["engine"] == "torch" and "warp-lang" not in environment
+    assert environment["engines"] == dict.fromkeys(engine.PARTS, "torch")
     assert "<td>engine</td><td>torch</td>" in Path("out/report.html").read_text()
 
 
@@ -107,13 +108,6 @@ def test_what_is_left_to_torch_depends_on_scene_and_device(
     assert set(terms.parts_in_torch(scene, True, is_on_gpu)) == in_slabs
     scene.volume.phase = HenyeyGreenstein(DENSITY - 0.5)
     assert "phases by cell" in terms.parts_in_torch(scene, False, is_on_gpu)
-
-
-def test_a_run_notes_the_engine_of_each_part(succeed: Run) -> None:
-    command = "optimize", "scene.yaml", "-o", "out", "-q", "--iterations", "1"
-    succeed(*command, "--engine", "warp", "-D", "diffusion.solver=jacobi")
-    noted = json.loads(Path("out/environment.json").read_text())["engines"]
-    assert noted == dict.fromkeys(engine.PARTS, "warp") | {"diffusion": "torch"}
 
 
 def test_it_is_refused_where_it_cannot_be(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
