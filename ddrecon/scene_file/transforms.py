@@ -145,7 +145,7 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
     named = [
         frame.value.get("file_path") if isinstance(frame.value, dict) else None for frame in frames
     ]
-    names = [one and Path(str(one.value)) for one in named]
+    names = [None if one is None else Path(str(one.value)) for one in named]
     listed = {name: set[Path]() for name in LISTS}
     for name, node in lists.items():
         for entry in node.children():
@@ -155,9 +155,9 @@ def _listed_splits(root: Node, frames: Sequence[Node]) -> list[str | None]:
             listed[name].add(path)
     train, *tests = listed.values()
     splits = list[str | None]()
-    for name in names:
-        is_test = any(name in test for test in tests)
-        is_train = name is None or name in train or LISTS[0] not in lists
+    for own in names:
+        is_test = any(own in test for test in tests)
+        is_train = own is None or own in train or LISTS[0] not in lists
         splits.append("test" if is_test else "train" if is_train else None)
     if not any(splits):
         raise root.refused("its lists of files name no frame")
